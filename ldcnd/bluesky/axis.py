@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, TypeVar
 
 from ldcnd.bluesky.status import Status
 from ldcnd.bluesky.trace import Trace
-from ldcnd.bluesky.values import number_key, reading, text_key
+from ldcnd.bluesky.values import number_key, reading, refuse_other_unit, text_key
 from ldcnd.client.axis import Axis as ClientAxis
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.motion import Motion, Position
+from ldcnd.client.rig import Rig
 from ldcnd.errors import (
     AxisUnreachable,
     CommandAborted,
@@ -21,6 +22,7 @@ from ldcnd.errors import (
     RequestRefused,
     SessionError,
     StopLatched,
+    UnknownAxis,
     WrongState,
 )
 from ldcnd.model.condition import assess
@@ -67,11 +69,12 @@ class ReadableAxis:
 
     parent = None
 
-    def __init__(self, name: str, axis: ClientAxis, info: AxisInfo, rig: str, loop: LoopThread) -> None:
+    def __init__(self, name: str, axis: ClientAxis, info: AxisInfo, rig: Rig, loop: LoopThread) -> None:
         self.name = name
         self._axis = axis
         self._info = info
-        self._source = f"ldcnd://{rig}/{info.axis}"
+        self._rig = rig
+        self._source = f"ldcnd://{rig.name}/{info.axis}"
         self._loop = loop
         self._not_before_ns = 0
         self._followers: dict[Callback[float], Status] = {}
@@ -94,7 +97,8 @@ class ReadableAxis:
         return await self._there(self._reading())
 
     async def describe(self) -> "dict[str, DataKey]":
-        """Return what the reading is."""
+        """Return what the reading is, by the daemon that is there now."""
+        self._info = await self._there(described(self._rig, self._info.axis))
         limits = self._info.limits
         return {
             self.name: number_key(
@@ -150,6 +154,7 @@ class ReadableAxis:
         return self._of((await self._measured()).sample)
 
     def _of(self, sample: PositionSample) -> "dict[str, Reading[float]]":
+        refuse_other_unit(self._info.axis, self._info.unit, sample.unit)
         condition = assess(self._axis.state.sample)
         return {self.name: reading(sample.value, sample.t * 1e-9, sample.quality, condition)}
 
@@ -188,7 +193,7 @@ class Axis(ReadableAxis):
         acceleration: of the moves, in units a second squared; None for the axis default.
     """
 
-    def __init__(self, name: str, axis: ClientAxis, info: AxisInfo, rig: str, loop: LoopThread) -> None:
+    def __init__(self, name: str, axis: ClientAxis, info: AxisInfo, rig: Rig, loop: LoopThread) -> None:
         super().__init__(name, axis, info, rig, loop)
         self.velocity: float | None = None
         self.acceleration: float | None = None
@@ -420,6 +425,18 @@ class Axis(ReadableAxis):
         if why.causes:
             cause = why.causes[0]
             raise RequestRefused(cause.text, axis=why.axis, remedy=cause.remedy)
+
+
+async def described(rig: Rig, axis: str) -> AxisInfo:
+    """Return what an axis is, by the daemon that is there now.
+
+    Raises:
+        UnknownAxis: there is no such axis.
+    """
+    infos = {info.axis: info for info in await rig.describe()}
+    if axis not in infos:
+        raise UnknownAxis(f"rig {rig.name} has no axis {axis!r}; it has {', '.join(infos)}", axis=axis, value=axis)
+    return infos[axis]
 
 
 def _pass_on(flight: Status, began: asyncio.Future[None]) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from ldcnd.bluesky.axis import Axis, ReadableAxis
+from ldcnd.bluesky.axis import Axis, ReadableAxis, described
 from ldcnd.bluesky.signal import Signal
 from ldcnd.client.loop_thread import LoopThread, loop_thread
 from ldcnd.client.rig import Rig
@@ -36,7 +36,6 @@ class Devices:
     def __init__(self, rig: Rig, loop: LoopThread) -> None:
         self._rig = rig
         self._loop = loop
-        self._info = {info.axis: info for info in loop.run(rig.describe())}
 
     @contextmanager
     def control(
@@ -55,9 +54,8 @@ class Devices:
             LeaseHeld: another program controls the axis.
             UnknownAxis: there is no such axis.
         """
-        info = self._known(axis)
         with self._loop.inside(self._rig.control(axis, client=client, lease_s=lease_s, force=force)) as held:
-            yield Axis(name or axis, held, info, self._rig.name, self._loop)
+            yield Axis(name or axis, held, self._known(axis), self._rig, self._loop)
 
     @contextmanager
     def control_all(self, *axes: str, client: str, lease_s: float = LEASE_S) -> Iterator[tuple[Axis, ...]]:
@@ -74,7 +72,7 @@ class Devices:
         """
         info = self._known(axis)
         with self._loop.inside(self._rig.watch(axis)) as watched:
-            yield ReadableAxis(name or axis, watched, info, self._rig.name, self._loop)
+            yield ReadableAxis(name or axis, watched, info, self._rig, self._loop)
 
     def signal(self, axis: str, item: str, *, name: str | None = None) -> Signal:
         """Return an item of an axis as a device: `velocity`, `adc`, `state`, `fault`, or `monitor/<name>`.
@@ -93,8 +91,4 @@ class Devices:
         return Signal(name or f"{axis}_{item.rpartition('/')[2]}", self._rig, info, item, self._loop)
 
     def _known(self, axis: str) -> AxisInfo:
-        if axis not in self._info:
-            raise UnknownAxis(
-                f"rig {self._rig.name} has no axis {axis!r}; it has {', '.join(self._info)}", axis=axis, value=axis
-            )
-        return self._info[axis]
+        return self._loop.run(described(self._rig, axis))

@@ -4,7 +4,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from ldcnd.bluesky.status import Status
-from ldcnd.bluesky.values import number_key, reading, text_key
+from ldcnd.bluesky.values import number_key, reading, refuse_other_unit, text_key
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
 from ldcnd.errors import SessionError
@@ -43,6 +43,7 @@ class Signal:
         self._item = item
         self._source = f"ldcnd://{rig.name}/{info.axis}/{item}"
         self._loop = loop
+        self._unit: str | None = None  # as described last
         self._followers: dict[Callback[float | str], Status] = {}
 
     @property
@@ -62,8 +63,8 @@ class Signal:
         """Return what the value is."""
         if self._item in TEXTS:
             return {self.name: text_key(self._source)}
-        _, unit = _value(await self._latest())
-        return {self.name: number_key(self._source, unit)}
+        _, self._unit = _value(await self._latest())
+        return {self.name: number_key(self._source, self._unit)}
 
     def subscribe(self, function: "Callback[float | str]") -> None:
         """Call `function` with every value that comes, on the devices' own thread."""
@@ -90,7 +91,8 @@ class Signal:
         return sample
 
     def _of(self, sample: Sample) -> "dict[str, Reading[float | str]]":
-        value, _ = _value(sample)
+        value, unit = _value(sample)
+        refuse_other_unit(self._axis, unit if self._unit is None else self._unit, unit)
         return {self.name: reading(value, sample.t * 1e-9, sample.quality)}
 
     def __repr__(self) -> str:

@@ -2,6 +2,7 @@
 
 from typing import TYPE_CHECKING, TypeVar
 
+from ldcnd.errors import WrongState
 from ldcnd.model.condition import Condition
 from ldcnd.model.samples import Quality
 
@@ -24,6 +25,21 @@ def reading(
         return {"value": value, "timestamp": at_s}
     message = f"quality {quality.value}"
     return {"value": value, "timestamp": at_s, "alarm_severity": SEVERITIES[quality], "message": message}
+
+
+def refuse_other_unit(axis: str, described: str, measured: str) -> None:
+    """Refuse a value whose unit is not the one that documents say.
+
+    Raises:
+        WrongState: the daemon was restarted with another unit.
+    """
+    if measured != described:
+        raise WrongState(
+            f"axis {axis}: its values are in {measured} now and were described in {described}",
+            axis=axis,
+            value=measured,
+            remedy="begin a new run, which describes it anew",
+        )
 
 
 def number_key(source: str, unit: str, *, limits: tuple[float | None, float | None] = (None, None)) -> "DataKey":

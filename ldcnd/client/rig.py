@@ -13,7 +13,7 @@ from ldcnd.client.events import Events, follow_events
 from ldcnd.client.lease import Control, inherited_lease, take_control
 from ldcnd.client.motion import Motion
 from ldcnd.client.rig_client import RigClient, Samples, find_rigs
-from ldcnd.errors import LeaseRequired, SessionError, UnknownAxis
+from ldcnd.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.commands import StopReply
@@ -41,6 +41,8 @@ from ldcnd.model.samples import FaultSample, Sample
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ENDPOINT_VARIABLE = "LDCND_CONNECT"
+DESCRIBE_PERIOD_S = 1.0
+"""Period of queries for what the axes are, for programs that outlive a daemon or its configuration, seconds."""
 
 
 @asynccontextmanager
@@ -252,6 +254,17 @@ class Rig:
     async def describe(self) -> list[AxisInfo]:
         """Return what every axis is: unit, limits, capabilities, in the order of lines and addresses."""
         return await self._client.axes()
+
+    async def follow_descriptions(self) -> AsyncIterator[Mapping[str, AxisInfo]]:
+        """Yield what every axis is by its name: at once, and soon after each reload and restart of the daemon."""
+        known: dict[str, AxisInfo] = {}
+        while True:
+            with contextlib.suppress(LdcndError):
+                described = {info.axis: info for info in await self.describe()}
+                if described and described != known:
+                    known = described
+                    yield known
+            await asyncio.sleep(DESCRIBE_PERIOD_S)
 
     async def buses(self) -> list[BusInfo]:
         """Return what every line is and how it does."""

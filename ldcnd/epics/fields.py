@@ -23,6 +23,8 @@ from caproto import (
 LONGEST_TEXT = 512
 """Characters of a text that is longer than an EPICS string, which has 39."""
 LONGEST_STRING = 39
+DESCRIPTION = (*("units", "precision", "upper_ctrl_limit", "lower_ctrl_limit", "upper_disp_limit", "lower_disp_limit"),)
+"""What a channel says about its values."""
 
 Value = float | int | str
 
@@ -86,6 +88,12 @@ class Field(ChannelData):  # type: ignore[misc] # caproto has no types
             return
         stamp = {} if at_s is None else {"timestamp": at_s}
         await super().write(value, verify_value=False, status=alarm.status, severity=alarm.severity, **stamp)
+
+    async def redescribe(self, like: "Field") -> None:
+        """Take unit, precision and limits from another field, and tell those who monitor them."""
+        said = {name: getattr(like, name) for name in DESCRIPTION if hasattr(like, name)}
+        if any(getattr(self, name) != value for name, value in said.items()):
+            await self.write_metadata(**said)
 
     def native(self, value: Any) -> Value:  # noqa: ANN401
         """Return a value as this channel has it."""

@@ -11,7 +11,7 @@ from caproto.asyncio.server import Context
 from ldcnd.client.rig import Rig
 from ldcnd.epics.fields import Field
 from ldcnd.epics.motor import MotorRecord, database
-from ldcnd.errors import LdcndError, LeaseExpired, LeaseHeld, OutcomeUnknown, SessionError, UnknownAxis
+from ldcnd.errors import LdcndError, UnknownAxis
 from ldcnd.listen_address import ListenAddress
 from ldcnd.model.meta import AxisInfo
 
@@ -40,10 +40,13 @@ class Gateway:
         self._rig = rig
         self._group = group
         self._tasks: set[asyncio.Task[None]] = set()
+        self._records: dict[str, MotorRecord] = {}
+        self._start(self._follow_descriptions(), "descriptions")
 
     def add(self, info: AxisInfo, defaults: tuple[float, float], prefix: str, *, moves: bool) -> None:
         """Show an axis, and begin to follow it."""
         record = MotorRecord(info, defaults, self._start_motion, self._stop, self.connected, moves=moves)
+        self._records[info.axis] = record
         self.variables |= database(prefix, {info.axis: record})
         self._start(self._follow(record), f"values of {info.axis}")
         for monitor in info.monitors:
@@ -59,6 +62,19 @@ class Gateway:
     def connected(self) -> frozenset[object]:
         """Return who is connected now."""
         return frozenset(self.circuits)
+
+    async def _follow_descriptions(self) -> None:
+        async for described in self._rig.follow_descriptions():
+            for name, record in self._records.items():
+                if name in described:
+                    await record.describe(described[name], await _defaults(self._rig, name))
+
+    async def _describe(self, record: MotorRecord) -> None:
+        """Have a record say what its axis is by the daemon that is there now."""
+        name = record.info.axis
+        for info in await self._rig.describe():
+            if info.axis == name:
+                await record.describe(info, await _defaults(self._rig, name))
 
     async def _follow(self, record: MotorRecord) -> None:
         axis = record.info.axis
@@ -86,9 +102,10 @@ class Gateway:
         while True:
             try:
                 async with self._rig.control(record.info.axis, client=WHO, lease_s=LEASE_S) as axis:
+                    await self._describe(record)  # a lease is of one run of the daemon, and so is what is put under it
                     await record.controlled(axis, WHO)
                     await asyncio.Event().wait()
-            except (LeaseExpired, LeaseHeld, OutcomeUnknown, SessionError) as error:
+            except LdcndError as error:
                 await record.controlled(None, str(error))
             await asyncio.sleep(RETRY_S)
 

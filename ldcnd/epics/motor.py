@@ -60,6 +60,8 @@ ALARMS = {
 }
 INPUTS = ("forward_limit", "reverse_limit", "index", "stop_input", "amplifier_enable")
 SEVERITIES = ("NO_ALARM", "MINOR", "MAJOR", "INVALID")
+DESCRIBED = (*("EGU", "PREC", "HLM", "LLM", "DHLM", "DLLM", "VMAX", "MRES", "ERES", "UREV", "BDST", "OUT", "DESC"),)
+"""Fields that say what the axis is."""
 MSTA_PLUS, MSTA_DONE, MSTA_POSITION, MSTA_PROBLEM, MSTA_MOVING, MSTA_COMM = 0x1, 0x2, 0x100, 0x200, 0x400, 0x1000
 MSTA_GAIN, MSTA_HOMED, MSTA_HIGH_SWITCH, MSTA_LOW_SWITCH = 0x800, 0x4000, 0x4, 0x2000
 """Bits of MSTA that the gateway supports."""
@@ -88,7 +90,6 @@ class MotorRecord:
         moves: bool,
     ) -> None:
         self.info = info
-        self.fields: dict[str, Field] = {}
         self._axis: Axis | None = None
         self._start = start
         self._stop = stop
@@ -109,16 +110,17 @@ class MotorRecord:
         self._faults: FaultSample | None = None
         self._condition = assess(None)
         self._switches = 0  # bits of MSTA
-        velocity, acceleration = defaults
-        self._highest_velocity = info.limits.velocity or NO_LIMIT
-        self._make(velocity, acceleration)
+        self.fields: dict[str, Field] = self._made(info, *defaults)
+        self._val = self["VAL"]
+        self._defaults = defaults
         if moves:
             self._let_move()
 
     # -- fields ------------------------------------------------------------------------------------------------------
 
-    def _make(self, velocity: float, acceleration: float) -> None:
-        info, unit = self.info, self.info.unit
+    @staticmethod
+    def _made(info: AxisInfo, velocity: float, acceleration: float) -> dict[str, Field]:
+        unit = info.unit
         low, high = info.limits.position_min, info.limits.position_max
         limits = (0.0, 0.0) if low is None and high is None else (_or(low, -NO_LIMIT), _or(high, NO_LIMIT))
         step = 1.0 / info.counts_per_unit if info.counts_per_unit else 1.0
@@ -127,10 +129,10 @@ class MotorRecord:
         def here(value: float = 0.0, limits: tuple[float, float] = (0.0, 0.0)) -> Field:
             return number(value, unit, precision=precision, limits=limits)
 
-        self._val = here(limits=limits)
+        target = here(limits=limits)
         record: dict[str, Field] = {
-            "VAL": self._val,
-            "DVAL": self._val,  # dial and user values are the same: OFF is 0 and DIR is Pos
+            "VAL": target,
+            "DVAL": target,  # dial and user values are the same: OFF is 0 and DIR is Pos
             "RBV": here(),
             "DRBV": here(),
             "RRBV": integer(),
@@ -180,9 +182,9 @@ class MotorRecord:
             "CNEN": choice("Disable", "Disable", "Enable"),
         }
         name = info.axis
-        self.fields |= {f"{name}.{field}": channel for field, channel in record.items()}
-        self.fields[name] = self._val
-        self.fields |= {
+        fields = {f"{name}.{field}": channel for field, channel in record.items()}
+        fields |= {
+            name: target,
             f"{name}:state": string(),
             f"{name}:condition": text(),
             f"{name}:velocity": number(0.0, f"{unit}/s", precision=precision),
@@ -192,11 +194,12 @@ class MotorRecord:
             f"{name}:control": string("none"),
         }
         if info.adc_full_scale:
-            self.fields[f"{name}:adc"] = number(0.0, "V")
+            fields[f"{name}:adc"] = number(0.0, "V")
         for monitor in info.monitors:
-            self.fields[f"{name}:{monitor}"] = number(0.0, precision=0)
+            fields[f"{name}:{monitor}"] = number(0.0, precision=0)
         if "input_signals" in info.monitors or TelemetryItem.INPUTS in info.items:
-            self.fields[f"{name}:inputs"] = text()
+            fields[f"{name}:inputs"] = text()
+        return fields
 
     def _let_move(self) -> None:
         can = set(self.info.capabilities)
@@ -231,6 +234,31 @@ class MotorRecord:
     def __getitem__(self, field: str) -> Field:
         return self.fields[f"{self.info.axis}.{field}"]
 
+    async def describe(self, info: AxisInfo, defaults: tuple[float, float]) -> None:
+        """Take what the axis is from now on: its daemon was reloaded or restarted.
+
+        After a change of unit nothing moves until Go is put to SPMG: numbers of clients may be in the former one.
+        """
+        before, fresh = self.info, self._made(info, *defaults)
+        is_other_unit = info.unit != before.unit
+        described = {f"{info.axis}.{field}" for field in DESCRIBED}
+        highest = info.limits.velocity or NO_LIMIT
+        if is_other_unit or defaults != self._defaults or float(self["VELO"].value) > highest:
+            described |= {f"{info.axis}.{field}" for field in ("VELO", "JVEL", "ACCL")}
+        if is_other_unit:
+            if self["SPMG"].action:
+                await self["SPMG"].show("Stop")
+            self._sent, self._state = None, None
+            await self._show_beside(
+                "message", f"its unit is {info.unit} now and was {before.unit}: put Go to SPMG to let it move"
+            )
+        self.info, self._defaults = info, defaults
+        for name, channel in self.fields.items():
+            if name in fresh:
+                await channel.redescribe(fresh[name])
+                if name in described:
+                    await channel.show(fresh[name].value)
+
     def beside(self, name: str) -> Field | None:
         """Return a variable beside the record, such as `adc`."""
         return self.fields.get(f"{self.info.axis}:{name}")
@@ -241,6 +269,8 @@ class MotorRecord:
         """Show a sample; the item names monitors."""
         alarm, at_s = QUALITIES[sample.quality], sample.t * 1e-9
         match sample:
+            case PositionSample() if sample.unit != self.info.unit:
+                await self["RBV"].show(self["RBV"].value, SILENT)  # of a daemon that is not described here yet
             case PositionSample():
                 worst = max(alarm, self._alarm, key=lambda each: each.severity)
                 for field in ("RBV", "DRBV"):
@@ -475,12 +505,13 @@ class MotorRecord:
         return Put()
 
     async def _put_velo(self, asked: Value) -> Put:
-        if float(asked) > self._highest_velocity:
+        highest = self.info.limits.velocity or NO_LIMIT
+        if float(asked) > highest:
             raise ValueOutOfRange(
                 f"axis {self.info.axis}: {asked} {self.info.unit}/s is above its limit",
                 axis=self.info.axis,
                 value=asked,
-                limit=self._highest_velocity,
+                limit=highest,
             )
         return await self._put_positive(asked)
 

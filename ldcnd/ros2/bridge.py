@@ -39,13 +39,12 @@ class Bridge:
     """The axes of a rig, as messages.
 
     Attributes:
-        joints: the axes that are joints.
+        axes: what they are, by name.
     """
 
     def __init__(self, rig: str, axes: Mapping[str, AxisInfo]) -> None:
         self._rig = rig
-        self._axes = axes
-        self.joints = {name for name, info in axes.items() if info.unit in SI}
+        self.axes = axes
         self._velocities: dict[str, VelocitySample] = {}
         self._states: dict[str, StateSample] = {}
         self._faults: dict[str, FaultSample] = {}
@@ -59,17 +58,21 @@ class Bridge:
                 self._states[axis] = sample
             case FaultSample():
                 self._faults[axis] = sample
-            case PositionSample() if axis in self.joints and self._is_known(axis, sample):
-                scale = SI[self._axes[axis].unit]
+            case PositionSample() if sample.unit in SI and self._is_known(axis, sample):
+                scale = SI[sample.unit]  # of the daemon that has measured it, which may have another unit than before
                 velocity = self._velocities.get(axis)
-                is_fresh = velocity is not None and abs(sample.t - velocity.t) <= FRESH_NS
+                is_fresh = (
+                    velocity is not None
+                    and velocity.unit == f"{sample.unit}/s"
+                    and abs(sample.t - velocity.t) <= FRESH_NS
+                )
                 velocities = (velocity.value * scale,) if velocity and is_fresh else ()
                 return JointState(sample.t, (axis,), (sample.value * scale,), velocities)
         return None
 
     def diagnostics(self, now_ns: int) -> DiagnosticArray:
         """Return a report on every axis."""
-        return DiagnosticArray(now_ns, tuple(self._status(name, now_ns) for name in self._axes))
+        return DiagnosticArray(now_ns, tuple(self._status(name, now_ns) for name in self.axes))
 
     def _is_known(self, axis: str, sample: PositionSample) -> bool:
         """Tell whether a position says where the axis is: a joint state has no place for a reservation."""
@@ -79,7 +82,7 @@ class Bridge:
         return assess(state, self._faults.get(axis)).place is Place.KNOWN
 
     def _status(self, axis: str, now_ns: int) -> DiagnosticStatus:
-        info, state, faults = self._axes[axis], self._states.get(axis), self._faults.get(axis)
+        info, state, faults = self.axes[axis], self._states.get(axis), self._faults.get(axis)
         active = faults.active if faults else ()
         is_old = state is not None and now_ns - state.t > SILENT_NS
         condition = assess(state, faults, silence=NOT_REPORTED if is_old else "")
@@ -115,14 +118,20 @@ async def run_bridge(rig: Rig, session: Session, axes: tuple[str, ...], domain: 
             declared.push_async_callback(token.close)
             publishers.append(publisher)
         async with asyncio.TaskGroup() as group:
-            group.create_task(_joints(rig, bridge, infos, publishers[0]), name="joint states")
+            group.create_task(_joints(rig, bridge, publishers[0]), name="joint states")
+            group.create_task(_descriptions(rig, bridge, axes), name="descriptions")
             group.create_task(_diagnostics(bridge, publishers[1]), name="diagnostics")
 
 
-async def _joints(rig: Rig, bridge: Bridge, infos: Mapping[str, AxisInfo], publisher: Publisher) -> None:
+async def _descriptions(rig: Rig, bridge: Bridge, axes: tuple[str, ...]) -> None:
+    async for infos in rig.follow_descriptions():
+        bridge.axes = {name: info for name, info in infos.items() if not axes or name in axes}
+
+
+async def _joints(rig: Rig, bridge: Bridge, publisher: Publisher) -> None:
     async with rig.samples() as samples:
         async for axis, sample in samples:
-            if axis in infos and (message := bridge.take(axis, sample)):
+            if axis in bridge.axes and (message := bridge.take(axis, sample)):
                 publisher.publish(message.payload, message.t)
 
 

@@ -16,8 +16,11 @@ from ldcnd.bluesky import Axis, Fly, ReadableAxis, Signal, Trace
 from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, RequestRefused, StopLatched, UnknownAxis, WrongState
 from ldcnd.model.events import ReadEvents
 from ldcnd.model.leases import Acquire
+from ldcnd.model.meta import AxisLimits
 from ldcnd.model.samples import AxisState, Moving
+from ldcnd.planning.plan import plan_rig
 from tests.support.bluesky_engine import Laboratory, laboratory
+from tests.support.rig import two_axes
 
 IN_POSITION = 0.02
 """Millimetres between where a motor stands and where it was sent."""
@@ -124,6 +127,23 @@ def test_where_an_axis_was_sent_is_forgotten_once_something_else_has_stopped_or_
 
         assert located["setpoint"] == pytest.approx(lab.truth("x"), abs=IN_POSITION)
         assert located["setpoint"] < 40 - 1
+
+
+def test_the_limits_of_a_description_follow_a_reload(lab: Laboratory):
+    config = two_axes()
+    (bus,) = config.bus
+    x = bus.axis[0].model_copy(update={"limits": AxisLimits(position_min=-3, position_max=6, velocity=10)})
+    changed = config.model_copy(update={"bus": (bus.model_copy(update={"axis": (x, *bus.axis[1:])}),)})
+
+    async def reload(wanted) -> None:
+        lab.running.daemon.reconfigure(wanted, plan_rig(wanted))
+
+    with lab.powered("x") as (x,):
+        lab.loop.run(reload(changed))
+        described = lab.loop.run(x.describe())["x"]
+        lab.loop.run(reload(config))
+
+    assert described["limits"]["control"] == {"low": -3, "high": 6}
 
 
 def test_a_fly_scan_yields_pages_of_positions_with_the_times_of_the_drive(lab: Laboratory, monkeypatch):

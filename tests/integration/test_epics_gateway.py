@@ -2,12 +2,15 @@
 
 import asyncio
 import random
-from contextlib import asynccontextmanager, suppress
+import re
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 
 import pytest
 from caproto import AccessRights, AlarmSeverity, Forbidden
 
 from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient
+from ldcnd.daemon.process.assembly import build_daemon
 from ldcnd.epics.gateway import gateway
 from ldcnd.errors import (
     CommandAborted,
@@ -18,13 +21,17 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
+from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.commands import MoveAbsolute, Reset
 from ldcnd.model.events import ReadEvents
 from ldcnd.model.leases import Acquire
+from ldcnd.model.meta import AxisLimits
 from ldcnd.model.samples import LinkState, Moving
+from ldcnd.planning.plan import plan_rig
 from tests.support.dialect_rig import LS_182AP, dialect_rig
 from tests.support.epics_records import VALUES, put, shows
-from tests.support.rig import running_rig, two_axes
+from tests.support.process import ROOT
+from tests.support.rig import EPOCH_NS, running_rig, two_axes
 
 FIELDS = [
     "VAL",
@@ -449,6 +456,71 @@ async def test_a_daemon_that_says_nothing_leaves_no_axis_that_has_arrived():
 
         assert made.variables["T:x.DMOV"].value == 0
         assert made.variables["T:x.RBV"].severity == AlarmSeverity.INVALID_ALARM
+
+
+async def test_limits_and_velocities_follow_a_reload():
+    async with records() as (running, made):
+        await put(made, "T:x.VELO", 30.0)
+        config = two_axes()
+        (bus,) = config.bus
+        limits = AxisLimits(position_min=-5, position_max=6, velocity=10)
+        x = bus.axis[0].model_copy(update={"limits": limits, "velocity": 4.0})
+        changed = config.model_copy(update={"bus": (bus.model_copy(update={"axis": (x, *bus.axis[1:])}),)})
+        running.daemon.reconfigure(changed, plan_rig(changed))
+        await shows(made, "T:x.HLM", 6)
+        await asyncio.sleep(0.1)
+        target = made.variables["T:x.VAL"]
+
+        shown = {name: made.variables[f"T:x.{name}"].value for name in ("LLM", "DHLM", "VMAX", "EGU", "SPMG")}
+        assert shown == {"LLM": -5, "DHLM": 6, "VMAX": 10, "EGU": "mm", "SPMG": "Go"}
+        assert made.variables["T:x.VELO"].value == pytest.approx(4, rel=0.01)
+        assert (target.lower_ctrl_limit, target.upper_ctrl_limit) == (-5, 6)
+        with pytest.raises(ValueOutOfRange):
+            await put(made, "T:x.VELO", 20.0)
+
+
+async def test_a_daemon_with_another_unit_is_not_moved_by_numbers_of_the_former_one():
+    broker = MemoryBroker()
+    loop = asyncio.get_running_loop()
+
+    @asynccontextmanager
+    async def life(instance: str, unit: str):
+        config = two_axes()
+        (bus,) = config.bus
+        axes = tuple(axis.model_copy(update={"unit": unit}) for axis in bus.axis)
+        config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
+        async with broker.session() as session, asyncio.TaskGroup() as group:
+            daemon = build_daemon(config, session, lambda: EPOCH_NS + round(loop.time() * 1e9), instance)
+            running = group.create_task(daemon.run(), name=instance)
+            await daemon.wait_up()
+            yield
+            daemon.end()
+            await running
+
+    async with broker.session() as session, AsyncExitStack() as faces:
+        client = RigClient(session, "sim")
+        async with life("first", "um"):
+            rig = Rig(client, await client.daemon())
+            made = await faces.enter_async_context(gateway(rig, prefix="T:", moves=rig.axes))
+            await shows(made, "T:x:control", "epics gateway")
+            await put(made, "T:x.CNEN", "Enable")
+            await put(made, "T:x", 1.0)
+        async with life("second", "mm"):
+            await shows(made, "T:x.EGU", "mm")
+            await shows(made, "T:x:control", "epics gateway")
+            await put(made, "T:x.CNEN", "Enable")
+            with pytest.raises(WrongState, match="SPMG"):
+                await put(made, "T:x", 50.0)
+            await put(made, "T:x.TWF", 0)
+            stands = (await client.position("x")).value
+            await put(made, "T:x.SPMG", "Go")
+            await put(made, "T:x", stands + 2)
+
+            assert stands == pytest.approx(0, abs=2)
+            assert made.variables["T:x"].units == "mm"
+            assert made.variables["T:x.RBV"].units == "mm"
+            assert made.variables["T:x.VELO"].units == "mm/s"
+            assert (await client.position("x")).value == pytest.approx(stands + 2, abs=0.02)
 
 
 @pytest.mark.parametrize("seed", range(1))

@@ -106,7 +106,12 @@ async def test_joint_states_are_in_metres_with_the_time_of_the_drive():
         report = bridge.diagnostics(made[-1][1].t)
         later = bridge.diagnostics(made[-1][1].t + 10**10)
 
-    assert bridge.joints == {"x", "y"}
+    in_micrometres = made[0][0].model_copy(update={"unit": "um"})  # of a daemon with another configuration
+    restated = bridge.take("x", in_micrometres)
+    assert restated
+    assert restated.positions == (in_micrometres.value * 1e-6,)
+    assert restated.velocities == ()
+    assert bridge.take("x", made[0][0].model_copy(update={"unit": "count"})) is None
     for sample, message in made:
         assert (message.t, message.names) == (sample.t, ("x",))
         assert message.positions[0] == pytest.approx(sample.value * 1e-3)
