@@ -1,14 +1,14 @@
 """An axis as a Bluesky device: read, moved, stopped and flown by a plan."""
 
 import asyncio
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator
-from contextlib import asynccontextmanager, suppress
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, TypeVar
 
 from ldcnd.bluesky.status import Status
 from ldcnd.bluesky.trace import Trace
-from ldcnd.bluesky.values import number_key, reading, refuse_other_unit, text_key
+from ldcnd.bluesky.values import SILENT_S, instant, number_key, reading, refuse_other_unit, text_key, within
 from ldcnd.client.axis import Axis as ClientAxis
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.motion import Motion, Position
@@ -20,7 +20,6 @@ from ldcnd.errors import (
     LdcndError,
     OutcomeUnknown,
     RequestRefused,
-    SessionError,
     StopLatched,
     UnknownAxis,
     WrongState,
@@ -36,8 +35,6 @@ if TYPE_CHECKING:
 
 FRESH_S = 1.0
 """A position that came longer ago is not read: a newer one is waited for, in seconds."""
-SILENT_S = 10.0
-"""Longest wait for such a position, and for an axis to come to rest after a motion that failed, in seconds."""
 PAGE_SAMPLES = 1000
 """Maximum number of positions on a page of a fly scan."""
 
@@ -87,7 +84,7 @@ class ReadableAxis:
     async def read(self) -> "dict[str, Reading[float]]":
         """Return the position, stamped with the time at which the drive was there.
 
-        After a motion of this device the position was measured after its end.
+        It was measured after the last motion of this device and after the last trigger.
 
         Raises:
             AxisUnreachable: the drive does not answer.
@@ -121,6 +118,14 @@ class ReadableAxis:
             per_unit = f"count/{self._info.unit}"
             keys[f"{self.name}_counts_per_unit"] = number_key(f"{self._source}/counts_per_unit", per_unit)
         return keys
+
+    def trigger(self) -> Status:
+        """Have `read` return a position that was measured from now on, whichever axis has moved until now."""
+
+        async def set_instant() -> None:
+            self._not_before_ns = max(self._not_before_ns, await instant(self._rig))
+
+        return self._start("trigger", set_instant())
 
     def subscribe(self, function: "Callback[float]") -> None:
         """Call `function` with the reading of every position that comes, on the devices' own thread."""
@@ -160,7 +165,7 @@ class ReadableAxis:
 
     async def _measured(self) -> Position:
         """Return a position that is a measurement, not old, and newer than the end of the last motion."""
-        async with _within(SILENT_S, f"axis {self._info.axis}: no new position came for {SILENT_S:g} s"):
+        async with within(SILENT_S, f"axis {self._info.axis}: no new position came for {SILENT_S:g} s"):
             while True:
                 if self._axis.state.link is LinkState.DOWN:
                     raise AxisUnreachable(
@@ -408,7 +413,7 @@ class Axis(ReadableAxis):
     async def _rest(self, *, is_news: bool = False) -> None:
         """Wait until the axis stands, as far as the daemon knows it; after a stop that is news, in a later state."""
         known = self._axis.state.sample
-        async with _within(SILENT_S, f"axis {self._info.axis}: it did not come to rest within {SILENT_S:g} s"):
+        async with within(SILENT_S, f"axis {self._info.axis}: it did not come to rest within {SILENT_S:g} s"):
             while is_news and self._axis.state.sample is known:
                 await self._axis.news(None)
             while self._axis.state.moving is not Moving.NO and self._axis.state.link is not LinkState.DOWN:
@@ -444,15 +449,6 @@ def _pass_on(flight: Status, began: asyncio.Future[None]) -> None:
     error = flight.exception()
     if not began.done():
         began.set_exception(error or CommandAborted("the motion was stopped before it began"))
-
-
-@asynccontextmanager
-async def _within(seconds: float, problem: str) -> AsyncIterator[None]:
-    try:
-        async with asyncio.timeout(seconds):
-            yield
-    except TimeoutError:
-        raise SessionError(problem, remedy="see `ldcnd top`") from None
 
 
 async def _discard(work: Awaitable[object]) -> None:

@@ -4,7 +4,7 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from ldcnd.bluesky.status import Status
-from ldcnd.bluesky.values import number_key, reading, refuse_other_unit, text_key
+from ldcnd.bluesky.values import SILENT_S, instant, number_key, reading, refuse_other_unit, text_key, within
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
 from ldcnd.errors import SessionError
@@ -14,6 +14,7 @@ from ldcnd.model.samples import (
     FaultSample,
     MonitorSample,
     PositionSample,
+    Quality,
     Sample,
     StateSample,
     VelocitySample,
@@ -43,6 +44,7 @@ class Signal:
         self._item = item
         self._source = f"ldcnd://{rig.name}/{info.axis}/{item}"
         self._loop = loop
+        self._triggered: Sample | None = None
         self._unit: str | None = None  # as described last
         self._followers: dict[Callback[float | str], Status] = {}
 
@@ -51,13 +53,31 @@ class Signal:
         """Plot the value if it is a number."""
         return {"fields": [] if self._item in TEXTS else [self.name]}
 
+    def trigger(self) -> Status:
+        """Wait for a value that was measured from now on, for the next reading; fails when none comes within 10 s."""
+        return Status(f"trigger of {self.name}", self._loop.start(self._take_next()))
+
+    async def _take_next(self) -> None:
+        self._triggered = None
+        problem = f"axis {self._axis}: no {self._item} was measured within {SILENT_S:g} s after the trigger"
+        async with (
+            within(SILENT_S, problem, f"raise the rate of {self._item} in the daemon's configuration"),
+            self._rig.samples(self._axis, self._item) as samples,
+        ):
+            not_before_ns = await instant(self._rig)
+            async for _, sample in samples:
+                if sample.t > not_before_ns and sample.quality is not Quality.BAD:
+                    self._triggered = sample
+                    return
+
     async def read(self) -> "dict[str, Reading[float | str]]":
-        """Return the last value, stamped with the time at which it was true.
+        """Return the value of the last trigger, once, or else the last value, with the time at which it was true.
 
         Raises:
             SessionError: there is none yet, or the daemon does not answer.
         """
-        return self._of(await self._latest())
+        sample, self._triggered = self._triggered, None
+        return self._of(sample or await self._latest())
 
     async def describe(self) -> "dict[str, DataKey]":
         """Return what the value is."""

@@ -1,8 +1,12 @@
 """Readings and their descriptions, as event-model has them."""
 
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING, TypeVar
 
-from ldcnd.errors import WrongState
+from ldcnd.client.rig import Rig
+from ldcnd.errors import SessionError, WrongState
 from ldcnd.model.condition import Condition
 from ldcnd.model.samples import Quality
 
@@ -11,6 +15,8 @@ if TYPE_CHECKING:
     from event_model.documents import DataKey
 
 ValueT = TypeVar("ValueT")
+SILENT_S = 10.0
+"""Longest wait for a new value, and for an axis to come to rest after a motion that failed, in seconds."""
 SEVERITIES = {Quality.GOOD: 0, Quality.UNCERTAIN: 1, Quality.BAD: 2}
 
 
@@ -40,6 +46,28 @@ def refuse_other_unit(axis: str, described: str, measured: str) -> None:
             value=measured,
             remedy="begin a new run, which describes it anew",
         )
+
+
+@asynccontextmanager
+async def within(seconds: float, problem: str, remedy: str = "see `ldcnd top`") -> AsyncIterator[None]:
+    """Bound what happens in a context.
+
+    Raises:
+        SessionError: it has taken longer.
+    """
+    try:
+        async with asyncio.timeout(seconds):
+            yield
+    except TimeoutError:
+        raise SessionError(problem, remedy=remedy) from None
+
+
+async def instant(rig: Rig) -> int:
+    """Return an instant of the daemon's clock, UTC in ns since 1970, at or after the end of every motion that is over.
+
+    Clocks of two machines may differ, so that of this one does not tell what was measured after a trigger.
+    """
+    return max((state.t for state in (await rig.states()).values()), default=0)
 
 
 def number_key(source: str, unit: str, *, limits: tuple[float | None, float | None] = (None, None)) -> "DataKey":

@@ -162,6 +162,7 @@ class Rig(Facade[rig.Rig]):
     describe = _waiting(rig.Rig.describe)
     buses = _waiting(rig.Rig.buses)
     faults = _waiting(rig.Rig.faults)
+    states = _waiting(rig.Rig.states)
     holders = _waiting(rig.Rig.holders)
     outcome = _waiting(rig.Rig.outcome)
     latest = _waiting(rig.Rig.latest)

@@ -37,7 +37,7 @@ from ldcnd.model.rig_commands import (
     SpeedOverrideReply,
     WalkPath,
 )
-from ldcnd.model.samples import FaultSample, Sample
+from ldcnd.model.samples import FaultSample, Sample, StateSample
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ENDPOINT_VARIABLE = "LDCND_CONNECT"
@@ -273,6 +273,10 @@ class Rig:
     async def faults(self) -> dict[str, FaultSample]:
         """Return what is wrong with every axis."""
         return await self._client.faults()
+
+    async def states(self) -> dict[str, StateSample]:
+        """Return the last state of every axis that has one."""
+        return await self._client.states()
 
     async def holders(self) -> HolderList:
         """Return who controls what."""

@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 
 import bluesky.plan_stubs as bps
 import bluesky.plans as bp
@@ -12,11 +12,20 @@ from bluesky.preprocessors import monitor_during_wrapper
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
 import ldcnd.bluesky.axis
-from ldcnd.bluesky import Axis, Fly, ReadableAxis, Signal, Trace
-from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, RequestRefused, StopLatched, UnknownAxis, WrongState
+from ldcnd.bluesky import Axis, Fly, ReadableAxis, Signal, Status, Trace
+from ldcnd.config.rig import RigConfig
+from ldcnd.errors import (
+    CommandAborted,
+    LeaseExpired,
+    LeaseHeld,
+    RequestRefused,
+    SessionError,
+    StopLatched,
+    UnknownAxis,
+    WrongState,
+)
 from ldcnd.model.events import ReadEvents
 from ldcnd.model.leases import Acquire
-from ldcnd.model.meta import AxisLimits
 from ldcnd.model.samples import AxisState, Moving
 from ldcnd.planning.plan import plan_rig
 from tests.support.bluesky_engine import Laboratory, laboratory
@@ -42,11 +51,28 @@ def stands(lab: Laboratory, axis: str) -> bool:
     return lab.loop.run(lab.running.client.state(axis)).moving is Moving.NO
 
 
+@contextmanager
+def configured(lab: Laboratory, **changes: dict[str, float]):
+    """Reload the daemon with other settings of x for the time of the context."""
+
+    async def reload(config: RigConfig) -> None:
+        lab.running.daemon.reconfigure(config, plan_rig(config))
+
+    config = two_axes()
+    (bus,) = config.bus
+    x = bus.axis[0]
+    x = x.model_copy(update={key: getattr(x, key).model_copy(update=change) for key, change in changes.items()})
+    changed = config.model_copy(update={"bus": (bus.model_copy(update={"axis": (x, *bus.axis[1:])}),)})
+    lab.loop.run(reload(changed))
+    yield
+    lab.loop.run(reload(config))
+
+
 def test_devices_satisfy_the_protocols_without_a_base_class(lab: Laboratory):
     wanted = {
-        ReadableAxis: ("Readable", "Configurable", "Subscribable", "HasHints", "HasName", "HasParent"),
+        ReadableAxis: ("Readable", "Triggerable", "Configurable", "Subscribable", "HasHints", "HasName", "HasParent"),
         Axis: ("Movable", "Locatable", "Stoppable", "Checkable", "Preparable", "Flyable", "EventPageCollectable"),
-        Signal: ("Readable", "Subscribable", "HasHints"),
+        Signal: ("Readable", "Triggerable", "Subscribable", "HasHints"),
         Trace: ("Readable", "Triggerable", "HasHints"),
     }
     with lab.powered("x") as (x,), lab.devices.watch("y") as y:
@@ -98,6 +124,40 @@ def test_a_reading_after_a_move_was_measured_after_its_end(lab: Laboratory):
     assert all(at < 1.8e9 for at in measured)  # of the rig's clock, not this machine's
 
 
+def test_a_detector_in_a_step_scan_is_measured_at_its_point(lab: Laboratory):
+    async def ended(status: Status) -> None:
+        while not status.done:
+            await asyncio.sleep(0.001)  # no longer: a plan goes on at once, and so does this
+
+    async def step_scan() -> None:
+        for target in range(0, 55, 5):
+            await ended(x.set(target))
+            for device in (adc, seen):
+                await ended(device.trigger())
+            measured.append(((await adc.read())["x_adc"]["value"], (await seen.read())["seen"]["value"]))
+            truth.append((lab.potentiometer("x"), lab.truth("x")))
+
+    measured, truth = [], []
+    with configured(lab, rates={"adc": 1}), lab.powered("x") as (x,), lab.devices.watch("x", name="seen") as seen:
+        adc = lab.devices.signal("x", "adc")
+        lab.loop.run(step_scan())
+        shown = lab.loop.run(lab.running.client.last("x", "adc"))
+
+    volts_per_share = shown.volts * shown.full_scale / shown.counts
+    (volts, places), (shares, positions) = zip(*measured, strict=True), zip(*truth, strict=True)
+    assert volts == pytest.approx([each * volts_per_share for each in shares], abs=0.02)
+    assert places == pytest.approx(positions, abs=IN_POSITION)
+    assert len({*volts}) == 11
+
+
+def test_a_trigger_of_an_item_that_is_not_measured_any_more_says_which():
+    with laboratory() as lab:
+        adc = lab.devices.signal("x", "adc")
+        lab.unplug("x")
+        with pytest.raises(SessionError, match="no adc was measured within 10 s after the trigger"):
+            adc.trigger().wait(60)
+
+
 def test_a_relative_grid_ends_where_it_began(lab: Laboratory):
     with lab.powered("x", "y") as (x, y):
         began = (lab.truth("x"), lab.truth("y"))
@@ -130,18 +190,8 @@ def test_where_an_axis_was_sent_is_forgotten_once_something_else_has_stopped_or_
 
 
 def test_the_limits_of_a_description_follow_a_reload(lab: Laboratory):
-    config = two_axes()
-    (bus,) = config.bus
-    x = bus.axis[0].model_copy(update={"limits": AxisLimits(position_min=-3, position_max=6, velocity=10)})
-    changed = config.model_copy(update={"bus": (bus.model_copy(update={"axis": (x, *bus.axis[1:])}),)})
-
-    async def reload(wanted) -> None:
-        lab.running.daemon.reconfigure(wanted, plan_rig(wanted))
-
-    with lab.powered("x") as (x,):
-        lab.loop.run(reload(changed))
+    with lab.powered("x") as (x,), configured(lab, limits={"position_min": -3, "position_max": 6}):
         described = lab.loop.run(x.describe())["x"]
-        lab.loop.run(reload(config))
 
     assert described["limits"]["control"] == {"low": -3, "high": 6}
 

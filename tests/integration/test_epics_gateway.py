@@ -2,7 +2,6 @@
 
 import asyncio
 import random
-import re
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 
 import pytest
@@ -30,7 +29,6 @@ from ldcnd.model.samples import LinkState, Moving
 from ldcnd.planning.plan import plan_rig
 from tests.support.dialect_rig import LS_182AP, dialect_rig
 from tests.support.epics_records import VALUES, put, shows
-from tests.support.process import ROOT
 from tests.support.rig import EPOCH_NS, running_rig, two_axes
 
 FIELDS = [

@@ -79,6 +79,10 @@ class Laboratory:
         """Return where the simulated motor of an axis of the simulated rig is, in axis units."""
         return self.module(axis).shaft.position_counts / COUNTS_PER_UNIT[axis]
 
+    def potentiometer(self, axis: str) -> float:
+        """Return how far the potentiometer on the motor of an axis is turned, 0 to 1."""
+        return self.module(axis).shaft.potentiometer()
+
     def module(self, axis: str) -> SimulatedDrive:
         """Return the simulated drive of an axis."""
         module = self.chain.modules[list(COUNTS_PER_UNIT).index(axis)]
