@@ -42,6 +42,23 @@ class only_while:  # noqa: N801 - read as a statement
         _condition.reset(self._token)
 
 
+def until_begun(condition: Condition) -> Condition:
+    """Return a condition that is checked until its first packet is sent: what has begun is carried out whole.
+
+    For several packets that only make sense together, and of which none moves a motor: outputs that have become outputs
+    get their levels.
+    """
+    begun = False
+
+    def check() -> None:
+        nonlocal begun
+        if not begun:
+            condition()
+            begun = True
+
+    return check
+
+
 def condition_in_force() -> Condition | None:
     """Return the condition of the context in which this is called, if there is one."""
     return _condition.get()

@@ -67,7 +67,17 @@ def _class_of(module: str) -> str:
 def test_no_call_of_the_asyncio_client_is_missing_from_the_blocking_one():
     for theirs, ours in ((Axis, blocking.Axis), (Rig, blocking.Rig)):
         public = {name for name, _ in inspect.getmembers(theirs) if not name.startswith("_")}
-        inner = {"watched", "controlled", "news", "halt_now", "halt_unfinished", "begun", "lost", "outcome"}
+        inner = {
+            "watched",
+            "controlled",
+            "news",
+            "halt_now",
+            "halt_unfinished",
+            "begun",
+            "lost",
+            "outcome",
+            "follow_descriptions",
+        }
         assert public - inner <= set(dir(ours)), theirs
 
 

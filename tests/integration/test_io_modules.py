@@ -278,3 +278,18 @@ async def test_a_pwm_output_that_is_unknown_is_to_be_named(executed):
         assert io.pwm == pwm
         await set_io(rig, pwm1=0.0, pwm2=1.0)
         assert io.pwm == (0, 255)
+
+
+async def test_a_stop_between_the_packets_of_one_command_leaves_no_output_at_a_level_that_was_not_asked_for():
+    chain = chain_of()
+    async with cabinet(chain) as (rig, io):
+        before = io.outputs
+        asked = asyncio.create_task(set_io(rig, high=[4], low=[9]))
+        while io.outputs == before:
+            await asyncio.sleep(0.0002)
+        await rig.client.stop("x")
+        await asked
+
+        assert (io.latch & 0b1000, io.latch & 0b1_0000_0000) == (0b1000, 0)
+        with pytest.raises(StopLatched):
+            await set_io(rig, high=[9])

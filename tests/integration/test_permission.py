@@ -35,6 +35,7 @@ from ldcnd.model.commands import (
     Track,
 )
 from ldcnd.model.samples import AxisState
+from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
@@ -396,3 +397,22 @@ async def test_no_motion_begins_once_the_daemon_ends(command, after_s, tmp_path)
         before = drive(chain, 3).shaft.position_counts
         await asyncio.sleep(2.0)
         assert drive(chain, 3).shaft.position_counts == pytest.approx(before, abs=5)
+
+
+async def test_a_stop_at_the_end_of_the_daemon_is_sent_for_as_long_as_there_is_time():
+    chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS)))
+    async with rig_on(chain, simulated_config()) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveVelocity(velocity=5.0))
+        await asyncio.sleep(0.5)
+        now_s = asyncio.get_running_loop().time()
+        lost = Fault(FaultKind.REQUEST_LOST, 1.0, now_s, until_s=now_s + 1.2)
+        chain._injector = FaultInjector(FaultPlan((lost,)))
+        rig.daemon.end()
+        await asyncio.wait([rig.running])
+
+        await asyncio.sleep(1.0)
+        before = drive(chain, 1).shaft.position_counts
+        await asyncio.sleep(1.0)
+        assert drive(chain, 1).shaft.position_counts == pytest.approx(before, abs=5)

@@ -5,12 +5,13 @@ from itertools import pairwise
 
 import pytest
 
+from ldcnd.config.rig import RigConfig
 from ldcnd.drivers.ldcn.addressing import WAITING_ADDRESSES
 from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.messaging.keys import Keys
 from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 
@@ -266,3 +267,29 @@ async def test_drives_come_back_and_lines_are_taken_over_through_noise(seed):
     assert bus.started_by == "adoption"
     assert abs(at) > 10_000
     assert abs(drive(chain, 1).loop.position - 90_000) <= 1
+
+
+async def test_an_sc_that_only_left_questions_unanswered_is_not_reset_where_the_port_passes_no_rates_on():
+    spec = ChainSpec((ModuleSpec("ls182ap"), ModuleSpec("picservo-sc")), baud_check=False)
+    chain = build_chain(spec)
+    axes = [
+        {"name": "x", "address": 1, "model": "ls-182ap", "unit": "mm", "counts_per_unit": 1000.0},
+        {"name": "s", "address": 2, "model": "pic-servo-sc", "unit": "mm", "counts_per_unit": 1000.0},
+    ]
+    common = {
+        "velocity": 20.0,
+        "acceleration": 200.0,
+        "gains": {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000},
+    }
+    document = simulated_config().model_dump(mode="json", exclude_unset=True)
+    document["bus"][0]["axis"] = [axis | common for axis in axes]
+    document["bus"][0].pop("module", None)
+    async with rig_on(chain, RigConfig.model_validate(document)) as rig:
+        await rig.until("s", lambda state: state.link == "up")
+        await rig.client.command("s", Power(on=True))
+        now_s = asyncio.get_running_loop().time()
+        chain._injector = FaultInjector(FaultPlan((Fault(FaultKind.REPLY_LOST, 1.0, now_s, until_s=now_s + 2.5),)))
+        await asyncio.sleep(6.0)
+
+        assert drive(chain, 2).loop.servo_on
+        assert Command.HARD_RESET not in {packet.command for packet in rig.sent[-2000:] if packet.address == 2}

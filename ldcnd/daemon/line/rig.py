@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
-from ldcnd.bus.transaction import Condition, only_while
+from ldcnd.bus.transaction import Condition, only_while, until_begun
 from ldcnd.daemon.clock import Clock
 from ldcnd.daemon.line.line import BusService
 from ldcnd.daemon.publish.publisher import Publisher
@@ -127,7 +127,7 @@ class ModuleService:
         if twice:
             raise MalformedRequest(f"module {self.name}: line {twice[0]} cannot be high and low", value=twice[0])
         self._check(condition)
-        with only_while(condition):
+        with only_while(until_begun(condition)):
             reading = await self._driver.set_outputs(levels, frozenset(command.inputs), (command.pwm1, command.pwm2))
         log.info("outputs set", module=self.name, high=command.high, low=command.low, inputs=command.inputs)
         return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)

@@ -33,6 +33,8 @@ log = get_logger("daemon")
 API = 1
 """Version of keys and payloads: within one, fields are only ever added."""
 TOKEN_PERIOD_S = 0.2
+STOP_AGAIN_S = 0.02
+"""Pause between two attempts at a stop that no drive has confirmed, at the end of the daemon, seconds."""
 STOP_TIME_S = 2.0
 """Time for the axes to confirm their loss policies when the daemon is ended."""
 
@@ -219,9 +221,15 @@ class Daemon:
                     group.create_task(self._bring_to_rest(axis), name=f"rest {name}")
         except TimeoutError:
             log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
+        for name, axis in self.rig.axes.items():
+            if axis.stop_is_pending:
+                log.error("stop not confirmed at the end of the daemon, the axis may move", axis=name)
 
     async def _bring_to_rest(self, axis: AxisService) -> None:
         await apply_policy(axis, axis.config.loss.daemon, "the daemon ends")
+        while axis.stop_is_pending:  # as long as there is time for it: after that nothing sends it again
+            await axis.send_pending_stop()
+            await asyncio.sleep(STOP_AGAIN_S)
         await axis.take_gains_back()
 
     async def _keep_references(self) -> None:

@@ -177,7 +177,9 @@ class Gathering:
         for each in self.places:
             if not (each.profile.sc_extensions and self._bus.misses(each.address)):
                 continue
-            if await self._listen(each.address, at_reset):
+            # one that answers at the line's rate, too, has not restarted: only its replies were lost for a while, or
+            # the port does not pass rates on (a pseudo-terminal); a reset would switch off a motor that holds
+            if await self._listen(each.address, at_reset) and not await self._answers(each.address):
                 node = Node(each.address, each.profile)
                 before = await self._at(at_reset, commands.read_status(node, MOTION_ITEMS))
                 await asyncio.sleep(WATCH_S)
