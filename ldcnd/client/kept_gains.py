@@ -82,7 +82,7 @@ def kept_for(rig: str, axis: str) -> KeptGains | None:
     try:
         kept = durable.read(path, KeptGains.model_validate_json)
     except durable.DamagedFile as error:
-        raise ConfigError(str(error), remedy=by_hand) from error
+        raise ConfigError(f"the gains kept of axis {axis} cannot be read: {error}", remedy=by_hand) from error
     if kept is None:
         return None
     if (kept.rig, kept.axis) != (rig, axis):

@@ -5,6 +5,7 @@ worth is decided by times; a ratio of counts shows where time may have gone. Thi
 its `tests.support`, and prints its counts as JSON; `rows` sets them side by side.
 """
 
+import argparse
 import asyncio
 import gc
 import json
@@ -213,4 +214,5 @@ def _all() -> dict[str, float]:
 
 
 if __name__ == "__main__":
+    argparse.ArgumentParser(description=__doc__).parse_args()
     print(json.dumps(_all()))

@@ -50,13 +50,15 @@ async def test_a_line_that_goes_down_leaves_a_capture(tmp_path):
 
 async def test_a_loose_contact_fills_no_disk(tmp_path):
     async with running_rig(config_with("clean_start", tmp_path)) as rig:
-        bus = rig.daemon.rig.buses[0].bus
+        bus, loop = rig.daemon.rig.buses[0].bus, asyncio.get_running_loop()
+        began_s = loop.time()
         for _ in range(25):
             await bus.wait_opened()
             bus._line.transport_lost("a loose contact")
             await asyncio.sleep(1.0)
+        most = (loop.time() - began_s) / 10.0 + 1  # one every 10 s
 
-    assert len(list(tmp_path.iterdir())) == 3  # in 25 s, and one every 10 s at most
+    assert 1 < len(list(tmp_path.iterdir())) <= most
 
 
 async def test_nothing_is_written_without_a_place_or_a_cause(tmp_path):

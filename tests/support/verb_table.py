@@ -34,7 +34,6 @@ EXPLAINED = {
     ("wire_log", "client"): "for people: `ldcnd bus wire-log`",
     ("rehearse", "client"): "for people: `ldcnd drill`",
     ("release", "command line"): "a lease of the command line ends with its command",
-    ("renew", "command line"): "a command that holds control renews it by itself",
     ("stop", "command line"): "`ldcnd stop`, by the stops' own key",
     ("rehearse", "command line"): "`ldcnd drill`",
     ("report_shadow", "command line"): "`ldcnd shadow`",
