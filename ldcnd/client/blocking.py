@@ -4,7 +4,7 @@ Nothing is implemented twice: a call runs the asyncio client's own method on a l
 arguments, its result and its errors. Safe to use from several threads. An interrupted wait for a motion halts the axis.
 """
 
-from collections.abc import Callable, Coroutine, Iterator, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AbstractContextManager, contextmanager
 from functools import wraps
 from pathlib import Path
@@ -18,6 +18,7 @@ from ldcnd.client.notebook import table
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import ZenohSettings
 from ldcnd.model.events import CommandEvent
+from ldcnd.model.meta import AxisInfo
 from ldcnd.model.rig_commands import LinePath
 from ldcnd.model.samples import PositionSample, Sample
 
@@ -179,6 +180,10 @@ class Rig(Facade[rig.Rig]):
     def axes(self) -> tuple[str, ...]:
         """The names of its axes."""
         return self._wrapped.axes
+
+    def follow_descriptions(self) -> Iterator[Mapping[str, AxisInfo]]:
+        """Yield what every axis is by its name: at once, and soon after each reload and restart of the daemon."""
+        return self._loop.each(self._wrapped.follow_descriptions())
 
     preview_together = _waiting(rig.Rig.preview_together)
     set_speed_override = _waiting(rig.Rig.set_speed_override)

@@ -10,15 +10,15 @@ from caproto.asyncio.server import Context
 
 from ldcnd.client.rig import Rig
 from ldcnd.epics.fields import Field
-from ldcnd.epics.motor import MotorRecord, database
+from ldcnd.epics.motor import NO_HOLDER, MotorRecord, database
 from ldcnd.errors import LdcndError, UnknownAxis
 from ldcnd.listen_address import ListenAddress
 from ldcnd.model.meta import AxisInfo
 
 LEASE_S = 1.0
 """The axes do what their `loss.client` says so soon after this program is gone, in seconds."""
-RETRY_S = 5.0
-"""Pause before the next request for control that another program has, seconds."""
+IDLE_S = 30.0
+"""Control is given back when an axis has not moved and nothing was put to it for so long, seconds."""
 SILENT_S = 5.0
 """Time without samples after which an axis is shown as unknown, seconds."""
 MOTIONLESS = (1.0, 1.0)
@@ -98,16 +98,17 @@ class Gateway:
                 await record.take(sample, monitor)
 
     async def _hold(self, record: MotorRecord) -> None:
-        """Control an axis; control that another program has is never taken by force."""
+        """Control an axis from a put that needs it until it idles; what another program has is never taken by force."""
         while True:
+            await record.wait_wanted()
             try:
                 async with self._rig.control(record.info.axis, client=WHO, lease_s=LEASE_S) as axis:
                     await self._describe(record)  # a lease is of one run of the daemon, and so is what is put under it
                     await record.controlled(axis, WHO)
-                    await asyncio.Event().wait()
+                    await record.wait_idle(IDLE_S)
+                    await record.controlled(None, NO_HOLDER)
             except LdcndError as error:
                 await record.controlled(None, str(error))
-            await asyncio.sleep(RETRY_S)
 
     async def _stop(self, axis: str) -> object:
         async with self._rig.watch(axis) as watched:

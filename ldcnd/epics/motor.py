@@ -6,6 +6,7 @@ Fields follow the motor record of the EPICS collaboration. What the gateway cann
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
+from functools import partial
 
 from caproto import AlarmSeverity, AlarmStatus
 
@@ -41,6 +42,8 @@ from ldcnd.model.samples import (
     VelocitySample,
 )
 
+NO_HOLDER = "none"
+"""Shown as who controls an axis while this gateway does not and was not refused."""
 NO_LIMIT = 1e30
 """Stands for a missing limit when the other one is set; both 0 stand for none, as in the motor record."""
 REST_S = 10.0
@@ -91,11 +94,15 @@ class MotorRecord:
     ) -> None:
         self.info = info
         self._axis: Axis | None = None
+        self._is_refused = False  # another program had control when this one asked for it, or took it
+        self._control_wanted = asyncio.Event()
+        self._control_changed = asyncio.Event()
+        self._used_s = 0.0  # when a put needed control last, in loop time
         self._start = start
         self._stop = stop
         self._clients = clients
         self._pending = 0
-        self._wanted_halts = 0  # as `_halts` was when the newest target was put
+        self._jog_puts = 0
         self._halts = 0  # puts so far that halt: a motion that was put before one does not begin after it
         self._wanted: float | None = None  # the newest target that was put and has no reply yet
         self._waiting: asyncio.Future[Put] | None = None  # what sends it once those before it have a reply
@@ -191,7 +198,8 @@ class MotorRecord:
             f"{name}:faults": text(),
             f"{name}:first_fault": string(),
             f"{name}:message": text(),
-            f"{name}:control": string("none"),
+            f"{name}:reset": integer(),
+            f"{name}:control": string(NO_HOLDER),
         }
         if info.adc_full_scale:
             fields[f"{name}:adc"] = number(0.0, "V")
@@ -230,6 +238,9 @@ class MotorRecord:
             actions["CNEN"] = self._put_cnen
         for field, action in actions.items():
             self[field].action = self._explained(action)
+        reset = self.beside("reset")
+        if Verb.RESET in can and reset is not None:
+            reset.action = self._explained(self._put_reset)
 
     def __getitem__(self, field: str) -> Field:
         return self.fields[f"{self.info.axis}.{field}"]
@@ -249,6 +260,7 @@ class MotorRecord:
             if self["SPMG"].action:
                 await self["SPMG"].show("Stop")
             self._sent, self._state = None, None
+            await self.silent()  # what is shown is of the former daemon
             await self._show_beside(
                 "message", f"its unit is {info.unit} now and was {before.unit}: put Go to SPMG to let it move"
             )
@@ -362,9 +374,28 @@ class MotorRecord:
         await self["SEVR"].show(SEVERITIES[self._alarm.severity])
 
     async def controlled(self, axis: Axis | None, holder: str) -> None:
-        """Take or lose control of the axis."""
+        """Take, give back or lose control of the axis."""
         self._axis = axis
+        self._is_refused = axis is None and holder != NO_HOLDER
+        self._control_wanted.clear()
+        self._control_changed.set()
         await self._show_beside("control", holder)
+
+    async def wait_wanted(self) -> None:
+        """Wait until a put needs control of the axis."""
+        await self._control_wanted.wait()
+
+    async def wait_idle(self, for_s: float) -> None:
+        """Wait until the axis has not moved and nothing was put that needs control for some time, in seconds.
+
+        Raises:
+            LeaseExpired: control was lost.
+        """
+        loop = asyncio.get_running_loop()
+        while (left_s := self._used_s + for_s - loop.time()) > 0:
+            await asyncio.sleep(left_s)
+            if self._pending or self._wanted is not None or self._moving is not Moving.NO:
+                self._used_s = loop.time()
 
     async def _show_beside(self, name: str, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
         field = self.beside(name)
@@ -388,22 +419,31 @@ class MotorRecord:
         return explained
 
     async def _put_val(self, asked: Value) -> Put:
-        axis, target = self._movable(), float(asked)
+        halts = self._halts
+        axis, target = await self._movable(), float(asked)
         if self["SET"].value == "Set":
             await axis.set_position(target)
             return Put(target)
-        return await self._go(target)
+        return await self._go(target, halts)
 
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
         if not asked:
             return Put(0)
-        self._movable()
+        halts = self._halts
+        await self._movable()
         target = float(self._val.value) if self._wanted is None else self._wanted
-        put = await self._go(target + sign * float(self["TWV"].value))
+        put = await self._go(target + sign * float(self["TWV"].value), halts)
         return Put(0, put.end)
 
-    async def _go(self, target: float) -> Put:
-        """Send the axis to a target; of those that are put before it can be sent only the newest is."""
+    async def _go(self, target: float, halts: int) -> Put:
+        """Send the axis to a target; of those that are put before it can be sent only the newest is.
+
+        Args:
+            target: in axis units.
+            halts: as they were when it was put.
+        """
+        if self._halts != halts:
+            return Put()
         low, high = float(self["LLM"].value), float(self["HLM"].value)
         if (low or high) and not low <= target <= high:
             await self["LVIO"].show(1)
@@ -419,15 +459,17 @@ class MotorRecord:
         if self._waiting is None:
             self._waiting = asyncio.get_running_loop().create_future()
             self._start(self._go_to_newest(self._waiting), f"target of {self.info.axis}")
-        waiting, self._wanted_halts = self._waiting, self._halts
+        waiting = self._waiting
         await self._val.show(target)
         return await asyncio.shield(waiting)
 
     async def _go_to_newest(self, waiting: "asyncio.Future[Put]") -> None:
         async with self._turn:
-            self._waiting, target, halts = None, self._wanted or 0.0, self._wanted_halts
+            self._waiting, target = None, self._wanted
             try:
-                put = await self._moved(lambda: self._absolute(self._controlled(), target), halts, target)
+                put = Put()
+                if target is not None:  # not halted since it was put
+                    put = await self._moved(partial(self._absolute, target), self._halts, target)
             except Exception as error:  # noqa: BLE001 - of those who have put it
                 if not waiting.cancelled():
                     waiting.set_exception(error)
@@ -442,30 +484,36 @@ class MotorRecord:
     async def _put_home(self, asked: Value, sign: int) -> Put:
         if not asked:
             return Put(0)
-        axis, velocity = self._movable(), float(self["HVEL"].value)
+        halts = self._halts
+        axis, velocity = await self._movable(), float(self["HVEL"].value)
         if not velocity:
             raise ValueOutOfRange(
                 f"axis {self.info.axis}: HVEL is 0", axis=self.info.axis, remedy="put the velocity of the search there"
             )
-        put = await self._moved(lambda: axis.home(velocity=sign * velocity), self._halts)
+        put = await self._moved(lambda: axis.home(velocity=sign * velocity), halts)
         return Put(0, put.end)
 
     async def _put_jog(self, asked: Value, field: str, sign: int) -> Put:
         """Begin a jog, or end the one under way."""
-        halts = self._halts
+        self._jog_puts += 1
+        halts, jog_puts, clients = self._halts, self._jog_puts, self._clients()
         await self._end_jog()
         if not asked or self._halts != halts:
             return Put(0)
-        axis, begun = self._movable(), asyncio.get_running_loop().create_future()
+        axis, begun = await self._movable(), asyncio.get_running_loop().create_future()
+        if (self._halts, self._jog_puts) != (halts, jog_puts):
+            return Put(0)  # halted or released while control was on its way
         self._released = asyncio.Event()
         velocity = sign * float(self["JVEL"].value)
-        self._jogging = self._start(self._jog(axis, velocity, field, begun), f"jog of {self.info.axis}")
+        self._jogging = self._start(self._jog(axis, velocity, field, begun, clients), f"jog of {self.info.axis}")
         await begun
         return Put(1)
 
-    async def _jog(self, axis: Axis, velocity: float, field: str, begun: "asyncio.Future[None]") -> None:
+    async def _jog(
+        self, axis: Axis, velocity: float, field: str, begun: "asyncio.Future[None]", clients: frozenset[object]
+    ) -> None:
         """Jog until it is released, halted or at a limit, or until a client is gone: it may be the one that held it."""
-        clients, released = self._clients(), self._released
+        released = self._released
         self._pending += 1
         await self.show_motion()
         try:
@@ -501,8 +549,13 @@ class MotorRecord:
         return Put()
 
     async def _put_cnen(self, asked: Value) -> Put:
-        await self._controlled().power(on=asked == "Enable")
+        await (await self._controlled()).power(on=asked == "Enable")
         return Put()
+
+    async def _put_reset(self, asked: Value) -> Put:
+        if asked:
+            await (await self._controlled()).reset()
+        return Put(0)
 
     async def _put_velo(self, asked: Value) -> Put:
         highest = self.info.limits.velocity or NO_LIMIT
@@ -524,7 +577,8 @@ class MotorRecord:
     async def _keep(asked: Value) -> Put:
         return Put(asked)
 
-    async def _absolute(self, axis: Axis, target: float) -> Motion:
+    async def _absolute(self, target: float) -> Motion:
+        axis = await self._controlled()
         velocity = float(self["VELO"].value)
         return await axis.move_absolute(
             target,
@@ -539,7 +593,7 @@ class MotorRecord:
         self._pending += 1
         await self.show_motion()
         try:
-            self._movable()
+            await self._movable()
             motion = await starting() if self._halts == halts else None
         except CommandAborted:
             if self._halts == halts:
@@ -565,7 +619,7 @@ class MotorRecord:
     async def _until_end(self, motion: Motion, halts: int) -> None:
         try:
             if self._halts != halts:  # put while the motion was on its way to the daemon
-                await self._controlled().halt()
+                await (await self._controlled()).halt()
             await motion.done()
         except CommandAborted as error:
             if self._pending == 1:  # not sent elsewhere: it comes to rest
@@ -591,14 +645,22 @@ class MotorRecord:
     async def _halt(self) -> None:
         """Halt; where this gateway has no control a stop is the only thing that is not refused, and it latches."""
         self._halts += 1
+        self._wanted = None
         self._released.set()
         if self._axis is None:
-            await self._stop(self.info.axis)
+            if self._is_refused or self._moving is not Moving.NO:
+                await self._stop(self.info.axis)
             return
         if self._moving is not Moving.NO or self._pending:
             await self._axis.halt()
 
-    def _controlled(self) -> Axis:
+    async def _controlled(self) -> Axis:
+        self._used_s = asyncio.get_running_loop().time()
+        if self._axis is None:
+            self._control_changed.clear()
+            self._control_wanted.set()
+            await self._control_changed.wait()
+            self._used_s = asyncio.get_running_loop().time()
         if self._axis is None:
             held = self.beside("control")
             raise LeaseRequired(
@@ -607,12 +669,13 @@ class MotorRecord:
             )
         return self._axis
 
-    def _movable(self) -> Axis:
+    async def _movable(self) -> Axis:
+        axis = await self._controlled()  # which may change the unit, and so SPMG
         if self["SPMG"].value not in ("Go", "Move"):
             raise WrongState(
                 f"axis {self.info.axis}: SPMG is {self['SPMG'].value}", axis=self.info.axis, remedy="put Go there"
             )
-        return self._controlled()
+        return axis
 
 
 def database(prefix: str, records: Mapping[str, MotorRecord]) -> dict[str, Field]:

@@ -78,7 +78,21 @@ def pyepics_motor(record: str) -> None:
     until(lambda: motor.moving == 1 and motor.get_position(readback=True) > 2.1)
     motor.stop()
     until(lambda: motor.done_moving == 1)
-    assert motor.get_position(readback=True) < 49
+    stands = motor.get_position(readback=True)
+    assert stands < 49
+    motor.put("VELO", 20.0)
+    assert motor.move(1.0, relative=True, wait=True, timeout=LONGEST_S) == 0
+    assert abs(motor.get_position(readback=True) - stands - 1.0) < 0.1
+    motor.move(0.0, wait=True, timeout=LONGEST_S)
+    motor.put("TWV", 0.1)
+    for _ in range(50):
+        motor.put("TWF", 1)
+    until(lambda: motor.done_moving == 1 and abs(motor.get_position(readback=True) - 5.0) < 0.02)
+    assert abs(motor.get_position() - 5.0) < 1e-6
+    assert epics.caput(f"{record}.JOGR", 1, wait=True, timeout=LONGEST_S) == 1
+    time.sleep(0.3)
+    assert epics.caput(f"{record}.JOGR", 0, wait=True, timeout=LONGEST_S) == 1
+    until(lambda: motor.done_moving == 1 and abs(motor.get_position() - motor.get_position(readback=True)) < 0.1)
 
 
 def ophyd_motor(record: str) -> None:

@@ -171,6 +171,7 @@ def test_a_relative_grid_ends_where_it_began(lab: Laboratory):
 @pytest.mark.parametrize("ending", ["stop", "latch", "another program"])
 def test_where_an_axis_was_sent_is_forgotten_once_something_else_has_stopped_or_moved_it(lab: Laboratory, ending: str):
     with lab.powered("x") as (x,):
+        x.set(0.0).wait(60)
         status = x.set(40.0)
         lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
         if ending == "stop":

@@ -15,15 +15,17 @@ from ldcnd.errors import (
     CommandAborted,
     DriveFault,
     LdcndError,
+    LeaseHeld,
     LeaseRequired,
     PositionLimit,
+    StopLatched,
     ValueOutOfRange,
     WrongState,
 )
 from ldcnd.messaging.memory_session import MemoryBroker
 from ldcnd.model.commands import MoveAbsolute, Reset
 from ldcnd.model.events import ReadEvents
-from ldcnd.model.leases import Acquire
+from ldcnd.model.leases import Acquire, ListHolders
 from ldcnd.model.meta import AxisLimits
 from ldcnd.model.samples import LinkState, Moving
 from ldcnd.planning.plan import plan_rig
@@ -95,12 +97,10 @@ async def records(*, moves: bool = True, power: bool = True):
             await running.until(name, lambda state: state.link is LinkState.UP)
         rig = Rig(running.client, await running.client.daemon())
         async with gateway(rig, prefix="T:", moves=rig.axes if moves else ()) as made:
-            if moves:
-                await shows(made, "T:x:control", "epics gateway")
-                if power:
-                    await put(made, "T:x.CNEN", "Enable")
-                    await shows(made, "T:x.CNEN", "Enable")
             await shows(made, "T:x.SEVR", "NO_ALARM")
+            if moves and power:
+                await put(made, "T:x.CNEN", "Enable")
+                await shows(made, "T:x.CNEN", "Enable")
             yield running, made
 
 
@@ -128,7 +128,9 @@ async def test_the_record_has_the_fields_that_clients_use():
         beside = {name.partition(":x:")[2] for name in made.variables if ":x:" in name}
 
     assert shown == {"EGU": "mm", "PREC": 3, "MRES": 0.001, "HLM": 100, "LLM": -100, "RTYP": "motor"}
-    assert beside == {"adc", "condition", "control", "faults", "first_fault", "inputs", "message", "state", "velocity"}
+    assert beside == {
+        *("adc", "condition", "control", "faults", "first_fault", "inputs", "message", "reset", "state", "velocity"),
+    }
 
 
 async def test_a_jog_runs_until_it_is_released():
@@ -191,7 +193,7 @@ async def test_a_limit_switch_shows_at_the_end_of_the_axis_where_it_is(direction
         async with gateway(rig, prefix="T:", moves=("x",)) as made:
             await shows(made, "T:x.LLS", AlarmSeverity.INVALID_ALARM, "severity")  # the power driver is off
             assert made.variables["T:x.LLS"].value == 0
-            await shows(made, "T:x:control", "epics gateway")
+            await shows(made, "T:x.SEVR", "NO_ALARM")
             await put(made, "T:x.CNEN", "Enable")
             with pytest.raises(DriveFault, match="limit switch"):
                 await put(made, "T:x", 30.0)
@@ -200,7 +202,7 @@ async def test_a_limit_switch_shows_at_the_end_of_the_axis_where_it_is(direction
 
             await shows(made, "T:x.HLS", AlarmSeverity.NO_ALARM, "severity")
             assert made.variables["T:x:inputs"].value == f"{direction}_limit, amplifier_enable"
-            assert made.variables["T:x.RBV"].value < 21
+            assert made.variables["T:x.RBV"].value < 22
             with pytest.raises(DriveFault, match="limit switch"):
                 await put(made, "T:x", -30.0)
             await shows(made, "T:x.LLS", 1)
@@ -240,7 +242,7 @@ async def test_backlash_is_the_approach_of_the_daemon_and_one_put(direction: str
     async with dialect_rig(LS_182AP, approach={"direction": direction, "distance": 0.5}) as drive:
         rig = Rig(drive.rig.client, await drive.rig.client.daemon())
         async with gateway(rig, prefix="T:", moves=("x",)) as made:
-            await shows(made, "T:x:control", "epics gateway")
+            await shows(made, "T:x.SEVR", "NO_ALARM")
             await put(made, "T:x.CNEN", "Enable")
             seen, target = [], -2.0 * distance  # from the wrong side
             async with rig.samples("x", "position") as positions:
@@ -456,6 +458,66 @@ async def test_a_daemon_that_says_nothing_leaves_no_axis_that_has_arrived():
         assert made.variables["T:x.RBV"].severity == AlarmSeverity.INVALID_ALARM
 
 
+async def test_an_axis_of_a_gateway_that_idles_can_be_reset_by_others():
+    async with records() as (running, made):
+        await put(made, "T:x", 2.0)
+        await running.client.stop()
+        held = await running.client.ask(ListHolders())
+        with pytest.raises(LeaseHeld):
+            await running.client.command("x", Reset())
+        await asyncio.sleep(31)
+        await running.client.command("x", Reset())
+        released = await running.client.ask(ListHolders())
+        await put(made, "T:x", 3.0)
+
+        assert [holder.axis for holder in held.holders if holder.client] == ["x"]
+        assert not any(holder.client for holder in released.holders)
+        assert made.variables["T:x.RBV"].value == pytest.approx(3, abs=0.02)
+        assert made.variables["T:x:control"].value == "epics gateway"
+
+
+async def test_a_latch_is_cleared_by_a_put_and_nothing_moves():
+    async with records() as (running, made):
+        moving = asyncio.create_task(put(made, "T:x", 50.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await running.client.stop()
+        with suppress(CommandAborted, StopLatched):
+            await moving
+        await running.until("x", lambda state: state.moving is Moving.NO)
+        stands = (await running.client.position("x")).value
+        with pytest.raises(StopLatched):
+            await put(made, "T:x", stands + 1)
+        await put(made, "T:x:reset", 1)
+        state = await running.until("x", lambda state: not state.stop_latched)
+        await asyncio.sleep(2)
+
+        assert state.moving is Moving.NO
+        assert (await running.client.position("x")).value == pytest.approx(stands, abs=AT_REST)
+        assert made.variables["T:x:reset"].value == 0
+        await put(made, "T:x.TWF", 1)
+        assert made.variables["T:x.RBV"].value == pytest.approx(stands + 1, abs=AT_REST)
+
+
+@pytest.mark.parametrize("starting", ["VAL", "TWF", "JOGF", "HOMF"])
+@pytest.mark.parametrize("ending", ["STOP", "SPMG", "release"])
+async def test_what_is_halted_while_control_is_on_its_way_does_not_begin(starting: str, ending: str):
+    async with records() as (running, made):
+        await put(made, "T:x.HVEL", 1.0)
+        await asyncio.sleep(31)  # control was given back
+        moving = asyncio.create_task(put(made, f"T:x.{starting}", 5.0 if starting == "VAL" else 1))
+        await asyncio.sleep(0)
+        if ending == "release":
+            await put(made, "T:x.JOGF" if starting == "JOGF" else "T:x.STOP", 0 if starting == "JOGF" else 1)
+        else:
+            await put(made, f"T:x.{ending}", "Stop" if ending == "SPMG" else 1)
+        with suppress(WrongState):
+            await moving
+        await asyncio.sleep(3)
+
+        assert made.variables["T:x.RBV"].value == pytest.approx(0, abs=AT_REST)
+        assert (await running.client.state("x")).moving is Moving.NO
+
+
 async def test_limits_and_velocities_follow_a_reload():
     async with records() as (running, made):
         await put(made, "T:x.VELO", 30.0)
@@ -500,12 +562,12 @@ async def test_a_daemon_with_another_unit_is_not_moved_by_numbers_of_the_former_
         async with life("first", "um"):
             rig = Rig(client, await client.daemon())
             made = await faces.enter_async_context(gateway(rig, prefix="T:", moves=rig.axes))
-            await shows(made, "T:x:control", "epics gateway")
+            await shows(made, "T:x.SEVR", "NO_ALARM")
             await put(made, "T:x.CNEN", "Enable")
             await put(made, "T:x", 1.0)
         async with life("second", "mm"):
             await shows(made, "T:x.EGU", "mm")
-            await shows(made, "T:x:control", "epics gateway")
+            await shows(made, "T:x.SEVR", "NO_ALARM")
             await put(made, "T:x.CNEN", "Enable")
             with pytest.raises(WrongState, match="SPMG"):
                 await put(made, "T:x", 50.0)

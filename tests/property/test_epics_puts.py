@@ -10,7 +10,7 @@ from caproto import CaprotoError, Forbidden
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
-from ldcnd.epics.gateway import RETRY_S, WHO, Gateway, gateway
+from ldcnd.epics.gateway import WHO, Gateway, gateway
 from ldcnd.errors import LdcndError
 from ldcnd.model.events import ReadEvents
 from ldcnd.model.samples import LinkState, Moving
@@ -27,6 +27,7 @@ STILL_COUNTS = 3
 SETTLING_COUNTS = 50
 SETTLING_S = 3.0
 """By how much, and for how long, the loop goes on after the end of a profile that a halt has cut short."""
+PAUSE_S = 5.0
 MOVES = {"move_absolute", "home", "jog"}
 
 
@@ -74,7 +75,7 @@ class Campaign:
         assert abs(self.rests_at - ended_at) <= SETTLING_COUNTS
 
     async def give(self) -> None:
-        """Let it go, and wait until the gateway controls x again: nothing that was put before begins then."""
+        """Let it go, and have the gateway control x again: nothing that was put before begins then."""
         assert self.taken
         assert self.ann
         while self.under_way:
@@ -83,9 +84,10 @@ class Campaign:
         await self.ann.power(on=True)
         self.rests_at = self.counts("x")  # a loop that closes may shift it by a little
         await self.taken.aclose()
-        await shows(self.made, "T:x:control", WHO)
-        await asyncio.sleep(1.0)
+        await asyncio.sleep(PAUSE_S)
         self.check()
+        await put(self.made, "T:x.CNEN", "Enable")
+        await shows(self.made, "T:x:control", WHO)
         self.taken = self.ann = self.rests_at = None
 
     async def heal(self) -> None:
@@ -118,7 +120,7 @@ class Campaign:
             case "put":
                 self.begin()
             case "wait":
-                await asyncio.sleep(self.dice.choice([0.0, 0.05, self.dice.uniform(0.0, RETRY_S)]))
+                await asyncio.sleep(self.dice.choice([0.0, 0.05, self.dice.uniform(0.0, PAUSE_S)]))
             case "heal":
                 await self.heal()
             case "stop":
@@ -139,7 +141,6 @@ async def campaign(seed: int, steps: int) -> tuple[int, int]:
             for each in axes:
                 await each.power(on=True)
         async with gateway(rig, prefix="T:", axes=("x", "y"), moves=("x",)) as made:
-            await shows(made, "T:x:control", WHO)
             await put(made, "T:x.HVEL", 1.0)
             going = Campaign(running, rig, chain, made, random.Random(seed))
             for _ in range(steps):
