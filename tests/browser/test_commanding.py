@@ -79,6 +79,7 @@ async def test_a_jog_runs_while_the_button_or_an_arrow_key_is_held(house):
         if await house.sim.position("x") > 0:
             away, back, key = (backward, forward, "ArrowRight")
 
+        await expect(away).to_be_enabled()
         box = await away.bounding_box()
         await desk.page.mouse.move(box["x"] + 20, box["y"] + 10)
         await desk.page.mouse.down()

@@ -183,7 +183,7 @@ async def test_the_velocity_never_contradicts_the_state(house):
     moving = [value for state, value in values if state == "moving"]
     assert len(moving) > 5
     assert sorted(moving)[len(moving) // 2] == pytest.approx(5, abs=0.3)
-    assert min(moving[2:-2]) > 3
+    assert sum(value < 4 for value in moving) <= 4  # while it begins and while it settles
 
 
 async def test_a_speed_override_and_every_axis_that_was_lost_stand_on_top_of_every_page(house):

@@ -98,11 +98,13 @@ function Console() {
     event.preventDefault();
     main.current.focus();
   }}>Skip to the page</a>
-    <header class="top">
-      <span class="brand">ldcnd</span>
-      <${Navigation} at=${at} />
-      <${Summary} />
-      <${StopAll} />
+    <header class="frame">
+      <div class="top">
+        <span class="brand">ldcnd</span>
+        <${Navigation} at=${at} />
+        <${Summary} />
+        <${StopAll} />
+      </div>
       <${Notices} />
     </header>
     <main id="main" tabindex="-1" ref=${main}>

@@ -11,10 +11,8 @@ const DRAWN_EACH_MS = 100;
 const SILENT_AFTER_S = 3;
 /** What is shown of an axis of which no condition came yet. */
 const NOTHING_KNOWN = { known: false, live: false, mark: "no data", state: "unknown", alarm: "invalid", troubles: [] };
-/** A drive reports its velocity in whole counts a servo tick: below this share of the limit, positions say it better. */
-const SLOW_SHARE = 0.1;
 /** Long enough for a slow axis to count something, short enough to follow a change of velocity. */
-const SLOPE_S = 0.5;
+const SLOPE_S = 0.3;
 const REPORTS_KEPT = 61;
 const EVENTS_KEPT = 1_000;
 /** An observer speaks every ten seconds: an hour and a half. */
@@ -55,17 +53,17 @@ export class Axis {
     return this.info?.capabilities.includes(capability) ?? false;
   }
 
-  /** Velocity in units a second: of the drive, or while it is slow the slope of what was measured of this motion.
+  /** Velocity in units a second: the slope of the latest positions of this motion, or of the standstill after it.
 
-   * What was measured before a motion has begun, or has ended, says nothing about it: null until something was measured since.
+   * The drive's own, in whole counts a servo tick, is coarse: it counts until two positions are there. What was measured
+   * before the motion has begun, or has ended, says nothing about it: null until something was measured since.
    */
   get velocity() {
     const { sinceNs } = this.#motion;
     const sample = this.samples.velocity;
-    const told = sample && sample.t >= sinceNs ? sample.value : null;
+    const told = sample && sample.t >= sinceNs && this.state?.moving !== "no" ? sample.value : null;
     const [first, last] = [this.#positions[0], this.#positions.at(-1)];
-    const limit = this.info?.limits.velocity ?? 0;
-    if ((told !== null && Math.abs(told) > SLOW_SHARE * limit) || !first || last.t === first.t) return told;
+    if (!first || last.t === first.t) return told;
     return ((last.value - first.value) * 1e9) / (last.t - first.t);
   }
 
@@ -109,8 +107,9 @@ export class Axis {
 
   #remember(sample) {
     const good = sample && sample.quality !== "bad";
-    const fits = ({ t }) => sample.t - t <= SLOPE_S * 1e9 && t >= this.#motion.sinceNs;
-    this.#positions = good ? [...this.#positions, sample].filter(fits) : [];
+    const before = this.#positions.filter(({ t }) => t >= this.#motion.sinceNs && t < sample?.t);
+    const recent = before.filter(({ t }) => sample.t - t <= SLOPE_S * 1e9);
+    this.#positions = good ? [...(recent.length ? recent : before.slice(-1)), sample] : [];
   }
 
   /** A motion begins or ends: only positions from then on belong to it. */
