@@ -13,6 +13,8 @@ const SILENT_AFTER_S = 3;
 const NOTHING_KNOWN = { known: false, live: false, mark: "no data", state: "unknown", alarm: "invalid", troubles: [] };
 /** Long enough for a slow axis to count something, short enough to follow a change of velocity. */
 const SLOPE_S = 0.3;
+/** The drive's latest velocity may be older than its state. */
+const AT_REST = new Set(["disabled", "standstill", "error_stop"]);
 const REPORTS_KEPT = 61;
 const EVENTS_KEPT = 1_000;
 /** An observer speaks every ten seconds: an hour and a half. */
@@ -61,7 +63,7 @@ export class Axis {
   get velocity() {
     const { sinceNs } = this.#motion;
     const sample = this.samples.velocity;
-    const told = sample && sample.t >= sinceNs && this.state?.moving !== "no" ? sample.value : null;
+    const told = sample && sample.t >= sinceNs && !AT_REST.has(this.state?.state) ? sample.value : null;
     const [first, last] = [this.#positions[0], this.#positions.at(-1)];
     if (!first || last.t === first.t) return told;
     return ((last.value - first.value) * 1e9) / (last.t - first.t);
