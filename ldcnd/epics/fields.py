@@ -4,6 +4,7 @@ A field without an action is read-only, and says so to its clients. An action ra
 gets a failed put.
 """
 
+import math
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,8 @@ from caproto import (
     ChannelInteger,
     ChannelString,
 )
+
+from ldcnd.number_text import read_number
 
 LONGEST_TEXT = 512
 """Characters of a text that is longer than an EPICS string, which has 39."""
@@ -101,7 +104,19 @@ class Field(ChannelData):  # type: ignore[misc] # caproto has no types
 
 
 class Number(Field, ChannelDouble):  # type: ignore[misc]
-    """A number with a unit."""
+    """A number with a unit; a client may put it as a text, read as everywhere a person types one."""
+
+    def native(self, value: Any) -> Value:  # noqa: ANN401
+        """Return a number or the number that a text stands for.
+
+        Raises:
+            ValueError: it is none, or not finite.
+        """
+        given = super().native(value)
+        number = read_number(given, str(self.units)) if isinstance(given, str) else given
+        if not math.isfinite(number):
+            raise ValueError(f"{number} is not a finite number")
+        return number
 
 
 class Integer(Field, ChannelInteger):  # type: ignore[misc]
