@@ -11,7 +11,7 @@ from ldcnd.drivers.ldcn.packet import Command
 from ldcnd.messaging.keys import Keys
 from ldcnd.model.commands import MoveAbsolute, Power
 from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
-from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
+from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan, FaultyReply, FaultyRequest
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 
@@ -269,27 +269,41 @@ async def test_drives_come_back_and_lines_are_taken_over_through_noise(seed):
     assert abs(drive(chain, 1).loop.position - 90_000) <= 1
 
 
-async def test_an_sc_that_only_left_questions_unanswered_is_not_reset_where_the_port_passes_no_rates_on():
+@pytest.mark.parametrize("silent_s", [0.6, 1.0, 1.5, 2.0, 2.5, 3.0])
+async def test_an_sc_that_only_left_questions_unanswered_is_not_reset_where_the_port_passes_no_rates_on(silent_s):
     spec = ChainSpec((ModuleSpec("ls182ap"), ModuleSpec("picservo-sc")), baud_check=False)
     chain = build_chain(spec)
-    axes = [
-        {"name": "x", "address": 1, "model": "ls-182ap", "unit": "mm", "counts_per_unit": 1000.0},
-        {"name": "s", "address": 2, "model": "pic-servo-sc", "unit": "mm", "counts_per_unit": 1000.0},
-    ]
-    common = {
-        "velocity": 20.0,
-        "acceleration": 200.0,
-        "gains": {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000},
-    }
+    gains = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000}
+    common = {"unit": "mm", "counts_per_unit": 1000.0, "velocity": 20.0, "acceleration": 200.0, "gains": gains}
     document = simulated_config().model_dump(mode="json", exclude_unset=True)
-    document["bus"][0]["axis"] = [axis | common for axis in axes]
+    document["bus"][0]["axis"] = [
+        {"name": "x", "address": 1, "model": "ls-182ap"} | common,
+        {"name": "s", "address": 2, "model": "pic-servo-sc"} | common,
+    ]
     document["bus"][0].pop("module", None)
     async with rig_on(chain, RigConfig.model_validate(document)) as rig:
         await rig.until("s", lambda state: state.link == "up")
         await rig.client.command("s", Power(on=True))
-        now_s = asyncio.get_running_loop().time()
-        chain._injector = FaultInjector(FaultPlan((Fault(FaultKind.REPLY_LOST, 1.0, now_s, until_s=now_s + 2.5),)))
-        await asyncio.sleep(6.0)
+        now_s, sent = asyncio.get_running_loop().time(), len(rig.sent)
+        chain._injector = MuteModule(2, now_s + silent_s)
+        await asyncio.sleep(8.0)
 
+        resets = {packet.address for packet in rig.sent[sent:] if packet.command is Command.HARD_RESET}
+        assert not resets & {2, 0xFF, 0x81}
         assert drive(chain, 2).loop.servo_on
-        assert Command.HARD_RESET not in {packet.command for packet in rig.sent[-2000:] if packet.address == 2}
+
+
+class MuteModule(FaultInjector):
+    """Loses the replies of one module until an instant."""
+
+    def __init__(self, address: int, until_s: float) -> None:
+        super().__init__(FaultPlan())
+        self._address, self._until_s, self._mute = address, until_s, False
+
+    def request(self, data: bytes, at_s: float) -> FaultyRequest:
+        packet = data[data.rfind(b"\xaa") :]
+        self._mute = at_s < self._until_s and len(packet) > 2 and packet[1] == self._address
+        return FaultyRequest(tuple(data))
+
+    def reply(self, data: bytes, at_s: float) -> FaultyReply:
+        return FaultyReply(b"" if self._mute else data)
