@@ -103,7 +103,7 @@ async def test_a_move_that_waits_behind_another_is_withdrawn_by_the_end_of_its_c
     assert "waits until" in accepted
     assert behind.returncode == 130
     assert state.moving == "no"
-    assert [event.status for event in events if "before it began" in (event.reason or "")] == ["aborted"]
+    assert [event.status for event in events if "overtaken by halt" in (event.reason or "")] == ["aborted"]
 
 
 async def test_a_waited_move_may_be_left_running(served):
