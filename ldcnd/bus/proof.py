@@ -140,7 +140,7 @@ class Proofs:
             proof.lose(problem, silent=silent)
 
     def missed(self, node: int, misses: int) -> None:
-        """Take note that a node has left so many exchanges in a row unanswered."""
+        """Note how many exchanges in a row a node has left unanswered."""
         if misses >= MISSES_UNTIL_LOST and (proof := self._nodes.get(node)) and proof.holds:
             proof.lose(f"address {node} has stopped answering")
 

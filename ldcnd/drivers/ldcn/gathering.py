@@ -3,9 +3,9 @@
 A module that lost power waits at address 0 and 19200 baud. Its address output is high, so the next one is deaf; one
 behind that receives, because the output of the deaf one is low. Several modules of one chain may thus wait at address 0
 and receive together, and one more may restart between a proof and the packet that relies on it. So nothing at address 0
-ever gets the address of a place. It first gets a waiting address, which belongs to no place: that is harmless whoever
-receives it, and connects those behind it, which is what a stop needs. From then on the modules at this waiting address
-can only become fewer, and what is proven about them stays true until the packet that moves them to their place.
+ever gets the address of a place. It first gets a waiting address, which belongs to no place: that is harmless whichever
+module receives it, and connects those behind it, which is what a stop needs. From then on the modules at this waiting
+address can only become fewer, and what is proven about them stays true until the packet that moves them to their place.
 
 What proves a place, after every module that receives was taken off address 0:
 
@@ -179,7 +179,8 @@ class Gathering:
                 continue
             # one that answers at the line's rate, too, has not restarted: only its replies were lost for a while, or
             # the port does not pass rates on (a pseudo-terminal); a reset would switch off a motor that holds
-            if await self._listen(each.address, at_reset) and not await self._answers(each.address):
+            heard = await self._listen(each.address, at_reset)
+            if heard and heard.identity and each.accepts(heard.identity) and not await self._answers(each.address):
                 node = Node(each.address, each.profile)
                 before = await self._at(at_reset, commands.read_status(node, MOTION_ITEMS))
                 await asyncio.sleep(WATCH_S)
@@ -253,7 +254,7 @@ class Gathering:
         return await self._rate.who_is(address) is not None or await self._rate.who_is(address) is not None
 
     async def _listen(self, address: int, baud: int | None = None) -> Heard | None:
-        """Ask for an identity; None means silence, as replies that collide are heard and understood by nobody."""
+        """Read an identity; None means silence. Replies that collide are no silence: their identity is None."""
         received = bytearray()
         exchange = read_identity(address)
 
