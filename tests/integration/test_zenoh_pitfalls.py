@@ -25,6 +25,7 @@ from ldcnd.messaging.zenoh_config import endpoints, zenoh_config
 from ldcnd.messaging.zenoh_session import open_zenoh_session
 from ldcnd.messaging.zenoh_settings import LEASE_MS, ZenohSettings
 from ldcnd.model.commands import ErrorReply
+from ldcnd.model.samples import StateSample
 from tests.support.rig import SIMULATED
 from tests.support.router import router
 from tests.support.session_pair import JSON, KEYS, POSITION, Pair, echo, free_endpoint, served, until
@@ -176,11 +177,18 @@ async def test_two_daemons_that_are_both_asked_both_refuse(pair: Pair, endpoint:
             return len(answers) == 2
 
         await until(both)
-        state = await RigClient(pair.client, "sim").state("x")
+        rig = RigClient(pair.client, "sim")
+
+        states: list[StateSample] = []
+
+        async def known() -> bool:  # the queryables of a daemon reach the client one after another
+            states[:] = [state] if (state := await rig.state("x")) else []
+            return bool(states)
+
+        await until(known)
 
     assert codes == [ErrorCode.DUPLICATE_DAEMON] * 2
-    assert state
-    assert state.enabled is False
+    assert [state.enabled for state in states] == [False]
 
 
 async def test_answers_are_kept_although_they_have_one_key(pair: Pair, endpoint: str):
