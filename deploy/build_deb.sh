@@ -51,7 +51,7 @@ install -Dm644 "$source/LICENSE" "$doc/copyright"
 gzip -9n "$root"/usr/share/man/man1/*.1
 plugins=$root/usr/lib/$("$python" -c 'import sysconfig; print(sysconfig.get_config_var("MULTIARCH"))')/wireshark/plugins
 mkdir -p "$plugins"
-"$opt/bin/python" -c 'from ldcnd.families.dissector import dissector; print(dissector(), end="")' > "$plugins/ldcnd.lua"
+"$opt/bin/python" -c 'from ldcnd.ops.dissector import dissector; print(dissector(), end="")' > "$plugins/ldcnd.lua"
 mkdir -p "$root/etc/ldcnd" "$root/usr/bin" "$root/DEBIAN"
 ln -s /opt/ldcnd/bin/ldcnd "$root/usr/bin/ldcnd"
 

@@ -4,7 +4,7 @@ import importlib.metadata
 import shutil
 from pathlib import Path
 
-from ldcnd.fault_pages import FOLDER
+from ldcnd.contract.fault_pages import FOLDER
 
 HERE = Path(__file__).parent
 

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
     from ldcnd.client.motion import Motion, Position, State
     from ldcnd.client.rig import Rig, connect
     from ldcnd.client.traces import Trace
-    from ldcnd.errors import LdcndError
+    from ldcnd.contract.errors import LdcndError
 
 _HOME = {
     "Axis": ("ldcnd.client.axis", "Axis"),
-    "LdcndError": ("ldcnd.errors", "LdcndError"),
+    "LdcndError": ("ldcnd.contract.errors", "LdcndError"),
     "Motion": ("ldcnd.client.motion", "Motion"),
     "Position": ("ldcnd.client.motion", "Position"),
     "Rig": ("ldcnd.client.rig", "Rig"),

@@ -3,7 +3,7 @@
 import ipaddress
 from dataclasses import dataclass
 
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 
 HIGHEST_PORT = 0xFFFF
 

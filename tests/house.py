@@ -32,9 +32,9 @@ import structlog
 import ldcnd
 from ldcnd.cli.main import cli
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.model.commands import MoveAbsolute, Power, SetPosition
-from ldcnd.model.parameters import ReadAlarms
-from ldcnd.model.traces import TakeTrace
+from ldcnd.contract.commands import MoveAbsolute, Power, SetPosition
+from ldcnd.contract.parameters import ReadAlarms
+from ldcnd.contract.traces import TakeTrace
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.console_rig import open_page, running_console
@@ -42,7 +42,7 @@ from tests.support.rig import SIMULATED, RunningRig, running_rig
 from tests.support.trace_rig import trace_config
 
 PACKAGE = Path(ldcnd.__file__).parent
-SESSION = "messaging/memory_session.py"
+SESSION = "net/memory_session.py"
 OUTSIDE = ("sim/", SESSION, "log.py")
 DOORS = ("data_received", "admit", "offer", "reply")
 """What the world outside calls: bytes of the line, and a query with its answer."""
@@ -51,11 +51,8 @@ SETTLED_S = 0.1
 TURN_S = 0.0005
 QUIET_HZ = 0.01
 """Of all polls while a command is followed, so that none of them mixes with it."""
-WINGS = (
-    "sim", "console", "lab", "bluesky", "epics", "ros2", "recording", "top", "ops", "pki", "planning", "bench", "scan",
-    "doctor", "accept", "commissioning", "commissioning_page", "tuning", "shadow", "testing", "twin", "port", "secop",
-)  # fmt: skip
-"""Folders and modules, wherever they lie, that are no part of the core."""
+WINGS = ("sim", "console", "lab", "ops", "bench")
+"""Folders that are no part of the core."""
 LEAST_SHARED, SHARE = 4, 0.6
 """How many fields two twins have in common at least, and which share of the smaller one's these are."""
 

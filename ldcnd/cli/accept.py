@@ -10,18 +10,18 @@ from pathlib import Path
 
 import click
 
-from ldcnd.bus.bus import Bus
 from ldcnd.cli.typed import Finite, Whole
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.driver import Gains
-from ldcnd.families.family import TrialMove, Tries
-from ldcnd.families.known import DEFAULT, FAMILIES
-from ldcnd.families.opened import show_findings
+from ldcnd.contract.health import Finding, Verdict
+from ldcnd.contract.number_text import NotANumber, read_whole
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.family import TrialMove, Tries
+from ldcnd.drives.known import DEFAULT, FAMILIES
+from ldcnd.drives.opened import show_findings
+from ldcnd.line.bus import Bus
+from ldcnd.line.capture import Capture, CaptureHeader, capture_lines
 from ldcnd.log import configure_logging
-from ldcnd.model.health import Finding, Verdict
-from ldcnd.number_text import NotANumber, read_whole
 from ldcnd.version import version
-from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines
 
 HELD_S = 1.0
 """Time without Enter after which the dead-man counts as released, seconds."""

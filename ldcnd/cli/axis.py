@@ -10,7 +10,7 @@ from ldcnd.cli.rig import stop_rig
 from ldcnd.cli.sending import Sender, commanding
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     BufferMode,
     Direction,
     Halt,
@@ -35,8 +35,8 @@ from ldcnd.model.commands import (
     SetPwm,
     Track,
 )
-from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import TelemetryItem
 
 WAIT = click.option("--wait", is_flag=True, help="Return when it has ended; Ctrl-C halts the axis.")
 LEAVE = click.option("--leave-running", is_flag=True, help="With --wait: Ctrl-C ends the wait only, the axis moves on.")

@@ -5,8 +5,8 @@ import click
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import NotSupported
-from ldcnd.model.parameters import (
+from ldcnd.contract.errors import NotSupported
+from ldcnd.contract.parameters import (
     AlarmReport,
     ClearCounter,
     CounterName,
@@ -16,7 +16,7 @@ from ldcnd.model.parameters import (
     ReadMonitors,
     ReadProfile,
 )
-from ldcnd.model.samples import MonitorName, MonitorSample
+from ldcnd.contract.samples import MonitorName, MonitorSample
 
 
 @click.command()

@@ -10,10 +10,10 @@ from ldcnd.cli.quantities import decimals, sample_text
 from ldcnd.cli.typed import Whole, axis_of
 from ldcnd.client.overview import AxisNow, overview
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError
-from ldcnd.model.condition import Place, assess
-from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import (
+from ldcnd.contract.condition import Place, assess
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import (
     AxisState,
     FaultSample,
     LinkState,

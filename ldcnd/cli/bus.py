@@ -11,14 +11,14 @@ from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.typed import Finite, NewFile, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
-from ldcnd.daemon.process.replay import config_of
-from ldcnd.drivers.transcript import Describe
-from ldcnd.families.dissector import install
-from ldcnd.families.known import FAMILIES
-from ldcnd.model.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer, Snapshot
-from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines, parse_capture
-from ldcnd.wirelog.pcapng import encode_pcapng
-from ldcnd.wirelog.recorder import WireEvent, WireRecord, parse_records
+from ldcnd.contract.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer, Snapshot
+from ldcnd.daemon.replay import config_of
+from ldcnd.drives.known import FAMILIES
+from ldcnd.drives.transcript import Describe
+from ldcnd.line.capture import Capture, CaptureHeader, capture_lines, parse_capture
+from ldcnd.line.flight_recorder import WireEvent, WireRecord, parse_records
+from ldcnd.ops.dissector import install
+from ldcnd.ops.pcapng import encode_pcapng
 
 TEXT, WORDS, PCAPNG = FORMATS = ("text", "words", "pcapng")
 

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import click
 
+from ldcnd.config.plan import require_plan
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.process.assembly import session_settings
-from ldcnd.errors import ConfigError
-from ldcnd.messaging.zenoh_config import zenoh_config
-from ldcnd.planning.plan import require_plan
+from ldcnd.contract.errors import ConfigError
+from ldcnd.daemon.assembly import session_settings
+from ldcnd.net.zenoh_config import zenoh_config
 
 
 @click.command()

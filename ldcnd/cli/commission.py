@@ -8,6 +8,11 @@ from pathlib import Path
 import click
 
 from ldcnd import durable
+from ldcnd.bench.commissioning.checklist import STEPS, Checklist, axis_of
+from ldcnd.bench.commissioning.record import StepRecord
+from ldcnd.bench.commissioning.report import html_of
+from ldcnd.bench.commissioning.walk import Walk
+from ldcnd.bench.person import Left, Person
 from ldcnd.cli.connection import AxisName, Target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.output import FAILED, show_lines
@@ -15,13 +20,8 @@ from ldcnd.cli.terminal_person import TerminalPerson
 from ldcnd.cli.typed import Finite, NewFile, force_option
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.commissioning.checklist import STEPS, Checklist, axis_of
-from ldcnd.commissioning.record import StepRecord
-from ldcnd.commissioning.report import html_of
-from ldcnd.commissioning.walk import Walk
 from ldcnd.config.rig import load_config
-from ldcnd.errors import ConfigError
-from ldcnd.person import Left, Person
+from ldcnd.contract.errors import ConfigError
 from ldcnd.version import version
 
 

@@ -18,11 +18,11 @@ from pydantic import ValidationError
 from ldcnd.cli.output import show_lines
 from ldcnd.client.lease import inherited_lease
 from ldcnd.client.rig_client import RigClient, find_rigs, on_each_rig
-from ldcnd.errors import LdcndError, SessionError, UnknownAxis
-from ldcnd.messaging.session import Session
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.frozen import Frozen
+from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis
+from ldcnd.contract.frozen import Frozen
+from ldcnd.net.session import Session
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 COMPLETION_S = 2.0

@@ -10,10 +10,10 @@ import click
 
 from ldcnd.cli.connection import DEFAULT_ENDPOINT
 from ldcnd.cli.served_at import CONSOLE_ADDRESS, address_option
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_settings import ZenohSettings
 
 if TYPE_CHECKING:
     from ldcnd.console.server import MoreRoutes
@@ -91,7 +91,7 @@ def command(
 
 def _commissioning(config: Path, endpoints: Sequence[str]) -> "MoreRoutes":
     """Return the routes of the commissioning page for a configuration."""
-    from ldcnd.commissioning_page.routes import Commissioning  # noqa: PLC0415 - its packages are optional
+    from ldcnd.console.commissioning.routes import Commissioning  # noqa: PLC0415 - its packages are optional
 
     words = ["ldcnd", "run", "--config", str(config)]
     if endpoints and endpoints[0] != DEFAULT_ENDPOINT:

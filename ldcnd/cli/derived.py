@@ -9,8 +9,8 @@ import click
 from ldcnd.cli.connection import AXIS, of_options
 from ldcnd.cli.sending import Sender, Sent, commanding
 from ldcnd.cli.typed import Finite, Whole
-from ldcnd.model.commands import AxisCommand
-from ldcnd.model.frozen import attribute_docstrings
+from ldcnd.contract.commands import AxisCommand
+from ldcnd.contract.frozen import attribute_docstrings
 
 
 def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False) -> click.Command:

@@ -8,15 +8,15 @@ from typing import Any
 
 import click
 
-from ldcnd.config.bus import BusConfig
 from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.errors import ConfigError, NotSupported
-from ldcnd.families.family import ConfigFiles, Examines
-from ldcnd.families.known import FAMILIES, chain_of
-from ldcnd.families.opened import show_findings
+from ldcnd.contract.errors import ConfigError, NotSupported
+from ldcnd.contract.health import Finding, Verdict
+from ldcnd.drives.family import ConfigFiles, Examines
+from ldcnd.drives.known import FAMILIES, chain_of
+from ldcnd.drives.line_config import BusConfig
+from ldcnd.drives.opened import show_findings
 from ldcnd.log import configure_logging
-from ldcnd.model.health import Finding, Verdict
 
 FILES = ConfigFiles(
     lambda file: load_config(file).bus, lambda file, settings: chain_of(settings, load_config(file).sim), set_for_axis

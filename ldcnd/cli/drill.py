@@ -10,11 +10,11 @@ from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.typed import Finite
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import WrongState
-from ldcnd.model.commands import MoveVelocity, Power
-from ldcnd.model.leases import Acquire
-from ldcnd.model.rig_commands import Rehearse
-from ldcnd.model.samples import AxisState, StateSample, TelemetryItem
+from ldcnd.contract.commands import MoveVelocity, Power
+from ldcnd.contract.errors import WrongState
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.rig_commands import Rehearse
+from ldcnd.contract.samples import AxisState, StateSample, TelemetryItem
 
 RUN_UP_S = 0.5
 """Time in motion before the loss, seconds."""

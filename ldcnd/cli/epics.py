@@ -9,7 +9,7 @@ from ldcnd.cli.ending import on_end
 from ldcnd.cli.served_at import address_option
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
 
 DEFAULT_ADDRESS = "127.0.0.1:5064"
@@ -35,7 +35,7 @@ async def _serve(
     client: RigClient, address: ListenAddress, axes: tuple[str, ...], prefix: str | None, *, moves: bool
 ) -> None:
     try:
-        from ldcnd.epics.gateway import gateway, serve  # noqa: PLC0415 - needs an optional package
+        from ldcnd.lab.epics.gateway import gateway, serve  # noqa: PLC0415 - needs an optional package
     except ImportError as error:
         raise ConfigError("caproto is not installed", remedy="pip install 'ldcnd[epics]'") from error
     rig = Rig(client, await client.daemon())

@@ -8,7 +8,7 @@ from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.typed import Whole, axis_of
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.events import ALARM_HISTORY, DRIVE_CHANGED, REFERENCE, UNSETTLED, CommandEvent
+from ldcnd.contract.events import ALARM_HISTORY, DRIVE_CHANGED, REFERENCE, UNSETTLED, CommandEvent
 
 
 @click.command()

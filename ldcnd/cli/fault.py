@@ -5,7 +5,7 @@ from difflib import get_close_matches
 import click
 from click.shell_completion import CompletionItem
 
-from ldcnd.fault_pages import codes, page_text
+from ldcnd.contract.fault_pages import codes, page_text
 
 
 class Code(click.types.StringParamType):

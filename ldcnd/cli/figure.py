@@ -4,7 +4,7 @@ import importlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

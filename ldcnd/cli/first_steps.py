@@ -12,7 +12,7 @@ from pathlib import Path
 from ldcnd.cli.connection import DEFAULT_ENDPOINT
 from ldcnd.cli.output import show_lines
 from ldcnd.config.rig import RigConfig
-from ldcnd.daemon.process.daemon import Daemon
+from ldcnd.daemon.daemon import Daemon
 from ldcnd.listen_address import ListenAddress
 
 LINK_S = 20.0

@@ -7,8 +7,8 @@ import click
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.typed import Finite
 from ldcnd.client.fleet import AxisReport, RigReport, survey
-from ldcnd.errors import SessionError
-from ldcnd.messaging.session import Session
+from ldcnd.contract.errors import SessionError
+from ldcnd.net.session import Session
 
 
 @click.command()

@@ -8,7 +8,7 @@ from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import on_end
 from ldcnd.cli.served_at import address_option
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
 
 DEFAULT_ADDRESS = "127.0.0.1:8765"
@@ -24,7 +24,7 @@ def command(target: Target, address: ListenAddress) -> None:
 
 async def _serve(client: RigClient, address: ListenAddress) -> None:
     try:
-        from ldcnd.recording.live_view import LiveView  # noqa: PLC0415 - needs an optional package
+        from ldcnd.lab.recording.live_view import LiveView  # noqa: PLC0415 - needs an optional package
     except ImportError as error:
         raise ConfigError("foxglove-sdk is not installed", remedy="install ldcnd[foxglove]") from error
     ending = asyncio.Event()

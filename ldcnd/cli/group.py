@@ -13,8 +13,8 @@ from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, commanding, halted
 from ldcnd.cli.typed import Finite, axis_of, number_of
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.events import ReadOutcome
-from ldcnd.model.rig_commands import (
+from ldcnd.contract.events import ReadOutcome
+from ldcnd.contract.rig_commands import (
     AxisMove,
     AxisPath,
     LinePath,

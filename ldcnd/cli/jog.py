@@ -16,9 +16,9 @@ from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control, control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError, LeaseExpired
-from ldcnd.model.commands import LONGEST_HOLD_S, Jog
-from ldcnd.model.meta import AxisInfo
+from ldcnd.contract.commands import LONGEST_HOLD_S, Jog
+from ldcnd.contract.errors import ConfigError, LeaseExpired
+from ldcnd.contract.meta import AxisInfo
 
 LEASE_S = 1.0
 """The daemon applies `loss.client` so soon when this program disappears."""

@@ -12,8 +12,8 @@ from ldcnd.cli.sending import NAME
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LeaseExpired
-from ldcnd.model.leases import ListHolders
+from ldcnd.contract.errors import LeaseExpired
+from ldcnd.contract.leases import ListHolders
 
 
 @click.group()

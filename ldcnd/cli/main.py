@@ -10,7 +10,7 @@ import click
 
 from ldcnd.cli.lazy_group import LazyGroup
 from ldcnd.cli.output import DONE, EXIT_CODES, exit_code, print_under_any_encoding
-from ldcnd.errors import LdcndError
+from ldcnd.contract.errors import LdcndError
 
 COMMANDS = {
     "run": ("ldcnd.cli.run", "Run the daemon."),

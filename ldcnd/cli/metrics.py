@@ -10,12 +10,12 @@ from ldcnd.cli.ending import on_end
 from ldcnd.cli.served_at import address_option
 from ldcnd.client.health import health_reports
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.samples import FaultSample, ShadowSample, StateSample, TelemetryItem
 from ldcnd.listen_address import ListenAddress
-from ldcnd.model.samples import FaultSample, ShadowSample, StateSample, TelemetryItem
 
 if TYPE_CHECKING:
-    from ldcnd.metrics import HealthCollector
+    from ldcnd.lab.metrics import HealthCollector
 
 DEFAULT_ADDRESS = "127.0.0.1:9464"
 
@@ -32,7 +32,7 @@ async def _serve(client: RigClient, address: ListenAddress) -> None:
     try:
         from prometheus_client import CollectorRegistry  # noqa: PLC0415 - an optional package
 
-        from ldcnd.metrics import HealthCollector, metrics_server  # noqa: PLC0415
+        from ldcnd.lab.metrics import HealthCollector, metrics_server  # noqa: PLC0415
     except ImportError as error:
         raise ConfigError("prometheus-client is not installed", remedy="pip install 'ldcnd[metrics]'") from error
     loop = asyncio.get_running_loop()

@@ -6,7 +6,7 @@ import sys
 
 import click
 
-from ldcnd.errors import ConfigError, LdcndError, SessionError, Step
+from ldcnd.contract.errors import ConfigError, LdcndError, SessionError, Step
 from ldcnd.printable import printable
 
 TYPED = {

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from ldcnd.errors import ConfigError
-from ldcnd.families.family import HasParameters
-from ldcnd.families.known import FAMILIES
-from ldcnd.model.parameters import ParameterDump
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.parameters import ParameterDump
+from ldcnd.drives.family import HasParameters
+from ldcnd.drives.known import FAMILIES
 
 LARGEST = 0xFFFF
 FAMILY = next(family for family in FAMILIES.values() if isinstance(family, HasParameters))

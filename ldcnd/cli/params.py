@@ -12,7 +12,8 @@ from ldcnd.cli.parameter_file import ParameterFile, as_toml, load_parameters
 from ldcnd.cli.typed import NewFile, Whole, force_option
 from ldcnd.client.parameters import Transfer, carry_out, plan_transfer, read_dump
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.parameters import (
+from ldcnd.contract.number_text import NotANumber, read_word
+from ldcnd.contract.parameters import (
     ListParameters,
     Memory,
     ParameterDump,
@@ -23,7 +24,6 @@ from ldcnd.model.parameters import (
     RestartEepromCount,
     WriteParameter,
 )
-from ldcnd.number_text import NotANumber, read_word
 
 UNFINISHED = 1
 """Exit code: files or memories differ, or not everything was written."""

@@ -7,8 +7,8 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.typed import Whole
-from ldcnd.errors import ConfigError
-from ldcnd.pki.access import Role
+from ldcnd.contract.errors import ConfigError
+from ldcnd.ops.pki.access import Role
 
 FOLDER = click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 DAYS = 730
@@ -28,7 +28,7 @@ def command() -> None:
 def init(folder: Path, name: str) -> None:
     """Make the site's authority in FOLDER."""
     _require_cryptography()
-    from ldcnd.pki.site import set_up  # noqa: PLC0415 - needs an optional package
+    from ldcnd.ops.pki.site import set_up  # noqa: PLC0415 - needs an optional package
 
     set_up(folder, name, _now())
     click.echo(f"{folder}: authority made; next: ldcnd pki add {folder} NAME --role daemon --ip ADDRESS")
@@ -44,7 +44,7 @@ def init(folder: Path, name: str) -> None:
 def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: tuple[str, ...], days: int) -> None:
     """Give NAME a login: a certificate and a Zenoh configuration, in one file to hand over."""
     _require_cryptography()
-    from ldcnd.pki.site import Site, new_login  # noqa: PLC0415 - needs an optional package
+    from ldcnd.ops.pki.site import Site, new_login  # noqa: PLC0415 - needs an optional package
 
     login = new_login(name, Role(role), (*hosts, *addresses))
     site = Site(folder)
@@ -65,7 +65,7 @@ def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: t
 def revoke(folder: Path, name: str) -> None:
     """Take the rights of a viewer or operator back."""
     _require_cryptography()
-    from ldcnd.pki.site import Site  # noqa: PLC0415 - needs an optional package
+    from ldcnd.ops.pki.site import Site  # noqa: PLC0415 - needs an optional package
 
     site = Site(folder)
     site.revoke(name)

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import click
 
+from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import load_config
-from ldcnd.model.plan import BusPlan
-from ldcnd.planning.plan import plan_rig
+from ldcnd.contract.plan import BusPlan
 
 EXIT_OVERFULL = 1
 

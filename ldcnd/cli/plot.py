@@ -11,11 +11,11 @@ from ldcnd.cli.figure import save_figure, stacked_rows
 from ldcnd.cli.recording_file import EXIT_INCOMPLETE, RECORDING, require_mcap, tell_damages, utc
 from ldcnd.cli.typed import NewFile, force_option
 from ldcnd.client.trace_file import column_title
-from ldcnd.errors import ConfigError
-from ldcnd.model.events import FINAL, CommandEvent, CommandStatus
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.events import FINAL, CommandEvent, CommandStatus
 
 if TYPE_CHECKING:
-    from ldcnd.recording.reading import AxisHistory
+    from ldcnd.lab.recording.reading import AxisHistory
 
 NS_PER_S = 1e9
 MOST_LABELS = 40
@@ -30,7 +30,7 @@ MOST_LABELS = 40
 def command(recording: Path, axis: str, output: Path) -> None:
     """Draw AXIS of RECORDING: its quantities, commands and faults against time; needs the extras record and plot."""
     require_mcap()
-    from ldcnd.recording.reading import Recording, axis_history  # noqa: PLC0415 - needs an optional package
+    from ldcnd.lab.recording.reading import Recording, axis_history  # noqa: PLC0415 - needs an optional package
 
     file = Recording(recording)
     history = axis_history(file, axis)

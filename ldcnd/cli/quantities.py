@@ -2,11 +2,11 @@
 
 import math
 
-from ldcnd.model.commands import CommandReply, Verb
-from ldcnd.model.condition import assess
-from ldcnd.model.events import CommandOutcome
-from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import (
+from ldcnd.contract.commands import CommandReply, Verb
+from ldcnd.contract.condition import assess
+from ldcnd.contract.events import CommandOutcome
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import (
     AdcSample,
     FaultSample,
     InputsSample,

@@ -45,7 +45,7 @@ def command(target: Target, out: Path | None, rotate_mb: int) -> None:
 def recover_file(damaged: Path, whole: Path) -> None:
     """Copy what can be read of DAMAGED, such as NAME.mcap.part after a power cut, into WHOLE."""
     require_mcap()
-    from ldcnd.recording.recovery import recover  # noqa: PLC0415 - needs an optional package
+    from ldcnd.lab.recording.recovery import recover  # noqa: PLC0415 - needs an optional package
 
     saved = recover(damaged, whole)
     tell_damages(damaged, saved.damages)
@@ -59,7 +59,7 @@ def recover_file(damaged: Path, whole: Path) -> None:
 def export(recording: Path, folder: Path) -> None:
     """Write RECORDING into FOLDER as CSV: a table for each topic, a row for each message, a column for each value."""
     require_mcap()
-    from ldcnd.recording.tables import export_tables  # noqa: PLC0415 - needs an optional package
+    from ldcnd.lab.recording.tables import export_tables  # noqa: PLC0415 - needs an optional package
 
     done = export_tables(recording, folder)
     click.echo(f"{done.rows} messages in {len(done.tables)} tables in {folder}")
@@ -74,7 +74,7 @@ def dated(pattern: Path, start: datetime) -> Path:
 
 
 async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
-    from ldcnd.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder  # noqa: PLC0415 - needs an optional package
+    from ldcnd.lab.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder  # noqa: PLC0415 - needs an optional package
 
     recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes)
     on_end(recorder.end)

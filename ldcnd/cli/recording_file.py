@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 
 RECORDING = click.Path(path_type=Path, exists=True, dir_okay=False)
 EXIT_INCOMPLETE = 1

@@ -6,14 +6,14 @@ from pathlib import Path
 import click
 
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.process.replay import Played, Take, config_of, play, published_line, virtual_time
+from ldcnd.contract.codec import decode_received
+from ldcnd.contract.events import CommandEvent
+from ldcnd.contract.keys import EVENT
+from ldcnd.contract.samples import FaultSample, TelemetryItem
+from ldcnd.daemon.replay import Played, Take, config_of, play, published_line, virtual_time
+from ldcnd.line.capture import Capture, CaptureHeader, parse_capture
 from ldcnd.log import configure_logging
-from ldcnd.messaging.codec import decode_received
-from ldcnd.messaging.keys import EVENT
-from ldcnd.messaging.session import Sample
-from ldcnd.model.events import CommandEvent
-from ldcnd.model.samples import FaultSample, TelemetryItem
-from ldcnd.wirelog.capture import Capture, CaptureHeader, parse_capture
+from ldcnd.net.session import Sample
 
 FILE = click.Path(path_type=Path, exists=True, dir_okay=False)
 

@@ -7,8 +7,8 @@ import click
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.output import FAILED, UNREACHABLE, show_error, show_lines
 from ldcnd.cli.sending import NAME, Sender, commanding
-from ldcnd.errors import LdcndError, SessionError, UnknownAxis
-from ldcnd.model.commands import Power, Reset
+from ldcnd.contract.commands import Power, Reset
+from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis
 
 
 def stop_rig(target: Target, axis: str | None) -> None:

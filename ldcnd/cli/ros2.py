@@ -9,7 +9,7 @@ from ldcnd.cli.ending import on_end
 from ldcnd.cli.typed import Whole
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import UnknownAxis
+from ldcnd.contract.errors import UnknownAxis
 
 HIGHEST_DOMAIN = 232
 
@@ -25,9 +25,9 @@ def command(target: Target, axes: tuple[str, ...], router: str, domain: int) -> 
 
 
 async def _serve(client: RigClient, axes: tuple[str, ...], router: str, domain: int) -> None:
-    from ldcnd.messaging.zenoh_session import open_zenoh_session  # noqa: PLC0415 - loads Zenoh
-    from ldcnd.messaging.zenoh_settings import ZenohSettings  # noqa: PLC0415
-    from ldcnd.ros2.bridge import run_bridge  # noqa: PLC0415
+    from ldcnd.lab.ros2.bridge import run_bridge  # noqa: PLC0415
+    from ldcnd.net.zenoh_session import open_zenoh_session  # noqa: PLC0415 - loads Zenoh
+    from ldcnd.net.zenoh_settings import ZenohSettings  # noqa: PLC0415
 
     rig = Rig(client, await client.daemon())
     for axis in axes:

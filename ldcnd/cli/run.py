@@ -10,16 +10,16 @@ import click
 
 from ldcnd.cli.ending import Terminal
 from ldcnd.cli.served_at import CONSOLE_ADDRESS, parsed_address
+from ldcnd.config.plan import require_plan
 from ldcnd.config.rig import RigConfig, load_config, single_line
-from ldcnd.daemon.process.assembly import open_daemon
-from ldcnd.daemon.process.daemon import Daemon
-from ldcnd.daemon.process.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap
-from ldcnd.daemon.process.systemd import Notifier
+from ldcnd.contract.frozen import build_models
+from ldcnd.daemon.assembly import open_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap
+from ldcnd.daemon.systemd import Notifier
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging, get_logger
-from ldcnd.messaging.zenoh_threads import senders_wait
-from ldcnd.model.frozen import build_models
-from ldcnd.planning.plan import require_plan
+from ldcnd.net.zenoh_threads import senders_wait
 
 log = get_logger("run")
 

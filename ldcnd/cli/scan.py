@@ -6,9 +6,9 @@ from pathlib import Path
 
 import click
 
-from ldcnd.config.begun import SCANNED, begun_with, scan_port, write
+from ldcnd.bench.begun import SCANNED, begun_with, scan_port, write
+from ldcnd.contract.health import Finding, Verdict
 from ldcnd.log import configure_logging
-from ldcnd.model.health import Finding, Verdict
 
 NOTHING_FOUND = 1
 """Exit code: no drive answers, or something must be put right first."""

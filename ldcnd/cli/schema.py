@@ -8,10 +8,10 @@ from ldcnd.cli.manual import as_markdown as as_reference
 from ldcnd.cli.manual import man_pages
 from ldcnd.cli.verb_methods import verb_methods, with_blocking_methods
 from ldcnd.config.reference import config_reference
-from ldcnd.daemon.publish.asyncapi import asyncapi_text
-from ldcnd.daemon.publish.contract import all_schemas, as_markdown
-from ldcnd.errors import ConfigError
-from ldcnd.errors import as_markdown as errors_as_markdown
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.errors import as_markdown as errors_as_markdown
+from ldcnd.daemon.asyncapi import asyncapi_text
+from ldcnd.daemon.contract import all_schemas, as_markdown
 
 
 @click.group()

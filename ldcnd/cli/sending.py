@@ -16,11 +16,11 @@ from ldcnd.cli.quantities import number, outcome, values_of
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.errors import LdcndError, SessionError, UnknownAxis
-from ldcnd.model.commands import AxisCommand, CommandReply, Effect, Halt, Power, Verb
-from ldcnd.model.events import CommandStatus, ReadOutcome
-from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.commands import AxisCommand, CommandReply, Effect, Halt, Power, Verb
+from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis
+from ldcnd.contract.events import CommandStatus, ReadOutcome
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
 
 HALT_TIME_S = 3.0
 NAME = "ldcnd"

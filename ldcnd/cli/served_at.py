@@ -5,7 +5,7 @@ from typing import TypeVar
 
 import click
 
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 
 CONSOLE_ADDRESS = "127.0.0.1:8470"

@@ -12,10 +12,10 @@ from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.ending import on_end
 from ldcnd.cli.output import show_lines
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 
 if TYPE_CHECKING:
-    from ldcnd.tuning.ldcn.watching import ShadowAlarm
+    from ldcnd.bench.tuning.ldcn.watching import ShadowAlarm
 
 
 @click.command()
@@ -32,7 +32,7 @@ def command(target: Target, reports: tuple[Path, ...]) -> None:
     """
     if find_spec("numpy") is None:
         raise ConfigError("the shadow needs numpy; install it with: pip install 'ldcnd[tune]'")
-    from ldcnd.tuning.ldcn.watching import read_report, watch  # noqa: PLC0415 - needs an optional package
+    from ldcnd.bench.tuning.ldcn.watching import read_report, watch  # noqa: PLC0415 - needs an optional package
 
     plants = [read_report(path) for path in reports]
     twice = {plant.axis for plant in plants if [each.axis for each in plants].count(plant.axis) > 1}

@@ -10,15 +10,15 @@ from typing import Any, Self, TextIO
 import click
 
 from ldcnd.cli.typed import ForceOption, NewFile, Whole
-from ldcnd.config.simulated_line import FaultPlanConfig
-from ldcnd.config.toml import read_toml
-from ldcnd.families.family import PacketCutter, ServedLine, ServesLines
-from ldcnd.families.known import FAMILIES
+from ldcnd.drives.family import PacketCutter, ServedLine, ServesLines
+from ldcnd.drives.known import FAMILIES
+from ldcnd.drives.simulated_line import FaultPlanConfig
+from ldcnd.drives.toml import read_toml
+from ldcnd.line.capture import CaptureHeader, capture_lines
+from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.pty import serve_pty
 from ldcnd.version import version
-from ldcnd.wirelog.capture import CaptureHeader, capture_lines
-from ldcnd.wirelog.recorder import WireEvent, WireRecord
 
 SERVED = {name: family for name, family in FAMILIES.items() if isinstance(family, ServesLines)}
 

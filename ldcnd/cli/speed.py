@@ -8,7 +8,7 @@ from ldcnd.cli.quantities import rounded
 from ldcnd.cli.sending import NAME, Sender, commanding
 from ldcnd.cli.typed import Finite
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.rig_commands import SetSpeedOverride
+from ldcnd.contract.rig_commands import SetSpeedOverride
 
 
 @click.command()

@@ -10,10 +10,10 @@ from contextlib import asynccontextmanager
 
 from typing_extensions import override
 
+from ldcnd.bench.person import Left, Person
 from ldcnd.cli.keyboard import keys, repetitions
 from ldcnd.cli.output import show_lines
-from ldcnd.errors import ConfigError
-from ldcnd.person import Left, Person
+from ldcnd.contract.errors import ConfigError
 
 HELD = " "
 PART_BYTES = 4096

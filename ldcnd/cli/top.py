@@ -7,11 +7,11 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError
-from ldcnd.top.columns import as_text
-from ldcnd.top.follow import follow
-from ldcnd.top.glance import RigGlance
-from ldcnd.top.rig_view import RigView
+from ldcnd.contract.errors import ConfigError
+from ldcnd.lab.top.columns import as_text
+from ldcnd.lab.top.follow import follow
+from ldcnd.lab.top.glance import RigGlance
+from ldcnd.lab.top.rig_view import RigView
 
 ENOUGH_S = 2.5
 """Two reports of each line come in this time, so rates are known."""
@@ -43,7 +43,7 @@ async def _once(client: RigClient) -> RigGlance:
 
 async def _watch(client: RigClient) -> None:
     try:
-        from ldcnd.top.screen import TopScreen  # noqa: PLC0415 - an optional package
+        from ldcnd.lab.top.screen import TopScreen  # noqa: PLC0415 - an optional package
     except ImportError as error:
         raise ConfigError("textual is not installed", remedy="install ldcnd[tui]") from error
     await TopScreen(client).run_async()

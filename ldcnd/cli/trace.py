@@ -14,7 +14,8 @@ from ldcnd.cli.typed import Finite, NewFile, Whole, axis_of, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
 from ldcnd.client.traces import ENDING_S, Trace, armed_trace, fetch_trace, wait_for_trace
-from ldcnd.model.traces import (
+from ldcnd.contract.number_text import NotANumber, read_number
+from ldcnd.contract.traces import (
     LONGEST_WAIT_S,
     MOST_SAMPLES,
     AbortTrace,
@@ -25,7 +26,6 @@ from ldcnd.model.traces import (
     TraceTrigger,
     TriggerKind,
 )
-from ldcnd.number_text import NotANumber, read_number
 
 UPLOAD_S = 600.0
 """A drive's memory over a busy line takes minutes at worst."""

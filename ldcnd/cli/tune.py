@@ -13,8 +13,8 @@ from ldcnd.client.kept_gains import put_back as put_back_gains
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import NotSupported, WrongState
-from ldcnd.families.known import FAMILIES
+from ldcnd.contract.errors import NotSupported, WrongState
+from ldcnd.drives.known import FAMILIES
 
 
 @dataclass(frozen=True, slots=True)

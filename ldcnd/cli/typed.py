@@ -1,4 +1,4 @@
-"""Typed input: names with the nearest right one, and numbers as `ldcnd.number_text` reads them."""
+"""Typed input: names with the nearest right one, and numbers as `ldcnd.contract.number_text` reads them."""
 
 import os
 from collections.abc import Iterable
@@ -10,9 +10,9 @@ import click
 from typing_extensions import override
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import UnknownAxis
-from ldcnd.model.meta import AxisInfo
-from ldcnd.number_text import NotANumber, read_number, read_whole
+from ldcnd.contract.errors import UnknownAxis
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.number_text import NotANumber, read_number, read_whole
 
 NEAR = 0.4
 """How alike two names must be, from 0 to 1."""

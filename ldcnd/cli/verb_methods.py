@@ -11,10 +11,10 @@ import sys
 from collections.abc import Iterator
 from textwrap import dedent, fill
 
-from ldcnd.model.catalogue import COMMANDS
-from ldcnd.model.commands import About, AxisCommand, Command, Ends, Stop
-from ldcnd.model.frozen import Frozen, attribute_docstrings
-from ldcnd.model.traces import TakeTrace
+from ldcnd.contract.catalogue import COMMANDS
+from ldcnd.contract.commands import About, AxisCommand, Command, Ends, Stop
+from ldcnd.contract.frozen import Frozen, attribute_docstrings
+from ldcnd.contract.traces import TakeTrace
 
 BY_HAND = (Stop, TakeTrace)
 """`Axis` has these itself: a stop has a key of its own, and a trace is fetched when it is complete."""
@@ -55,8 +55,8 @@ def verb_methods() -> str:
     """Return the text of `ldcnd/client/verbs.py`, but for what ruff makes of it."""
     names: set[type] = set()
     methods = "".join(_method(command, names) for command in _of_axes())
-    imports = {"ldcnd.client.motion": {"Motion"}, "ldcnd.model.frozen": {"Frozen"}}
-    imports["ldcnd.model.commands"] = {"AxisCommand", "Command", "CommandReply"}
+    imports = {"ldcnd.client.motion": {"Motion"}, "ldcnd.contract.frozen": {"Frozen"}}
+    imports["ldcnd.contract.commands"] = {"AxisCommand", "Command", "CommandReply"}
     for used in names:
         imports.setdefault(used.__module__, set()).add(used.__name__)
     lines = [f"from {module} import {', '.join(sorted(found))}" for module, found in sorted(imports.items())]
@@ -132,7 +132,7 @@ def _annotations(command: type[Command[Frozen]]) -> dict[str, str]:
     """Return the annotations of the fields as their source has them, those of the bases included."""
     found: dict[str, str] = {}
     for base in reversed(command.__mro__):
-        if not base.__module__.startswith("ldcnd.model.") or "[" in base.__name__:
+        if not base.__module__.startswith("ldcnd.contract.") or "[" in base.__name__:
             continue
         node = ast.parse(dedent(inspect.getsource(base))).body[0]
         if isinstance(node, ast.ClassDef):

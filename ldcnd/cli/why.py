@@ -8,8 +8,8 @@ from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.output import typed
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.rig_client import RigClient
-from ldcnd.messaging.codec import remedy_of
-from ldcnd.model.commands import Why, WhyReply
+from ldcnd.contract.codec import remedy_of
+from ldcnd.contract.commands import Why, WhyReply
 
 
 @click.command()

@@ -16,14 +16,14 @@ from ldcnd.client.notebook import table
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, take_trace
 from ldcnd.client.verbs import AxisVerbs
-from ldcnd.errors import LdcndError, LeaseExpired, SessionError
-from ldcnd.messaging.codec import decode_received, explained
-from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
-from ldcnd.model.events import CommandOutcome, ReadOutcome
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
-from ldcnd.model.traces import TakeTrace, TraceTrigger
+from ldcnd.contract.codec import decode_received, explained
+from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
+from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError
+from ldcnd.contract.events import CommandOutcome, ReadOutcome
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.traces import TakeTrace, TraceTrigger
+from ldcnd.net.session import Sample, SampleKind
 
 LINGER_S = 0.03
 """Time that a position may wait for others, seconds: waking a program for each one costs more than all else."""

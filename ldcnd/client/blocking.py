@@ -15,12 +15,12 @@ from ldcnd.client import jog, motion, rig
 from ldcnd.client.fleet import RigReport, survey
 from ldcnd.client.loop_thread import LoopThread, loop_thread
 from ldcnd.client.notebook import table
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.events import CommandEvent
-from ldcnd.model.meta import AxisInfo
-from ldcnd.model.rig_commands import LinePath
-from ldcnd.model.samples import PositionSample, Sample
+from ldcnd.contract.events import CommandEvent
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.rig_commands import LinePath
+from ldcnd.contract.samples import PositionSample, Sample
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 
 P = ParamSpec("P")
 ResultT = TypeVar("ResultT")

@@ -9,11 +9,11 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import OutcomeUnknown, SessionError
-from ldcnd.messaging.codec import decode_received
-from ldcnd.messaging.keys import EVENT
-from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.events import CommandEvent, EventList, ReadEvents
+from ldcnd.contract.codec import decode_received
+from ldcnd.contract.errors import OutcomeUnknown, SessionError
+from ldcnd.contract.events import CommandEvent, EventList, ReadEvents
+from ldcnd.contract.keys import EVENT
+from ldcnd.net.session import Sample, SampleKind
 
 CHECK_PERIOD_S = 2.0
 """Period of queries for a missed last event, while none comes, seconds."""

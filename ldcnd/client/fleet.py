@@ -4,13 +4,13 @@ import asyncio
 
 from ldcnd.client.health import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient, daemons, find_rigs
-from ldcnd.errors import LdcndError, OutcomeUnknown
-from ldcnd.messaging.session import Session
-from ldcnd.model.condition import Condition, assess, line_troubles
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth
-from ldcnd.model.meta import AxisInfo, DaemonInfo
-from ldcnd.model.samples import FaultSample, StateSample
+from ldcnd.contract.condition import Condition, assess, line_troubles
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth
+from ldcnd.contract.meta import AxisInfo, DaemonInfo
+from ldcnd.contract.samples import FaultSample, StateSample
+from ldcnd.net.session import Session
 
 ASKED_AT_ONCE = 8
 """Maximum number of concurrent queries of rigs."""

@@ -4,9 +4,9 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.messaging.codec import decode_received
-from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.health import BusHealth, DaemonHealth
+from ldcnd.contract.codec import decode_received
+from ldcnd.contract.health import BusHealth, DaemonHealth
+from ldcnd.net.session import Sample, SampleKind
 
 
 async def last_health(client: RigClient) -> DaemonHealth | None:

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from ldcnd.model.commands import CommandReply, Jog
+from ldcnd.contract.commands import CommandReply, Jog
 
 RENEWALS_PER_HOLD = 4
 """Number of consecutive renewals that may be lost before a jog ends."""

@@ -12,10 +12,10 @@ from ldcnd import durable
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.client.standstill import at_rest, seen
-from ldcnd.errors import BusyTracing, ConfigError, StopLatched, WrongState
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.errors import BusyTracing, ConfigError, StopLatched, WrongState
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import AxisState
 
 NAMES = ("kp", "kd", "ki", "il", "ol", "cl", "el", "sr", "deadband")
 NEEDED = frozenset(NAMES) - {"cl", "deadband"}

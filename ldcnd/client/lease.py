@@ -9,9 +9,9 @@ from itertools import count
 from typing import TypeVar
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError, LeaseExpired, LeaseUnknown, OutcomeUnknown, Remedy, SessionError, step
-from ldcnd.model.commands import AxisCommand, CommandReply
-from ldcnd.model.leases import Acquire, LeaseReply, Release, Renew
+from ldcnd.contract.commands import AxisCommand, CommandReply
+from ldcnd.contract.errors import LdcndError, LeaseExpired, LeaseUnknown, OutcomeUnknown, Remedy, SessionError, step
+from ldcnd.contract.leases import Acquire, LeaseReply, Release, Renew
 
 ReplyT = TypeVar("ReplyT", bound=CommandReply)
 RequestT = TypeVar("RequestT", bound=AxisCommand[CommandReply])

@@ -6,11 +6,11 @@ from collections.abc import AsyncIterator
 from dataclasses import dataclass, field, replace
 
 from ldcnd.client.rig_client import CHECK_PERIOD_S
-from ldcnd.errors import CommandAborted, DriveFault, LdcndError, OutcomeUnknown, UnknownCommand
-from ldcnd.model.commands import CommandReply
-from ldcnd.model.condition import Condition, assess
-from ldcnd.model.events import FINAL, CommandOutcome, CommandStatus
-from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
+from ldcnd.contract.commands import CommandReply
+from ldcnd.contract.condition import Condition, assess
+from ldcnd.contract.errors import CommandAborted, DriveFault, LdcndError, OutcomeUnknown, UnknownCommand
+from ldcnd.contract.events import FINAL, CommandOutcome, CommandStatus
+from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
 
 SILENT_S = 10.0
 """Time without samples after which the outcome of a motion is unknown, seconds."""

@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 from ldcnd.client.health import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.condition import Condition, assess
-from ldcnd.model.health import AxisHealth
-from ldcnd.model.meta import AxisInfo
-from ldcnd.model.samples import FaultSample, PositionSample, StateSample
+from ldcnd.contract.condition import Condition, assess
+from ldcnd.contract.health import AxisHealth
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import FaultSample, PositionSample, StateSample
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError
-from ldcnd.model.parameters import (
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.parameters import (
     Memory,
     ParameterDump,
     PlannedParameters,

@@ -13,14 +13,12 @@ from ldcnd.client.events import Events, follow_events
 from ldcnd.client.lease import Control, inherited_lease, take_control
 from ldcnd.client.motion import Motion
 from ldcnd.client.rig_client import RigClient, Samples, find_rigs
-from ldcnd.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import StopReply
-from ldcnd.model.events import CommandOutcome, ReadOutcome
-from ldcnd.model.leases import HolderList, ListHolders
-from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
-from ldcnd.model.rig_commands import (
+from ldcnd.contract.commands import StopReply
+from ldcnd.contract.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
+from ldcnd.contract.events import CommandOutcome, ReadOutcome
+from ldcnd.contract.leases import HolderList, ListHolders
+from ldcnd.contract.meta import AxisInfo, BusInfo, DaemonInfo
+from ldcnd.contract.rig_commands import (
     AxisMove,
     AxisPath,
     IoReply,
@@ -37,7 +35,9 @@ from ldcnd.model.rig_commands import (
     SpeedOverrideReply,
     WalkPath,
 )
-from ldcnd.model.samples import FaultSample, Sample, StateSample
+from ldcnd.contract.samples import FaultSample, Sample, StateSample
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ENDPOINT_VARIABLE = "LDCND_CONNECT"

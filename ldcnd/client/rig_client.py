@@ -6,15 +6,13 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import TypeVar
 
-from ldcnd.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownCommand
-from ldcnd.messaging.codec import Encoding, decode_error, decode_received, encode
-from ldcnd.messaging.hand_over import Answer
-from ldcnd.messaging.keys import ALL_DAEMONS, ALL_RUNS, RIG_ITSELF, Keys
-from ldcnd.messaging.session import NO_PARAMETERS, Declaration, Sample, SampleKind, Session
-from ldcnd.model.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.meta import AxisInfo, BusInfo, DaemonInfo
-from ldcnd.model.samples import (
+from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode
+from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
+from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownCommand
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.keys import ALL_DAEMONS, ALL_RUNS, RIG_ITSELF, Keys
+from ldcnd.contract.meta import AxisInfo, BusInfo, DaemonInfo
+from ldcnd.contract.samples import (
     FaultSample,
     LinkState,
     MonitorName,
@@ -24,7 +22,9 @@ from ldcnd.model.samples import (
     TelemetryItem,
     sample_model,
 )
-from ldcnd.model.samples import Sample as Measurement
+from ldcnd.contract.samples import Sample as Measurement
+from ldcnd.net.hand_over import Answer
+from ldcnd.net.session import NO_PARAMETERS, Declaration, Sample, SampleKind, Session
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
@@ -321,7 +321,7 @@ class RigClient:
 
     async def _waits(self, command_id: str) -> bool:
         """Tell whether a command waits for another one: no state names it yet."""
-        from ldcnd.model.events import CommandStatus, ReadOutcome  # noqa: PLC0415 - clients that only read need none
+        from ldcnd.contract.events import CommandStatus, ReadOutcome  # noqa: PLC0415 - clients that only read need none
 
         try:
             return (await self.ask(ReadOutcome(command_id=command_id))).status is CommandStatus.ACCEPTED
@@ -333,7 +333,7 @@ class RigClient:
 
         They look alike. Who is not permitted to command gets no answer to a question of the same kind either.
         """
-        from ldcnd.model.leases import ListHolders  # noqa: PLC0415 - clients that only read need no model of leases
+        from ldcnd.contract.leases import ListHolders  # noqa: PLC0415 - clients that only read need no model of leases
 
         payload, encoding = encode(ListHolders(), Encoding.MSGPACK)
         try:

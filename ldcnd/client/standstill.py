@@ -3,8 +3,8 @@
 import asyncio
 
 from ldcnd.client.axis import Axis
-from ldcnd.errors import SessionError, WrongState
-from ldcnd.model.samples import Moving
+from ldcnd.contract.errors import SessionError, WrongState
+from ldcnd.contract.samples import Moving
 
 REST_S = 5.0
 """Longest time that an axis takes to come to rest, or to be heard of, seconds."""

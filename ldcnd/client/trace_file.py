@@ -5,9 +5,9 @@ import io
 from pathlib import Path
 
 from ldcnd.client.traces import Trace
-from ldcnd.errors import ConfigError
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.traces import TraceHeader
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.traces import TraceHeader
 
 MARK = "# ldcnd trace "
 SUFFIXES = (".json", ".csv")

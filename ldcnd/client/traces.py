@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from ldcnd.client.notebook import panes
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import DriveFault, LdcndError, OutcomeUnknown, Remedy, TraceTimedOut, WrongState, step
-from ldcnd.model.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, TracePhase, TraceReply
+from ldcnd.contract.errors import DriveFault, LdcndError, OutcomeUnknown, Remedy, TraceTimedOut, WrongState, step
+from ldcnd.contract.traces import AbortTrace, TakeTrace, TraceChunk, TraceHeader, TracePhase, TraceReply
 
 CHECK_PERIOD_S = 0.1
 ENDING_S = 10.0

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import TypeVar
 
 from ldcnd.client.motion import Motion
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
     Command,
@@ -39,8 +39,8 @@ from ldcnd.model.commands import (
     Why,
     WhyReply,
 )
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.parameters import (
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.parameters import (
     AlarmReport,
     ClearCounter,
     CounterName,
@@ -63,8 +63,8 @@ from ldcnd.model.parameters import (
     RestartEepromCount,
     WriteParameter,
 )
-from ldcnd.model.samples import MonitorName, ShadowFigure
-from ldcnd.model.traces import AbortTrace, TraceAbortReply
+from ldcnd.contract.samples import MonitorName, ShadowFigure
+from ldcnd.contract.traces import AbortTrace, TraceAbortReply
 
 ReplyT = TypeVar("ReplyT", bound=Frozen)
 AxisReplyT = TypeVar("AxisReplyT", bound=CommandReply)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.rig_commands import ReadWireLog
+from ldcnd.contract.rig_commands import ReadWireLog
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ldcnd import durable
 from ldcnd.config.rig import load_config
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 
 AXIS = "bus.axis"
 Literals = Mapping[str, str]

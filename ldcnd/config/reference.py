@@ -11,8 +11,8 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.config.toml import Variants
-from ldcnd.model.frozen import attribute_docstrings
+from ldcnd.contract.frozen import attribute_docstrings
+from ldcnd.drives.toml import Variants
 
 PLAIN = {str: "string", int: "integer", float: "number", bool: "true or false", Path: "path"}
 PREFACE = """# Configuration

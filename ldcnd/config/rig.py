@@ -5,12 +5,12 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
-from ldcnd.config.bus import BusConfig
-from ldcnd.config.simulated_line import SimulatedLineConfig
-from ldcnd.config.toml import NAME_CHARACTERS, Name, Variants, read_toml, refuse_duplicates
-from ldcnd.errors import ConfigError
-from ldcnd.families import known
-from ldcnd.model.frozen import Frozen
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.frozen import Frozen
+from ldcnd.drives import known
+from ldcnd.drives.line_config import BusConfig
+from ldcnd.drives.simulated_line import SimulatedLineConfig
+from ldcnd.drives.toml import NAME_CHARACTERS, Name, Variants, read_toml, refuse_duplicates
 
 Bus = Annotated[SerializeAsAny[BusConfig], Variants(known.bus_config, known.bus_configs)]
 SimulatedLine = Annotated[SerializeAsAny[SimulatedLineConfig], Variants(known.simulated_line, known.simulated_lines)]

@@ -15,13 +15,13 @@ from ldcnd.console.pages import Pages, control_needed, refuse_unwatched
 from ldcnd.console.replies import StopsReply
 from ldcnd.console.requests import body_of, json_reply
 from ldcnd.console.rigs import Rigs
-from ldcnd.errors import LdcndError, UnknownVerb
-from ldcnd.messaging.codec import Encoding, decode, error_reply
-from ldcnd.model.catalogue import BY_VERB
-from ldcnd.model.commands import About, AxisCommand, Command, ErrorReply, StopReply, Why
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.leases import Acquire, Release, Renew
-from ldcnd.model.rig_commands import AxisMove, MoveTogether, SetIo, SetIoTimer, SetSpeedOverride, WalkPath
+from ldcnd.contract.catalogue import BY_VERB
+from ldcnd.contract.codec import Encoding, decode, error_reply
+from ldcnd.contract.commands import About, AxisCommand, Command, ErrorReply, StopReply, Why
+from ldcnd.contract.errors import LdcndError, UnknownVerb
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.leases import Acquire, Release, Renew
+from ldcnd.contract.rig_commands import AxisMove, MoveTogether, SetIo, SetIoTimer, SetSpeedOverride, WalkPath
 
 STOP_TIME_S = 3.0
 LEASE_COMMANDS: frozenset[type[Command[Frozen]]] = frozenset({Acquire, Renew, Release})

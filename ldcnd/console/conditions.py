@@ -11,14 +11,14 @@ from typing import TypeVar
 
 import msgpack
 
-from ldcnd.errors import LdcndError
-from ldcnd.messaging.codec import Encoding, decode_received
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.condition import Condition, Kind, Place, Severity, Trouble, assess
-from ldcnd.model.health import BusHealth
-from ldcnd.model.samples import FaultSample, PositionSample, StateSample, TelemetryItem
-from ldcnd.model.samples import Sample as Measured
+from ldcnd.contract.codec import Encoding, decode_received
+from ldcnd.contract.condition import Condition, Kind, Place, Severity, Trouble, assess
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.health import BusHealth
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import FaultSample, PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.samples import Sample as Measured
+from ldcnd.net.session import Sample, SampleKind
 
 TOPIC = "condition"
 """The last chunk of the key under which a page gets the condition of an axis; no daemon publishes it."""

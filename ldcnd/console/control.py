@@ -14,9 +14,9 @@ from ldcnd.console.errors import answering_errors, error_response
 from ldcnd.console.pages import FromPage, PageControl, Pages, ToPage
 from ldcnd.console.reading import NOTHING_TO_SAY, SEND_TIME_S
 from ldcnd.console.requests import body_of, json_reply
-from ldcnd.errors import LdcndError
-from ldcnd.messaging.codec import Encoding, decode
-from ldcnd.model.frozen import Frozen
+from ldcnd.contract.codec import Encoding, decode
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.frozen import Frozen
 
 PAGE_HEADER = "x-ldcnd-page"
 MOST_AXES = 64

@@ -5,7 +5,8 @@ from collections.abc import Awaitable, Callable
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
-from ldcnd.errors import (
+from ldcnd.contract.codec import error_reply
+from ldcnd.contract.errors import (
     LdcndError,
     MalformedRequest,
     NotPermitted,
@@ -15,7 +16,6 @@ from ldcnd.errors import (
     UnknownAxis,
     UnknownVerb,
 )
-from ldcnd.messaging.codec import error_reply
 
 STATUS: tuple[tuple[tuple[type[LdcndError], ...], int], ...] = (
     ((MalformedRequest, PayloadTooLarge), 400),

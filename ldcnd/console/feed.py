@@ -11,7 +11,7 @@ from typing import Self
 import msgpack
 
 from ldcnd.console.latest_values import LatestValues
-from ldcnd.errors import MalformedRequest, TooManyRequests, ValueOutOfRange
+from ldcnd.contract.errors import MalformedRequest, TooManyRequests, ValueOutOfRange
 
 MOST_NEWS = 200
 """Maximum number of events in a frame; the latest are kept."""

@@ -14,8 +14,8 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ldcnd.console.visitors import Visitor, Visitors, is_csrf_of
-from ldcnd.errors import NotPermitted
-from ldcnd.messaging.codec import error_reply
+from ldcnd.contract.codec import error_reply
+from ldcnd.contract.errors import NotPermitted
 
 SESSION_COOKIE = "ldcnd_session"
 CSRF_COOKIE = "ldcnd_csrf"

@@ -19,7 +19,9 @@ from ldcnd.client.lease import Control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitor
-from ldcnd.errors import (
+from ldcnd.contract.codec import error_reply
+from ldcnd.contract.commands import AxisCommand, BufferMode, CommandReply, Effect, ErrorReply, Halt, Jog
+from ldcnd.contract.errors import (
     LdcndError,
     LeaseExpired,
     LeaseRequired,
@@ -28,13 +30,11 @@ from ldcnd.errors import (
     TooManyRequests,
     UnknownAxis,
 )
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.rig_commands import MoveTogether, MoveTogetherReply
+from ldcnd.contract.samples import Moving
 from ldcnd.log import get_logger
-from ldcnd.messaging.codec import error_reply
-from ldcnd.model.commands import AxisCommand, BufferMode, CommandReply, Effect, ErrorReply, Halt, Jog
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.leases import Acquire, ListHolders
-from ldcnd.model.rig_commands import MoveTogether, MoveTogetherReply
-from ldcnd.model.samples import Moving
 
 log = get_logger("console")
 

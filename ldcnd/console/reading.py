@@ -20,8 +20,8 @@ from ldcnd.console.feed import Feed, Page, parse_subscription
 from ldcnd.console.replies import RigsReply
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitors
-from ldcnd.errors import DriveFault, LdcndError, WrongState
-from ldcnd.fault_pages import page_text
+from ldcnd.contract.errors import DriveFault, LdcndError, WrongState
+from ldcnd.contract.fault_pages import page_text
 from ldcnd.version import version
 
 STATIC = Path(str(files("ldcnd.console") / "static"))

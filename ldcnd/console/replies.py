@@ -1,9 +1,9 @@
 """Replies of the console that are no public model of the daemon."""
 
-from ldcnd.model.commands import ErrorReply, StopReply
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
-from ldcnd.model.plan import RigBudget
+from ldcnd.contract.commands import ErrorReply, StopReply
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
+from ldcnd.contract.plan import RigBudget
 
 
 class RigReply(Frozen):

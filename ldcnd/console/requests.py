@@ -5,9 +5,9 @@ import asyncio
 from starlette.requests import Request
 from starlette.responses import Response
 
-from ldcnd.errors import MalformedRequest, PayloadTooLarge
-from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES
-from ldcnd.model.frozen import Frozen
+from ldcnd.contract.codec import MAX_PAYLOAD_BYTES
+from ldcnd.contract.errors import MalformedRequest, PayloadTooLarge
+from ldcnd.contract.frozen import Frozen
 
 BODY_TIME_S = 5.0
 """Maximum time to receive the body of a request, seconds."""

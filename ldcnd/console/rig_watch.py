@@ -7,11 +7,11 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import RigReply
-from ldcnd.errors import LdcndError, OutcomeUnknown
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown
+from ldcnd.contract.meta import CommandList
+from ldcnd.contract.plan import RigBudget
 from ldcnd.log import get_logger
-from ldcnd.messaging.session import Sample
-from ldcnd.model.meta import CommandList
-from ldcnd.model.plan import RigBudget
+from ldcnd.net.session import Sample
 
 log = get_logger("console")
 

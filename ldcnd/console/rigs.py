@@ -8,11 +8,11 @@ from ldcnd.client.rig_client import RigClient, daemons
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import EndpointReply, RigReply
 from ldcnd.console.rig_watch import RigWatch
-from ldcnd.errors import ConfigError, SessionError, UnknownAxis
+from ldcnd.contract.errors import ConfigError, SessionError, UnknownAxis
 from ldcnd.log import get_logger
-from ldcnd.messaging.session import Session
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.net.session import Session
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 
 log = get_logger("console")
 

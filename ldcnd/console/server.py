@@ -29,9 +29,9 @@ from ldcnd.console.replies import LinkReply
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import LINK_S, Visitors
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
-from ldcnd.messaging.zenoh_config import zenoh_config
+from ldcnd.net.zenoh_config import zenoh_config
 
 END_TIME_S = 1.0
 """Time for open pages to close when the console ends, seconds; then their connections are aborted."""

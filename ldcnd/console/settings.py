@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ldcnd.console.rigs import Endpoint
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
 
 LOOPBACK_NAMES = ("localhost", "127.0.0.1", "[::1]")

@@ -1,5 +1,5 @@
-"""The daemon: the one place where lines, drives and clients meet.
+"""The daemon: the one place where lines, axes and clients meet.
 
-Serves one rig over one session. Start with `process/daemon.py`. A command goes from `command/dispatch.py` to
-`axis/axis.py` and from there to the driver; a reading goes from `line/line.py` to `axis/axis.py` to `publish`.
+It serves one rig over one session. Start with `daemon.py`. A command goes from `dispatch.py` to the axis and from there
+to the drive; a reading goes from `line.py` to the axis and from there to the publisher.
 """

@@ -16,16 +16,16 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
+from ldcnd.axis.clock import Clock
 from ldcnd.config.rig import CapturesConfig, RigConfig, ZenohConfig
-from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.line.line import BusService
-from ldcnd.daemon.line.rig import Rig
-from ldcnd.errors import ConfigError
-from ldcnd.families.known import FAMILIES
+from ldcnd.contract.errors import ConfigError
+from ldcnd.daemon.line import BusService
+from ldcnd.daemon.rig import Rig
+from ldcnd.drives.known import FAMILIES
+from ldcnd.line.capture import Capture, CaptureHeader, capture_lines
+from ldcnd.line.flight_recorder import WireEntries, WireRecord
 from ldcnd.log import get_logger
 from ldcnd.version import version
-from ldcnd.wirelog.capture import Capture, CaptureHeader, capture_lines
-from ldcnd.wirelog.recorder import WireEntries, WireRecord
 
 log = get_logger("captures")
 

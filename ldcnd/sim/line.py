@@ -8,9 +8,9 @@ import asyncio
 
 from typing_extensions import override
 
-from ldcnd.errors import TransportLost
+from ldcnd.contract.errors import TransportLost
+from ldcnd.line.transport import Receiver, Transport
 from ldcnd.sim.chain import Chain
-from ldcnd.transport.transport import Receiver, Transport
 
 
 class SimulatedLine(Transport):

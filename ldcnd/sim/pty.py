@@ -20,9 +20,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Protocol, Self
 
+from ldcnd.line.line_discipline import actual_baud
+from ldcnd.line.terminal_link import TerminalLink
 from ldcnd.sim.chain import Chain
-from ldcnd.transport.line_discipline import actual_baud
-from ldcnd.transport.terminal_link import TerminalLink
 
 SPIN_S = 150e-6
 LONGEST_SLEEP_S = 0.05

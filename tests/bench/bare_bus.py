@@ -8,16 +8,16 @@ from dataclasses import replace
 import structlog
 from typing_extensions import override
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.poller import Poller
-from ldcnd.bus.settings import BusSettings
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.packet import Status, StatusItem
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.errors import BusError
-from ldcnd.exchange import Exchange, Timing
-from ldcnd.transport.port_url import port_opener
+from ldcnd.contract.errors import BusError
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.packet import Status, StatusItem
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange, Timing
+from ldcnd.line.poller import Poller
+from ldcnd.line.port_url import port_opener
+from ldcnd.line.settings import BusSettings
 
 BAUD = 115_200
 ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX

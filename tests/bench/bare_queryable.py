@@ -3,8 +3,8 @@
 import argparse
 import asyncio
 
-from ldcnd.messaging.hand_over import Query
-from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
+from ldcnd.net.hand_over import Query
+from ldcnd.net.zenoh_session import ZenohSettings, open_zenoh_session
 
 KEY = "bare/answer"
 

@@ -14,7 +14,7 @@ from functools import partial
 from itertools import product
 from pathlib import Path
 
-from ldcnd.daemon.process.service import held_awake
+from ldcnd.daemon.service import held_awake
 from tests.bench.processes import (
     PIC_SERVO,
     ROOT,

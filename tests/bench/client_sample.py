@@ -11,12 +11,12 @@ import sys
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-from ldcnd.daemon.publish.publisher import Publisher, Topic
-from ldcnd.messaging.codec import Encoding
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.contract.codec import Encoding
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.net.publisher import Publisher, Topic
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.bench.report import Row
 from tests.bench.sample_cost import publish_position
 from tests.support.process import free_port
@@ -54,9 +54,9 @@ threading.Event().wait()
 TYPED = f"""{REPORTS}
 import asyncio
 from ldcnd.client.axis import Axis
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.client.rig_client import RigClient
-from ldcnd.messaging.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_session import open_zenoh_session
 
 async def main():
     async with open_zenoh_session(ZenohSettings(mode="client", connect=(sys.argv[1],))) as session:

@@ -8,13 +8,13 @@ from enum import StrEnum
 from itertools import pairwise, product
 from typing import Literal
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.queue import Lane
-from ldcnd.bus.transaction import AT_ONCE, LANES
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.line.bus import Bus
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.line.queue import Lane
+from ldcnd.line.transaction import AT_ONCE, LANES
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock, saturating
 from tests.support.rig import RunningRig

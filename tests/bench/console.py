@@ -18,7 +18,7 @@ from urllib.parse import urlsplit
 from websockets.asyncio.client import ClientConnection
 
 from ldcnd.client.health import health_reports
-from ldcnd.model.health import BusHealth
+from ldcnd.contract.health import BusHealth
 from tests.bench.processes import LINE_CPU, SUBJECT_CPU, free_endpoint, process
 from tests.bench.report import Row
 from tests.support.browser import Browser, ask_over_tcp, feed, hanging_page

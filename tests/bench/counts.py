@@ -21,11 +21,11 @@ from typing import TYPE_CHECKING
 
 import ldcnd
 from ldcnd.config.rig import RigConfig
-from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Qos
-from ldcnd.model.commands import MoveRelative, Power
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.contract.codec import Encoding, encode
+from ldcnd.contract.commands import MoveRelative, Power
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.net.session import Qos
 from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig
 

@@ -8,7 +8,7 @@ import argparse
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from ldcnd.config.axis import RatesConfig
+from ldcnd.drives.axis_config import RatesConfig
 
 BITS = 8
 DEFAULT_RATES = RatesConfig()

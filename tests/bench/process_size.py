@@ -21,7 +21,7 @@ from pathlib import Path
 
 import zenoh
 
-from ldcnd.config.bus import BusConfig
+from ldcnd.drives.line_config import BusConfig
 from tests.bench.processes import ROOT, free_endpoint
 from tests.bench.report import Row, table
 

@@ -14,12 +14,12 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from ldcnd.daemon.publish.publisher import Publisher
-from ldcnd.messaging.codec import Encoding
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.samples import PositionSample, TelemetryItem
+from ldcnd.contract.codec import Encoding
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import PositionSample, TelemetryItem
+from ldcnd.net.publisher import Publisher
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.bench.client_sample import BARE, Reader
 from tests.bench.sample_cost import publish_position
 from tests.support.process import free_port
@@ -35,10 +35,10 @@ SETTLED_S = 1.5
 RECORDING = """
 import asyncio, gc, sys, threading, time
 from pathlib import Path
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.client.rig_client import RigClient
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.lab.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder
 
 async def main():
     gc.freeze()  # as the command line does

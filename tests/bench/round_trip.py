@@ -21,12 +21,12 @@ from pathlib import Path
 import structlog
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.process.service import held_awake, settle_heap
-from ldcnd.messaging.hand_over import Query
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.wirelog.recorder import WireEvent, WireRecord
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.service import held_awake, settle_heap
+from ldcnd.line.flight_recorder import WireEvent, WireRecord
+from ldcnd.net.hand_over import Query
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.bench.report import Row, table
 from tests.support.process import free_port, simulated_terminal
 
@@ -38,8 +38,8 @@ STOP_MOTOR = 0x7
 """Command code in the low half of the third byte: what `power off` sends."""
 CLIENT = """
 import asyncio, json, sys, time
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.messaging.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_session import open_zenoh_session
 
 async def main():
     async with open_zenoh_session(ZenohSettings(mode="client", connect=(sys.argv[1],))) as session:

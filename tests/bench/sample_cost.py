@@ -15,13 +15,13 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
-from ldcnd.daemon.publish.publisher import Publisher, Topic
-from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.samples import Quality, TelemetryItem
+from ldcnd.contract.codec import Encoding, encode
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import Quality, TelemetryItem
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.publisher import Publisher, Topic
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.bench.report import Row, table
 from tests.support.process import free_port
 from tests.support.router import PROGRAM as ROUTER
@@ -42,9 +42,9 @@ sys.stdin.read()
 """
 CLIENT = """
 import asyncio, sys
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.client.rig_client import RigClient
-from ldcnd.messaging.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_session import open_zenoh_session
 
 async def main():
     settings = ZenohSettings(mode="client", connect=(sys.argv[1],))

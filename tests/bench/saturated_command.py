@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.profiles import PROFILES
 from tests.bench.processes import SUBJECT_CPU, TooBusy, config_text, daemon, free_endpoint, heard, paced_lines, process
 from tests.bench.report import Row
 

@@ -7,12 +7,12 @@ import argparse
 import asyncio
 from dataclasses import dataclass
 
-from ldcnd.daemon.axis.axis import AxisService
-from ldcnd.drivers.driver import AxisReading
-from ldcnd.exchange import Timing
-from ldcnd.model.commands import MoveRelative, Power
-from ldcnd.model.events import ReadOutcome
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.axis.axis import AxisService
+from ldcnd.contract.commands import MoveRelative, Power
+from ldcnd.contract.events import ReadOutcome
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.drives.driver import AxisReading
+from ldcnd.line.exchange import Timing
 from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig
 

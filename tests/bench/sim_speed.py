@@ -20,18 +20,18 @@ from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.settings import BusSettings
-from ldcnd.drivers.driver import AxisSpec, Gains, Motion, Moves
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.network import LdcnNetwork
-from ldcnd.drivers.ldcn.packet import StatusItem
-from ldcnd.drivers.ldcn.profiles import LS_182AP
-from ldcnd.families.ldcn.simulation import SimulatedModuleConfig, SimulationConfig
+from ldcnd.drives.driver import AxisSpec, Gains, Motion, Moves
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.network import LdcnNetwork
+from ldcnd.drives.ldcn.packet import StatusItem
+from ldcnd.drives.ldcn.profiles import LS_182AP
+from ldcnd.line.bus import Bus
+from ldcnd.line.settings import BusSettings
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import build_chain
+from ldcnd.sim.ldcn.simulation import SimulatedModuleConfig, SimulationConfig
 from ldcnd.sim.line import open_simulated_line
 from tests.support.rough_host import enumeration, frame, jog, powered
 

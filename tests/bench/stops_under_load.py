@@ -24,13 +24,13 @@ from pathlib import Path
 
 import structlog
 
+from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.process.daemon import Daemon
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.planning.plan import plan_rig
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.bench.report import Row, table
 from tests.support.process import ROOT, free_port
 from tests.support.rig import SIMULATED

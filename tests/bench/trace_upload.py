@@ -5,17 +5,17 @@ from itertools import pairwise
 from unittest import mock
 
 from ldcnd.client.traces import take_trace
-from ldcnd.config.axis import AxisConfig, RatesConfig
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
-from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, Function
-from ldcnd.drivers.smartstep.trace_data import chunk_plan
-from ldcnd.families.smartstep import family
-from ldcnd.families.smartstep.config import SmartStepAxisConfig
-from ldcnd.model.traces import TakeTrace
+from ldcnd.contract.traces import TakeTrace
+from ldcnd.drives.axis_config import AxisConfig, RatesConfig
+from ldcnd.drives.smartstep import family
+from ldcnd.drives.smartstep.commands import LONGEST_STRING_BYTES
+from ldcnd.drives.smartstep.config import SmartStepAxisConfig
+from ldcnd.drives.smartstep.packet import PACKET_CHARACTERS, Function
+from ldcnd.drives.smartstep.trace_data import chunk_plan
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.smartstep.unit import CHARACTER_S
 from ldcnd.sim.smartstep.variant import SimulatedVariant
-from ldcnd.wirelog.recorder import WireEvent
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock
 from tests.support.rig import RunningRig

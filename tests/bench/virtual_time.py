@@ -10,17 +10,17 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import TypeVar
 
-from ldcnd.bus.bus import Bus
 from ldcnd.client.lease import control
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.process.service import settle_heap
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.model.commands import MoveVelocity, Power
+from ldcnd.contract.commands import MoveVelocity, Power
+from ldcnd.daemon.service import settle_heap
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.line.bus import Bus
+from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.line import SimulatedLine
-from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.bench import commands_and_polls, trace_upload
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock, saturating, saturating_smartsteps

@@ -14,8 +14,8 @@ from playwright.async_api import Browser, ConsoleMessage, Locator, Page, async_p
 
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.commands import Halt, Power, Reset
-from ldcnd.model.samples import PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.commands import Halt, Power, Reset
+from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
 from tests.support.process import ROOT, answering, client, free_port, process
 
 CHROMIUM = Path(os.environ.get("LDCND_CHROMIUM", "/usr/bin/chromium"))

@@ -9,7 +9,7 @@ from pathlib import Path
 from PIL import Image
 from playwright.async_api import expect
 
-from ldcnd.model.commands import MoveAbsolute, Power, SetGains
+from ldcnd.contract.commands import MoveAbsolute, Power, SetGains
 from tests.browser.house import Desk, House, open_house
 
 LARGEST_BYTES = 150_000

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from ldcnd.console.conditions import as_payload
-from ldcnd.model.condition import Place
+from ldcnd.contract.condition import Place
 from tests.unit.test_conditions_on_faces import CASES, Case, axis_now, known
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")

@@ -4,8 +4,8 @@ import re
 
 import pytest
 
-from ldcnd.model.commands import SetPosition
-from ldcnd.model.leases import ListHolders
+from ldcnd.contract.commands import SetPosition
+from ldcnd.contract.leases import ListHolders
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect

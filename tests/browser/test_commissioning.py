@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.commissioning.first_settings import SOFT_GAINS
+from ldcnd.bench.commissioning.first_settings import SOFT_GAINS
 from ldcnd.config.rig import load_config
 from tests.browser.house import CHROMIUM, Desk, console, is_trouble, open_browser
 from tests.support.process import START_TIME_S, answering, free_port, process

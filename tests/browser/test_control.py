@@ -6,7 +6,7 @@ import signal
 
 import pytest
 
-from ldcnd.model.leases import ListHolders
+from ldcnd.contract.leases import ListHolders
 from tests.browser.house import Desk, open_browser
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")

@@ -9,10 +9,10 @@ import pytest
 from ldcnd.cli.parameter_file import load_parameters
 from ldcnd.client.trace_file import load_trace
 from ldcnd.client.traces import fetch_trace, trace_header
-from ldcnd.model.commands import HomeMethod, HomeStop, MoveVelocity, Power, ReportShadow, SetGains
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import ShadowFigure
-from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, TracePhase, TriggerKind
+from ldcnd.contract.commands import HomeMethod, HomeStop, MoveVelocity, Power, ReportShadow, SetGains
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import ShadowFigure
+from ldcnd.contract.traces import MOST_CHANNELS, MOST_SAMPLES, TracePhase, TriggerKind
 from tests.support.process import ROOT
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")

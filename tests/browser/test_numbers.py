@@ -12,8 +12,8 @@ import pytest
 import pytest_asyncio
 
 from ldcnd.client.lease import control
-from ldcnd.model.commands import MoveVelocity, Power, SetPosition
-from ldcnd.number_text import NotANumber, read_number
+from ldcnd.contract.commands import MoveVelocity, Power, SetPosition
+from ldcnd.contract.number_text import NotANumber, read_number
 from tests.support.marionette import CONTROL, DELETE, ENTER, Firefox, firefox, open_firefox
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")

@@ -4,11 +4,11 @@ import re
 
 import pytest
 
-from ldcnd.model.commands import MoveVelocity, Power
-from ldcnd.model.leases import Acquire, ListHolders
-from ldcnd.model.parameters import ReadParameter
-from ldcnd.model.rig_commands import SetSpeedOverride
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.contract.commands import MoveVelocity, Power
+from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.parameters import ReadParameter
+from ldcnd.contract.rig_commands import SetSpeedOverride
+from ldcnd.contract.samples import TelemetryItem
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect

@@ -5,9 +5,9 @@ import re
 
 import pytest
 
-from ldcnd.drivers.smartstep.monitors import HISTORY_LENGTH
-from ldcnd.errors import LeaseHeld
-from ldcnd.model.parameters import Memory, ReadAllParameters, ReadParameter, WriteParameter
+from ldcnd.contract.errors import LeaseHeld
+from ldcnd.contract.parameters import Memory, ReadAllParameters, ReadParameter, WriteParameter
+from ldcnd.drives.smartstep.monitors import HISTORY_LENGTH
 
 axe = pytest.importorskip("axe_playwright_python.async_playwright", reason="needs axe-playwright-python")
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")

@@ -9,19 +9,19 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli.accept import capture_of, command
-from ldcnd.drivers.driver import Gains
-from ldcnd.families.family import TrialMove
-from ldcnd.families.known import FAMILIES
-from ldcnd.families.ldcn.acceptance import ASSUMPTIONS, accept, trial_bus
-from ldcnd.families.smartstep.config import SimulatedUnitConfig, simulated_units
-from ldcnd.model.health import Finding, Verdict
+from ldcnd.contract.health import Finding, Verdict
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.family import TrialMove
+from ldcnd.drives.known import FAMILIES
+from ldcnd.drives.ldcn.acceptance import ASSUMPTIONS, accept, trial_bus
+from ldcnd.drives.smartstep.config import SimulatedUnitConfig, simulated_units
+from ldcnd.line.capture import Capture, parse_capture
+from ldcnd.line.replay import Replay
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import PtyLine
 from ldcnd.sim.smartstep.cable import smartstep_chain
-from ldcnd.wirelog.capture import Capture, parse_capture
-from ldcnd.wirelog.replay import Replay
 from tests.support.chain_rig import drive, rig_on, simulated_config
 from tests.support.plugged_rig import MODELS
 from tests.support.serial_adapter import Plug

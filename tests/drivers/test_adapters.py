@@ -5,10 +5,10 @@ import contextlib
 
 import pytest
 
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, SetPosition
-from ldcnd.model.samples import AxisState, FaultSample, LinkState, Moving, PositionSample, Quality, TelemetryItem
-from ldcnd.model.traces import TakeTrace
+from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, SetPosition
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.samples import AxisState, FaultSample, LinkState, Moving, PositionSample, Quality, TelemetryItem
+from ldcnd.contract.traces import TakeTrace
 from tests.support.chain_rig import drive, simulated_config
 from tests.support.plugged_rig import RATES, Plugged, X, Y, plugged, slow_config
 from tests.support.serial_adapter import AT_ONCE, Fifo, LatencyTimer

@@ -11,14 +11,14 @@ from click.testing import CliRunner
 
 from ldcnd.cli import bus
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.process.replay import config_of
-from ldcnd.drivers.ldcn.packet import Command, PacketReader, Status, StatusItem, decode_status, status_bytes
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.smartstep.packet import PACKET_CHARACTERS, decode_command, decode_reply
-from ldcnd.families.dissector import FILE, PERSONAL_PLUGINS, dissector, install
-from ldcnd.wirelog.capture import Capture, parse_capture
-from ldcnd.wirelog.pcapng import encode_pcapng
-from ldcnd.wirelog.recorder import WireEvent, WireRecord
+from ldcnd.daemon.replay import config_of
+from ldcnd.drives.ldcn.packet import Command, PacketReader, Status, StatusItem, decode_status, status_bytes
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.drives.smartstep.packet import PACKET_CHARACTERS, decode_command, decode_reply
+from ldcnd.line.capture import Capture, parse_capture
+from ldcnd.line.flight_recorder import WireEvent, WireRecord
+from ldcnd.ops.dissector import FILE, PERSONAL_PLUGINS, dissector, install
+from ldcnd.ops.pcapng import encode_pcapng
 from tests.support.captures import FOLDER, NAMES
 from tests.support.rig import SIMULATED, running_rig
 

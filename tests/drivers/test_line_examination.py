@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.families.ldcn.examination import LineAsConfigured, adapter_findings, examine
-from ldcnd.families.ldcn.family import open_ldcn_line
-from ldcnd.model.health import Finding, Verdict
+from ldcnd.contract.health import Finding, Verdict
+from ldcnd.drives.ldcn.examination import LineAsConfigured, adapter_findings, examine
+from ldcnd.drives.ldcn.family import open_ldcn_line
+from ldcnd.line.adapter import Adapter, LineErrors, adapter_of
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.transport.adapter import Adapter, LineErrors, adapter_of
 from tests.support.chain_rig import drive, rig_on
 from tests.support.plugged_rig import MODELS, slow_config
 from tests.support.process import LDCND

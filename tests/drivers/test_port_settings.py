@@ -13,14 +13,13 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.settings import BusSettings
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.process.service import require_writable
-from ldcnd.drivers.ldcn.addressing import LineRate, nulls
-from ldcnd.drivers.ldcn.registers import BaudCodes
-from ldcnd.errors import ConfigError, NotSupported, TransportLost
-from ldcnd.transport.line_discipline import (
+from ldcnd.contract.errors import ConfigError, NotSupported, TransportLost
+from ldcnd.daemon.service import require_writable
+from ldcnd.drives.ldcn.addressing import LineRate, nulls
+from ldcnd.drives.ldcn.registers import BaudCodes
+from ldcnd.line.bus import Bus
+from ldcnd.line.line_discipline import (
     ENABLED,
     RTS_AFTER_SEND,
     RTS_ON_SEND,
@@ -30,8 +29,9 @@ from ldcnd.transport.line_discipline import (
     actual_baud,
     makes,
 )
-from ldcnd.transport.port_url import port_opener
-from ldcnd.transport.serial_port import SerialPort, SerialSettings, open_serial_port
+from ldcnd.line.port_url import port_opener
+from ldcnd.line.serial_port import SerialPort, SerialSettings, open_serial_port
+from ldcnd.line.settings import BusSettings
 from tests.support.recording_receiver import RecordingReceiver
 from tests.support.rig import SIMULATED
 from tests.support.serial_drivers import rs485_port, uart_8250

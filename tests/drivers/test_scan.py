@@ -4,16 +4,17 @@ import random
 
 import pytest
 
-from ldcnd.config.begun import begun_with, write
+from ldcnd.bench.begun import begun_with, write
 from ldcnd.config.rig import load_config
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.addressing import NULLS
-from ldcnd.drivers.ldcn.packet import Command, PacketReader
-from ldcnd.drivers.ldcn.registers import RESET_BAUD
-from ldcnd.errors import ConfigError
-from ldcnd.families.known import FAMILIES
-from ldcnd.families.opened import with_line
-from ldcnd.model.health import Verdict
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.health import Verdict
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.known import FAMILIES
+from ldcnd.drives.ldcn.addressing import NULLS
+from ldcnd.drives.ldcn.packet import Command, PacketReader
+from ldcnd.drives.ldcn.registers import RESET_BAUD
+from ldcnd.drives.opened import with_line
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -21,7 +22,6 @@ from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import Trip
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.sim.plant import MotorPlant
-from ldcnd.wirelog.recorder import WireEvent
 
 SERVOS = ("ls-182ap", "ls-173ap", "pic-servo-v4", "pic-servo-sc")
 OTHERS = ("pic-io", "pic-step")

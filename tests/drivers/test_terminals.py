@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power, Reset, SetPosition
-from ldcnd.model.samples import LinkState, Moving
+from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power, Reset, SetPosition
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.samples import LinkState, Moving
+from ldcnd.line.port_url import port_opener
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.pty import PtyLine
-from ldcnd.transport.port_url import port_opener
 from tests.support.chain_rig import ChainRig, rig_on, simulated_config
 from tests.support.plugged_rig import ENDLESS, MODELS, RATES
 from tests.support.position_judge import PositionJudge

@@ -10,9 +10,9 @@ import random
 
 import pytest
 
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, Reset, SetPosition
-from ldcnd.model.samples import AxisState, LinkState, Moving
+from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, Reset, SetPosition
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.samples import AxisState, LinkState, Moving
 from tests.support.chain_rig import drive
 from tests.support.plugged_rig import Plugged, X, Y, plugged, slow_config
 from tests.support.position_judge import PositionJudge

@@ -14,8 +14,8 @@ import pytest
 from bluesky import RunEngine
 from bluesky.utils import FailedStatus
 
-import ldcnd.bluesky
-from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, TelemetryItem
+import ldcnd.lab.bluesky
+from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, TelemetryItem
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.bluesky_engine import Documents, Laboratory, laboratory
 from tests.support.process import ROOT, START_TIME_S, answering, client, daemon, free_port, process, simulated_terminal
@@ -142,7 +142,7 @@ async def test_a_killed_daemon_fails_the_run_and_the_drive_ends_its_move(tmp_pat
                 kill()
 
         engine.subscribe(at_each, "event")
-        with contextlib.suppress(ldcnd.LdcndError), ldcnd.bluesky.connect(endpoint) as rig:
+        with contextlib.suppress(ldcnd.LdcndError), ldcnd.lab.bluesky.connect(endpoint) as rig:
             with rig.control("x", client="scan") as x:
                 x.power(on=True).wait(20)
                 with pytest.raises(FailedStatus):

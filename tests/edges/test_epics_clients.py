@@ -8,8 +8,8 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from ldcnd.model.commands import Power
-from ldcnd.model.samples import Moving
+from ldcnd.contract.commands import Power
+from ldcnd.contract.samples import Moving
 from tests.edges.epics_clients import CLIENTS
 from tests.support.process import ROOT, client, daemon, free_port, process
 

@@ -9,7 +9,7 @@ from caproto import AlarmSeverity
 
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.epics.gateway import gateway
+from ldcnd.lab.epics.gateway import gateway
 from tests.support.bluesky_engine import laboratory
 from tests.support.epics_records import shows
 from tests.support.process import ROOT

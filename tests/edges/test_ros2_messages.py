@@ -14,7 +14,7 @@ from pycdr2 import IdlStruct
 from pycdr2.types import float64, int32, sequence, uint8, uint32
 from rosbags.typesys import Stores, get_typestore
 
-from ldcnd.ros2.cdr import DIAGNOSTIC_ARRAY, JOINT_STATE, DiagnosticArray, DiagnosticStatus, JointState
+from ldcnd.lab.ros2.cdr import DIAGNOSTIC_ARRAY, JOINT_STATE, DiagnosticArray, DiagnosticStatus, JointState
 from tests.support.process import ROOT, daemon, free_port, process
 from tests.support.ros2_messages import DIAGNOSTICS, JOINTS
 from tests.support.router import router

@@ -5,10 +5,11 @@ from contextlib import suppress
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.faults import Knowledge, diagnose
-from ldcnd.drivers.ldcn.packet import (
+from ldcnd.contract.errors import BadReply
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.faults import Knowledge, diagnose
+from ldcnd.drives.ldcn.packet import (
     HEADER,
     Command,
     Packet,
@@ -20,10 +21,9 @@ from ldcnd.drivers.ldcn.packet import (
     decode_status,
     status_bytes,
 )
-from ldcnd.drivers.ldcn.profiles import PROFILES, Support
-from ldcnd.drivers.ldcn.received import decode_command, interpret, interpret_bytes
-from ldcnd.errors import BadReply
-from ldcnd.exchange import ReplyVerdict
+from ldcnd.drives.ldcn.profiles import PROFILES, Support
+from ldcnd.drives.ldcn.received import decode_command, interpret, interpret_bytes
+from ldcnd.line.exchange import ReplyVerdict
 
 unsure = st.sampled_from([True, False, None])
 profiles = st.sampled_from(list(PROFILES.values()))

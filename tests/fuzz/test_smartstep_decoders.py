@@ -6,7 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.drivers.smartstep.commands import (
+from ldcnd.contract.errors import BadReply
+from ldcnd.drives.smartstep.commands import (
     execute,
     is_self_hearing,
     probe,
@@ -16,13 +17,12 @@ from ldcnd.drivers.smartstep.commands import (
     string_reference,
     write_eeprom,
 )
-from ldcnd.drivers.smartstep.monitors import SPEED_FEEDBACK
-from ldcnd.drivers.smartstep.packet import Command, Reply, checksum, decode_command, decode_reply, piece_bytes
-from ldcnd.drivers.smartstep.parameters import PN100
-from ldcnd.drivers.smartstep.profiles import ByteOrder, SmartStepProfile, StringChecksum
-from ldcnd.drivers.smartstep.trace_data import split_words
-from ldcnd.errors import BadReply
-from ldcnd.exchange import Exchange, ReplyVerdict
+from ldcnd.drives.smartstep.monitors import SPEED_FEEDBACK
+from ldcnd.drives.smartstep.packet import Command, Reply, checksum, decode_command, decode_reply, piece_bytes
+from ldcnd.drives.smartstep.parameters import PN100
+from ldcnd.drives.smartstep.profiles import ByteOrder, SmartStepProfile, StringChecksum
+from ldcnd.drives.smartstep.trace_data import split_words
+from ldcnd.line.exchange import Exchange, ReplyVerdict
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 
 EXCHANGES: list[Exchange] = [

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drivers.smartstep.profiles import Framing
-from ldcnd.families.smartstep.config import SimulatedUnitConfig, simulated_units
+from ldcnd.drives.smartstep.config import SimulatedUnitConfig, simulated_units
+from ldcnd.drives.smartstep.profiles import Framing
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from tests.guest.machine import Adapter, Bench, booted_guest, far_end, why_no_guest

@@ -17,11 +17,11 @@ from dataclasses import dataclass
 import pytest
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError, OutcomeUnknown
-from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, Reset, SetPosition
-from ldcnd.model.meta import BusInfo
-from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample, TelemetryItem
-from ldcnd.model.traces import TakeTrace
+from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveVelocity, Power, Reset, SetPosition
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown
+from ldcnd.contract.meta import BusInfo
+from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample, TelemetryItem
+from ldcnd.contract.traces import TakeTrace
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from tests.guest.machine import Bench, Guest
@@ -46,9 +46,9 @@ POLLED_S = 120.0
 UNPLUGS = 20
 OPENING = """
 import asyncio, sys
-from ldcnd.errors import TransportLost
-from ldcnd.transport.line_discipline import actual_baud
-from ldcnd.transport.serial_port import SerialSettings, open_serial_port
+from ldcnd.contract.errors import TransportLost
+from ldcnd.line.line_discipline import actual_baud
+from ldcnd.line.serial_port import SerialSettings, open_serial_port
 
 async def main(path, *bauds):
     try:

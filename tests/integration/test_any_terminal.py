@@ -7,7 +7,7 @@ from asyncio.subprocess import PIPE
 import pytest
 import pytest_asyncio
 
-from ldcnd.model.commands import Halt, Power, SetPosition
+from ldcnd.contract.commands import Halt, Power, SetPosition
 from tests.support.process import LDCND, ROOT, client, daemon
 
 pytestmark = [

@@ -4,10 +4,10 @@ import asyncio
 
 import pytest
 
-from ldcnd.errors import PositionLimit
-from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Preview, Stop
-from ldcnd.model.events import ReadEvents
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Preview, Stop
+from ldcnd.contract.errors import PositionLimit
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.samples import AxisState
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
 
 FROM_BELOW = {"direction": "positive", "distance": 0.5}

@@ -7,9 +7,9 @@ import pytest
 from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config.bus import GroupConfig
 from ldcnd.config.rig import load_config
-from ldcnd.errors import (
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb, Why
+from ldcnd.contract.errors import (
     CommandExpired,
     CommandIdReused,
     DuplicateDaemon,
@@ -20,10 +20,10 @@ from ldcnd.errors import (
     StaleSequence,
     UnknownAxis,
 )
-from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb, Why
-from ldcnd.model.events import CommandStatus, ReadEvents, ReadOutcome
-from ldcnd.model.leases import SHORTEST_LEASE_S, Acquire, ListHolders
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
+from ldcnd.contract.leases import SHORTEST_LEASE_S, Acquire, ListHolders
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.line_config import GroupConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 

@@ -3,19 +3,19 @@
 import asyncio
 from typing import Any
 
+from ldcnd.axis.axis import QUEUED_COMMANDS
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.axis.axis import QUEUED_COMMANDS
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.errors import StopLatched, TooManyRequests
-from ldcnd.messaging.codec import decode_received
-from ldcnd.messaging.keys import EVENT, Keys
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.session import Sample
-from ldcnd.model.commands import CommandReply, Halt, MoveVelocity, Power
-from ldcnd.model.events import CommandEvent, CommandStatus
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.contract.codec import decode_received
+from ldcnd.contract.commands import CommandReply, Halt, MoveVelocity, Power
+from ldcnd.contract.errors import StopLatched, TooManyRequests
+from ldcnd.contract.events import CommandEvent, CommandStatus
+from ldcnd.contract.keys import EVENT, Keys
+from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.session import Sample
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 

@@ -5,10 +5,10 @@ import json
 import msgpack
 import pytest
 
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES
-from ldcnd.model.commands import Power
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.contract.codec import MAX_PAYLOAD_BYTES
+from ldcnd.contract.commands import Power
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.line.flight_recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig
 
 X = "ldcn/sim/@cmd/x"

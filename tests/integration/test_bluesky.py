@@ -11,10 +11,10 @@ from bluesky import protocols
 from bluesky.preprocessors import monitor_during_wrapper
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
-import ldcnd.bluesky.axis
-from ldcnd.bluesky import Axis, Fly, ReadableAxis, Signal, Status, Trace
+import ldcnd.lab.bluesky.axis
+from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
-from ldcnd.errors import (
+from ldcnd.contract.errors import (
     CommandAborted,
     LeaseExpired,
     LeaseHeld,
@@ -24,10 +24,10 @@ from ldcnd.errors import (
     UnknownAxis,
     WrongState,
 )
-from ldcnd.model.events import ReadEvents
-from ldcnd.model.leases import Acquire
-from ldcnd.model.samples import AxisState, Moving
-from ldcnd.planning.plan import plan_rig
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.lab.bluesky import Axis, Fly, ReadableAxis, Signal, Status, Trace
 from tests.support.bluesky_engine import Laboratory, laboratory
 from tests.support.rig import two_axes
 
@@ -198,7 +198,7 @@ def test_the_limits_of_a_description_follow_a_reload(lab: Laboratory):
 
 
 def test_a_fly_scan_yields_pages_of_positions_with_the_times_of_the_drive(lab: Laboratory, monkeypatch):
-    monkeypatch.setattr(ldcnd.bluesky.axis, "PAGE_SAMPLES", 10)
+    monkeypatch.setattr(ldcnd.lab.bluesky.axis, "PAGE_SAMPLES", 10)
 
     def flight():
         yield from bps.prepare(x, Fly(0, 5, velocity=5), wait=True)

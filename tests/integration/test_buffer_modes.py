@@ -7,10 +7,10 @@ from contextlib import asynccontextmanager
 import pytest
 
 from ldcnd.client.rig import Rig
-from ldcnd.errors import PositionLimit, WrongState
-from ldcnd.model.commands import BufferMode, CommandReply, Halt, MoveAbsolute, MoveVelocity, Power, SetPosition
-from ldcnd.model.events import CommandOutcome, CommandStatus, ReadOutcome
-from ldcnd.model.samples import AxisState, LinkState, PositionSample, TelemetryItem
+from ldcnd.contract.commands import BufferMode, CommandReply, Halt, MoveAbsolute, MoveVelocity, Power, SetPosition
+from ldcnd.contract.errors import PositionLimit, WrongState
+from ldcnd.contract.events import CommandOutcome, CommandStatus, ReadOutcome
+from ldcnd.contract.samples import AxisState, LinkState, PositionSample, TelemetryItem
 from tests.support.command_line import virtual_rig
 from tests.support.rig import RunningRig, running_rig
 

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.model.samples import LatchSample, LinkState, TelemetryItem
+from ldcnd.contract.samples import LatchSample, LinkState, TelemetryItem
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.io import IoWiring
 from ldcnd.sim.plant import MotorPlant

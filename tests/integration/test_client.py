@@ -21,15 +21,15 @@ from ldcnd.client.axis import Axis
 from ldcnd.client.loop_thread import loop_thread
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.process.daemon import Daemon
-from ldcnd.errors import CommandAborted, LeaseExpired, LeaseHeld, MalformedRequest, SessionError, UnknownAxis
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.catalogue import COMMANDS
-from ldcnd.model.commands import About, Halt
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.leases import Acquire
-from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
+from ldcnd.contract.catalogue import COMMANDS
+from ldcnd.contract.commands import About, Halt
+from ldcnd.contract.errors import CommandAborted, LeaseExpired, LeaseHeld, MalformedRequest, SessionError, UnknownAxis
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.net.memory_session import MemoryBroker
 from tests.support.process import ROOT, daemon
 from tests.support.rig import EPOCH_NS, RunningRig, running_rig, two_axes
 from tests.support.session_pair import free_endpoint

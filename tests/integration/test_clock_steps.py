@@ -7,10 +7,10 @@ import pytest
 
 from ldcnd.client.lease import control
 from ldcnd.config.rig import load_config
-from ldcnd.errors import LeaseExpired
-from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power
-from ldcnd.model.leases import Acquire
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power
+from ldcnd.contract.errors import LeaseExpired
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.samples import AxisState
 from tests.support.rig import SIMULATED, running_rig
 
 HOUR_S = 3600.0

@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.drivers.ldcn.registers import actual_baud, baud_at_reset, baud_divisor
-from ldcnd.errors import ValueOutOfRange
-from ldcnd.model.commands import MoveAbsolute, MoveVelocity
+from ldcnd.contract.commands import MoveAbsolute, MoveVelocity
+from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.drives.ldcn.registers import actual_baud, baud_at_reset, baud_divisor
 from ldcnd.sim.ldcn.chain import model
 from tests.support.dialect_rig import LS_182AP, SC, V2, V4, Dialect, DialectRig, dialect_rig
 

@@ -11,8 +11,8 @@ from contextlib import asynccontextmanager
 import pytest
 import pytest_asyncio
 
-from ldcnd.model.commands import Halt, Power, SetPosition
-from ldcnd.model.events import ReadEvents
+from ldcnd.contract.commands import Halt, Power, SetPosition
+from ldcnd.contract.events import ReadEvents
 from tests.support.process import LDCND, ROOT, answering, client, daemon, free_port
 
 pytestmark = [

@@ -5,9 +5,9 @@ import json
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.drivers.ldcn.commands import Command
-from ldcnd.drivers.ldcn.packet import PacketReader
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.drives.ldcn.commands import Command
+from ldcnd.drives.ldcn.packet import PacketReader
+from ldcnd.line.flight_recorder import WireEvent
 from tests.support.command_line import run_here, virtual_rig
 from tests.support.commissioning import rig_text
 

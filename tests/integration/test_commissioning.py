@@ -10,23 +10,23 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
+from ldcnd.bench.commissioning.checklist import STEPS, Checklist
+from ldcnd.bench.commissioning.first_settings import SOFT_GAINS
+from ldcnd.bench.commissioning.limit_switches import _judged
+from ldcnd.bench.commissioning.motor import CAUGHT, MOST_EL_COUNTS, OUTPUTS
+from ldcnd.bench.commissioning.record import Result, StepState
+from ldcnd.bench.commissioning.report import html_of
+from ldcnd.bench.commissioning.walk import Walk
+from ldcnd.bench.person import Left
+from ldcnd.bench.tuning.ldcn.plant import Plant
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import KeptGains, file_of, keep
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
-from ldcnd.commissioning.checklist import STEPS, Checklist
-from ldcnd.commissioning.first_settings import SOFT_GAINS
-from ldcnd.commissioning.limit_switches import _judged
-from ldcnd.commissioning.motor import CAUGHT, MOST_EL_COUNTS, OUTPUTS
-from ldcnd.commissioning.record import Result, StepState
-from ldcnd.commissioning.report import html_of
-from ldcnd.commissioning.walk import Walk
 from ldcnd.config.rig import load_config
-from ldcnd.errors import CommandAborted, ConfigError, LeaseExpired, LeaseHeld, StopLatched, WrongState
-from ldcnd.person import Left
+from ldcnd.contract.errors import CommandAborted, ConfigError, LeaseExpired, LeaseHeld, StopLatched, WrongState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.servo import FULL_PWM
-from ldcnd.tuning.ldcn.plant import Plant
 from tests.support.commissioning import AXIS, GAINS, PLANT, ScriptedPerson, commissioning_rig, rig_text
 from tests.support.process import ROOT
 from tests.support.rig import running_rig

@@ -10,17 +10,17 @@ from types import SimpleNamespace
 import pytest
 import serial
 
+from ldcnd.bench.commissioning.record import Record, StepState
 from ldcnd.client.kept_gains import KeptGains, keep, kept_for
-from ldcnd.commissioning.record import Record, StepState
-from ldcnd.commissioning_page.ldcn import tuning
-from ldcnd.commissioning_page.messages import Answer, FromPage
-from ldcnd.commissioning_page.page_person import HELD_S
-from ldcnd.commissioning_page.scan_conversation import ScanConversation
 from ldcnd.config.rig import load_config
-from ldcnd.errors import ErrorCode
-from ldcnd.model.leases import ListHolders
-from ldcnd.model.parameters import ReadParameter
-from ldcnd.model.samples import Moving
+from ldcnd.console.commissioning.ldcn import tuning
+from ldcnd.console.commissioning.messages import Answer, FromPage
+from ldcnd.console.commissioning.page_person import HELD_S
+from ldcnd.console.commissioning.scan_conversation import ScanConversation
+from ldcnd.contract.errors import ErrorCode
+from ldcnd.contract.leases import ListHolders
+from ldcnd.contract.parameters import ReadParameter
+from ldcnd.contract.samples import Moving
 from tests.support.commissioning import AXIS, GAINS, commissioning_rig, rig_text
 from tests.support.commissioning_page import COMMAND, ViewerSession, commissioning_console, commissioning_page, told_to
 from tests.support.console_rig import page, running_console

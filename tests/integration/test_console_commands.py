@@ -7,9 +7,9 @@ import pytest
 from ldcnd.client.events import latest_events
 from ldcnd.client.traces import arm_trace, fetch_trace, wait_for_trace
 from ldcnd.console import reading
-from ldcnd.model.events import ReadEvents
-from ldcnd.model.samples import AxisState
-from ldcnd.model.traces import TakeTrace
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.samples import AxisState
+from ldcnd.contract.traces import TakeTrace
 from tests.support.console_rig import open_page, running_console
 
 X = "/api/rigs/sim/axes/x"

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from ldcnd.model.leases import Acquire, ListHolders
-from ldcnd.model.samples import AxisState, Moving
+from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.samples import AxisState, Moving
 from tests.support.console_rig import open_page, running_console
 
 X = "/api/rigs/sim/axes/x"

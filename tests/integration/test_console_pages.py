@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.console import reading
 from ldcnd.console.feed import Feed
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.samples import AxisState
 from tests.support.console_rig import open_page, page, running_console
 
 

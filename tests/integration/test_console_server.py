@@ -12,14 +12,14 @@ import msgpack
 import pytest
 from websockets.exceptions import InvalidStatus
 
-from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Qos
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import StopReply
-from ldcnd.model.meta import DaemonInfo
-from ldcnd.pki.certificates import issue_daemon, new_authority
+from ldcnd.contract.codec import Encoding, encode
+from ldcnd.contract.commands import StopReply
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.meta import DaemonInfo
+from ldcnd.net.session import Qos
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.ops.pki.certificates import issue_daemon, new_authority
 from tests.support.browser import console, entries, feed, hanging_page, path_of
 from tests.support.process import LDCND, ROOT, answering, free_port, process
 from tests.support.router import router

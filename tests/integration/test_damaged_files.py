@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
+from ldcnd.bench.commissioning import record
 from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
-from ldcnd.commissioning import record
 from ldcnd.config.rig import load_config
-from ldcnd.errors import ConfigError
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.samples import LinkState
 from tests.support.command_line import virtual_rig
 from tests.support.rig import SIMULATED
 

@@ -3,9 +3,9 @@
 import asyncio
 from itertools import pairwise
 
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.samples import LinkState
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.wirelog.recorder import WireEvent
 from tests.bench.saturated_rig import saturating
 from tests.support.chain_rig import rig_on
 

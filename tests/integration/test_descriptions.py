@@ -2,10 +2,10 @@
 
 import asyncio
 
-from ldcnd.daemon.publish.meta import COUNTERS_HZ, axis_info, command_list
-from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.keys import Keys
-from ldcnd.model.commands import Home, Power, SetGains
+from ldcnd.contract.codec import Encoding, encode
+from ldcnd.contract.commands import Home, Power, SetGains
+from ldcnd.contract.keys import Keys
+from ldcnd.daemon.meta import COUNTERS_HZ, axis_info, command_list
 from tests.support.rig import RunningRig, running_rig
 
 KEYS = Keys("sim")

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.model.commands import Home, MoveAbsolute, MoveVelocity, Power, Reset
-from ldcnd.model.samples import AdcSample, AxisState, PositionSample, TelemetryItem, VelocitySample
+from ldcnd.contract.commands import Home, MoveAbsolute, MoveVelocity, Power, Reset
+from ldcnd.contract.samples import AdcSample, AxisState, PositionSample, TelemetryItem, VelocitySample
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,

@@ -7,8 +7,8 @@ import pytest
 
 from ldcnd.cli.doctor import examine_line
 from ldcnd.config.rig import load_config
-from ldcnd.errors import BusDown
-from ldcnd.model.health import Finding, Verdict
+from ldcnd.contract.errors import BusDown
+from ldcnd.contract.health import Finding, Verdict
 from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support.command_line import run_here
 

@@ -4,12 +4,12 @@ import asyncio
 
 import pytest
 
-from ldcnd.drivers.ldcn.controls import LimitPins
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.errors import LdcndError, RegisterUnknown, ReplyTimeout, ValueOutOfRange, WrongState
-from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Preview, SetGains, SetOutputs
-from ldcnd.model.meta import Provenance
-from ldcnd.model.samples import LinkState, Quality, TelemetryItem
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Preview, SetGains, SetOutputs
+from ldcnd.contract.errors import LdcndError, RegisterUnknown, ReplyTimeout, ValueOutOfRange, WrongState
+from ldcnd.contract.meta import Provenance
+from ldcnd.contract.samples import LinkState, Quality, TelemetryItem
+from ldcnd.drives.ldcn.controls import LimitPins
+from ldcnd.drives.ldcn.packet import Command
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
 from tests.support.dialect_rig import (
     AXIS,

@@ -9,9 +9,9 @@ from caproto import AccessRights, AlarmSeverity, Forbidden
 
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.epics.gateway import gateway
-from ldcnd.errors import (
+from ldcnd.config.plan import plan_rig
+from ldcnd.contract.commands import MoveAbsolute, Reset
+from ldcnd.contract.errors import (
     CommandAborted,
     DriveFault,
     LdcndError,
@@ -22,13 +22,13 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import MoveAbsolute, Reset
-from ldcnd.model.events import ReadEvents
-from ldcnd.model.leases import Acquire, ListHolders
-from ldcnd.model.meta import AxisLimits
-from ldcnd.model.samples import LinkState, Moving
-from ldcnd.planning.plan import plan_rig
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.meta import AxisLimits
+from ldcnd.contract.samples import LinkState, Moving
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.lab.epics.gateway import gateway
+from ldcnd.net.memory_session import MemoryBroker
 from tests.support.dialect_rig import LS_182AP, dialect_rig
 from tests.support.epics_records import VALUES, put, shows
 from tests.support.rig import EPOCH_NS, running_rig, two_axes

@@ -4,11 +4,11 @@ import asyncio
 
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.daemon.command.ledger import KEPT_EVENTS
-from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES
-from ldcnd.model.commands import Halt, Power
-from ldcnd.model.events import CommandStatus, ReadEvents
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.codec import MAX_PAYLOAD_BYTES
+from ldcnd.contract.commands import Halt, Power
+from ldcnd.contract.events import CommandStatus, ReadEvents
+from ldcnd.contract.samples import LinkState
+from ldcnd.daemon.ledger import KEPT_EVENTS
 from tests.support.rig import RunningRig, running_rig
 
 

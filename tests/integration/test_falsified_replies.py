@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.drivers.driver import AxisReading
-from ldcnd.exchange import Timing
-from ldcnd.model.commands import MoveRelative, Power
-from ldcnd.model.samples import AxisState, FaultSample, PositionSample, TelemetryItem
+from ldcnd.contract.commands import MoveRelative, Power
+from ldcnd.contract.samples import AxisState, FaultSample, PositionSample, TelemetryItem
+from ldcnd.drives.driver import AxisReading
+from ldcnd.line.exchange import Timing
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import Chain, ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import SIMULATED, running_rig

@@ -4,10 +4,10 @@ import asyncio
 
 import pytest
 
-from ldcnd.drivers.ldcn.faults import FaultCode
-from ldcnd.errors import DriveFault, NotReferenced, WrongState
-from ldcnd.model.commands import MoveAbsolute, Power, Reset, SetPosition, Stop
-from ldcnd.model.samples import AxisState, LinkState, Moving
+from ldcnd.contract.commands import MoveAbsolute, Power, Reset, SetPosition, Stop
+from ldcnd.contract.errors import DriveFault, NotReferenced, WrongState
+from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.drives.ldcn.faults import FaultCode
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,

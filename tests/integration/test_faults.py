@@ -6,9 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.faults import FaultCode
-from ldcnd.errors import DriveFault, NotReferenced, WrongState
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     Home,
     HomeMethod,
     HomeStop,
@@ -21,7 +19,9 @@ from ldcnd.model.commands import (
     SetPwm,
     Why,
 )
-from ldcnd.model.samples import AxisState, Moving
+from ldcnd.contract.errors import DriveFault, NotReferenced, WrongState
+from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.drives.ldcn.faults import FaultCode
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,

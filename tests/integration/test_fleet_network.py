@@ -25,15 +25,15 @@ from ldcnd.client.events import Events, follow_events
 from ldcnd.client.fleet import RigReport, survey
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.errors import LeaseExpired, OutcomeUnknown, SessionError
-from ldcnd.messaging.session import Session
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import CommandReply, MoveRelative, MoveVelocity, Power, Reset
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState, PositionSample, StateSample
-from ldcnd.pki.access import Role
-from ldcnd.pki.site import Site, new_login, set_up
+from ldcnd.contract.commands import CommandReply, MoveRelative, MoveVelocity, Power, Reset
+from ldcnd.contract.errors import LeaseExpired, OutcomeUnknown, SessionError
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState, PositionSample, StateSample
+from ldcnd.net.session import Session
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.ops.pki.access import Role
+from ldcnd.ops.pki.site import Site, new_login, set_up
 from tests.support.network import Network, NoNamespaces, router_config, router_words
 from tests.support.process import LDCND
 from tests.support.rig import SIMULATED

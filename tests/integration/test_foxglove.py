@@ -7,12 +7,12 @@ from asyncio.subprocess import PIPE
 
 import pytest
 
-from ldcnd.errors import ConfigError
-from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.events import CommandEvent, CommandStatus
-from ldcnd.model.samples import PositionSample
-from ldcnd.recording.live_view import LiveView
+from ldcnd.contract.codec import Encoding, encode
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.events import CommandEvent, CommandStatus
+from ldcnd.contract.samples import PositionSample
+from ldcnd.lab.recording.live_view import LiveView
+from ldcnd.net.session import Sample, SampleKind
 from tests.support.process import LDCND, ROOT, daemon
 from tests.support.websocket import foxglove_client
 

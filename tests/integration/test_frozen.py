@@ -9,12 +9,12 @@ import pytest
 
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import OutcomeUnknown, StopLatched
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.events import CommandStatus, ReadEvents
-from ldcnd.model.samples import AxisState, PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.errors import OutcomeUnknown, StopLatched
+from ldcnd.contract.events import CommandStatus, ReadEvents
+from ldcnd.contract.samples import AxisState, PositionSample, StateSample, TelemetryItem
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.support.process import ROOT, answering, client, daemon, free_port, process
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time]
@@ -29,10 +29,10 @@ JOGGER = """
 import asyncio, sys
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import MoveVelocity, Power, Verb
+from ldcnd.contract.errors import LdcndError
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.contract.commands import MoveVelocity, Power, Verb
 
 async def main():
     async with open_zenoh_session(ZenohSettings(mode="client", connect=(sys.argv[1],))) as session:

@@ -5,10 +5,8 @@ import math
 
 import pytest
 
-from ldcnd.daemon.command.rig_commands import move_together
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.registers import FRACTION
-from ldcnd.errors import (
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.errors import (
     CommandIdReused,
     MalformedRequest,
     NotSupported,
@@ -18,9 +16,11 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.rig_commands import AxisMove, LinePath, MoveTogether, PreviewTogether
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.contract.rig_commands import AxisMove, LinePath, MoveTogether, PreviewTogether
+from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.daemon.rig_commands import move_together
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
 
@@ -251,7 +251,7 @@ async def test_a_member_of_a_line_beyond_its_limit_keeps_all_at_rest():
 
 
 async def test_a_start_that_takes_longer_than_members_wait_for_each_other_has_one_outcome(monkeypatch):
-    monkeypatch.setattr("ldcnd.daemon.axis.procedures.group.MEETING_S", 0.01)  # as on a slow and busy line
+    monkeypatch.setattr("ldcnd.axis.procedures.group.MEETING_S", 0.01)  # as on a slow and busy line
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:
         await powered(rig, "x", "y")

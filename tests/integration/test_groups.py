@@ -6,12 +6,8 @@ import contextlib
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
-from ldcnd.drivers.ldcn.commands import spaced
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.network import GroupSpec, LineSpec, StartPolicy
-from ldcnd.errors import (
+from ldcnd.contract.commands import HomeMethod, MoveAbsolute, Power
+from ldcnd.contract.errors import (
     BusError,
     ConfigError,
     DriveFault,
@@ -21,8 +17,12 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.commands import HomeMethod, MoveAbsolute, Power
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.drives.driver import HomeCapture, Motion, StopMode
+from ldcnd.drives.ldcn.commands import spaced
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.network import GroupSpec, LineSpec, StartPolicy
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.bare_network import bare_network, specs

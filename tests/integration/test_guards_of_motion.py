@@ -8,9 +8,7 @@ import pytest
 
 from ldcnd.client.lease import control
 from ldcnd.config.rig import load_config
-from ldcnd.drivers.driver import StopMode
-from ldcnd.errors import CommandExpired, LdcndError, StopLatched, ValueOutOfRange, WrongState
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     BufferMode,
     Halt,
     Home,
@@ -25,7 +23,9 @@ from ldcnd.model.commands import (
     Stop,
     Track,
 )
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.errors import CommandExpired, LdcndError, StopLatched, ValueOutOfRange, WrongState
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.driver import StopMode
 from tests.support.dialect_rig import AXIS, V4, dialect_rig
 from tests.support.rig import SIMULATED, running_rig
 

@@ -7,9 +7,9 @@ from collections import Counter
 import pytest
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, Reset
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, Reset
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.samples import AxisState
 from tests.support.rig import running_rig
 
 CLIENTS = 200

@@ -6,17 +6,17 @@ from itertools import accumulate, pairwise
 
 import pytest
 
-from ldcnd.bus.queue import Lane
-from ldcnd.bus.wire import bucket_limit_s
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.publish.health import _Rate
-from ldcnd.families.smartstep.family import LEDGER_FILE
-from ldcnd.messaging.codec import decode_received
-from ldcnd.messaging.hand_over import PENDING_QUERIES
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import SampleKind
-from ldcnd.model.health import BusHealth, DaemonHealth
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.codec import decode_received
+from ldcnd.contract.health import BusHealth, DaemonHealth
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import LinkState
+from ldcnd.daemon.health import _Rate
+from ldcnd.drives.smartstep.family import LEDGER_FILE
+from ldcnd.line.queue import Lane
+from ldcnd.line.wire import bucket_limit_s
+from ldcnd.net.hand_over import PENDING_QUERIES
+from ldcnd.net.session import SampleKind
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.rig import SIMULATED, running_rig

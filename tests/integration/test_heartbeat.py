@@ -15,13 +15,13 @@ from pathlib import Path
 import pytest
 
 from ldcnd.config.rig import HeartbeatConfig, RigConfig
-from ldcnd.daemon.line.rig import Rig
-from ldcnd.daemon.process.heartbeat import Heartbeat
-from ldcnd.errors import ConfigError
-from ldcnd.messaging.codec import decode
-from ldcnd.model.health import DaemonHealth, HeartbeatHealth
+from ldcnd.contract.codec import decode
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.health import DaemonHealth, HeartbeatHealth
+from ldcnd.daemon.heartbeat import Heartbeat
+from ldcnd.daemon.rig import Rig
+from ldcnd.line.level import LevelFile, Output
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.transport.level import LevelFile, Output
 from tests.support.chain_rig import rig_on, simulated_config
 from tests.support.process import ROOT, answering, free_port
 
@@ -219,7 +219,7 @@ def test_a_heartbeat_that_cannot_be_is_refused(heartbeat, said):
 
 
 def test_a_missing_library_is_named(monkeypatch):
-    from ldcnd.daemon.process.heartbeat import open_output  # noqa: PLC0415
+    from ldcnd.daemon.heartbeat import open_output  # noqa: PLC0415
 
     monkeypatch.setitem(sys.modules, "gpiod", None)
 

@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.controls import HomingControl
-from ldcnd.errors import BusError, MalformedRequest, NotSupported, PositionLimit, VelocityLimit
-from ldcnd.model.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs
-from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.contract.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs
+from ldcnd.contract.errors import BusError, MalformedRequest, NotSupported, PositionLimit, VelocityLimit
+from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.drives.ldcn.controls import HomingControl
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from tests.support.dialect_rig import (
     AXIS,

@@ -8,10 +8,10 @@ import pytest
 
 from ldcnd.client.traces import arm_trace, armed_trace, fetch_trace, take_trace, trace_header, wait_for_trace
 from ldcnd.config.rig import load_config
-from ldcnd.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.traces import AbortTrace, TakeTrace, TracePhase, TraceTrigger, TriggerKind
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.contract.traces import AbortTrace, TakeTrace, TracePhase, TraceTrigger, TriggerKind
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.rig import SIMULATED, running_rig

@@ -8,13 +8,13 @@ import pytest
 
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.errors import AxisUnreachable, LeaseHeld, NotIdentified, OutcomeUnknown, WrongState
-from ldcnd.model.commands import Halt, MoveVelocity, Power, Reset, SetGains, SetOutputs, Stop, Why
-from ldcnd.model.condition import assess
-from ldcnd.model.leases import Acquire
-from ldcnd.model.rig_commands import SetIo, SetIoTimer
-from ldcnd.model.samples import AxisState, LinkState, Moving
+from ldcnd.contract.commands import Halt, MoveVelocity, Power, Reset, SetGains, SetOutputs, Stop, Why
+from ldcnd.contract.condition import assess
+from ldcnd.contract.errors import AxisUnreachable, LeaseHeld, NotIdentified, OutcomeUnknown, WrongState
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.rig_commands import SetIo, SetIoTimer
+from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.drives.ldcn.packet import Command
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive

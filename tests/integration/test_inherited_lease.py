@@ -8,10 +8,10 @@ import pytest
 from ldcnd.client.events import latest_events
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.model.catalogue import BY_VERB
-from ldcnd.model.commands import About, AxisCommand, Effect
-from ldcnd.model.leases import Acquire, Release
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.catalogue import BY_VERB
+from ldcnd.contract.commands import About, AxisCommand, Effect
+from ldcnd.contract.leases import Acquire, Release
+from ldcnd.contract.samples import LinkState
 from tests.support.command_line import VirtualRig, virtual_rig
 from tests.support.rig import SIMULATED
 

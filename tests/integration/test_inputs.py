@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.model.commands import MoveAbsolute, Stop
-from ldcnd.model.samples import InputsSample, TelemetryItem
+from ldcnd.contract.commands import MoveAbsolute, Stop
+from ldcnd.contract.samples import InputsSample, TelemetryItem
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import AXIS, LS_182AP, PLANT, SC, V4, DialectRig, dialect_rig
 

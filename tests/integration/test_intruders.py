@@ -5,14 +5,14 @@ from collections.abc import Callable
 
 import pytest
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.received import LoadTrajectory, ResetPosition, SetGain, SetHomingMode, StopMotor
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.events import DRIVE_CHANGED, CommandEvent, ReadEvents
-from ldcnd.model.samples import AxisState, LinkState, Moving
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.events import DRIVE_CHANGED, CommandEvent, ReadEvents
+from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.received import LoadTrajectory, ResetPosition, SetGain, SetHomingMode, StopMotor
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config

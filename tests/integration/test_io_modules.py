@@ -7,13 +7,13 @@ from contextlib import asynccontextmanager
 import pytest
 from pydantic import ValidationError
 
+from ldcnd.config.plan import plan_bus
 from ldcnd.config.rig import RigConfig
-from ldcnd.errors import LeaseHeld, RegisterUnknown, ReplyTimeout, StopLatched, ValueOutOfRange, WrongState
-from ldcnd.model.commands import MoveVelocity, Power, Stop
-from ldcnd.model.leases import Acquire
-from ldcnd.model.rig_commands import IoReply, SetIo, SetIoTimer, Snapshot
-from ldcnd.model.samples import IoSample, LinkState, TelemetryItem
-from ldcnd.planning.plan import plan_bus
+from ldcnd.contract.commands import MoveVelocity, Power, Stop
+from ldcnd.contract.errors import LeaseHeld, RegisterUnknown, ReplyTimeout, StopLatched, ValueOutOfRange, WrongState
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.rig_commands import IoReply, SetIo, SetIoTimer, Snapshot
+from ldcnd.contract.samples import IoSample, LinkState, TelemetryItem
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.io import IoWiring, SimulatedIo

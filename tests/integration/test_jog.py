@@ -5,11 +5,11 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from ldcnd.errors import LeaseExpired, LeaseHeld, PositionLimit, StopLatched, VelocityLimit
-from ldcnd.model.commands import Halt, Jog, MoveAbsolute, Stop
-from ldcnd.model.events import ReadEvents
-from ldcnd.model.leases import Acquire
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.contract.commands import Halt, Jog, MoveAbsolute, Stop
+from ldcnd.contract.errors import LeaseExpired, LeaseHeld, PositionLimit, StopLatched, VelocityLimit
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.samples import AxisState, LinkState
 from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, SC, V1, V4, dialect_rig
 
 HOLD_S = 0.4

@@ -16,13 +16,13 @@ import pytest
 
 from ldcnd import durable
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.received import PlainCommand, ResetPosition
-from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.errors import LdcndError, NotReferenced, ReplyTimeout, RequestRefused, WrongState
-from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveRelative, Power, Reset, SetPosition
-from ldcnd.model.events import CommandStatus, ReadEvents
-from ldcnd.model.samples import FaultSample, LinkState, PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveRelative, Power, Reset, SetPosition
+from ldcnd.contract.errors import LdcndError, NotReferenced, ReplyTimeout, RequestRefused, WrongState
+from ldcnd.contract.events import CommandStatus, ReadEvents
+from ldcnd.contract.samples import FaultSample, LinkState, PositionSample, StateSample, TelemetryItem
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.received import PlainCommand, ResetPosition
+from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config

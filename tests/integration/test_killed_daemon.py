@@ -6,8 +6,8 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from ldcnd.model.commands import Home, MoveAbsolute, Power, Probe
-from ldcnd.model.samples import AxisState, LinkState, PositionSample, TelemetryItem
+from ldcnd.contract.commands import Home, MoveAbsolute, Power, Probe
+from ldcnd.contract.samples import AxisState, LinkState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, START_TIME_S, _all_axes_answer, client, free_port, process, simulated_terminal
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time]

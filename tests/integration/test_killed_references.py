@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import LdcndError, RequestRefused
-from ldcnd.model.commands import Halt, MoveRelative, Power, Reset, SetPosition
-from ldcnd.model.samples import LinkState, PositionSample, TelemetryItem
+from ldcnd.contract.commands import Halt, MoveRelative, Power, Reset, SetPosition
+from ldcnd.contract.errors import LdcndError, RequestRefused
+from ldcnd.contract.samples import LinkState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, START_TIME_S, answering, client, free_port, process, simulated_terminal
 
 pytestmark = pytest.mark.real_time

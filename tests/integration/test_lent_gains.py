@@ -5,9 +5,9 @@ import asyncio
 import pytest
 
 from ldcnd.client.lease import control
-from ldcnd.errors import LeaseRequired
-from ldcnd.model.commands import Jog, MoveRelative, Power, SetGains
-from ldcnd.model.leases import Acquire, Release
+from ldcnd.contract.commands import Jog, MoveRelative, Power, SetGains
+from ldcnd.contract.errors import LeaseRequired
+from ldcnd.contract.leases import Acquire, Release
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
 

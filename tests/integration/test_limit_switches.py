@@ -5,9 +5,9 @@ import asyncio
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.errors import WrongState
-from ldcnd.model.commands import MoveAbsolute, MoveRelative, MoveVelocity
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.commands import MoveAbsolute, MoveRelative, MoveVelocity
+from ldcnd.contract.errors import WrongState
+from ldcnd.contract.samples import AxisState
 from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, LS_182AP_22, SC, V2, V3, V4, dialect_rig
 
 GUARDED = {"limit_switches": "stop"}

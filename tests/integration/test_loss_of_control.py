@@ -6,17 +6,17 @@ import pytest
 
 from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
-from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.command.leases import LeaseWatch
-from ldcnd.daemon.process.daemon import Daemon
-from ldcnd.daemon.publish.health import HealthWatch
-from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired
-from ldcnd.model.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.leases import Acquire, LeaseReply
-from ldcnd.model.rig_commands import Rehearsal, Rehearse
-from ldcnd.model.samples import AxisState, Moving
+from ldcnd.contract.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
+from ldcnd.contract.errors import LeaseExpired, LeaseHeld, LeaseRequired
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.leases import Acquire, LeaseReply
+from ldcnd.contract.rig_commands import Rehearsal, Rehearse
+from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.health import HealthWatch
+from ldcnd.daemon.leases import LeaseWatch
+from ldcnd.drives.axis_config import LossConfig, LossPolicy
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive
 from tests.support.rig import SIMULATED, RunningRig, running_rig

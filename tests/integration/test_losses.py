@@ -5,12 +5,12 @@ import asyncio
 import pytest
 from structlog.testing import capture_logs
 
-from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.errors import NotReferenced, WrongState
-from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power, Reset
-from ldcnd.model.rig_commands import Rehearsal, Rehearse
-from ldcnd.model.samples import AxisState, LinkState, Moving, PositionSample, Quality, TelemetryItem
+from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power, Reset
+from ldcnd.contract.errors import NotReferenced, WrongState
+from ldcnd.contract.rig_commands import Rehearsal, Rehearse
+from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, Quality, TelemetryItem
+from ldcnd.drives.axis_config import LossConfig, LossPolicy
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import SIMULATED, RunningRig, running_rig

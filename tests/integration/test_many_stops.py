@@ -8,9 +8,9 @@ import pytest
 import zenoh
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.messaging.hand_over import PENDING_QUERIES, Query
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.net.hand_over import PENDING_QUERIES, Query
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.support.rig import running_rig
 from tests.support.session_pair import JSON, KEYS, free_endpoint
 

@@ -9,7 +9,7 @@ import pytest
 from prometheus_client import CollectorRegistry
 
 from ldcnd.client.health import health_reports
-from ldcnd.metrics import HealthCollector
+from ldcnd.lab.metrics import HealthCollector
 from tests.support.process import LDCND, ROOT, daemon
 from tests.support.rig import running_rig
 

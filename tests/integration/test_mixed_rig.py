@@ -7,13 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.bus.queue import Lane
 from ldcnd.client.events import latest_events
 from ldcnd.config.rig import load_config
-from ldcnd.drivers.smartstep.parameters import PN100
-from ldcnd.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
-from ldcnd.model.commands import MoveVelocity, Power, Reset
-from ldcnd.model.parameters import (
+from ldcnd.contract.commands import MoveVelocity, Power, Reset
+from ldcnd.contract.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
+from ldcnd.contract.parameters import (
     AlarmReport,
     ClearCounter,
     CounterName,
@@ -30,7 +28,7 @@ from ldcnd.model.parameters import (
     ReadProfile,
     WriteParameter,
 )
-from ldcnd.model.samples import (
+from ldcnd.contract.samples import (
     AxisState,
     FaultSample,
     LinkState,
@@ -42,6 +40,8 @@ from ldcnd.model.samples import (
     TelemetryItem,
     VelocitySample,
 )
+from ldcnd.drives.smartstep.parameters import PN100
+from ldcnd.line.queue import Lane
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from tests.support.rig import RunningRig, running_rig

@@ -6,15 +6,15 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.errors import (
+from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveAnalog, SetPwm, Track, Verb
+from ldcnd.contract.errors import (
     DriveFault,
     LdcndError,
     NotSupported,
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.commands import Halt, Home, MoveAbsolute, MoveAnalog, SetPwm, Track, Verb
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.dialect_rig import (
     AXIS,

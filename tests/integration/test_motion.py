@@ -5,8 +5,7 @@ import asyncio
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.errors import NotReferenced, PositionLimit, StopLatched, WrongState
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     Halt,
     Home,
     MoveAbsolute,
@@ -17,7 +16,8 @@ from ldcnd.model.commands import (
     Reset,
     SetPosition,
 )
-from ldcnd.model.samples import AxisState, Moving, PositionSample, TelemetryItem, VelocitySample
+from ldcnd.contract.errors import NotReferenced, PositionLimit, StopLatched, WrongState
+from ldcnd.contract.samples import AxisState, Moving, PositionSample, TelemetryItem, VelocitySample
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 

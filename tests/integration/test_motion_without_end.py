@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from ldcnd.drivers.ldcn.received import AddPathPoints
-from ldcnd.model.commands import SetPwm
+from ldcnd.contract.commands import SetPwm
+from ldcnd.drives.ldcn.received import AddPathPoints
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, DialectRig, adopting_rig, dialect_rig
 
 PWM = {"duty": 0.5, "duration_s": 60.0}

@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import pytest
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     AxisCommand,
     CommandReply,
     Home,
@@ -25,8 +24,9 @@ from ldcnd.model.commands import (
     SetPwm,
     Track,
 )
-from ldcnd.model.rig_commands import AxisMove, MoveTogether
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.rig_commands import AxisMove, MoveTogether
+from ldcnd.contract.samples import AxisState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
 from ldcnd.sim.plant import MotorPlant
 from tests.support.dialect_rig import (

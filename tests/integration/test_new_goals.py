@@ -4,10 +4,10 @@ import asyncio
 
 import pytest
 
-from ldcnd.drivers.ldcn.packet import Command, PacketReader
-from ldcnd.errors import WrongState
-from ldcnd.model.commands import MoveAbsolute, MoveRelative, MoveVelocity
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.contract.commands import MoveAbsolute, MoveRelative, MoveVelocity
+from ldcnd.contract.errors import WrongState
+from ldcnd.drives.ldcn.packet import Command, PacketReader
+from ldcnd.line.flight_recorder import WireEvent
 from tests.support.dialect_rig import SC, V4, DialectRig, dialect_rig
 
 

@@ -5,8 +5,8 @@ import json
 from pathlib import Path
 
 from ldcnd.config.rig import load_config
-from ldcnd.model.commands import MoveAbsolute, Power, Reset
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.commands import MoveAbsolute, Power, Reset
+from ldcnd.contract.samples import LinkState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.command_line import virtual_rig
 

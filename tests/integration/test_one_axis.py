@@ -3,7 +3,7 @@
 import asyncio
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.contract.samples import TelemetryItem
 from tests.support.rig import running_rig
 
 

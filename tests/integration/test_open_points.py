@@ -7,9 +7,9 @@ from enum import StrEnum
 import pytest
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.model.commands import Home, MoveAbsolute, MoveRelative, MoveVelocity, Power, Probe, Reset
-from ldcnd.model.rig_commands import SetIo
-from ldcnd.model.samples import AxisState, LinkState, TelemetryItem
+from ldcnd.contract.commands import Home, MoveAbsolute, MoveRelative, MoveVelocity, Power, Probe, Reset
+from ldcnd.contract.rig_commands import SetIo
+from ldcnd.contract.samples import AxisState, LinkState, TelemetryItem
 from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant

@@ -9,7 +9,7 @@ import pytest
 
 from ldcnd.cli.parameter_file import load_parameters
 from ldcnd.config.rig import load_config
-from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000
+from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from tests.support.command_line import virtual_rig

@@ -8,15 +8,22 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.errors import CommandExpired, CommandIdReused, NotSupported, PositionLimit, ValueOutOfRange, WrongState
-from ldcnd.model.commands import Direction, Halt, MoveRelative, Power, Reset, Stop
-from ldcnd.model.leases import Acquire, Release
-from ldcnd.model.rig_commands import AxisPath, PathReply, WalkPath
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.contract.commands import Direction, Halt, MoveRelative, Power, Reset, Stop
+from ldcnd.contract.errors import (
+    CommandExpired,
+    CommandIdReused,
+    NotSupported,
+    PositionLimit,
+    ValueOutOfRange,
+    WrongState,
+)
+from ldcnd.contract.leases import Acquire, Release
+from ldcnd.contract.rig_commands import AxisPath, PathReply, WalkPath
+from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.wirelog.recorder import WireEvent
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
 from tests.support.rig import EPOCH_NS
 

@@ -5,20 +5,20 @@ from contextlib import asynccontextmanager
 
 import pytest
 
+from ldcnd.axis.state import STOP_UNCONFIRMED
 from ldcnd.client.events import latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.axis.state import STOP_UNCONFIRMED
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.drivers.driver import StopMode
-from ldcnd.drivers.ldcn.packet import Command, PacketReader
-from ldcnd.drivers.network import AdoptFallback, StartPolicy
-from ldcnd.errors import BusDown, StopLatched, WrongState
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import Halt, MoveAbsolute, MoveVelocity, Power, Reset
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveVelocity, Power, Reset
+from ldcnd.contract.errors import BusDown, StopLatched, WrongState
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.drives.axis_config import LossConfig, LossPolicy
+from ldcnd.drives.driver import StopMode
+from ldcnd.drives.ldcn.packet import Command, PacketReader
+from ldcnd.drives.network import AdoptFallback, StartPolicy
+from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig

@@ -10,18 +10,8 @@ import pytest
 import ldcnd.daemon
 from ldcnd.client.events import latest_events
 from ldcnd.client.lease import Control, control
-from ldcnd.config.axis import LossConfig, LossPolicy
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.errors import (
-    DuplicateDaemon,
-    LeaseExpired,
-    PositionLimit,
-    StopLatched,
-    ValueOutOfRange,
-    WrongState,
-)
-from ldcnd.messaging.keys import Keys
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     BufferMode,
     CommandReply,
     Halt,
@@ -34,7 +24,17 @@ from ldcnd.model.commands import (
     Stop,
     Track,
 )
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.errors import (
+    DuplicateDaemon,
+    LeaseExpired,
+    PositionLimit,
+    StopLatched,
+    ValueOutOfRange,
+    WrongState,
+)
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.axis_config import LossConfig, LossPolicy
 from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config

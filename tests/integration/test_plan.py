@@ -8,18 +8,18 @@ import time
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.bus.queue import Lane
 from ldcnd.cli.main import cli
+from ldcnd.config.plan import plan_rig, require_plan
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.errors import ConfigError
-from ldcnd.messaging.codec import decode, decode_error
-from ldcnd.model.health import BusHealth
-from ldcnd.model.plan import RigBudget
-from ldcnd.planning.plan import plan_rig, require_plan
+from ldcnd.contract.codec import decode, decode_error
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.health import BusHealth
+from ldcnd.contract.plan import RigBudget
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.line.queue import Lane
 from tests.bench.virtual_time import smartsteps_busy
 from tests.support.rig import SIMULATED, running_rig
 

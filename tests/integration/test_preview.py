@@ -2,9 +2,9 @@
 
 import pytest
 
-from ldcnd.errors import MalformedRequest
-from ldcnd.model.commands import MoveAbsolute, Power, Preview
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.contract.commands import MoveAbsolute, Power, Preview
+from ldcnd.contract.errors import MalformedRequest
+from ldcnd.line.flight_recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig
 
 

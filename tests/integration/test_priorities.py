@@ -7,16 +7,16 @@ from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
 from ldcnd.client.traces import arm_trace
+from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.errors import LdcndError
-from ldcnd.messaging.codec import decode
-from ldcnd.model.meta import AxisInfo
-from ldcnd.model.plan import RigBudget
-from ldcnd.model.traces import TakeTrace
-from ldcnd.planning.plan import plan_rig
+from ldcnd.contract.codec import decode
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.traces import TakeTrace
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.priority_rig import Asked, granted, ranked_config

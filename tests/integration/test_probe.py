@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.errors import MalformedRequest, NotSupported, VelocityLimit
-from ldcnd.model.commands import Probe
-from ldcnd.model.samples import AxisState, LatchSample, TelemetryItem
+from ldcnd.contract.commands import Probe
+from ldcnd.contract.errors import MalformedRequest, NotSupported, VelocityLimit
+from ldcnd.contract.samples import AxisState, LatchSample, TelemetryItem
 from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, LS_182AP_22, PLANT, SC, V1, V2, V4, dialect_rig
 
 able = pytest.mark.parametrize("dialect", [V1, V2, V4, SC, LS_182AP, LS_182AP_22], ids=lambda dialect: dialect.name)

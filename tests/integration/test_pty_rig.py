@@ -5,8 +5,8 @@ import asyncio
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.model.commands import Home, MoveAbsolute, Power
-from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.contract.commands import Home, MoveAbsolute, Power
+from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from tests.support.process import ROOT, client, daemon, simulated_terminal
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time]

@@ -13,11 +13,11 @@ from mcap.records import Channel
 
 from ldcnd.cli.main import cli
 from ldcnd.cli.record import dated
-from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.samples import PositionSample
-from ldcnd.recording.reading import Recording
-from ldcnd.recording.recorder import Recorder
+from ldcnd.contract.codec import Encoding, encode
+from ldcnd.contract.samples import PositionSample
+from ldcnd.lab.recording.reading import Recording
+from ldcnd.lab.recording.recorder import Recorder
+from ldcnd.net.session import Sample, SampleKind
 from tests.support.process import LDCND, ROOT, daemon
 
 VALUE = PositionSample(

@@ -12,16 +12,16 @@ import pytest
 from mcap.reader import make_reader
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.errors import ConfigError
-from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.commands import MoveAbsolute, Power, Verb
-from ldcnd.model.events import CommandEvent, CommandStatus
-from ldcnd.model.health import DaemonHealth
-from ldcnd.model.samples import AxisState
-from ldcnd.recording.mcap_file import FACTS
-from ldcnd.recording.recorder import FLUSH_PERIOD_S, Recorder
-from ldcnd.recording.recovery import recover
+from ldcnd.contract.codec import Encoding, encode
+from ldcnd.contract.commands import MoveAbsolute, Power, Verb
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.events import CommandEvent, CommandStatus
+from ldcnd.contract.health import DaemonHealth
+from ldcnd.contract.samples import AxisState
+from ldcnd.lab.recording.mcap_file import FACTS
+from ldcnd.lab.recording.recorder import FLUSH_PERIOD_S, Recorder
+from ldcnd.lab.recording.recovery import recover
+from ldcnd.net.session import Sample, SampleKind
 from tests.support.process import ROOT
 from tests.support.recordings import LARGE, checked_topics, recorded_rig, thirty_one_axes
 from tests.support.rig import EPOCH_NS

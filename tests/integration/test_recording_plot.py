@@ -8,10 +8,10 @@ from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
 from ldcnd.config.rig import load_config
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState
-from ldcnd.recording.reading import AxisHistory, Recording, axis_history
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState
+from ldcnd.lab.recording.reading import AxisHistory, Recording, axis_history
 from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.recordings import recorded_rig
 from tests.support.rig import SIMULATED

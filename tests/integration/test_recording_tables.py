@@ -6,11 +6,11 @@ import json
 
 import pytest
 
-from ldcnd.errors import ConfigError
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState
-from ldcnd.recording.tables import export_tables
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState
+from ldcnd.lab.recording.tables import export_tables
 from tests.support.recordings import recorded_rig
 from tests.support.rig import EPOCH_NS
 

@@ -6,11 +6,11 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.ldcn.addressing import WAITING_ADDRESSES
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.messaging.keys import Keys
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.samples import AxisState, LinkState, Moving, TelemetryItem
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
+from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
+from ldcnd.drives.ldcn.packet import Command
 from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan, FaultyReply, FaultyRequest
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import pytest
 
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.model.leases import Acquire
-from ldcnd.model.samples import LinkState
-from ldcnd.model.traces import TakeTrace
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.samples import LinkState
+from ldcnd.contract.traces import TakeTrace
 from tests.support.command_line import VirtualRig, virtual_rig
 from tests.support.rig import SIMULATED
 

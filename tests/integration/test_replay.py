@@ -6,10 +6,10 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.process.replay import config_of
-from ldcnd.errors import ConfigError, MalformedRequest, ReplayDeviation
-from ldcnd.wirelog.capture import Capture, parse_capture
-from ldcnd.wirelog.recorder import WireEvent, WireRecord
+from ldcnd.contract.errors import ConfigError, MalformedRequest, ReplayDeviation
+from ldcnd.daemon.replay import config_of
+from ldcnd.line.capture import Capture, parse_capture
+from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from tests.support.captures import FOLDER, NAMES, record, replayed
 
 

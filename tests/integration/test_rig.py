@@ -2,8 +2,8 @@
 
 import pytest
 
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.samples import AxisState
 from tests.support.rig import running_rig
 
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.errors import NotSupported, OutcomeUnknown, WrongState
-from ldcnd.model.commands import Direction, Home, MoveAbsolute, MoveRelative, MoveVelocity, SetPosition, Track
-from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.contract.commands import Direction, Home, MoveAbsolute, MoveRelative, MoveVelocity, SetPosition, Track
+from ldcnd.contract.errors import NotSupported, OutcomeUnknown, WrongState
+from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.drives.ldcn.packet import Command
 from ldcnd.sim.plant import MotorPlant
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V1, V4, DialectRig, adopting_rig, dialect_rig
 

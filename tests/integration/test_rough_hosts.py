@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import Command
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rough_host import BAUD_CODES, HARD_RESET, enumeration, frame, jog, powered
 from tests.support.simulated_host import PATIENCE_S, SimulatedHost

@@ -8,8 +8,8 @@ from functools import partial
 import pytest
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.samples import PositionSample, Quality, TelemetryItem
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.samples import PositionSample, Quality, TelemetryItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

@@ -11,13 +11,13 @@ import pytest
 
 from ldcnd.client.rig_client import RigClient, Samples, find_rigs
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
-from ldcnd.messaging.session import Session
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import CommandReply, MoveRelative, Power
-from ldcnd.model.samples import AxisState, PositionSample, StateSample
+from ldcnd.contract.commands import CommandReply, MoveRelative, Power
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError
+from ldcnd.contract.samples import AxisState, PositionSample, StateSample
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.net.session import Session
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.support.process import LDCND, free_port
 from tests.support.rig import SIMULATED
 from tests.support.router import router

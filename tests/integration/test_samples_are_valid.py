@@ -6,11 +6,11 @@ from collections import Counter
 import pytest
 
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.messaging.codec import decode
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.model.commands import Halt, MoveVelocity, Power
-from ldcnd.model.samples import SAMPLE_MODELS, AxisState, LinkState, TelemetryItem
+from ldcnd.contract.codec import decode
+from ldcnd.contract.commands import Halt, MoveVelocity, Power
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import SAMPLE_MODELS, AxisState, LinkState, TelemetryItem
+from ldcnd.net.session import Sample, SampleKind
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 FAULT_AT_S = 5.0

@@ -5,10 +5,10 @@ import asyncio
 import pytest
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.ldcn.controls import StartUp
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.drives.ldcn.controls import StartUp
+from ldcnd.drives.ldcn.packet import Command
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on
 from tests.support.dialect_rig import COUNTS_PER_MM, GAINS

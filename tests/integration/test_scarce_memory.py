@@ -5,7 +5,7 @@ import resource
 
 import pytest
 
-from ldcnd.model.commands import Power
+from ldcnd.contract.commands import Power
 from tests.support.process import ROOT, answering, client, free_port, process
 
 RIG = ROOT / "config" / "simulated.toml"

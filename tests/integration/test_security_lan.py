@@ -10,12 +10,12 @@ import zenoh
 
 from ldcnd.client.events import latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import SessionError
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import Halt, Power, Verb
-from ldcnd.pki.access import Role
-from ldcnd.pki.site import Site, new_login, set_up
+from ldcnd.contract.commands import Halt, Power, Verb
+from ldcnd.contract.errors import SessionError
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.ops.pki.access import Role
+from ldcnd.ops.pki.site import Site, new_login, set_up
 from tests.support.access_facts import AccessFacts, alive
 from tests.support.process import free_port
 from tests.support.secured_rig import SecuredRig, answers, copy_setup, serving

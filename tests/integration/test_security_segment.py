@@ -6,9 +6,9 @@ from collections.abc import Iterator
 import pytest
 import zenoh
 
-from ldcnd.errors import SessionError
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.contract.errors import SessionError
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.support.access_facts import AccessFacts
 from tests.support.process import free_port
 from tests.support.secured_rig import SecuredRig, copy_setup, serving

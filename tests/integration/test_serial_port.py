@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.errors import TransportLost
-from ldcnd.transport.serial_port import SerialSettings, open_serial_port
-from ldcnd.transport.transport import Transport
+from ldcnd.contract.errors import TransportLost
+from ldcnd.line.serial_port import SerialSettings, open_serial_port
+from ldcnd.line.transport import Transport
 from tests.support.recording_receiver import RecordingReceiver
 
 pytestmark = pytest.mark.real_time

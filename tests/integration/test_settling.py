@@ -7,15 +7,15 @@ from typing import Any
 
 import pytest
 
+from ldcnd.axis.state import window_counts
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
-from ldcnd.config.axis import RatesConfig, SettleConfig
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.axis.state import window_counts
-from ldcnd.errors import DriveFault
-from ldcnd.model.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, Reset, Stop
-from ldcnd.model.events import CommandEvent, CommandStatus, ReadEvents, ReadOutcome
-from ldcnd.model.samples import AxisState, FaultSample, PositionSample, TelemetryItem
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, Reset, Stop
+from ldcnd.contract.errors import DriveFault
+from ldcnd.contract.events import CommandEvent, CommandStatus, ReadEvents, ReadOutcome
+from ldcnd.contract.samples import AxisState, FaultSample, PositionSample, TelemetryItem
+from ldcnd.drives.axis_config import RatesConfig, SettleConfig
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 DISTANCES = {"x": 5.0, "y": -5.0, "z": 5.0, "c": 90.0}

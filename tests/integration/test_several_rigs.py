@@ -5,8 +5,8 @@ import json
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.samples import LinkState
 from tests.support.command_line import virtual_rig
 from tests.support.rig import SIMULATED, running_rig
 

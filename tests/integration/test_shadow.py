@@ -7,20 +7,20 @@ from dataclasses import asdict, replace
 
 import pytest
 
+from ldcnd.bench.tuning.ldcn import shadow
+from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.bench.tuning.ldcn.report import Estimate
+from ldcnd.bench.tuning.ldcn.watching import LOOK_S, WatchedAxis, memory_file, watch
 from ldcnd.client.kept_gains import KeptGains, forget, gains_in, keep
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config.axis import RatesConfig
 from ldcnd.config.rig import load_config
-from ldcnd.errors import ConfigError, NotSupported
-from ldcnd.model.commands import ReportShadow
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.contract.commands import ReportShadow
+from ldcnd.contract.errors import ConfigError, NotSupported
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.drives.axis_config import RatesConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.plant import MotorPlant, Shaft
-from ldcnd.tuning.ldcn import shadow
-from ldcnd.tuning.ldcn.plant import Plant
-from ldcnd.tuning.ldcn.report import Estimate
-from ldcnd.tuning.ldcn.watching import LOOK_S, WatchedAxis, memory_file, watch
 from tests.support.command_line import virtual_rig
 from tests.support.pages import ROOT, blocks_of
 from tests.support.rig import SIMULATED, running_rig

@@ -15,8 +15,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from ldcnd.wirelog.capture import parse_capture
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.line.capture import parse_capture
+from ldcnd.line.flight_recorder import WireEvent
 
 pytestmark = pytest.mark.real_time
 

@@ -3,8 +3,8 @@
 import asyncio
 
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.model.commands import Power
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.commands import Power
+from ldcnd.contract.samples import AxisState
 from tests.support.rig import SIMULATED, running_rig
 
 HAPPENS_AT_S = 20.0

@@ -12,9 +12,9 @@ from prometheus_client import CollectorRegistry
 from uvicorn import Config
 from uvicorn.server import ServerState
 
-from ldcnd import metrics
 from ldcnd.console import connections
-from ldcnd.metrics import metrics_server
+from ldcnd.lab import metrics
+from ldcnd.lab.metrics import metrics_server
 from tests.support.browser import console
 from tests.support.process import free_port
 

@@ -6,14 +6,14 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.client.traces import arm_trace, fetch_trace, take_trace, trace_header, wait_for_trace
-from ldcnd.drivers.smartstep.profiles import ByteOrder, CountUnit, StringChecksum, TraceWordLayout
-from ldcnd.errors import BusyTracing, DriveFault, NotSupported, ValueOutOfRange, WrongState
-from ldcnd.messaging.codec import decode
-from ldcnd.messaging.keys import Keys
-from ldcnd.model.parameters import WriteParameter
-from ldcnd.model.plan import RigBudget
-from ldcnd.model.samples import TelemetryItem
-from ldcnd.model.traces import AbortTrace, TakeTrace, TracePhase, TraceTrigger, TriggerKind
+from ldcnd.contract.codec import decode
+from ldcnd.contract.errors import BusyTracing, DriveFault, NotSupported, ValueOutOfRange, WrongState
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.parameters import WriteParameter
+from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.contract.traces import AbortTrace, TakeTrace, TracePhase, TraceTrigger, TriggerKind
+from ldcnd.drives.smartstep.profiles import ByteOrder, CountUnit, StringChecksum, TraceWordLayout
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.rig import EPOCH_NS
 from tests.support.trace_rig import trace_rig, trace_rig_over_zenoh

@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from ldcnd.errors import NotSupported, ValueOutOfRange, WrongState
-from ldcnd.model.commands import Home, MoveVelocity
-from ldcnd.model.rig_commands import Snapshot
+from ldcnd.contract.commands import Home, MoveVelocity
+from ldcnd.contract.errors import NotSupported, ValueOutOfRange, WrongState
+from ldcnd.contract.rig_commands import Snapshot
 from tests.support.dialect_rig import AXIS, LS_182AP, V4, dialect_rig
 
 FREEZES = {"snapshot": True}

@@ -4,12 +4,12 @@ import asyncio
 
 import pytest
 
-from ldcnd.errors import LeaseHeld, WrongState
-from ldcnd.model.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, Preview, SetPwm, Track
-from ldcnd.model.events import ReadEvents
-from ldcnd.model.leases import Acquire
-from ldcnd.model.rig_commands import SetSpeedOverride
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, Preview, SetPwm, Track
+from ldcnd.contract.errors import LeaseHeld, WrongState
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.rig_commands import SetSpeedOverride
+from ldcnd.contract.samples import AxisState
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
 
 dialects = pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)

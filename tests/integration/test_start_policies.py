@@ -5,13 +5,13 @@ import contextlib
 
 import pytest
 
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.received import LoadTrajectory
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import MoveAbsolute, MoveVelocity, Power
-from ldcnd.model.samples import AxisState, LinkState, Moving, StateSample, TelemetryItem
+from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.samples import AxisState, LinkState, Moving, StateSample, TelemetryItem
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.received import LoadTrajectory
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 from tests.support.rig import running_rig

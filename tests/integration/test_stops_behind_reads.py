@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.command.dispatch import EarlyStops
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.publish.meta import WORK_PER_STEP
-from ldcnd.messaging.hand_over import Query
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.reads import READS_OF_A_CLIENT
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.contract.keys import Keys
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.dispatch import EarlyStops
+from ldcnd.daemon.meta import WORK_PER_STEP
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.net.hand_over import Query
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.reads import READS_OF_A_CLIENT
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 STOP_MOTOR = 0x7

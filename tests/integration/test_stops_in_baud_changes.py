@@ -7,8 +7,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.commands import MoveVelocity, Power
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.commands import MoveVelocity, Power
+from ldcnd.contract.samples import LinkState
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import rig_on, simulated_config
 from tests.support.interruptions import CopiedLoop, Interruptions, run_with_copies

@@ -5,10 +5,10 @@ import contextlib
 
 import pytest
 
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import MoveAbsolute, Power, Reset
-from ldcnd.model.rig_commands import AxisMove, MoveTogether
-from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.contract.commands import MoveAbsolute, Power, Reset
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.rig_commands import AxisMove, MoveTogether
+from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from tests.support.chain_rig import simulated_config
 from tests.support.rig import RunningRig, running_rig
 

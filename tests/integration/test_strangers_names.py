@@ -5,8 +5,8 @@ import json
 import pytest
 from structlog.testing import capture_logs
 
-from ldcnd.errors import ErrorCode
-from ldcnd.model.events import ReadEvents
+from ldcnd.contract.errors import ErrorCode
+from ldcnd.contract.events import ReadEvents
 from ldcnd.printable import is_printable
 from tests.support.rig import running_rig
 from tests.support.session_pair import error_of

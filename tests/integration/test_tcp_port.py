@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.errors import ConfigError, NotSupported, TransportLost
-from ldcnd.transport.port_url import port_opener
-from ldcnd.transport.tcp_port import BACKLOG_BYTES, TcpPort, open_tcp_port
-from ldcnd.transport.transport import Transport
+from ldcnd.contract.errors import ConfigError, NotSupported, TransportLost
+from ldcnd.line.port_url import port_opener
+from ldcnd.line.tcp_port import BACKLOG_BYTES, TcpPort, open_tcp_port
+from ldcnd.line.transport import Transport
 from tests.support.recording_receiver import RecordingReceiver
 
 pytestmark = pytest.mark.real_time

@@ -6,16 +6,16 @@ from collections import Counter
 
 import pytest
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.queue import Lane
-from ldcnd.bus.settings import BusSettings
-from ldcnd.drivers.driver import AxisSpec, Gains, Motion
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.network import LdcnNetwork
-from ldcnd.drivers.ldcn.packet import StatusItem
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.errors import BusError, OutcomeUnknown, ReplyTimeout
+from ldcnd.contract.errors import BusError, OutcomeUnknown, ReplyTimeout
+from ldcnd.drives.driver import AxisSpec, Gains, Motion
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.network import LdcnNetwork
+from ldcnd.drives.ldcn.packet import StatusItem
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.line.bus import Bus
+from ldcnd.line.queue import Lane
+from ldcnd.line.settings import BusSettings
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line

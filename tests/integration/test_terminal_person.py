@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
+from ldcnd.bench.person import Left
 from ldcnd.cli.terminal_person import TerminalPerson
-from ldcnd.errors import ConfigError
-from ldcnd.person import Left
+from ldcnd.contract.errors import ConfigError
 
 pytestmark = pytest.mark.real_time
 TICKS = 5

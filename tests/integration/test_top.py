@@ -6,10 +6,10 @@ from asyncio.subprocess import PIPE
 import pytest
 from textual.widgets import DataTable, Static
 
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.top.columns import NARROW
-from ldcnd.top.glance import RigGlance
-from ldcnd.top.screen import TopScreen
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.lab.top.columns import NARROW
+from ldcnd.lab.top.glance import RigGlance
+from ldcnd.lab.top.screen import TopScreen
 from tests.support.process import LDCND, ROOT, client, daemon
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time]

@@ -3,13 +3,13 @@
 import asyncio
 from contextlib import asynccontextmanager
 
-from ldcnd.model.commands import Halt, MoveAbsolute, Power
-from ldcnd.model.condition import Severity
-from ldcnd.model.samples import AxisState, LinkState, Moving
+from ldcnd.contract.commands import Halt, MoveAbsolute, Power
+from ldcnd.contract.condition import Severity
+from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.lab.top.columns import as_text, headline
+from ldcnd.lab.top.follow import follow
+from ldcnd.lab.top.rig_view import RigView
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.top.columns import as_text, headline
-from ldcnd.top.follow import follow
-from ldcnd.top.rig_view import RigView
 from tests.support.rig import running_rig
 
 

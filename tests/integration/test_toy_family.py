@@ -5,13 +5,13 @@ import asyncio
 import msgpack
 import pytest
 
+from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import load_config
-from ldcnd.errors import ConfigError
-from ldcnd.families.known import HOMES
-from ldcnd.model.commands import MoveAbsolute, Power, SetPosition, Stop, Verb
-from ldcnd.model.samples import AxisState, Moving
-from ldcnd.planning.plan import plan_rig
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.contract.commands import MoveAbsolute, Power, SetPosition, Stop, Verb
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.drives.known import HOMES
+from ldcnd.line.flight_recorder import WireEvent
 from tests.support.console_rig import console_of, page
 from tests.support.recordings import checked_topics, recorded_rig
 from tests.toy.family import TOY

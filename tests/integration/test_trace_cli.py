@@ -8,8 +8,8 @@ import pytest
 
 from ldcnd.client.trace_file import load_trace
 from ldcnd.client.traces import trace_header
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.traces import TracePhase
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.traces import TracePhase
 from tests.support.process import LDCND, ROOT, client, daemon
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time]

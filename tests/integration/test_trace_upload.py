@@ -2,10 +2,10 @@
 
 import pytest
 
+from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import load_config
-from ldcnd.drivers.smartstep.commands import LONGEST_STRING_BYTES
-from ldcnd.drivers.smartstep.profiles import SMARTSTEP
-from ldcnd.planning.plan import plan_rig
+from ldcnd.drives.smartstep.commands import LONGEST_STRING_BYTES
+from ldcnd.drives.smartstep.profiles import SMARTSTEP
 from tests.bench.trace_upload import AS_A_RULE_BYTES, MEMORIES, READINGS, SHARE, limit_s, share_of_limit
 from tests.support.trace_rig import MIXED
 

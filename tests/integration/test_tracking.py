@@ -4,7 +4,8 @@ import asyncio
 
 import pytest
 
-from ldcnd.errors import (
+from ldcnd.contract.commands import SetGains, Track
+from ldcnd.contract.errors import (
     NotReferenced,
     NotSupported,
     OutcomeUnknown,
@@ -12,8 +13,7 @@ from ldcnd.errors import (
     TooManyRequests,
     ValueOutOfRange,
 )
-from ldcnd.model.commands import SetGains, Track
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.samples import AxisState
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from tests.support.dialect_rig import (
     AXIS,

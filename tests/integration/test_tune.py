@@ -9,15 +9,18 @@ from dataclasses import replace
 import click
 import pytest
 
+from ldcnd.bench.tuning.ldcn.plan import plan
+from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.bench.tuning.ldcn.report import plan_reported, reported
+from ldcnd.bench.tuning.ldcn.session import measure, verify
 from ldcnd.cli import tune
 from ldcnd.cli.connection import Target
 from ldcnd.client.kept_gains import file_of, kept_for, put_back
 from ldcnd.client.lease import control
 from ldcnd.client.rig import Rig
-from ldcnd.config.axis import ApproachConfig
 from ldcnd.config.rig import load_config
-from ldcnd.drivers.ldcn.profiles import LS_182AP
-from ldcnd.errors import (
+from ldcnd.contract.commands import MoveAbsolute, Power, SetGains
+from ldcnd.contract.errors import (
     DriveFault,
     LeaseExpired,
     NotReferenced,
@@ -26,14 +29,11 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.commands import MoveAbsolute, Power, SetGains
+from ldcnd.drives.axis_config import ApproachConfig
+from ldcnd.drives.ldcn.profiles import LS_182AP
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.plant import MotorPlant
-from ldcnd.tuning.ldcn.plan import plan
-from ldcnd.tuning.ldcn.plant import Plant
-from ldcnd.tuning.ldcn.report import plan_reported, reported
-from ldcnd.tuning.ldcn.session import measure, verify
 from tests.support.rig import SIMULATED, running_rig
 
 CONFIGURED = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000, "sr": 1, "deadband": 0}

@@ -8,7 +8,7 @@ from asyncio.subprocess import DEVNULL, PIPE
 import pytest
 
 from ldcnd.client.kept_gains import LEASE_S
-from ldcnd.model.leases import ListHolders
+from ldcnd.contract.leases import ListHolders
 from tests.support.process import LDCND, ROOT, client, daemon
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(300)]

@@ -6,15 +6,8 @@ from importlib import import_module
 import click
 import pytest
 
-from ldcnd.cli.smartstep import tune
-from ldcnd.client.kept_gains import KeptGains, file_of, keep, kept_for, put_back
-from ldcnd.client.rig import Rig
-from ldcnd.config.rig import load_config
-from ldcnd.errors import NotSupported, ValueOutOfRange, WrongState
-from ldcnd.families.known import FAMILIES
-from ldcnd.model.parameters import ReadParameter, WriteParameter
-from ldcnd.tuning.smartstep import guided
-from ldcnd.tuning.smartstep.session import (
+from ldcnd.bench.tuning.smartstep import guided
+from ldcnd.bench.tuning.smartstep.session import (
     MoveFigures,
     SmartStepTuning,
     check_wanted,
@@ -22,6 +15,13 @@ from ldcnd.tuning.smartstep.session import (
     read_tuning,
     try_gains,
 )
+from ldcnd.cli.smartstep import tune
+from ldcnd.client.kept_gains import KeptGains, file_of, keep, kept_for, put_back
+from ldcnd.client.rig import Rig
+from ldcnd.config.rig import load_config
+from ldcnd.contract.errors import NotSupported, ValueOutOfRange, WrongState
+from ldcnd.contract.parameters import ReadParameter, WriteParameter
+from ldcnd.drives.known import FAMILIES
 from tests.support.command_line import virtual_rig
 from tests.support.trace_rig import MIXED, trace_rig
 

@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from ldcnd.model.samples import Moving
+from ldcnd.contract.samples import Moving
 from tests.support.command_line import run_all
 from tests.support.process import ROOT, client, daemon
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pytest
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import StopLatched
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.commands import Power, Reset
+from ldcnd.contract.commands import Power, Reset
+from ldcnd.contract.errors import StopLatched
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.support.process import ROOT, daemon
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(120)]

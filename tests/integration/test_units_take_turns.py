@@ -7,15 +7,15 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.drivers.smartstep.costs import words_of
-from ldcnd.drivers.smartstep.monitors import OUTPUT_SIGNALS, SPEED_FEEDBACK, WORDS
-from ldcnd.drivers.smartstep.poller import Basic, Item, Listeners, UnitPoller
-from ldcnd.drivers.smartstep.profiles import SMARTSTEP
-from ldcnd.model.samples import MonitorName
-from ldcnd.planning.cost import Cost
-from ldcnd.planning.line_plan import LinePlan, Poll, Urgent, plan_line
+from ldcnd.contract.samples import MonitorName
+from ldcnd.drives.cost import Cost
+from ldcnd.drives.line_plan import LinePlan, Poll, Urgent, plan_line
+from ldcnd.drives.smartstep.costs import words_of
+from ldcnd.drives.smartstep.monitors import OUTPUT_SIGNALS, SPEED_FEEDBACK, WORDS
+from ldcnd.drives.smartstep.poller import Basic, Item, Listeners, UnitPoller
+from ldcnd.drives.smartstep.profiles import SMARTSTEP
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.smartstep.variant import SimulatedVariant
-from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import simulated, smartstep_line
 
 VARIANT = SimulatedVariant()

@@ -4,9 +4,9 @@ import asyncio
 
 import pytest
 
-from ldcnd.errors import PositionLimit, WrongState
-from ldcnd.model.commands import Halt, MoveAbsolute, MoveVelocity, SetPwm
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveVelocity, SetPwm
+from ldcnd.contract.errors import PositionLimit, WrongState
+from ldcnd.contract.samples import AxisState
 from ldcnd.sim.plant import MotorPlant
 from tests.support.dialect_rig import AXIS, LS_173AP, LS_182AP, SC, V1, V4, DialectRig, dialect_rig
 

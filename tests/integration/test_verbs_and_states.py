@@ -4,10 +4,9 @@ from collections.abc import Awaitable, Callable
 
 import pytest
 
-from ldcnd.daemon.axis.axis import AxisService
-from ldcnd.daemon.axis.state import ActiveCommand, Completion
-from ldcnd.errors import ErrorCode, LdcndError
-from ldcnd.model.commands import (
+from ldcnd.axis.axis import AxisService
+from ldcnd.axis.state import ActiveCommand, Completion
+from ldcnd.contract.commands import (
     Halt,
     Home,
     HomeMethod,
@@ -24,7 +23,8 @@ from ldcnd.model.commands import (
     Track,
     Verb,
 )
-from ldcnd.model.samples import AxisState, LinkState
+from ldcnd.contract.errors import ErrorCode, LdcndError
+from ldcnd.contract.samples import AxisState, LinkState
 from tests.support.dialect_rig import AXIS, V4, dialect_rig
 
 TAKEN, WRONG, LATCHED, AWAY = "taken", ErrorCode.WRONG_STATE, ErrorCode.STOP_LATCHED, ErrorCode.AXIS_UNREACHABLE

@@ -13,7 +13,7 @@ from ldcnd.cli import connection
 from ldcnd.cli.connection import TargetOption
 from ldcnd.cli.main import COMMANDS, cli, main
 from ldcnd.cli.output import EXIT_CODES
-from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.net.memory_session import MemoryBroker
 
 VALUES = ("nan", "inf", "0", "-1", "", "9" * 30, "\x1b[2J", "no/such")
 DOCUMENTED = set(EXIT_CODES)

@@ -5,12 +5,12 @@ import asyncio
 import pytest
 
 from ldcnd.client.wire_log import fetch_wire_log
-from ldcnd.config.bus import RecorderConfig
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.command.rig_commands import LONGEST_DATA_BYTES
-from ldcnd.errors import ValueOutOfRange
-from ldcnd.model.rig_commands import ReadWireLog
-from ldcnd.wirelog.recorder import WireEvent, parse_records
+from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.contract.rig_commands import ReadWireLog
+from ldcnd.daemon.rig_commands import LONGEST_DATA_BYTES
+from ldcnd.drives.line_config import RecorderConfig
+from ldcnd.line.flight_recorder import WireEvent, parse_records
 from tests.support.rig import SIMULATED, running_rig
 
 

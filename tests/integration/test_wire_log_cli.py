@@ -5,8 +5,8 @@ import re
 
 import pytest
 
-from ldcnd.wirelog.capture import parse_capture
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.line.capture import parse_capture
+from ldcnd.line.flight_recorder import WireEvent
 from tests.support.command_line import run_all
 from tests.support.process import ROOT, daemon
 

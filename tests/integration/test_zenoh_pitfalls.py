@@ -15,17 +15,17 @@ import pytest
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.errors import ErrorCode, ValueOutOfRange
-from ldcnd.messaging.codec import decode
-from ldcnd.messaging.hand_over import Query
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Session
-from ldcnd.messaging.zenoh_config import endpoints, zenoh_config
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import LEASE_MS, ZenohSettings
-from ldcnd.model.commands import ErrorReply
-from ldcnd.model.samples import StateSample
+from ldcnd.contract.codec import decode
+from ldcnd.contract.commands import ErrorReply
+from ldcnd.contract.errors import ErrorCode, ValueOutOfRange
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import StateSample
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.net.hand_over import Query
+from ldcnd.net.session import Session
+from ldcnd.net.zenoh_config import endpoints, zenoh_config
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import LEASE_MS, ZenohSettings
 from tests.support.rig import SIMULATED
 from tests.support.router import router
 from tests.support.session_pair import JSON, KEYS, POSITION, Pair, echo, free_endpoint, served, until
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.real_time
 
 HOLDER = """
 import asyncio, sys
-from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
+from ldcnd.net.zenoh_session import ZenohSettings, open_zenoh_session
 async def main():
     async with open_zenoh_session(ZenohSettings(connect=(sys.argv[1],), mode="client")) as session:
         await session.declare_token("ldcn/bench1/alive/frozen")

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from ldcnd.errors import ConfigError, SessionError
-from ldcnd.messaging.hand_over import PENDING_QUERIES, Query
-from ldcnd.messaging.session import Qos, Session
-from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
+from ldcnd.contract.errors import ConfigError, SessionError
+from ldcnd.net.hand_over import PENDING_QUERIES, Query
+from ldcnd.net.session import Qos, Session
+from ldcnd.net.zenoh_session import ZenohSettings, open_zenoh_session
 from tests.support.query_facts import QueryFacts
 from tests.support.session_facts import SampleFacts, TokenFacts
 from tests.support.session_pair import JSON, KEYS, POSITION, Pair, echo, free_endpoint, served, subscribed, until
@@ -38,8 +38,8 @@ session.close()
 
 DAEMON = """
 import asyncio, sys
-from ldcnd.messaging.session import Qos
-from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
+from ldcnd.net.session import Qos
+from ldcnd.net.zenoh_session import ZenohSettings, open_zenoh_session
 async def main():
     asked = asyncio.Queue()
     async with open_zenoh_session(ZenohSettings(listen=(sys.argv[1],))) as session:

@@ -14,17 +14,20 @@ from tests.mutants.changes import Mutant, mutants_of
 from tests.mutants.covering import ROOT, Covering, record
 
 SUBJECTS = (
-    "ldcnd/daemon/command/*.py", "ldcnd/daemon/axis/*.py", "ldcnd/daemon/axis/procedures/*.py",
-    "ldcnd/daemon/line/*.py", "ldcnd/bus/*.py",
-    *(f"ldcnd/drivers/ldcn/{name}.py" for name in (
+    "ldcnd/axis/*.py", "ldcnd/axis/procedures/*.py",
+    *(f"ldcnd/daemon/{name}.py" for name in ("dispatch", "leases", "ledger", "line", "rig", "rig_commands")),
+    *(f"ldcnd/line/{name}.py" for name in (
+        "bus", "line", "poller", "proof", "queue", "resync", "settings", "transaction", "wire",
+    )),
+    *(f"ldcnd/drives/ldcn/{name}.py" for name in (
         "addressing", "adoption", "commands", "controls", "faults", "groups", "io_module", "network", "packet", "path",
         "received", "record", "registers", "servo", "trajectory",
     )),
-    *(f"ldcnd/drivers/smartstep/{name}.py" for name in (
+    *(f"ldcnd/drives/smartstep/{name}.py" for name in (
         "commands", "drive", "ledger", "modes", "monitors", "network", "packet", "parameter_store", "parameters",
         "trace", "trace_check", "trace_result", "transfer", "words",
     )),
-    "ldcnd/messaging/hand_over.py", "ldcnd/messaging/reads.py",
+    "ldcnd/net/hand_over.py", "ldcnd/net/reads.py",
 )  # fmt: skip
 """Admission, authority, ledger, guards, planner, tracker, policies, procedures, lines, status decoding, parameters."""
 TESTS = ("tests/unit", "tests/property", "tests/integration", "tests/fuzz", "tests/drivers")

@@ -12,12 +12,12 @@ from structlog.testing import capture_logs
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.received import PlainCommand
-from ldcnd.errors import LdcndError, RequestRefused
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import MoveRelative, Power
+from ldcnd.contract.commands import MoveRelative, Power
+from ldcnd.contract.errors import LdcndError, RequestRefused
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.received import PlainCommand
+from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.jumping_loop import JumpingLoop

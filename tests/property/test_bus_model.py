@@ -11,11 +11,11 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.queue import Lane
-from ldcnd.bus.settings import BusSettings
-from ldcnd.errors import BadReply, BusBusy, BusDown, BusError, OutcomeUnknown, PacketRejected, ReplyTimeout
-from ldcnd.exchange import Exchange
+from ldcnd.contract.errors import BadReply, BusBusy, BusDown, BusError, OutcomeUnknown, PacketRejected, ReplyTimeout
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange
+from ldcnd.line.queue import Lane
+from ldcnd.line.settings import BusSettings
 from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support import toy_family as toy
 from tests.support.scripted_line import Say, ScriptedOpener

@@ -15,11 +15,7 @@ from structlog.testing import capture_logs
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.process.daemon import Daemon
-from ldcnd.errors import LdcndError
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
     CommandReply,
@@ -29,9 +25,13 @@ from ldcnd.model.commands import (
     Reset,
     SetPosition,
 )
-from ldcnd.model.leases import Acquire, Release, Renew
-from ldcnd.model.rig_commands import AxisPath, WalkPath
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.leases import Acquire, Release, Renew
+from ldcnd.contract.rig_commands import AxisPath, WalkPath
+from ldcnd.contract.samples import LinkState
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

@@ -10,10 +10,10 @@ from caproto import CaprotoError, Forbidden
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
-from ldcnd.epics.gateway import WHO, Gateway, gateway
-from ldcnd.errors import LdcndError
-from ldcnd.model.events import ReadEvents
-from ldcnd.model.samples import LinkState, Moving
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.samples import LinkState, Moving
+from ldcnd.lab.epics.gateway import WHO, Gateway, gateway
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive

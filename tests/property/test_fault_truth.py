@@ -10,12 +10,12 @@ import random
 
 import pytest
 
-from ldcnd.daemon.axis.state import AxisTracker
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.faults import WARNINGS, FaultCode
-from ldcnd.drivers.ldcn.record import DriveState
-from ldcnd.drivers.ldcn.registers import ServoRegisters
-from ldcnd.exchange import Timing
+from ldcnd.axis.state import AxisTracker
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.faults import WARNINGS, FaultCode
+from ldcnd.drives.ldcn.record import DriveState
+from ldcnd.drives.ldcn.registers import ServoRegisters
+from ldcnd.line.exchange import Timing
 from ldcnd.sim.ldcn.power import Condition, LogosolPower, Trip
 from tests.support.simulated_axis import ON, ONE, SimulatedAxis
 

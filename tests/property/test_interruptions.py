@@ -16,12 +16,7 @@ from structlog.testing import capture_logs
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.process.daemon import Daemon
-from ldcnd.errors import LdcndError, OutcomeUnknown
-from ldcnd.messaging.keys import RIG_ITSELF
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
     Command,
@@ -46,11 +41,16 @@ from ldcnd.model.commands import (
     Track,
     Why,
 )
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.leases import Acquire, ListHolders, Release, Renew
-from ldcnd.model.rig_commands import AxisMove, MoveTogether
-from ldcnd.model.samples import StateSample
-from ldcnd.model.traces import TakeTrace
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.keys import RIG_ITSELF
+from ldcnd.contract.leases import Acquire, ListHolders, Release, Renew
+from ldcnd.contract.rig_commands import AxisMove, MoveTogether
+from ldcnd.contract.samples import StateSample
+from ldcnd.contract.traces import TakeTrace
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.interruptions import Chosen, CopiedLoop, Interruptions, in_new_loop, run_with_copies

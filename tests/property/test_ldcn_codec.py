@@ -5,10 +5,10 @@ from itertools import pairwise
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.packet import (
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.packet import (
     AuxFlag,
     Command,
     Packet,
@@ -22,9 +22,9 @@ from ldcnd.drivers.ldcn.packet import (
     encode_packet,
     encode_status,
 )
-from ldcnd.drivers.ldcn.profiles import PROFILES, Profile, Support
-from ldcnd.drivers.ldcn.received import LoadTrajectory, SetGain, decode_command
-from ldcnd.drivers.ldcn.trajectory import (
+from ldcnd.drives.ldcn.profiles import PROFILES, Profile, Support
+from ldcnd.drives.ldcn.received import LoadTrajectory, SetGain, decode_command
+from ldcnd.drives.ldcn.trajectory import (
     ProfileMode,
     Trajectory,
     acceleration_counts_per_s2,

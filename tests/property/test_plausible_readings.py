@@ -15,11 +15,11 @@ import pytest
 from structlog.testing import capture_logs
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.received import ResetPosition, SetGain, StopMotor
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import Halt, Home, HomeMethod, MoveAbsolute, MoveVelocity, Power
-from ldcnd.model.samples import LinkState, Moving, PositionSample, Quality, TelemetryItem
+from ldcnd.contract.commands import Halt, Home, HomeMethod, MoveAbsolute, MoveVelocity, Power
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.samples import LinkState, Moving, PositionSample, Quality, TelemetryItem
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.received import ResetPosition, SetGain, StopMotor
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

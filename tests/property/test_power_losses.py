@@ -12,10 +12,10 @@ import random
 import pytest
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.ldcn.addressing import WAITING_ADDRESSES
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import Halt, MoveAbsolute, Power
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.commands import Halt, MoveAbsolute, Power
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.samples import LinkState
+from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import rig_on

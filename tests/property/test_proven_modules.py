@@ -14,9 +14,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.ldcn.packet import Command, Packet, StatusItem
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     Halt,
     Home,
     Jog,
@@ -33,7 +31,9 @@ from ldcnd.model.commands import (
     Stop,
     Track,
 )
-from ldcnd.model.rig_commands import AxisMove, MoveTogether, Rehearse, SetIo, SetIoTimer, SetSpeedOverride, Snapshot
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.rig_commands import AxisMove, MoveTogether, Rehearse, SetIo, SetIoTimer, SetSpeedOverride, Snapshot
+from ldcnd.drives.ldcn.packet import Command, Packet, StatusItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive

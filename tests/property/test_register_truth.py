@@ -13,11 +13,7 @@ from structlog.testing import capture_logs
 from typing_extensions import override
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.drivers.ldcn.controls import LimitPins
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.registers import FRACTION
-from ldcnd.errors import LdcndError
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     AxisCommand,
     CommandReply,
     Halt,
@@ -27,8 +23,12 @@ from ldcnd.model.commands import (
     SetGains,
     SetOutputs,
 )
-from ldcnd.model.rig_commands import SetIo
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.rig_commands import SetIo
+from ldcnd.contract.samples import LinkState
+from ldcnd.drives.ldcn.controls import LimitPins
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
 from ldcnd.sim.jumping_loop import JumpingLoop

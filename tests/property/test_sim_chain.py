@@ -5,7 +5,7 @@ import itertools
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
+from ldcnd.drives.ldcn.packet import Command, Packet, encode_packet
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
 

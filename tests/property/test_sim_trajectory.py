@@ -5,9 +5,9 @@ from dataclasses import replace
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.trajectory import ProfileMode
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.trajectory import ProfileMode
 from ldcnd.sim.ldcn.power import Condition, Trip
 from ldcnd.sim.ldcn.servo import HomeSearch, ServoLoop
 from ldcnd.sim.ldcn.trajectory import ProfileGenerator

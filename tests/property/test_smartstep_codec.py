@@ -5,8 +5,8 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.drivers.smartstep.commands import reference, string_reference
-from ldcnd.drivers.smartstep.packet import (
+from ldcnd.drives.smartstep.commands import reference, string_reference
+from ldcnd.drives.smartstep.packet import (
     Command,
     Function,
     Reply,
@@ -17,8 +17,8 @@ from ldcnd.drivers.smartstep.packet import (
     decode_reply,
     strip_parity,
 )
-from ldcnd.drivers.smartstep.profiles import ByteOrder, StringChecksum, TraceWordLayout
-from ldcnd.drivers.smartstep.trace_data import (
+from ldcnd.drives.smartstep.profiles import ByteOrder, StringChecksum, TraceWordLayout
+from ldcnd.drives.smartstep.trace_data import (
     TracePoint,
     decode_word,
     encode_word,
@@ -27,7 +27,7 @@ from ldcnd.drivers.smartstep.trace_data import (
     split_words,
     unwrap,
 )
-from ldcnd.exchange import Exchange, ReplyVerdict
+from ldcnd.line.exchange import Exchange, ReplyVerdict
 from ldcnd.sim.smartstep.unit import string_reply
 
 units = st.integers(0, 15)

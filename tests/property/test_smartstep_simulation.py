@@ -4,9 +4,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ldcnd.drivers.smartstep.monitors import Counter, CounterReading
-from ldcnd.drivers.smartstep.packet import Command, Function, decode_reply
-from ldcnd.drivers.smartstep.parameters import PN000
+from ldcnd.drives.smartstep.monitors import Counter, CounterReading
+from ldcnd.drives.smartstep.packet import Command, Function, decode_reply
+from ldcnd.drives.smartstep.parameters import PN000
 from ldcnd.sim.smartstep.drive import SimulatedMotor
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 

@@ -4,8 +4,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ldcnd.drivers.smartstep.parameters import PN202, PN203
-from ldcnd.drivers.smartstep.profiles import (
+from ldcnd.contract.errors import BadReply, ReplyTimeout
+from ldcnd.contract.traces import TakeTrace
+from ldcnd.drives.smartstep.parameters import PN202, PN203
+from ldcnd.drives.smartstep.profiles import (
     ByteOrder,
     CommandPulseGear,
     CountUnit,
@@ -13,8 +15,8 @@ from ldcnd.drivers.smartstep.profiles import (
     StringChecksum,
     TraceWordLayout,
 )
-from ldcnd.drivers.smartstep.trace_check import Reading, Samples, Shown, comparisons, judge
-from ldcnd.drivers.smartstep.trace_data import (
+from ldcnd.drives.smartstep.trace_check import Reading, Samples, Shown, comparisons, judge
+from ldcnd.drives.smartstep.trace_data import (
     DataObject,
     IoObject,
     TraceConstants,
@@ -23,9 +25,7 @@ from ldcnd.drivers.smartstep.trace_data import (
     encode_word,
     scale,
 )
-from ldcnd.drivers.smartstep.trace_result import DATA, SIGNALS, assign
-from ldcnd.errors import BadReply, ReplyTimeout
-from ldcnd.model.traces import TakeTrace
+from ldcnd.drives.smartstep.trace_result import DATA, SIGNALS, assign
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
 

@@ -12,16 +12,19 @@ from typing import Any, cast
 
 from typing_extensions import override
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.proof import Proofs
-from ldcnd.config.axis import AxisConfig
-from ldcnd.daemon.axis.axis import AxisService
-from ldcnd.daemon.axis.guards import UNCONDITIONAL, Right
-from ldcnd.daemon.axis.state import ActiveCommand
-from ldcnd.daemon.axis.telemetry import Arrival
-from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.publish.publisher import Publisher
-from ldcnd.drivers.driver import (
+from ldcnd.axis.axis import AxisService
+from ldcnd.axis.clock import Clock
+from ldcnd.axis.guards import UNCONDITIONAL, Right
+from ldcnd.axis.state import ActiveCommand
+from ldcnd.axis.telemetry import Arrival
+from ldcnd.contract.codec import Encoding
+from ldcnd.contract.commands import AxisCommand, CommandReply, HomeMethod, PinMode, Power, Verb
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import Sample, TelemetryItem
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.driver import (
     NO_CEILING,
     AnalogMotion,
     AxisReading,
@@ -39,14 +42,11 @@ from ldcnd.drivers.driver import (
     Tracks,
     Warns,
 )
-from ldcnd.errors import LdcndError
-from ldcnd.exchange import Exchange, ReplyVerdict, Timing
-from ldcnd.messaging.codec import Encoding
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import AxisCommand, CommandReply, HomeMethod, PinMode, Power, Verb
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import Sample, TelemetryItem
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange, ReplyVerdict, Timing
+from ldcnd.line.proof import Proofs
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.publisher import Publisher
 
 KEYS = Keys("bench")
 COUNTS_PER_MM = 1000

@@ -5,17 +5,17 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.settings import BusSettings
-from ldcnd.drivers.driver import AxisSpec, Gains
-from ldcnd.drivers.ldcn.network import LdcnNetwork
-from ldcnd.drivers.ldcn.packet import Packet, PacketReader
-from ldcnd.drivers.ldcn.registers import RESET_BAUD
-from ldcnd.drivers.network import LineSpec
+from ldcnd.drives.driver import AxisSpec, Gains
+from ldcnd.drives.ldcn.network import LdcnNetwork
+from ldcnd.drives.ldcn.packet import Packet, PacketReader
+from ldcnd.drives.ldcn.registers import RESET_BAUD
+from ldcnd.drives.network import LineSpec
+from ldcnd.line.bus import Bus
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.line.settings import BusSettings
+from ldcnd.line.transport import Transport
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import open_simulated_line
-from ldcnd.transport.transport import Transport
-from ldcnd.wirelog.recorder import WireEvent
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1, deadband=0)
 

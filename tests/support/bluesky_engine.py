@@ -10,11 +10,11 @@ from typing import Any
 from bluesky import RunEngine
 from event_model import DocumentNames, schema_validators
 
-from ldcnd.bluesky import Axis, Devices
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.samples import LinkState
+from ldcnd.lab.bluesky import Axis, Devices
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

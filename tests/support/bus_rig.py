@@ -5,11 +5,11 @@ from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from typing import Any
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.settings import BusSettings
-from ldcnd.errors import (
+from ldcnd.contract.errors import (
     BusError,
 )
+from ldcnd.line.bus import Bus
+from ldcnd.line.settings import BusSettings
 from tests.support import toy_family as toy
 from tests.support.scripted_line import Say, Script, ScriptedLine, ScriptedOpener
 from tests.support.toy_family import ToyPoller

@@ -11,14 +11,14 @@ from pathlib import Path
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.capture import lines_of
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.process.replay import config_of, play, published_line, virtual_time
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.session import Sample
-from ldcnd.model.commands import MoveAbsolute, Power
+from ldcnd.daemon.replay import config_of, play, published_line, virtual_time
+from ldcnd.line.capture import Capture
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.session import Sample
 from ldcnd.sim.jumping_loop import JumpingLoop
-from ldcnd.wirelog.capture import Capture
 
 FOLDER = Path(__file__).parents[1] / "captures"
 NAMES = ("clean_start", "power_loss", "corrupted_line")

@@ -9,16 +9,16 @@ from types import MappingProxyType
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
-from ldcnd.daemon.line.line import BusService
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.drivers.ldcn.packet import Packet, PacketReader
-from ldcnd.drivers.ldcn.registers import RESET_BAUD
-from ldcnd.messaging.memory_session import MemoryBroker
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.line import BusService
+from ldcnd.drives.ldcn.packet import Packet, PacketReader
+from ldcnd.drives.ldcn.registers import RESET_BAUD
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.line.transport import Opener
+from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.line import open_simulated_line
-from ldcnd.transport.transport import Opener
-from ldcnd.wirelog.recorder import WireEvent
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig
 
 UP_WITHIN_S = 60.0

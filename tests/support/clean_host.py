@@ -3,13 +3,13 @@
 import asyncio
 import contextlib
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.settings import BusSettings
-from ldcnd.drivers.driver import AxisSpec
-from ldcnd.drivers.ldcn.network import LdcnNetwork
-from ldcnd.drivers.ldcn.profiles import Support
-from ldcnd.drivers.network import BringUpReport, LineSpec, ModuleEntry
-from ldcnd.errors import NetworkMismatch
+from ldcnd.contract.errors import NetworkMismatch
+from ldcnd.drives.driver import AxisSpec
+from ldcnd.drives.ldcn.network import LdcnNetwork
+from ldcnd.drives.ldcn.profiles import Support
+from ldcnd.drives.network import BringUpReport, LineSpec, ModuleEntry
+from ldcnd.line.bus import Bus
+from ldcnd.line.settings import BusSettings
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.line import open_simulated_line

@@ -20,8 +20,8 @@ from ldcnd.cli import connection
 from ldcnd.cli import connection as connecting
 from ldcnd.cli.main import main
 from ldcnd.config.rig import RigConfig
-from ldcnd.messaging.session import Session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.net.session import Session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig

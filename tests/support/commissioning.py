@@ -9,10 +9,10 @@ from pathlib import Path
 
 from typing_extensions import override
 
+from ldcnd.bench.commissioning.checklist import Checklist
+from ldcnd.bench.person import Left, Person
 from ldcnd.client.rig import Rig
-from ldcnd.commissioning.checklist import Checklist
 from ldcnd.config.rig import load_config
-from ldcnd.person import Left, Person
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive

@@ -9,10 +9,10 @@ from typing import Any
 
 from typing_extensions import override
 
-from ldcnd.commissioning_page.messages import ToPage, View
-from ldcnd.commissioning_page.routes import Commissioning
-from ldcnd.messaging.hand_over import Answer
-from ldcnd.messaging.memory_session import MemorySession
+from ldcnd.console.commissioning.messages import ToPage, View
+from ldcnd.console.commissioning.routes import Commissioning
+from ldcnd.net.hand_over import Answer
+from ldcnd.net.memory_session import MemorySession
 from tests.support.browser import Browser
 from tests.support.commissioning import AXIS, CommissioningRig
 from tests.support.console_rig import PageSocket, RunningConsole, console_of, page

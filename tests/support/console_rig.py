@@ -17,8 +17,8 @@ from ldcnd.console.server import MoreRoutes, build_app
 from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import Visitors
 from ldcnd.listen_address import ListenAddress
-from ldcnd.messaging.session import Session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.net.session import Session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.support.browser import Browser, JsonObject, WebAnswer, WebQuestion, web_answer
 from tests.support.rig import EPOCH_NS, RunningRig, running_rig
 

@@ -8,8 +8,8 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.model.commands import AxisCommand, CommandReply, Power
-from ldcnd.model.samples import AxisState, FaultSample, StateSample, TelemetryItem
+from ldcnd.contract.commands import AxisCommand, CommandReply, Power
+from ldcnd.contract.samples import AxisState, FaultSample, StateSample, TelemetryItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model

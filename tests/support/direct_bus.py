@@ -5,10 +5,10 @@ from collections.abc import Awaitable, Callable
 from types import SimpleNamespace
 from typing import TypeVar
 
-from ldcnd.bus.proof import Proofs
-from ldcnd.bus.queue import Lane
-from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader
-from ldcnd.exchange import Exchange
+from ldcnd.drives.ldcn.packet import Command, Packet, PacketReader
+from ldcnd.line.exchange import Exchange
+from ldcnd.line.proof import Proofs
+from ldcnd.line.queue import Lane
 from tests.support.simulated_host import SimulatedHost
 
 ReplyT = TypeVar("ReplyT")

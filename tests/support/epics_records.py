@@ -5,7 +5,7 @@ from random import Random
 
 from caproto import ChannelType
 
-from ldcnd.epics.gateway import Gateway
+from ldcnd.lab.epics.gateway import Gateway
 
 KINDS = {str: ChannelType.STRING, int: ChannelType.LONG, float: ChannelType.DOUBLE}
 VALUES: tuple[float | int | str, ...] = (

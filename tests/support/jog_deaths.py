@@ -31,7 +31,7 @@ from websockets.asyncio.client import connect
 
 import ldcnd
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.commands import Power
+from ldcnd.contract.commands import Power
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.pty import PtyLine

@@ -10,7 +10,7 @@ import os
 import signal
 from pathlib import Path
 
-from ldcnd.recording.mcap_file import McapFile
+from ldcnd.lab.recording.mcap_file import McapFile
 from ldcnd.sim.jumping_loop import JumpingLoop
 from tests.support.recordings import recorded_rig, thirty_one_axes
 

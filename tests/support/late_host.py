@@ -7,9 +7,9 @@ import random
 
 from typing_extensions import override
 
+from ldcnd.line.transport import Receiver, Transport
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
-from ldcnd.transport.transport import Receiver, Transport
 
 
 class LateHost(Transport, Receiver):

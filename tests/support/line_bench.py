@@ -3,15 +3,15 @@
 import asyncio
 from collections import deque
 
-from ldcnd.bus.line import Line
-from ldcnd.bus.queue import Lane
-from ldcnd.bus.resync import Resync
-from ldcnd.bus.settings import BusSettings
-from ldcnd.bus.transaction import Transaction
-from ldcnd.bus.wire import BusStatistics
-from ldcnd.errors import BusError
-from ldcnd.exchange import Exchange, Timing
-from ldcnd.wirelog.recorder import WireLog
+from ldcnd.contract.errors import BusError
+from ldcnd.line.exchange import Exchange, Timing
+from ldcnd.line.flight_recorder import WireLog
+from ldcnd.line.line import Line
+from ldcnd.line.queue import Lane
+from ldcnd.line.resync import Resync
+from ldcnd.line.settings import BusSettings
+from ldcnd.line.transaction import Transaction
+from ldcnd.line.wire import BusStatistics
 from tests.support import toy_family as toy
 from tests.support.scripted_line import Say, ScriptedLine
 

@@ -8,10 +8,10 @@ import argparse
 import asyncio
 import math
 
-from ldcnd.drivers.ldcn.registers import FRACTION
-from ldcnd.model.commands import Power
-from ldcnd.model.rig_commands import AxisMove, MoveTogether, PreviewTogether
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.commands import Power
+from ldcnd.contract.rig_commands import AxisMove, MoveTogether, PreviewTogether
+from ldcnd.contract.samples import LinkState
+from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config

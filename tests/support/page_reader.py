@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Self
 
 from ldcnd.client.traces import trace_header
-from ldcnd.model.traces import TracePhase
+from ldcnd.contract.traces import TracePhase
 from tests.support.pages import Block, blocks_of
 from tests.support.process import END_TIME_S, START_TIME_S, answering, client, free_port
 

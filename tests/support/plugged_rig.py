@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.samples import LinkState
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.plant import MotorPlant

@@ -8,20 +8,20 @@ from itertools import pairwise
 
 from typing_extensions import override
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.poller import Poller
-from ldcnd.bus.settings import BusSettings, ServoCycle
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.packet import Status, StatusItem
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
-from ldcnd.errors import BusError
-from ldcnd.exchange import Exchange, Timing
+from ldcnd.contract.errors import BusError
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.packet import Status, StatusItem
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange, Timing
+from ldcnd.line.poller import Poller
+from ldcnd.line.settings import BusSettings, ServoCycle
+from ldcnd.line.transport import Transport
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.line import open_simulated_line
-from ldcnd.transport.transport import Transport
 from tests.support.late_host import LateHost
 
 BAUD = 115_200

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from ldcnd.model.samples import PositionSample, Quality, TelemetryItem
+from ldcnd.contract.samples import PositionSample, Quality, TelemetryItem
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from tests.support.chain_rig import ChainRig
 

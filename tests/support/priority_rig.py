@@ -5,9 +5,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.messaging.codec import decode
-from ldcnd.model.health import AxisHealth, BusHealth
-from ldcnd.model.plan import PollPriority
+from ldcnd.contract.codec import decode
+from ldcnd.contract.health import AxisHealth, BusHealth
+from ldcnd.contract.plan import PollPriority
 from tests.support.rig import RunningRig
 
 

@@ -13,10 +13,10 @@ from contextlib import asynccontextmanager
 from pathlib import Path
 
 from ldcnd.client.rig_client import RigClient, find_rigs
-from ldcnd.errors import LdcndError
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.samples import LinkState
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 
 ROOT = Path(__file__).parents[2]
 LDCND = (sys.executable, "-m", "ldcnd")

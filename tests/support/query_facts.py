@@ -5,9 +5,9 @@ from collections.abc import Callable
 
 import pytest
 
-from ldcnd.errors import ErrorCode, InternalError, OutcomeUnknown, PositionLimit
-from ldcnd.messaging.codec import Encoding, rebuild_error
-from ldcnd.messaging.hand_over import PENDING_QUERIES, Answer, OnQuery, Query
+from ldcnd.contract.codec import Encoding, rebuild_error
+from ldcnd.contract.errors import ErrorCode, InternalError, OutcomeUnknown, PositionLimit
+from ldcnd.net.hand_over import PENDING_QUERIES, Answer, OnQuery, Query
 from tests.support.session_pair import HALT, JSON, KEYS, Pair, echo, error_of, served, until
 
 

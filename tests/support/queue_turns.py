@@ -2,8 +2,8 @@
 
 from typing import Any, TypeVar
 
-from ldcnd.bus.poller import Poller
-from ldcnd.bus.queue import ExchangeQueue, Queueable
+from ldcnd.line.poller import Poller
+from ldcnd.line.queue import ExchangeQueue, Queueable
 
 JobT = TypeVar("JobT", bound=Queueable)
 

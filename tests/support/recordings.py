@@ -14,8 +14,8 @@ import jsonschema_rs
 from mcap.reader import make_reader
 
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.messaging.session import Sample
-from ldcnd.recording.recorder import KEPT_SAMPLES, Recorder
+from ldcnd.lab.recording.recorder import KEPT_SAMPLES, Recorder
+from ldcnd.net.session import Sample
 from ldcnd.sim.chain import Chain
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 

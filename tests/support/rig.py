@@ -9,12 +9,12 @@ from types import MappingProxyType
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.process.daemon import Daemon
-from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
-from ldcnd.model.commands import CommandReply
-from ldcnd.model.events import CommandStatus, ReadEvents
-from ldcnd.model.samples import StateSample
+from ldcnd.contract.commands import CommandReply
+from ldcnd.contract.events import CommandStatus, ReadEvents
+from ldcnd.contract.samples import StateSample
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.net.memory_session import MemoryBroker, MemorySession
 from ldcnd.sim.chain import Chain
 
 EPOCH_NS = 1_700_000_000_000_000_000

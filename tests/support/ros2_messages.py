@@ -1,6 +1,6 @@
 """Messages of ROS 2 whose bytes are compared with those of other libraries."""
 
-from ldcnd.ros2.cdr import DiagnosticArray, DiagnosticStatus, JointState
+from ldcnd.lab.ros2.cdr import DiagnosticArray, DiagnosticStatus, JointState
 
 JOINTS = (
     JointState(1_700_000_000_123_456_789, ("x",), (0.0125,), (-0.5,)),

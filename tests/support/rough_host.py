@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 from typing_extensions import override
 
+from ldcnd.line.transport import Receiver
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
-from ldcnd.transport.transport import Receiver
 
 HARD_RESET = bytes.fromhex("aa ff 0f 0e")
 BAUD_CODES = {9600: 0x81, 19_200: 0x3F, 57_600: 0x14, 115_200: 0x0A}

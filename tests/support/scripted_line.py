@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from typing_extensions import override
 
-from ldcnd.errors import TransportLost
-from ldcnd.transport.transport import Receiver, Transport
+from ldcnd.contract.errors import TransportLost
+from ldcnd.line.transport import Receiver, Transport
 
 BITS_PER_BYTE = 10
 

@@ -34,11 +34,11 @@ from pathlib import Path
 
 from typing_extensions import override
 
-from ldcnd.errors import TransportLost
+from ldcnd.contract.errors import TransportLost
+from ldcnd.line.line_discipline import actual_baud
+from ldcnd.line.transport import Receiver, Transport
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
-from ldcnd.transport.line_discipline import actual_baud
-from ldcnd.transport.transport import Receiver, Transport
 
 LONGEST_WAIT_S = 0.02
 READ_BYTES = 4096

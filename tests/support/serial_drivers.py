@@ -13,8 +13,8 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from ldcnd.transport import line_discipline, serial_port
-from ldcnd.transport.line_discipline import SERIAL_RS485, TIOCGRS485, TIOCSRS485, actual_baud
+from ldcnd.line import line_discipline, serial_port
+from ldcnd.line.line_discipline import SERIAL_RS485, TIOCGRS485, TIOCSRS485, actual_baud
 
 UART_FALLBACK = 9600
 

@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from ldcnd.errors import SessionError
-from ldcnd.messaging.session import UNDELIVERED_SAMPLES, Qos, Sample, SampleKind
+from ldcnd.contract.errors import SessionError
+from ldcnd.net.session import UNDELIVERED_SAMPLES, Qos, Sample, SampleKind
 from tests.support.session_pair import JSON, KEYS, POSITION, Pair, subscribed
 
 

@@ -5,11 +5,11 @@ import socket
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
-from ldcnd.messaging.codec import Encoding, decode
-from ldcnd.messaging.hand_over import Answer, Query
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.session import Qos, Sample, Session
-from ldcnd.model.commands import ErrorReply
+from ldcnd.contract.codec import Encoding, decode
+from ldcnd.contract.commands import ErrorReply
+from ldcnd.contract.keys import Keys
+from ldcnd.net.hand_over import Answer, Query
+from ldcnd.net.session import Qos, Sample, Session
 
 KEYS = Keys("bench1")
 JSON = Encoding.JSON.value

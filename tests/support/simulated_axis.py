@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.packet import Command, Status, StatusFlag
-from ldcnd.drivers.ldcn.registers import encode_gains
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, encode_trajectory
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.packet import Command, Status, StatusFlag
+from ldcnd.drives.ldcn.registers import encode_gains
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, encode_trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import Condition

@@ -1,7 +1,7 @@
 """A host on a simulated LDCN/NMC chain that needs no event loop: it passes the time itself."""
 
-from ldcnd.drivers.ldcn.packet import Command, Packet, Status, StatusItem, decode_status, encode_packet
-from ldcnd.drivers.ldcn.profiles import Profile
+from ldcnd.drives.ldcn.packet import Command, Packet, Status, StatusItem, decode_status, encode_packet
+from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.sim.chain import Chain
 
 PATIENCE_S = 0.03

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-from ldcnd.drivers.ldcn.packet import AuxFlag, Command, Status
-from ldcnd.drivers.ldcn.path import PathPoint, encode_points
-from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S
+from ldcnd.drives.ldcn.packet import AuxFlag, Command, Status
+from ldcnd.drives.ldcn.path import PathPoint, encode_points
+from ldcnd.drives.ldcn.registers import FRACTION, SERVO_CYCLE_S
 from ldcnd.sim.ldcn.chain import model
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import SimulatedAxis

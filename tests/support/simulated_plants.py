@@ -5,16 +5,16 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.errors import DriveFault
+from ldcnd.bench.tuning.ldcn.design import Proposal, duration_s, propose, stiff_gains, within_authority
+from ldcnd.bench.tuning.ldcn.excitation import Bounds, Excitation, Record, Shown, Trial, Trials
+from ldcnd.bench.tuning.ldcn.identify import Identified, identify
+from ldcnd.bench.tuning.ldcn.plant import ENDLESS_COUNTS, Plant
+from ldcnd.bench.tuning.ldcn.response import Figures, Move, Response, Start, simulate
+from ldcnd.bench.tuning.ldcn.verdict import measured, worst
+from ldcnd.contract.errors import DriveFault
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.sim.plant import MotorPlant
-from ldcnd.tuning.ldcn.design import Proposal, duration_s, propose, stiff_gains, within_authority
-from ldcnd.tuning.ldcn.excitation import Bounds, Excitation, Record, Shown, Trial, Trials
-from ldcnd.tuning.ldcn.identify import Identified, identify
-from ldcnd.tuning.ldcn.plant import ENDLESS_COUNTS, Plant
-from ldcnd.tuning.ldcn.response import Figures, Move, Response, Start, simulate
-from ldcnd.tuning.ldcn.verdict import measured, worst
 
 REFERENCE = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1)
 """The gains of the examples in config/."""

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.settings import BusSettings
-from ldcnd.drivers.driver import AxisSpec
-from ldcnd.drivers.smartstep.addresses import NEVER_VALID
-from ldcnd.drivers.smartstep.drive import SmartStepAxis, UnitSpec
-from ldcnd.drivers.smartstep.ledger import EepromLedger
-from ldcnd.drivers.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
-from ldcnd.drivers.smartstep.packet import decode_command
-from ldcnd.drivers.smartstep.parameter_store import EepromRules
-from ldcnd.drivers.smartstep.parameters import PN000, Parameter
-from ldcnd.drivers.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile, Wiring
+from ldcnd.drives.driver import AxisSpec
+from ldcnd.drives.smartstep.addresses import NEVER_VALID
+from ldcnd.drives.smartstep.drive import SmartStepAxis, UnitSpec
+from ldcnd.drives.smartstep.ledger import EepromLedger
+from ldcnd.drives.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
+from ldcnd.drives.smartstep.packet import decode_command
+from ldcnd.drives.smartstep.parameter_store import EepromRules
+from ldcnd.drives.smartstep.parameters import PN000, Parameter
+from ldcnd.drives.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile, Wiring
+from ldcnd.line.bus import Bus
+from ldcnd.line.settings import BusSettings
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.sim.smartstep.cable import smartstep_chain

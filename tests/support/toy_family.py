@@ -8,10 +8,10 @@ from collections.abc import Set as AbstractSet
 
 from typing_extensions import override
 
-from ldcnd.bus.poller import Poller
-from ldcnd.bus.resync import Resync
-from ldcnd.errors import BadReply, BusError
-from ldcnd.exchange import Effect, Exchange, ReplyVerdict, Timing
+from ldcnd.contract.errors import BadReply, BusError
+from ldcnd.line.exchange import Effect, Exchange, ReplyVerdict, Timing
+from ldcnd.line.poller import Poller
+from ldcnd.line.resync import Resync
 from tests.support.scripted_line import Say, Script
 
 REQUEST_BYTES = 6

@@ -9,19 +9,19 @@ from pathlib import Path
 from types import MappingProxyType
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config.axis import AxisConfig, RatesConfig
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.drivers.smartstep.parameters import PN000
-from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject, TracePoint
-from ldcnd.families.smartstep.config import SmartStepAxisConfig, SmartStepUnitConfig
-from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.drives.axis_config import AxisConfig, RatesConfig
+from ldcnd.drives.smartstep.config import SmartStepAxisConfig, SmartStepUnitConfig
+from ldcnd.drives.smartstep.parameters import PN000
+from ldcnd.drives.smartstep.trace_data import DataObject, IoObject, TracePoint
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.net.memory_session import MemoryBroker, MemorySession
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
-from ldcnd.wirelog.recorder import WireEvent
 from tests.support.process import free_port
 from tests.support.rig import RunningRig, running_rig
 

@@ -12,9 +12,9 @@ from ldcnd.cli.main import cli
 from ldcnd.cli.verb_methods import method_name
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
-from ldcnd.model.catalogue import COMMANDS
-from ldcnd.model.commands import About, Command
-from ldcnd.model.frozen import Frozen
+from ldcnd.contract.catalogue import COMMANDS
+from ldcnd.contract.commands import About, Command
+from ldcnd.contract.frozen import Frozen
 from tests.support.process import ROOT
 
 PAGE = ROOT / "docs" / "reference" / "verbs.md"

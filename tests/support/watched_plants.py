@@ -5,17 +5,17 @@ import random
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import FRACTION
+from ldcnd.bench.tuning.ldcn.design import stiff_gains, within_authority
+from ldcnd.bench.tuning.ldcn.effort import Seen
+from ldcnd.bench.tuning.ldcn.identify import Identified
+from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.bench.tuning.ldcn.response import Move
+from ldcnd.drives.ldcn.profiles import Profile
+from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.power import PicServoPower
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.ldcn.servo import ServoLoop
 from ldcnd.sim.plant import MotorPlant, Shaft
-from ldcnd.tuning.ldcn.design import stiff_gains, within_authority
-from ldcnd.tuning.ldcn.effort import Seen
-from ldcnd.tuning.ldcn.identify import Identified
-from ldcnd.tuning.ldcn.plant import Plant
-from ldcnd.tuning.ldcn.response import Move
 from tests.support.simulated_plants import DrawnPlant
 
 MOTOR_SHARE = 0.4

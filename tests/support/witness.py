@@ -5,14 +5,14 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ldcnd.daemon.process.daemon import Daemon
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader
-from ldcnd.drivers.ldcn.received import AddPathPoints, LoadTrajectory, StopMotor, received_command
-from ldcnd.drivers.ldcn.registers import FRACTION
-from ldcnd.drivers.ldcn.trajectory import ProfileMode
-from ldcnd.model.commands import Verb
-from ldcnd.model.samples import LinkState, Moving
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.samples import LinkState, Moving
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.packet import Command, Packet, PacketReader
+from ldcnd.drives.ldcn.received import AddPathPoints, LoadTrajectory, StopMotor, received_command
+from ldcnd.drives.ldcn.registers import FRACTION
+from ldcnd.drives.ldcn.trajectory import ProfileMode
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 

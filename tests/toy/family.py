@@ -12,12 +12,14 @@ from typing import Any, Literal
 from pydantic import Field
 from typing_extensions import override
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.resync import Resync
-from ldcnd.config.axis import MovedAxisConfig
-from ldcnd.config.bus import BusConfig
-from ldcnd.config.simulated_line import SimulatedLineConfig
-from ldcnd.drivers.driver import (
+from ldcnd.contract.catalogue import verbs_for
+from ldcnd.contract.commands import Capability, Verb
+from ldcnd.contract.errors import BadReply, NetworkMismatch, NotSupported, ReplyTimeout
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.drives.axis_config import MovedAxisConfig
+from ldcnd.drives.cost import LineTiming, cost_of
+from ldcnd.drives.driver import (
     NO_CEILING,
     AnalogMotion,
     AxisReading,
@@ -30,22 +32,20 @@ from ldcnd.drivers.driver import (
     PwmOutput,
     StopMode,
 )
-from ldcnd.drivers.network import BringUpReport, Network
-from ldcnd.drivers.transcript import Describe
-from ldcnd.errors import BadReply, NetworkMismatch, NotSupported, ReplyTimeout
-from ldcnd.exchange import Effect, Exchange, ReplyVerdict
-from ldcnd.families.family import Demand, Family, Line, OpenLine, bus_settings
-from ldcnd.model.catalogue import verbs_for
-from ldcnd.model.commands import Capability, Verb
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.samples import TelemetryItem
-from ldcnd.planning.cost import LineTiming, cost_of
-from ldcnd.planning.line_plan import Poll, Urgent
+from ldcnd.drives.family import Demand, Family, Line, OpenLine, bus_settings
+from ldcnd.drives.line_config import BusConfig
+from ldcnd.drives.line_plan import Poll, Urgent
+from ldcnd.drives.network import BringUpReport, Network
+from ldcnd.drives.simulated_line import SimulatedLineConfig
+from ldcnd.drives.transcript import Describe
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Effect, Exchange, ReplyVerdict
+from ldcnd.line.flight_recorder import WireRecord
+from ldcnd.line.port_url import port_opener
+from ldcnd.line.resync import Resync
+from ldcnd.line.transport import Opener
 from ldcnd.sim.chain import NEVER_S, Chain, Module, Reply
 from ldcnd.sim.line import open_simulated_line
-from ldcnd.transport.port_url import port_opener
-from ldcnd.transport.transport import Opener
-from ldcnd.wirelog.recorder import WireRecord
 
 BAUD = 57_600
 FRAME = struct.Struct("<BBBii")

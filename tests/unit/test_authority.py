@@ -1,7 +1,7 @@
 import pytest
 
-from ldcnd.daemon.command.leases import Authority
-from ldcnd.errors import LeaseExpired, LeaseHeld, LeaseRequired, LeaseUnknown, StaleSequence, UnknownAxis
+from ldcnd.contract.errors import LeaseExpired, LeaseHeld, LeaseRequired, LeaseUnknown, StaleSequence, UnknownAxis
+from ldcnd.daemon.leases import Authority
 
 
 @pytest.fixture

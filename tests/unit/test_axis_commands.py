@@ -5,20 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.driver import Fault, Gains, Motion, StopMode
-from ldcnd.errors import (
-    BadReply,
-    LeaseExpired,
-    MalformedRequest,
-    NotReferenced,
-    OutcomeUnknown,
-    PositionLimit,
-    ReplyTimeout,
-    StopLatched,
-    ValueOutOfRange,
-    WrongState,
-)
-from ldcnd.model.commands import (
+from ldcnd.contract.commands import (
     Halt,
     MoveAbsolute,
     MoveRelative,
@@ -32,8 +19,21 @@ from ldcnd.model.commands import (
     SetPosition,
     Verb,
 )
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState, Moving
+from ldcnd.contract.errors import (
+    BadReply,
+    LeaseExpired,
+    MalformedRequest,
+    NotReferenced,
+    OutcomeUnknown,
+    PositionLimit,
+    ReplyTimeout,
+    StopLatched,
+    ValueOutOfRange,
+    WrongState,
+)
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.drives.driver import Fault, Gains, Motion, StopMode
 from tests.support.axis_bench import GAINS, RUNNING, AxisBench, axis_bench, raising
 
 WARNING = Fault("position_wrap", "the counter has wrapped", stops=False)

@@ -5,10 +5,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from ldcnd.config.axis import RatesConfig
-from ldcnd.daemon.axis.polling import AGAIN_S, AxisPoller
-from ldcnd.exchange import Timing
-from ldcnd.model.samples import TelemetryItem
+from ldcnd.axis.polling import AGAIN_S, AxisPoller
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.drives.axis_config import RatesConfig
+from ldcnd.line.exchange import Timing
 
 POSITION, VELOCITY, ADC, STATE = (
     TelemetryItem.POSITION,

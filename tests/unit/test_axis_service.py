@@ -6,12 +6,23 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.daemon.axis.axis import QUEUED_COMMANDS, STOP_ROUNDS
-from ldcnd.daemon.axis.guards import Right
-from ldcnd.daemon.axis.plausibility import ROUNDS
-from ldcnd.drivers.driver import Fault, StopMode
-from ldcnd.drivers.network import BringUpReport
-from ldcnd.errors import (
+from ldcnd.axis.axis import QUEUED_COMMANDS, STOP_ROUNDS
+from ldcnd.axis.guards import Right
+from ldcnd.axis.plausibility import ROUNDS
+from ldcnd.contract.commands import (
+    BufferMode,
+    Halt,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    QuickStop,
+    Reset,
+    SetPosition,
+    Stop,
+    Verb,
+)
+from ldcnd.contract.errors import (
     AxisUnreachable,
     BadReply,
     BusDown,
@@ -29,22 +40,11 @@ from ldcnd.errors import (
     TooManyRequests,
     WrongState,
 )
-from ldcnd.exchange import Timing
-from ldcnd.model.commands import (
-    BufferMode,
-    Halt,
-    MoveAbsolute,
-    MoveRelative,
-    MoveVelocity,
-    Power,
-    QuickStop,
-    Reset,
-    SetPosition,
-    Stop,
-    Verb,
-)
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState, LinkState, Moving, Quality, TelemetryItem
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality, TelemetryItem
+from ldcnd.drives.driver import Fault, StopMode
+from ldcnd.drives.network import BringUpReport
+from ldcnd.line.exchange import Timing
 from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, raising
 
 THERE = MoveAbsolute(position=10.0)

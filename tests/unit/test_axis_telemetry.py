@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.driver import Fault
-from ldcnd.drivers.parameter_access import MonitorValue
-from ldcnd.exchange import Timing
-from ldcnd.model.commands import MoveAbsolute
-from ldcnd.model.samples import AxisState, MonitorName, Quality, TelemetryItem
-from ldcnd.model.traces import TraceChunk
+from ldcnd.contract.commands import MoveAbsolute
+from ldcnd.contract.samples import AxisState, MonitorName, Quality, TelemetryItem
+from ldcnd.contract.traces import TraceChunk
+from ldcnd.drives.driver import Fault
+from ldcnd.drives.parameter_access import MonitorValue
+from ldcnd.line.exchange import Timing
 from tests.support.axis_bench import KEYS, RUNNING, AxisBench, axis_bench
 
 POSITION, VELOCITY, ADC = TelemetryItem.POSITION, TelemetryItem.VELOCITY, TelemetryItem.ADC

@@ -2,12 +2,12 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.daemon.axis.state import JUMPED, MISSES_UNTIL_DOWN, ActiveCommand, AxisTracker, Completion
-from ldcnd.drivers.driver import AxisReading, Fault
-from ldcnd.exchange import Timing
-from ldcnd.model.commands import Verb
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState, LinkState, Moving, Quality
+from ldcnd.axis.state import JUMPED, MISSES_UNTIL_DOWN, ActiveCommand, AxisTracker, Completion
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality
+from ldcnd.drives.driver import AxisReading, Fault
+from ldcnd.line.exchange import Timing
 
 OFF = AxisReading(
     position_counts=0,

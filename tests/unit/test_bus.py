@@ -5,15 +5,15 @@ from typing import Any
 
 import pytest
 
-from ldcnd.bus.queue import LANE_LIMITS, Lane
-from ldcnd.bus.transaction import only_while
-from ldcnd.errors import (
+from ldcnd.contract.errors import (
     BusBusy,
     LdcndError,
     NotSupported,
     WrongState,
 )
-from ldcnd.exchange import Effect
+from ldcnd.line.exchange import Effect
+from ldcnd.line.queue import LANE_LIMITS, Lane
+from ldcnd.line.transaction import only_while
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
 from tests.support.toy_family import ToyPoller

@@ -3,15 +3,15 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.bus.bus import LONGEST_REOPEN_S
-from ldcnd.bus.queue import Lane
-from ldcnd.errors import (
+from ldcnd.contract.errors import (
     BadReply,
     BusDown,
     OutcomeUnknown,
     PacketRejected,
     ReplyTimeout,
 )
+from ldcnd.line.bus import LONGEST_REOPEN_S
+from ldcnd.line.queue import Lane
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, Rig, outcome, running, scripted
 from tests.support.scripted_line import Say

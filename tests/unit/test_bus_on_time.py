@@ -2,11 +2,11 @@
 
 import asyncio
 
-from ldcnd.bus.bus import LONGEST_OPENING_S, LONGEST_REOPEN_S, Bus
-from ldcnd.bus.line import LATE_S, Phase
-from ldcnd.bus.queue import Lane
-from ldcnd.errors import TransportLost
-from ldcnd.transport.transport import Transport
+from ldcnd.contract.errors import TransportLost
+from ldcnd.line.bus import LONGEST_OPENING_S, LONGEST_REOPEN_S, Bus
+from ldcnd.line.line import LATE_S, Phase
+from ldcnd.line.queue import Lane
+from ldcnd.line.transport import Transport
 from tests.support import toy_family as toy
 from tests.support.bus_rig import SETTINGS, Rig, outcome, running
 from tests.support.toy_family import ToyPoller

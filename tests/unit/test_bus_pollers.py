@@ -3,13 +3,13 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.bus.bus import LONGEST_BACKOFF_S
-from ldcnd.errors import (
+from ldcnd.contract.errors import (
     BadReply,
     PacketRejected,
     ReplyTimeout,
 )
-from ldcnd.exchange import Exchange
+from ldcnd.line.bus import LONGEST_BACKOFF_S
+from ldcnd.line.exchange import Exchange
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, Rig, polled, running, scripted
 from tests.support.scripted_line import Say, Script

@@ -1,8 +1,8 @@
 import pytest
 
-from ldcnd.errors import MalformedRequest
-from ldcnd.wirelog.capture import CaptureHeader, capture_lines, parse_capture
-from ldcnd.wirelog.recorder import WireEvent, WireRecord, parse_records
+from ldcnd.contract.errors import MalformedRequest
+from ldcnd.line.capture import CaptureHeader, capture_lines, parse_capture
+from ldcnd.line.flight_recorder import WireEvent, WireRecord, parse_records
 
 HEADER = CaptureHeader(
     version="0.1.0",

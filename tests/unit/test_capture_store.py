@@ -6,8 +6,8 @@ import pytest
 from structlog.testing import capture_logs
 
 from ldcnd.daemon.capture import CaptureStore
-from ldcnd.wirelog.capture import Capture, parse_capture
-from ldcnd.wirelog.recorder import WireEvent, WireRecord
+from ldcnd.line.capture import Capture, parse_capture
+from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from tests.unit.test_capture import HEADER, RECORDS
 
 

@@ -5,7 +5,7 @@ import pytest
 
 from ldcnd.cli import main
 from ldcnd.cli.output import WRONG_CONFIG, show_lines
-from ldcnd.errors import ConfigError, LeaseHeld
+from ldcnd.contract.errors import ConfigError, LeaseHeld
 
 
 def test_a_refused_configuration_comes_with_what_to_do(monkeypatch, capsys):

@@ -6,8 +6,8 @@ from click.testing import CliRunner
 
 from ldcnd.cli.parameter_file import as_toml, load_parameters
 from ldcnd.cli.params import command
-from ldcnd.errors import ConfigError
-from ldcnd.model.parameters import DriveFacts, ParameterDump, ParameterValue
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.parameters import DriveFacts, ParameterDump, ParameterValue
 
 READ_AT = datetime(2026, 11, 22, 12, 0, tzinfo=UTC)
 FACTS = DriveFacts(driver_type=0x000C, software_version=1, unit=1, gain_switch=4, switches=("PARAMETERS_RULE",))

@@ -7,9 +7,9 @@ import pytest
 
 import ldcnd
 from ldcnd.cli.output import typed
-from ldcnd.errors import LeaseHeld, Remedy, step
-from ldcnd.messaging.codec import error_reply, rebuild_error
-from ldcnd.model.commands import Verb
+from ldcnd.contract.codec import error_reply, rebuild_error
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.errors import LeaseHeld, Remedy, step
 from tests.support.pages import require_command_line
 
 SOURCES = Path(ldcnd.__file__).parent

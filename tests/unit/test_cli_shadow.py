@@ -5,14 +5,14 @@ from dataclasses import asdict
 
 import pytest
 
+from ldcnd.bench.tuning.ldcn import watching
+from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.bench.tuning.ldcn.report import Estimate
+from ldcnd.bench.tuning.ldcn.shadow import FigureName
+from ldcnd.bench.tuning.ldcn.watching import ShadowAlarm
 from ldcnd.cli import shadow
 from ldcnd.cli.connection import Target
-from ldcnd.errors import ConfigError
-from ldcnd.tuning.ldcn import watching
-from ldcnd.tuning.ldcn.plant import Plant
-from ldcnd.tuning.ldcn.report import Estimate
-from ldcnd.tuning.ldcn.shadow import FigureName
-from ldcnd.tuning.ldcn.watching import ShadowAlarm
+from ldcnd.contract.errors import ConfigError
 from tests.unit.test_cli_tune import REPORT
 
 PLANT = {name: Estimate(value=value, interval=0, unit="") for name, value in asdict(Plant(20_000, 5, 4)).items()}

@@ -2,11 +2,11 @@
 
 import pytest
 
+from ldcnd.bench.tuning.ldcn import guided
+from ldcnd.bench.tuning.ldcn.report import Estimate, LoopMargins, MoveFigures, TuningReport
 from ldcnd.cli.ldcn import tune
 from ldcnd.cli.tune import TuneOptions
-from ldcnd.errors import ConfigError
-from ldcnd.tuning.ldcn import guided
-from ldcnd.tuning.ldcn.report import Estimate, LoopMargins, MoveFigures, TuningReport
+from ldcnd.contract.errors import ConfigError
 
 PREDICTED = MoveFigures(settling_s=0.016, settled=True, overshoot=0.022, following_error=0.111, error=0.0)
 REPORT = TuningReport(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.families.known import DEFAULT, HOMES
+from ldcnd.drives.known import DEFAULT, HOMES
 from tests.support.process import ROOT
 
 CLIENT = ROOT / "ldcnd" / "client"
@@ -52,28 +52,16 @@ try:
 except SystemExit as end:
     print(end.code, *sys.modules, sep="\\n")
 """
-BESIDE_A_DAEMON = {
-    "bluesky",
-    "commissioning",
-    "commissioning_page",
-    "console",
-    "epics",
-    "metrics",
-    "pki",
-    "recording",
-    "ros2",
-    "top",
-    "tuning",
-}
+BESIDE_A_DAEMON = {"bench", "bluesky", "console", "lab", "ops"}
 DAEMON = """
 import asyncio, sys, time
 from pathlib import Path
 from ldcnd.cli import main, run
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.publish.contract import all_schemas
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.planning.plan import require_plan
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.contract import all_schemas
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.config.plan import require_plan
 
 async def build(config):
     require_plan(config)
@@ -105,7 +93,7 @@ def test_a_call_of_the_command_line_loads_little(words: str, tmp_path: Path) -> 
     code, *loaded = printed_by(CALL.format(words=[*words.split(), "-e", "127.0.0.1:1"]), tmp_path)
 
     assert code == "3"
-    assert "ldcnd.messaging.zenoh_session" in loaded
+    assert "ldcnd.net.zenoh_session" in loaded
     assert not {f"ldcnd.{name}" for name in OURS - {"cli"}} & set(loaded)
     assert not (OTHERS - {"click"} | SLOW_TO_LOAD) & set(loaded)
 

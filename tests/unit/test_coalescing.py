@@ -8,10 +8,10 @@ from itertools import pairwise
 import pytest
 from typing_extensions import override
 
-from ldcnd.bus.queue import Lane
-from ldcnd.bus.transaction import only_while
-from ldcnd.errors import BusError
-from ldcnd.exchange import Effect, Exchange, Timing
+from ldcnd.contract.errors import BusError
+from ldcnd.line.exchange import Effect, Exchange, Timing
+from ldcnd.line.queue import Lane
+from ldcnd.line.transaction import only_while
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
 from tests.support.scripted_line import Say

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.errors import ErrorCode, LdcndError, MalformedRequest, PayloadTooLarge, PositionLimit
-from ldcnd.messaging.codec import (
+from ldcnd.contract.catalogue import AXIS_COMMANDS
+from ldcnd.contract.codec import (
     MAX_PAYLOAD_BYTES,
     MAX_RECEIVED_BYTES,
     Encoding,
@@ -25,11 +25,11 @@ from ldcnd.messaging.codec import (
     reply_encoding,
     to_json,
 )
-from ldcnd.model.catalogue import AXIS_COMMANDS
-from ldcnd.model.commands import ErrorReply, Home, MoveAbsolute, Power, Reset
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.plan import RigBudget
-from ldcnd.model.samples import (
+from ldcnd.contract.commands import ErrorReply, Home, MoveAbsolute, Power, Reset
+from ldcnd.contract.errors import ErrorCode, LdcndError, MalformedRequest, PayloadTooLarge, PositionLimit
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.samples import (
     AxisState,
     CurrentCommand,
     FaultEntry,

@@ -6,11 +6,11 @@ from collections.abc import Iterator
 import msgpack
 import pytest
 
-from ldcnd.daemon.publish.contract import all_schemas
-from ldcnd.messaging.codec import Encoding, decode, encode
-from ldcnd.model.catalogue import AXIS_COMMANDS, AXIS_QUESTIONS, COMMANDS, RIG_COMMANDS, verbs_for
-from ldcnd.model.commands import About, AxisCommand, Capability, Command, CommandReply, Effect, Ends, Verb
-from ldcnd.model.frozen import Frozen, schema_name
+from ldcnd.contract.catalogue import AXIS_COMMANDS, AXIS_QUESTIONS, COMMANDS, RIG_COMMANDS, verbs_for
+from ldcnd.contract.codec import Encoding, decode, encode
+from ldcnd.contract.commands import About, AxisCommand, Capability, Command, CommandReply, Effect, Ends, Verb
+from ldcnd.contract.frozen import Frozen, schema_name
+from ldcnd.daemon.contract import all_schemas
 from tests.support.process import ROOT
 
 VECTORS = json.loads((ROOT / "tests" / "vectors" / "commands.json").read_text(encoding="utf-8"))["commands"]

@@ -2,9 +2,9 @@
 
 import pytest
 
-from ldcnd.model.condition import Severity, Trouble, assess, line_troubles
-from ldcnd.model.health import AxisHealth, ItemHealth
-from ldcnd.model.samples import AxisState, FaultEntry, FaultSample, LinkState, Moving, Quality, StateSample
+from ldcnd.contract.condition import Severity, Trouble, assess, line_troubles
+from ldcnd.contract.health import AxisHealth, ItemHealth
+from ldcnd.contract.samples import AxisState, FaultEntry, FaultSample, LinkState, Moving, Quality, StateSample
 
 
 def state(**changes) -> StateSample:

@@ -18,16 +18,13 @@ from ldcnd.client.fleet import AxisReport, RigReport
 from ldcnd.client.overview import AxisNow
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
-from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.session import Sample, SampleKind
-from ldcnd.metrics import HealthCollector
-from ldcnd.model.condition import Place, assess
-from ldcnd.model.frozen import Frozen
-from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, StopWaitHealth
-from ldcnd.model.meta import AxisInfo, AxisLimits, DaemonInfo
-from ldcnd.model.samples import (
+from ldcnd.contract.codec import Encoding, encode
+from ldcnd.contract.condition import Place, assess
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth, StopWaitHealth
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.meta import AxisInfo, AxisLimits, DaemonInfo
+from ldcnd.contract.samples import (
     AxisState,
     FaultEntry,
     FaultSample,
@@ -38,9 +35,12 @@ from ldcnd.model.samples import (
     StateSample,
     TelemetryItem,
 )
-from ldcnd.ros2.bridge import ERROR, OK, STALE, WARN, Bridge
-from ldcnd.top.columns import as_text
-from ldcnd.top.rig_view import Description, RigView
+from ldcnd.lab.metrics import HealthCollector
+from ldcnd.lab.ros2.bridge import ERROR, OK, STALE, WARN, Bridge
+from ldcnd.lab.top.columns import as_text
+from ldcnd.lab.top.rig_view import Description, RigView
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.session import Sample, SampleKind
 
 NOW_NS = 1_000_000_000_000
 NUMBER = 60.0
@@ -238,13 +238,13 @@ def notebook(at: Known) -> str:
 
 
 def bluesky(at: Known) -> str:
-    values = pytest.importorskip("ldcnd.bluesky.values")
+    values = pytest.importorskip("ldcnd.lab.bluesky.values")
     read = values.reading(at.position.value, 0.0, Quality.GOOD, assess(at.state))
     return str(read)
 
 
 def epics(at: Known) -> str:
-    motor = pytest.importorskip("ldcnd.epics.motor")
+    motor = pytest.importorskip("ldcnd.lab.epics.motor")
 
     async def shown() -> str:
         record = motor.MotorRecord(INFO, (1.0, 1.0), None, None, frozenset, moves=False)

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.config.rig import RigConfig, load_config, single_line
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 
 CONFIGURATIONS = Path(__file__).parents[2] / "config"
 

@@ -10,8 +10,8 @@ import pytest
 
 from ldcnd.console.feed import MOST_PAGES, Feed, parse_subscription
 from ldcnd.console.latest_values import LatestValues
-from ldcnd.errors import MalformedRequest, TooManyRequests, ValueOutOfRange
-from ldcnd.messaging.session import Sample, SampleKind
+from ldcnd.contract.errors import MalformedRequest, TooManyRequests, ValueOutOfRange
+from ldcnd.net.session import Sample, SampleKind
 
 MSGPACK, JSON = "application/msgpack;position_sample", "application/json"
 

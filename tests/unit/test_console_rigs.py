@@ -7,12 +7,12 @@ import pytest
 
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.rigs import MOST_RIGS, Endpoint, Rigs
-from ldcnd.errors import UnknownAxis
-from ldcnd.messaging.codec import Encoding, encode
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.meta import DaemonInfo
+from ldcnd.contract.codec import Encoding, encode
+from ldcnd.contract.errors import UnknownAxis
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.meta import DaemonInfo
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.zenoh_settings import ZenohSettings
 
 HERE, THERE = Endpoint("here", ZenohSettings()), Endpoint("there", ZenohSettings())
 

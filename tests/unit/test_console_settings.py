@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.console.settings import ConsoleSettings, read_token
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 
 CERTIFICATE, KEY, TOKEN = Path("cert.pem"), Path("key.pem"), "t" * 40

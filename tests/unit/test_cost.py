@@ -5,17 +5,17 @@ import math
 
 import pytest
 
-from ldcnd.bus.settings import LINGER_S
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.costs import price_list
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
-from ldcnd.drivers.smartstep.costs import price_list as smartstep_price_list
-from ldcnd.drivers.smartstep.parameters import PN000
-from ldcnd.exchange import Exchange
-from ldcnd.model.samples import TelemetryItem
-from ldcnd.planning.cost import LineTiming, cost_of
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.drives.cost import LineTiming, cost_of
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.costs import price_list
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
+from ldcnd.drives.smartstep.costs import price_list as smartstep_price_list
+from ldcnd.drives.smartstep.parameters import PN000
+from ldcnd.line.exchange import Exchange
+from ldcnd.line.settings import LINGER_S
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.line import SimulatedLine, open_simulated_line

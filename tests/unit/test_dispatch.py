@@ -8,14 +8,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from ldcnd.daemon.axis.axis import AxisService
-from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.dispatch import PENDING_REQUESTS, Dispatcher, Requests
-from ldcnd.daemon.command.leases import Authority
-from ldcnd.daemon.command.ledger import EventLog, Ledger
-from ldcnd.daemon.line.rig import Rig
-from ldcnd.drivers.driver import StopMode
-from ldcnd.errors import (
+from ldcnd.axis.axis import AxisService
+from ldcnd.axis.clock import Clock
+from ldcnd.contract.catalogue import RENAMED
+from ldcnd.contract.commands import BufferMode, Halt, MoveAbsolute, MoveVelocity, Power, Preview, SetGains, Stop, Why
+from ldcnd.contract.errors import (
     CommandExpired,
     CommandIdReused,
     DuplicateDaemon,
@@ -30,13 +27,16 @@ from ldcnd.errors import (
     StaleSequence,
     UnknownAxis,
 )
-from ldcnd.messaging.hand_over import Query
-from ldcnd.model.catalogue import RENAMED
-from ldcnd.model.commands import BufferMode, Halt, MoveAbsolute, MoveVelocity, Power, Preview, SetGains, Stop, Why
-from ldcnd.model.events import CommandStatus, ReadEvents, ReadOutcome
-from ldcnd.model.leases import Acquire, LeaseReply, ListHolders, Release, Renew
-from ldcnd.model.rig_commands import AxisMove, MoveTogether, Rehearsal, Rehearse
-from ldcnd.model.samples import AxisState
+from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
+from ldcnd.contract.leases import Acquire, LeaseReply, ListHolders, Release, Renew
+from ldcnd.contract.rig_commands import AxisMove, MoveTogether, Rehearsal, Rehearse
+from ldcnd.contract.samples import AxisState
+from ldcnd.daemon.dispatch import PENDING_REQUESTS, Dispatcher, Requests
+from ldcnd.daemon.leases import Authority
+from ldcnd.daemon.ledger import EventLog, Ledger
+from ldcnd.daemon.rig import Rig
+from ldcnd.drives.driver import StopMode
+from ldcnd.net.hand_over import Query
 from tests.support.axis_bench import KEYS, RUNNING, STANDING, AxisBench, axis_bench, raising
 
 THERE = MoveAbsolute(position=10.0)

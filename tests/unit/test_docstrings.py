@@ -1,6 +1,6 @@
 """What docstrings must say: fields of models, in their schemas; packages, to those who come new."""
 
-from ldcnd.model.frozen import Frozen, attribute_docstrings
+from ldcnd.contract.frozen import Frozen, attribute_docstrings
 
 
 class Base(Frozen):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.epics.fields import Put, number
+from ldcnd.lab.epics.fields import Put, number
 
 
 @pytest.mark.parametrize(("text", "value"), [("1.5", 1.5), ("1,5", 1.5), (b"-2 mm", -2.0), (3, 3), (0.25, 0.25)])

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from ldcnd.errors import ERRORS, ErrorCode, as_markdown
+from ldcnd.contract.errors import ERRORS, ErrorCode, as_markdown
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "errors.md").read_text()

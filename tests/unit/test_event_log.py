@@ -5,13 +5,13 @@ from unittest.mock import Mock
 
 from structlog.testing import capture_logs
 
-from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.command.ledger import PAGE_BYTES, PUBLISHED_AFTER_S, UNPUBLISHED_EVENTS, Entry, EventLog
-from ldcnd.daemon.publish.publisher import Publisher
-from ldcnd.errors import BusDown, SessionError
-from ldcnd.messaging.codec import to_json
-from ldcnd.model.commands import Power
-from ldcnd.model.events import CommandStatus, ReadEvents
+from ldcnd.axis.clock import Clock
+from ldcnd.contract.codec import to_json
+from ldcnd.contract.commands import Power
+from ldcnd.contract.errors import BusDown, SessionError
+from ldcnd.contract.events import CommandStatus, ReadEvents
+from ldcnd.daemon.ledger import PAGE_BYTES, PUBLISHED_AFTER_S, UNPUBLISHED_EVENTS, Entry, EventLog
+from ldcnd.net.publisher import Publisher
 
 
 class Told:

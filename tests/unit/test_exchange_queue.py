@@ -3,9 +3,9 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.bus.poller import Poller
-from ldcnd.bus.queue import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, ExchangeQueue, Lane
-from ldcnd.errors import BusBusy
+from ldcnd.contract.errors import BusBusy
+from ldcnd.line.poller import Poller
+from ldcnd.line.queue import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, ExchangeQueue, Lane
 from tests.support.queue_turns import take
 from tests.support.toy_family import ToyPoller
 

@@ -5,14 +5,14 @@ import re
 import pytest
 from click.testing import CliRunner
 
-from ldcnd import errors
+from ldcnd.axis.state import OF_DAEMON, AxisTracker
 from ldcnd.cli.main import cli, main
-from ldcnd.daemon.axis.state import OF_DAEMON, AxisTracker
-from ldcnd.drivers.ldcn.faults import FaultCode
-from ldcnd.drivers.smartstep.monitors import ALARMS, AlarmKind
-from ldcnd.errors import DriveFault, ErrorCode, LdcndError
-from ldcnd.fault_pages import FOLDER, UNLISTED_ALARM, codes, page_of, page_text
-from ldcnd.messaging.codec import error_reply
+from ldcnd.contract import errors
+from ldcnd.contract.codec import error_reply
+from ldcnd.contract.errors import DriveFault, ErrorCode, LdcndError
+from ldcnd.contract.fault_pages import FOLDER, UNLISTED_ALARM, codes, page_of, page_text
+from ldcnd.drives.ldcn.faults import FaultCode
+from ldcnd.drives.smartstep.monitors import ALARMS, AlarmKind
 from tests.support.pages import command_lines, require_command_line
 
 DAEMON_FAULTS = {fault.code for fault in OF_DAEMON}

@@ -12,13 +12,13 @@ from ldcnd.cli.fleet import table
 from ldcnd.client.fleet import survey
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.errors import MalformedRequest
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.model.samples import LinkState
+from ldcnd.contract.errors import MalformedRequest
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.samples import LinkState
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.support.process import LDCND
 from tests.support.rig import EPOCH_NS, SIMULATED
 from tests.support.session_pair import free_endpoint

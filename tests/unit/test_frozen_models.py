@@ -1,6 +1,6 @@
 """Models are built when they are needed first, or all of them on demand."""
 
-from ldcnd.model.frozen import Frozen, build_models
+from ldcnd.contract.frozen import Frozen, build_models
 
 
 def test_a_model_is_built_at_its_first_use():

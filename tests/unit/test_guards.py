@@ -1,8 +1,8 @@
 import pytest
 
-from ldcnd.daemon.axis import guards
-from ldcnd.daemon.axis.state import AxisTracker
-from ldcnd.errors import (
+from ldcnd.axis import guards
+from ldcnd.axis.state import AxisTracker
+from ldcnd.contract.errors import (
     AccelerationLimit,
     AxisUnreachable,
     NotReferenced,
@@ -11,8 +11,8 @@ from ldcnd.errors import (
     VelocityLimit,
     WrongState,
 )
-from ldcnd.model.meta import AxisLimits
-from ldcnd.model.samples import AxisState, FaultEntry, LinkState
+from ldcnd.contract.meta import AxisLimits
+from ldcnd.contract.samples import AxisState, FaultEntry, LinkState
 
 
 def ready(*faults: str, **changes: object) -> AxisTracker:

@@ -5,8 +5,8 @@ import threading
 
 import pytest
 
-from ldcnd.messaging.hand_over import HandOver, Load, TokenChanges
-from ldcnd.messaging.workers import Workers
+from ldcnd.net.hand_over import HandOver, Load, TokenChanges
+from ldcnd.net.workers import Workers
 
 pytestmark = pytest.mark.real_time
 

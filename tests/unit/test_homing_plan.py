@@ -3,11 +3,11 @@
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.config.axis import AxisConfig
-from ldcnd.daemon.axis.procedures.home import plan_search
-from ldcnd.drivers.driver import Homes, StopMode
-from ldcnd.errors import MalformedRequest, NotSupported
-from ldcnd.model.commands import Home, HomeMethod
+from ldcnd.axis.procedures.home import plan_search
+from ldcnd.contract.commands import Home, HomeMethod
+from ldcnd.contract.errors import MalformedRequest, NotSupported
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.driver import Homes, StopMode
 
 PRESET = {
     "method": "reverse_limit",

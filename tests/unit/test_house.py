@@ -4,9 +4,9 @@ import pytest
 
 from tests.house import FLOWS, way_of
 
-QUERY = ("messaging/hand_over.py Intake.admit", "messaging/hand_over.py Query.finish")
+QUERY = ("net/hand_over.py Intake.admit", "net/hand_over.py Query.finish")
 ENDS = {
-    "poll": ("bus/line.py Line.data_received", "daemon/publish/publisher.py Topic.publish"),
+    "poll": ("line/line.py Line.data_received", "net/publisher.py Topic.publish"),
     "move": QUERY,
     "move of the console": (
         "console/gate.py Gate.__call__",

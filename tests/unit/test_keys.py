@@ -5,8 +5,8 @@ import zenoh
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from ldcnd.errors import MalformedRequest, ValueOutOfRange, WildcardRefused
-from ldcnd.messaging.keys import RIG_ITSELF, AliveAddress, CommandAddress, Keys, TelemetryAddress, matches
+from ldcnd.contract.errors import MalformedRequest, ValueOutOfRange, WildcardRefused
+from ldcnd.contract.keys import RIG_ITSELF, AliveAddress, CommandAddress, Keys, TelemetryAddress, matches
 
 KEYS = Keys("bench1")
 

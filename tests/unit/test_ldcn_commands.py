@@ -4,16 +4,16 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Group, Node
-from ldcnd.drivers.ldcn.controls import HomingControl, IoOption, LimitPins, StopControl
-from ldcnd.drivers.ldcn.packet import Status, StatusFlag, StatusItem
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.registers import BaudCodes, actual_baud
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.errors import BadReply, NotSupported, ValueOutOfRange
-from ldcnd.exchange import Effect, ReplyVerdict
+from ldcnd.contract.errors import BadReply, NotSupported, ValueOutOfRange
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Group, Node
+from ldcnd.drives.ldcn.controls import HomingControl, IoOption, LimitPins, StopControl
+from ldcnd.drives.ldcn.packet import Status, StatusFlag, StatusItem
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.line.exchange import Effect, ReplyVerdict
 
 LS_182AP = PROFILES["ls-182ap"]
 V1, V2, V3, V4 = (PROFILES[f"pic-servo-v{version}"] for version in (1, 2, 3, 4))

@@ -2,14 +2,14 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn import commands
-from ldcnd.drivers.ldcn.commands import Node
-from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.packet import StatusItem, item_bytes
-from ldcnd.drivers.ldcn.profiles import LS_173AP, LS_182AP
-from ldcnd.drivers.ldcn.received import SetGain, decode_command
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, TrajectoryControl
-from ldcnd.errors import BadReply
+from ldcnd.contract.errors import BadReply
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.packet import StatusItem, item_bytes
+from ldcnd.drives.ldcn.profiles import LS_173AP, LS_182AP
+from ldcnd.drives.ldcn.received import SetGain, decode_command
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, TrajectoryControl
 
 DRIVE = Node(1, LS_182AP)
 INITIAL = Trajectory(position=0, velocity=0, acceleration=1, pwm_or_target=0, start_now=True)

@@ -2,9 +2,9 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn.faults import WARNINGS, Fault, FaultCode, Knowledge, diagnose
-from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag
-from ldcnd.drivers.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn.faults import WARNINGS, Fault, FaultCode, Knowledge, diagnose
+from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag
+from ldcnd.drives.ldcn.profiles import PROFILES
 
 LS_182AP = PROFILES["ls-182ap"]
 LS_173AP = PROFILES["ls-173ap"]

@@ -1,7 +1,7 @@
 """Which group address each module has."""
 
-from ldcnd.drivers.ldcn.addressing import GroupPlan
-from ldcnd.drivers.network import GroupSpec
+from ldcnd.drives.ldcn.addressing import GroupPlan
+from ldcnd.drives.network import GroupSpec
 
 AXES = {1: "x", 2: "y", 3: "z", 5: "c"}
 PLAN = GroupPlan((GroupSpec("pair", ("x", "z"), leader="z"),), AXES)

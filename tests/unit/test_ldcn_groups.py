@@ -4,15 +4,15 @@ from types import SimpleNamespace
 
 import pytest
 
-from ldcnd.drivers.driver import AxisSpec, Gains, Motion, StopMode
-from ldcnd.drivers.ldcn.addressing import EVERYBODY, GroupPlan
-from ldcnd.drivers.ldcn.commands import Group, save_home
-from ldcnd.drivers.ldcn.groups import Groups
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4
-from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.drivers.network import GroupSpec
-from ldcnd.errors import DriveFault, NotSupported, OutcomeUnknown, ReplyTimeout, StopLatched, WrongState
+from ldcnd.contract.errors import DriveFault, NotSupported, OutcomeUnknown, ReplyTimeout, StopLatched, WrongState
+from ldcnd.drives.driver import AxisSpec, Gains, Motion, StopMode
+from ldcnd.drives.ldcn.addressing import EVERYBODY, GroupPlan
+from ldcnd.drives.ldcn.commands import Group, save_home
+from ldcnd.drives.ldcn.groups import Groups
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4
+from ldcnd.drives.ldcn.servo import LdcnAxis
+from ldcnd.drives.network import GroupSpec
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.direct_bus import DirectBus
 from tests.support.simulated_host import SimulatedHost

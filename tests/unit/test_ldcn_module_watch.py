@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn.network import PERIOD_S, ModuleWatch
+from ldcnd.drives.ldcn.network import PERIOD_S, ModuleWatch
 
 
 async def test_each_turn_should_be_over_by_the_next_one_and_a_late_one_shifts_none():

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.driver import HomeCapture, Motion, StopMode
-from ldcnd.drivers.ldcn.addressing import Expected, Identity, differences
-from ldcnd.drivers.ldcn.adoption import Found
-from ldcnd.drivers.ldcn.commands import Node, read_status
-from ldcnd.drivers.ldcn.packet import Command, StatusItem
-from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
-from ldcnd.drivers.ldcn.registers import actual_baud
-from ldcnd.drivers.network import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
-from ldcnd.errors import NetworkMismatch, NotSupported, ReplyTimeout, StopLatched
-from ldcnd.model.commands import HomeMethod
+from ldcnd.contract.commands import HomeMethod
+from ldcnd.contract.errors import NetworkMismatch, NotSupported, ReplyTimeout, StopLatched
+from ldcnd.drives.driver import HomeCapture, Motion, StopMode
+from ldcnd.drives.ldcn.addressing import Expected, Identity, differences
+from ldcnd.drives.ldcn.adoption import Found
+from ldcnd.drives.ldcn.commands import Node, read_status
+from ldcnd.drives.ldcn.packet import Command, StatusItem
+from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
+from ldcnd.drives.ldcn.registers import actual_baud
+from ldcnd.drives.network import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive

@@ -2,8 +2,8 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn.packet import Command, Packet, PacketReader, ReceivedPacket, decode_packet, encode_packet
-from ldcnd.errors import BadReply, ValueOutOfRange
+from ldcnd.contract.errors import BadReply, ValueOutOfRange
+from ldcnd.drives.ldcn.packet import Command, Packet, PacketReader, ReceivedPacket, decode_packet, encode_packet
 
 READ_POSITION = bytes.fromhex("aa 01 13 01 15")
 

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn.profiles import PROFILES, HomingSource, Support, identify
+from ldcnd.drives.ldcn.profiles import PROFILES, HomingSource, Support, identify
 
 
 @pytest.mark.parametrize(

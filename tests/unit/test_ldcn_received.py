@@ -2,11 +2,12 @@
 
 import pytest
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.packet import Command, Packet, encode_packet
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.received import (
+from ldcnd.contract.errors import BadReply
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.packet import Command, Packet, encode_packet
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn.received import (
     HardReset,
     Interpretation,
     IoControl,
@@ -21,8 +22,7 @@ from ldcnd.drivers.ldcn.received import (
     interpret,
     interpret_bytes,
 )
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.errors import BadReply
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 
 LS_182AP = PROFILES["ls-182ap"]
 V3, V4 = PROFILES["pic-servo-v3"], PROFILES["pic-servo-v4"]

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drivers.ldcn.controls import HomingControl, StopControl
-from ldcnd.drivers.ldcn.faults import FaultCode
-from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag, StatusItem
-from ldcnd.drivers.ldcn.profiles import PROFILES, Support
-from ldcnd.drivers.ldcn.trajectory import TrajectoryControl
+from ldcnd.drives.ldcn.controls import HomingControl, StopControl
+from ldcnd.drives.ldcn.faults import FaultCode
+from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag, StatusItem
+from ldcnd.drives.ldcn.profiles import PROFILES, Support
+from ldcnd.drives.ldcn.trajectory import TrajectoryControl
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "ldcn-nmc.md").read_text(encoding="utf-8")
 

@@ -2,15 +2,15 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.registers import baud_divisor
-from ldcnd.drivers.ldcn.trajectory import (
+from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn.registers import baud_divisor
+from ldcnd.drives.ldcn.trajectory import (
     acceleration_counts_per_s2,
     programmed_acceleration,
     programmed_velocity,
     velocity_counts_per_s,
 )
-from ldcnd.errors import ValueOutOfRange
 
 LS_182AP = PROFILES["ls-182ap"]
 V4 = PROFILES["pic-servo-v4"]

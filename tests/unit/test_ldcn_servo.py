@@ -5,14 +5,14 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.bus.queue import Lane
-from ldcnd.drivers.driver import AnalogMotion, AxisSpec, Gains, HomeCapture, Motion, PwmOutput, StopMode
-from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins
-from ldcnd.drivers.ldcn.packet import Command, StatusItem
-from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V4
-from ldcnd.drivers.ldcn.servo import LdcnAxis
-from ldcnd.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
-from ldcnd.model.commands import HomeMethod, PinMode
+from ldcnd.contract.commands import HomeMethod, PinMode
+from ldcnd.contract.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
+from ldcnd.drives.driver import AnalogMotion, AxisSpec, Gains, HomeCapture, Motion, PwmOutput, StopMode
+from ldcnd.drives.ldcn.controls import HomingControl, LimitPins
+from ldcnd.drives.ldcn.packet import Command, StatusItem
+from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_V4
+from ldcnd.drives.ldcn.servo import LdcnAxis
+from ldcnd.line.queue import Lane
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant

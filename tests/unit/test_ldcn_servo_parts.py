@@ -4,10 +4,13 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.driver import AnalogMotion, Ceiling, Gains, HomeCapture, Motion, PwmOutput, StopMode
-from ldcnd.drivers.ldcn.controls import HomingControl, LimitPins, pin_bits
-from ldcnd.drivers.ldcn.packet import AuxFlag, Status, StatusFlag
-from ldcnd.drivers.ldcn.profiles import (
+from ldcnd.contract.commands import HomeMethod, PinMode
+from ldcnd.contract.errors import BadReply, NotSupported, ReplyTimeout, ValueOutOfRange
+from ldcnd.contract.meta import Provenance
+from ldcnd.drives.driver import AnalogMotion, Ceiling, Gains, HomeCapture, Motion, PwmOutput, StopMode
+from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, pin_bits
+from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag
+from ldcnd.drives.ldcn.profiles import (
     LS_173AP,
     LS_182AP,
     PIC_SERVO_SC,
@@ -16,13 +19,10 @@ from ldcnd.drivers.ldcn.profiles import (
     PIC_SERVO_V4,
     PROFILES,
 )
-from ldcnd.drivers.ldcn.record import DriveState
-from ldcnd.drivers.ldcn.registers import REPLY_LOST, Assumed, Known, ServoRegisters, Unknown
-from ldcnd.drivers.ldcn.servo import home_methods, homing_control, opens_loop
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of
-from ldcnd.errors import BadReply, NotSupported, ReplyTimeout, ValueOutOfRange
-from ldcnd.model.commands import HomeMethod, PinMode
-from ldcnd.model.meta import Provenance
+from ldcnd.drives.ldcn.record import DriveState
+from ldcnd.drives.ldcn.registers import REPLY_LOST, Assumed, Known, ServoRegisters, Unknown
+from ldcnd.drives.ldcn.servo import home_methods, homing_control, opens_loop
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1)
 CLOSED = AuxFlag.SERVO_ON | AuxFlag.INDEX

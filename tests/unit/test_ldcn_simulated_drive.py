@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.controls import LimitPins, StopControl
-from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
-from ldcnd.drivers.ldcn.registers import encode_gains
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.drives.ldcn.controls import LimitPins, StopControl
+from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.registers import encode_gains
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.plant import MotorPlant

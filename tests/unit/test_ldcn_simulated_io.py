@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.packet import Command
-from ldcnd.drivers.ldcn.pic_io import (
+from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.pic_io import (
     IoItem,
     IoNode,
     SetDirection,
@@ -19,10 +20,9 @@ from ldcnd.drivers.ldcn.pic_io import (
     encode_io_command,
     send_io_command,
 )
-from ldcnd.errors import ValueOutOfRange
-from ldcnd.families.ldcn.simulation import SimulatedChainConfig
 from ldcnd.sim.ldcn.chain import Analog, ChainSpec, Line, ModuleSpec, TimedEvent, build_chain, model
 from ldcnd.sim.ldcn.io import IoWiring
+from ldcnd.sim.ldcn.simulation import SimulatedChainConfig
 from tests.support.simulated_host import SimulatedHost
 
 ALL = 0x0FFF

@@ -5,11 +5,11 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.packet import AuxFlag, Command, Packet, StatusFlag, encode_packet
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.packet import AuxFlag, Command, Packet, StatusFlag, encode_packet
+from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
 from ldcnd.sim.ldcn.power import Condition, Trip
 from ldcnd.sim.ldcn.quirks import AnalogEnd, CommandBuffer

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.packet import Command, Packet, StatusFlag, StatusItem, encode_packet
-from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_V1, PIC_SERVO_V4
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.errors import ValueOutOfRange
+from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.drives.ldcn.packet import Command, Packet, StatusFlag, StatusItem, encode_packet
+from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_V1, PIC_SERVO_V4
+from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings
 from tests.support.simulated_host import SimulatedHost, little

@@ -2,10 +2,10 @@
 
 import pytest
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
-from ldcnd.drivers.ldcn.trajectory import Trajectory
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.trajectory import Trajectory
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, SOFT_GAINS, UTILITY_GAINS, SimulatedAxis

@@ -4,15 +4,15 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.commands import Node, add_path_points, start_path
-from ldcnd.drivers.ldcn.controls import IoOption, StopControl
-from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
-from ldcnd.drivers.ldcn.path import PathPoint, decode_point, encode_point
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.registers import FRACTION, encode_gains
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.errors import NotSupported, ValueOutOfRange
+from ldcnd.contract.errors import NotSupported, ValueOutOfRange
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.commands import Node, add_path_points, start_path
+from ldcnd.drives.ldcn.controls import IoOption, StopControl
+from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.path import PathPoint, decode_point, encode_point
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn.registers import FRACTION, encode_gains
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import HalfPoint, LimitInPath, PathOverflow, PathWithoutServo

@@ -2,12 +2,12 @@
 
 import pytest
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.controls import StopControl
-from ldcnd.drivers.ldcn.faults import AFTER_RESET, FaultCode, Knowledge, diagnose
-from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
-from ldcnd.drivers.ldcn.profiles import LS_182AP
-from ldcnd.drivers.ldcn.registers import encode_gains
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.faults import AFTER_RESET, FaultCode, Knowledge, diagnose
+from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.profiles import LS_182AP
+from ldcnd.drives.ldcn.registers import encode_gains
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import Condition
 from tests.support.simulated_host import SimulatedHost, little

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.controls import IoOption, StartUp, StopControl
-from ldcnd.drivers.ldcn.packet import AuxFlag, Command, StatusFlag
-from ldcnd.drivers.ldcn.registers import FRACTION, SERVO_CYCLE_S, encode_gains
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.families.ldcn.simulation import SimulatedChainConfig
+from ldcnd.drives.ldcn.controls import IoOption, StartUp, StopControl
+from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.registers import FRACTION, SERVO_CYCLE_S, encode_gains
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import ExcludedOptions, RelativeTo, ResetInMotion, UnknownBaud
+from ldcnd.sim.ldcn.simulation import SimulatedChainConfig
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, UTILITY_GAINS, SimulatedAxis
 from tests.support.simulated_host import SimulatedHost, little

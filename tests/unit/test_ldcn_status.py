@@ -2,7 +2,8 @@
 
 import pytest
 
-from ldcnd.drivers.ldcn.packet import (
+from ldcnd.contract.errors import BadReply
+from ldcnd.drives.ldcn.packet import (
     AuxFlag,
     Status,
     StatusFlag,
@@ -13,9 +14,8 @@ from ldcnd.drivers.ldcn.packet import (
     item_bytes,
     status_bytes,
 )
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.errors import BadReply
-from ldcnd.exchange import ReplyVerdict
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.line.exchange import ReplyVerdict
 
 LS_182AP = PROFILES["ls-182ap"]
 PIC_SERVO_SC = PROFILES["pic-servo-sc"]

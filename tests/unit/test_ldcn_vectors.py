@@ -8,11 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn import commands, pic_io
-from ldcnd.drivers.ldcn.commands import Group, Node
-from ldcnd.drivers.ldcn.controls import IoOption, LimitPins, StartUp
-from ldcnd.drivers.ldcn.packet import (
+from ldcnd.contract.errors import BadReply, ValueOutOfRange
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn import commands, pic_io
+from ldcnd.drives.ldcn.commands import Group, Node
+from ldcnd.drives.ldcn.controls import IoOption, LimitPins, StartUp
+from ldcnd.drives.ldcn.packet import (
     Command,
     Status,
     StatusFlag,
@@ -22,9 +23,9 @@ from ldcnd.drivers.ldcn.packet import (
     encode_packet,
     encode_status,
 )
-from ldcnd.drivers.ldcn.path import PathPoint, decode_point
-from ldcnd.drivers.ldcn.profiles import PROFILES, DeviceKind
-from ldcnd.drivers.ldcn.received import (
+from ldcnd.drives.ldcn.path import PathPoint, decode_point
+from ldcnd.drives.ldcn.profiles import PROFILES, DeviceKind
+from ldcnd.drives.ldcn.received import (
     AddPathPoints,
     DefineStatus,
     HardReset,
@@ -41,9 +42,8 @@ from ldcnd.drivers.ldcn.received import (
     decode_command,
     interpret_bytes,
 )
-from ldcnd.drivers.ldcn.registers import BAUD_DIVISORS, BaudCodes, baud_divisor, module_baud
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.errors import BadReply, ValueOutOfRange
+from ldcnd.drives.ldcn.registers import BAUD_DIVISORS, BaudCodes, baud_divisor, module_baud
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 
 VECTORS = Path(__file__).parents[1] / "vectors"
 ROWS = [row for name in ("ldcn-nmc.json", "sc-io.json") for row in json.loads((VECTORS / name).read_text())]

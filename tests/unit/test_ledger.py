@@ -1,11 +1,11 @@
 import pytest
 
-from ldcnd.daemon.axis.state import ActiveCommand, Completion
-from ldcnd.daemon.command.ledger import ANSWERS_PER_SENDER, SENDERS, Entry, Ledger
-from ldcnd.errors import CommandIdReused, StopLatched, TooManyRequests, UnknownCommand
-from ldcnd.model.commands import REPLAYED_WITHIN_S, CommandReply, Halt, MoveAbsolute, Verb
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState
+from ldcnd.axis.state import ActiveCommand, Completion
+from ldcnd.contract.commands import REPLAYED_WITHIN_S, CommandReply, Halt, MoveAbsolute, Verb
+from ldcnd.contract.errors import CommandIdReused, StopLatched, TooManyRequests, UnknownCommand
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState
+from ldcnd.daemon.ledger import ANSWERS_PER_SENDER, SENDERS, Entry, Ledger
 
 MOVE = MoveAbsolute(position=1.0)
 
@@ -145,7 +145,7 @@ def test_an_id_is_remembered_for_the_time_that_the_contract_names():
 
 
 def test_ids_that_could_not_be_remembered_are_refused_before_anything_is_done(ledger, monkeypatch):
-    monkeypatch.setattr("ldcnd.daemon.command.ledger.LARGEST_MEMORY", 3)
+    monkeypatch.setattr("ldcnd.daemon.ledger.LARGEST_MEMORY", 3)
     for number in range(3):
         done(ledger, f"c{number}")
 

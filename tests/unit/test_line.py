@@ -2,9 +2,9 @@ import asyncio
 
 import pytest
 
-from ldcnd.bus.line import Phase
-from ldcnd.exchange import Exchange, Timing
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.line.exchange import Exchange, Timing
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.line.line import Phase
 from tests.support import toy_family as toy
 from tests.support.line_bench import MARGIN_S, REPLY_S, REQUEST_S, Bench, RecordingTransaction, settle
 from tests.support.scripted_line import Say

@@ -1,6 +1,6 @@
 import pytest
 
-from ldcnd.exchange import Exchange
+from ldcnd.line.exchange import Exchange
 from tests.support import toy_family as toy
 from tests.support.line_bench import REQUEST_S, Bench, RecordingTransaction, settle
 from tests.support.scripted_line import Say

@@ -2,8 +2,8 @@
 
 import pytest
 
-from ldcnd.bus.line import Phase
-from ldcnd.bus.settings import LINGER_S
+from ldcnd.line.line import Phase
+from ldcnd.line.settings import LINGER_S
 from tests.support import toy_family as toy
 from tests.support.line_bench import REPLY_S, REQUEST_S, Bench, settle
 from tests.support.scripted_line import Say

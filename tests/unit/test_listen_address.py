@@ -4,7 +4,7 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli import console, foxglove, metrics
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.messaging.login_probe import refusals
+from ldcnd.net.login_probe import refusals
 from tests.support.process import free_port
 
 pytestmark = pytest.mark.real_time

@@ -5,10 +5,10 @@ from collections.abc import AsyncIterator
 
 import pytest
 
-from ldcnd.errors import OutcomeUnknown
-from ldcnd.messaging.hand_over import Query
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.session import Qos, Sample
+from ldcnd.contract.errors import OutcomeUnknown
+from ldcnd.net.hand_over import Query
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.session import Qos, Sample
 from tests.support.query_facts import QueryFacts
 from tests.support.session_facts import SampleFacts, TokenFacts
 from tests.support.session_pair import JSON, KEYS, Pair, echo

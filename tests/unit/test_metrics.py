@@ -8,9 +8,9 @@ import promql_parser
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
-from ldcnd.metrics import SHADOW_FRESH_S, HealthCollector
-from ldcnd.model.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth, StopWaitHealth
-from ldcnd.model.samples import LinkState, Quality, ShadowFigure, ShadowSample
+from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth, StopWaitHealth
+from ldcnd.contract.samples import LinkState, Quality, ShadowFigure, ShadowSample
+from ldcnd.lab.metrics import SHADOW_FRESH_S, HealthCollector
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
 DAEMON = DaemonHealth(t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=8, waiting_queries=3, dropped=9)

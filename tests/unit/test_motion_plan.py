@@ -1,6 +1,6 @@
 import pytest
 
-from ldcnd.daemon.axis.motion import profile_duration_s
+from ldcnd.axis.motion import profile_duration_s
 
 
 def test_a_long_move_is_a_trapezoid():

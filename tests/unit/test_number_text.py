@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.number_text import NotANumber, read_number, read_whole, read_word
+from ldcnd.contract.number_text import NotANumber, read_number, read_whole, read_word
 
 ROOT = Path(__file__).parents[2]
 CASES = json.loads((ROOT / "tests" / "vectors" / "typed_numbers.json").read_text(encoding="utf-8"))

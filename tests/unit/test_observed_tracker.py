@@ -1,7 +1,7 @@
-from ldcnd.daemon.axis.state import ObservedTracker
-from ldcnd.drivers.driver import AxisReading, Fault
-from ldcnd.exchange import Timing
-from ldcnd.model.samples import AxisState, LinkState, Moving
+from ldcnd.axis.state import ObservedTracker
+from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.drives.driver import AxisReading, Fault
+from ldcnd.line.exchange import Timing
 
 ALARM = Fault("alarm_0010", "Overcurrent")
 

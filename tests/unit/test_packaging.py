@@ -16,8 +16,8 @@ import pytest
 from hatchling.builders.sdist import SdistBuilder
 from hatchling.builders.wheel import WheelBuilder
 
-from ldcnd.daemon.publish.contract import all_schemas
-from ldcnd.fault_pages import codes
+from ldcnd.contract.fault_pages import codes
+from ldcnd.daemon.contract import all_schemas
 from tests.support.pages import ROOT
 
 NOT_SOURCE = shutil.ignore_patterns(".git", ".venv", "build", "dist", "state", "__pycache__", ".*_cache", ".hypothesis")

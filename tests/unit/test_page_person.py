@@ -4,10 +4,10 @@ import asyncio
 
 import pytest
 
-from ldcnd.commissioning_page.conversation import Conversation
-from ldcnd.commissioning_page.messages import Answer, FromPage, Hold, View
-from ldcnd.commissioning_page.page_person import HELD_S, PagePerson
-from ldcnd.person import Left
+from ldcnd.bench.person import Left
+from ldcnd.console.commissioning.conversation import Conversation
+from ldcnd.console.commissioning.messages import Answer, FromPage, Hold, View
+from ldcnd.console.commissioning.page_person import HELD_S, PagePerson
 
 
 @pytest.fixture

@@ -2,8 +2,8 @@
 
 import struct
 
-from ldcnd.wirelog.pcapng import encode_pcapng
-from ldcnd.wirelog.recorder import WireEvent, WireRecord
+from ldcnd.line.flight_recorder import WireEvent, WireRecord
+from ldcnd.ops.pcapng import encode_pcapng
 
 ZERO_NS = 1_700_000_000_000_000_000
 RECORDS = (

@@ -4,9 +4,9 @@ import random
 
 import pytest
 
-from ldcnd.bus.queue import MOST_GUARD, PhaseOrder, PhaseTracker
-from ldcnd.bus.settings import ServoCycle
-from ldcnd.exchange import Timing
+from ldcnd.line.exchange import Timing
+from ldcnd.line.queue import MOST_GUARD, PhaseOrder, PhaseTracker
+from ldcnd.line.settings import ServoCycle
 from tests.support.polled_chain import saturated
 from tests.support.toy_family import ToyPoller
 

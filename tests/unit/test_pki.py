@@ -12,9 +12,9 @@ from cryptography import x509
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
 from ldcnd.cli.main import cli
-from ldcnd.errors import ConfigError
-from ldcnd.pki.access import PERMITTED, Role, Subject, access_control
-from ldcnd.pki.site import Login, Site, new_login, read_roster, set_up
+from ldcnd.contract.errors import ConfigError
+from ldcnd.ops.pki.access import PERMITTED, Role, Subject, access_control
+from ldcnd.ops.pki.site import Login, Site, new_login, read_roster, set_up
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
 SETUPS = Path(__file__).parents[2] / "config" / "zenoh"

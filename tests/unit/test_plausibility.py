@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.config.axis import AxisConfig
-from ldcnd.daemon.axis.plausibility import NOISE_COUNTS, ROUNDS, Judgement, PlausibilityGate, Step, Verdict, agree
-from ldcnd.drivers.driver import AxisReading, Fault, Motion
-from ldcnd.exchange import Timing
+from ldcnd.axis.plausibility import NOISE_COUNTS, ROUNDS, Judgement, PlausibilityGate, Step, Verdict, agree
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.driver import AxisReading, Fault, Motion
+from ldcnd.line.exchange import Timing
 
 CONFIG = AxisConfig.model_validate(
     {

@@ -5,11 +5,11 @@ import random
 
 import pytest
 
-from ldcnd.bus.poller import Poller, Priority
-from ldcnd.bus.queue import Choose, ExchangeQueue
-from ldcnd.planning.cost import Cost
-from ldcnd.planning.line_plan import Poll, Urgent, largest, plan_line
-from ldcnd.planning.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
+from ldcnd.drives.cost import Cost
+from ldcnd.drives.line_plan import Poll, Urgent, largest, plan_line
+from ldcnd.drives.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
+from ldcnd.line.poller import Poller, Priority
+from ldcnd.line.queue import Choose, ExchangeQueue
 from tests.support.queue_turns import take
 
 MS = 0.001

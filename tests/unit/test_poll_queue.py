@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.bus.poller import NO_DEADLINE_S, Poller, Priority
-from ldcnd.bus.queue import POLLS_PER_LOWER, Choose, PollQueue
+from ldcnd.line.poller import NO_DEADLINE_S, Poller, Priority
+from ldcnd.line.queue import POLLS_PER_LOWER, Choose, PollQueue
 from tests.support.toy_family import ToyPoller
 
 HIGH, NORMAL, LOW = Priority

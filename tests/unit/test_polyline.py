@@ -5,8 +5,8 @@ from itertools import accumulate
 
 import pytest
 
-from ldcnd.daemon.axis.polyline import ROUNDING_COUNTS, PathAxis, walk
-from ldcnd.errors import ValueOutOfRange
+from ldcnd.axis.polyline import ROUNDING_COUNTS, PathAxis, walk
+from ldcnd.contract.errors import ValueOutOfRange
 
 PERIOD_S, CYCLE_S = 0.01, 0.0005
 UNIT = 1000.0

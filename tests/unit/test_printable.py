@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.errors import LdcndError, MalformedRequest, UnknownAxis
-from ldcnd.messaging.codec import Encoding, decode, decode_received, encode
-from ldcnd.model.commands import Halt
-from ldcnd.model.events import CommandEvent, CommandStatus
-from ldcnd.model.leases import Acquire
+from ldcnd.contract.codec import Encoding, decode, decode_received, encode
+from ldcnd.contract.commands import Halt
+from ldcnd.contract.errors import LdcndError, MalformedRequest, UnknownAxis
+from ldcnd.contract.events import CommandEvent, CommandStatus
+from ldcnd.contract.leases import Acquire
 from ldcnd.printable import is_printable, printable
 
 ATTACKS = (

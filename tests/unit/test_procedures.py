@@ -8,10 +8,23 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.daemon.axis.guards import Right
-from ldcnd.daemon.axis.procedures.group import GroupMoveRequest, Meeting
-from ldcnd.drivers.driver import AnalogMotion, Fault, HomeCapture, Motion, PwmOutput, StopMode
-from ldcnd.errors import (
+from ldcnd.axis.guards import Right
+from ldcnd.axis.procedures.group import GroupMoveRequest, Meeting
+from ldcnd.contract.commands import (
+    Home,
+    HomeMethod,
+    HomeStop,
+    Jog,
+    MoveAbsolute,
+    MoveAnalog,
+    MoveVelocity,
+    Power,
+    Probe,
+    ProbeSource,
+    SetPwm,
+    Track,
+)
+from ldcnd.contract.errors import (
     CommandExpired,
     LdcndError,
     LeaseExpired,
@@ -27,22 +40,9 @@ from ldcnd.errors import (
     VelocityLimit,
     WrongState,
 )
-from ldcnd.model.commands import (
-    Home,
-    HomeMethod,
-    HomeStop,
-    Jog,
-    MoveAbsolute,
-    MoveAnalog,
-    MoveVelocity,
-    Power,
-    Probe,
-    ProbeSource,
-    SetPwm,
-    Track,
-)
-from ldcnd.model.events import CommandStatus
-from ldcnd.model.samples import AxisState, TelemetryItem
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState, TelemetryItem
+from ldcnd.drives.driver import AnalogMotion, Fault, HomeCapture, Motion, PwmOutput, StopMode
 from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, raising
 
 LOST = ReplyTimeout("no reply")

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from ldcnd.daemon.process.service import held_awake, loop_factory, settle_heap
+from ldcnd.daemon.service import held_awake, loop_factory, settle_heap
 
 
 @pytest.mark.real_time

@@ -5,10 +5,10 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.bus.proof import MISSES_UNTIL_LOST, bringing_up
-from ldcnd.bus.queue import Lane
-from ldcnd.errors import AxisUnreachable, LdcndError, NotIdentified
-from ldcnd.exchange import Effect
+from ldcnd.contract.errors import AxisUnreachable, LdcndError, NotIdentified
+from ldcnd.line.exchange import Effect
+from ldcnd.line.proof import MISSES_UNTIL_LOST, bringing_up
+from ldcnd.line.queue import Lane
 from tests.support import toy_family as toy
 from tests.support.bus_rig import Rig, running
 from tests.support.scripted_line import Say

@@ -6,10 +6,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from ldcnd.errors import ErrorCode
-from ldcnd.messaging.hand_over import Answer, Query
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.messaging.reads import (
+from ldcnd.contract.errors import ErrorCode
+from ldcnd.net.hand_over import Answer, Query
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.reads import (
     BLOCKED_S,
     LEAVING_AT_ONCE,
     READS_OF_A_CLIENT,

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drivers.ldcn.packet import Command, StatusItem, check_status, decode_status
-from ldcnd.drivers.ldcn.pic_io import IoItem, decode_io_status
-from ldcnd.drivers.ldcn.profiles import LS_231, PIC_IO, PIC_SERVO_V4, SK_2310G2, identify
-from ldcnd.drivers.ldcn.received import decode_command
-from ldcnd.exchange import ReplyVerdict
+from ldcnd.drives.ldcn.packet import Command, StatusItem, check_status, decode_status
+from ldcnd.drives.ldcn.pic_io import IoItem, decode_io_status
+from ldcnd.drives.ldcn.profiles import LS_231, PIC_IO, PIC_SERVO_V4, SK_2310G2, identify
+from ldcnd.drives.ldcn.received import decode_command
+from ldcnd.line.exchange import ReplyVerdict
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.simulated_host import SimulatedHost
 

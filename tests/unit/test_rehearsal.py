@@ -2,8 +2,8 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.planning.cost import Cost
-from ldcnd.planning.simulated_polling import Drive, mean_lengths_s
+from ldcnd.drives.cost import Cost
+from ldcnd.drives.simulated_polling import Drive, mean_lengths_s
 from tests.support.polled_chain import BAUD, CYCLE, saturated
 
 BYTE_S = 10 / BAUD

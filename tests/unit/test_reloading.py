@@ -5,8 +5,8 @@ from typing import Any
 import pytest
 
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.process.service import plan_reload
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
+from ldcnd.daemon.service import plan_reload
 
 SIMULATED = Path(__file__).parents[2] / "config" / "simulated.toml"
 RUNNING = load_config(SIMULATED)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 import pytest
 
 from ldcnd.client.rig_client import RigClient, find_rigs
-from ldcnd.errors import LdcndError, OutcomeUnknown, SessionError
-from ldcnd.messaging.hand_over import Query
-from ldcnd.messaging.memory_session import MemoryBroker, MemorySession
-from ldcnd.messaging.session import Declaration, Qos
-from ldcnd.model.commands import Power
-from ldcnd.model.samples import PositionSample
+from ldcnd.contract.commands import Power
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError
+from ldcnd.contract.samples import PositionSample
+from ldcnd.net.hand_over import Query
+from ldcnd.net.memory_session import MemoryBroker, MemorySession
+from ldcnd.net.session import Declaration, Qos
 from tests.support.session_pair import JSON, KEYS, POSITION
 
 POWER = Power(on=True)

@@ -6,11 +6,11 @@ import pytest
 from zenoh.ext import Int64, z_serialize
 
 from ldcnd.client.rig import Rig
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.samples import LinkState
-from ldcnd.ros2.bridge import Bridge
-from ldcnd.ros2.cdr import JOINT_STATE
-from ldcnd.ros2.graph import Node, advertise, attachment_of
+from ldcnd.contract.samples import LinkState
+from ldcnd.lab.ros2.bridge import Bridge
+from ldcnd.lab.ros2.cdr import JOINT_STATE
+from ldcnd.lab.ros2.graph import Node, advertise, attachment_of
+from ldcnd.net.memory_session import MemoryBroker
 from tests.support.rig import running_rig, two_axes
 from tests.support.ros2_messages import DIAGNOSTICS, JOINTS
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.daemon.axis.state import SettleJudge, Settling
+from ldcnd.axis.state import SettleJudge, Settling
 from tests.support.axis_bench import AT_REST
 
 SETTLING = Settling(target_counts=1000, window_counts=10, time_s=0.05, timeout_s=1.0)

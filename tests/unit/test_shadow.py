@@ -5,11 +5,11 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC
-from ldcnd.tuning.ldcn.effort import MOST_GAP_S, EffortMeter, Seen
-from ldcnd.tuning.ldcn.plant import Plant
-from ldcnd.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Shadow
-from ldcnd.tuning.ldcn.watching import meaning
+from ldcnd.bench.tuning.ldcn.effort import MOST_GAP_S, EffortMeter, Seen
+from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.bench.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Shadow
+from ldcnd.bench.tuning.ldcn.watching import meaning
+from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC
 from tests.support.simulated_plants import drawn_plants
 from tests.support.watched_plants import AxisAtWork
 

@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.errors import TransportLost
+from ldcnd.contract.errors import TransportLost
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.jumping_loop import JumpingLoop

@@ -14,10 +14,10 @@ from contextlib import contextmanager
 
 import pytest
 
-from ldcnd.errors import TransportLost
+from ldcnd.contract.errors import TransportLost
+from ldcnd.line.serial_port import SerialSettings, open_serial_port
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import PtyLine
-from ldcnd.transport.serial_port import SerialSettings, open_serial_port
 
 pytestmark = pytest.mark.real_time
 

@@ -1,10 +1,10 @@
 """What `ldcnd sim --wire-log` writes about a foreign host."""
 
 from ldcnd.cli.sim import WireLogFile
-from ldcnd.drivers.ldcn.packet import PacketReader
-from ldcnd.drivers.smartstep.packet import CommandCutter, add_parity
-from ldcnd.wirelog.capture import parse_capture
-from ldcnd.wirelog.recorder import WireEvent
+from ldcnd.drives.ldcn.packet import PacketReader
+from ldcnd.drives.smartstep.packet import CommandCutter, add_parity
+from ldcnd.line.capture import parse_capture
+from ldcnd.line.flight_recorder import WireEvent
 
 
 def written(path, deeds, family="ldcn", cutter=PacketReader):

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from ldcnd.cli.sim import command
-from ldcnd.config.simulated_line import FaultPlanConfig
-from ldcnd.config.toml import read_toml
-from ldcnd.errors import ConfigError
-from ldcnd.families.ldcn.simulation import PlantConfig, Quirks, SimulatedChainConfig, SimulationConfig
+from ldcnd.contract.errors import ConfigError
+from ldcnd.drives.simulated_line import FaultPlanConfig
+from ldcnd.drives.toml import read_toml
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, build_chain
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
+from ldcnd.sim.ldcn.simulation import PlantConfig, Quirks, SimulatedChainConfig, SimulationConfig
 from ldcnd.sim.plant import MotorPlant
 
 TESTS = Path(__file__).parents[1]

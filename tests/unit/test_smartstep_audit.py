@@ -1,8 +1,8 @@
 """What the audit of a drive's parameters takes for a change by another program."""
 
-from ldcnd.drivers.smartstep.drive import ParameterAudit
-from ldcnd.drivers.smartstep.parameters import PARAMETERS
-from ldcnd.model.parameters import Memory, ParameterValue
+from ldcnd.contract.parameters import Memory, ParameterValue
+from ldcnd.drives.smartstep.drive import ParameterAudit
+from ldcnd.drives.smartstep.parameters import PARAMETERS
 
 PLACE = 4
 LABEL = PARAMETERS[PLACE].label

@@ -1,8 +1,9 @@
 import pytest
 
-from ldcnd.drivers.smartstep import commands
-from ldcnd.drivers.smartstep.addresses import OperatingMode, TraceRegister
-from ldcnd.drivers.smartstep.commands import (
+from ldcnd.contract.errors import BadReply, ValueOutOfRange
+from ldcnd.drives.smartstep import commands
+from ldcnd.drives.smartstep.addresses import OperatingMode, TraceRegister
+from ldcnd.drives.smartstep.commands import (
     ChecksumPin,
     Refusal,
     RefusalReason,
@@ -20,12 +21,11 @@ from ldcnd.drivers.smartstep.commands import (
     write_ram,
     write_trace_register,
 )
-from ldcnd.drivers.smartstep.monitors import SPEED_FEEDBACK
-from ldcnd.drivers.smartstep.packet import Command, Function, Reply, ResponseStatus, checksum
-from ldcnd.drivers.smartstep.parameters import PN100, PN304, parameter_at
-from ldcnd.drivers.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum
-from ldcnd.errors import BadReply, ValueOutOfRange
-from ldcnd.exchange import ReplyVerdict
+from ldcnd.drives.smartstep.monitors import SPEED_FEEDBACK
+from ldcnd.drives.smartstep.packet import Command, Function, Reply, ResponseStatus, checksum
+from ldcnd.drives.smartstep.parameters import PN100, PN304, parameter_at
+from ldcnd.drives.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum
+from ldcnd.line.exchange import ReplyVerdict
 from ldcnd.sim.smartstep.unit import string_reply
 
 

@@ -1,8 +1,8 @@
-from ldcnd.drivers.smartstep.commissioning import examine
-from ldcnd.drivers.smartstep.packet import decode_command
-from ldcnd.drivers.smartstep.parameters import PN000, PN100
-from ldcnd.drivers.smartstep.profiles import StringChecksum, Wiring
-from ldcnd.model.health import Finding, Verdict
+from ldcnd.contract.health import Finding, Verdict
+from ldcnd.drives.smartstep.commissioning import examine
+from ldcnd.drives.smartstep.packet import decode_command
+from ldcnd.drives.smartstep.parameters import PN000, PN100
+from ldcnd.drives.smartstep.profiles import StringChecksum, Wiring
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import SmartStepLine, simulated, smartstep_line
 

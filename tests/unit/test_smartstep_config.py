@@ -3,8 +3,8 @@ from pathlib import Path
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.errors import ConfigError
-from ldcnd.model.samples import MonitorName
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.samples import MonitorName
 
 GOOD = """
 rig = "bench"

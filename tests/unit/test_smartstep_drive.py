@@ -2,9 +2,9 @@
 
 import pytest
 
-from ldcnd.drivers.smartstep.monitors import CounterValue
-from ldcnd.drivers.smartstep.poller import UnitWords
-from ldcnd.model.samples import MonitorName
+from ldcnd.contract.samples import MonitorName
+from ldcnd.drives.smartstep.monitors import CounterValue
+from ldcnd.drives.smartstep.poller import UnitWords
 from tests.support.smartstep_line import simulated, smartstep_line
 
 PRESENT_ALARM, INPUTS, OUTPUTS, SPEED = 0x850A, 0x8005, 0x8006, 0x8000

@@ -2,8 +2,8 @@ import json
 
 import pytest
 
-from ldcnd.drivers.smartstep.ledger import EepromLedger
-from ldcnd.errors import ConfigError, EepromBudgetSpent
+from ldcnd.contract.errors import ConfigError, EepromBudgetSpent
+from ldcnd.drives.smartstep.ledger import EepromLedger
 
 
 async def test_counts_outlive_the_daemon(tmp_path):

@@ -5,15 +5,15 @@ import json
 
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import EEPROM_AREA, RAM_AREA, OperatingMode, Register, TraceRegister
-from ldcnd.drivers.smartstep.packet import Function, decode_command
-from ldcnd.drivers.smartstep.parameters import PN102
-from ldcnd.drivers.smartstep.profiles import SmartStepProfile
-from ldcnd.errors import BusError, DriveFault, RequestRefused
-from ldcnd.model.parameters import CounterName, Memory, WriteParameter
-from ldcnd.model.traces import TakeTrace, TraceTrigger, TriggerKind
+from ldcnd.contract.errors import BusError, DriveFault, RequestRefused
+from ldcnd.contract.parameters import CounterName, Memory, WriteParameter
+from ldcnd.contract.traces import TakeTrace, TraceTrigger, TriggerKind
+from ldcnd.drives.smartstep.addresses import EEPROM_AREA, RAM_AREA, OperatingMode, Register, TraceRegister
+from ldcnd.drives.smartstep.packet import Function, decode_command
+from ldcnd.drives.smartstep.parameters import PN102
+from ldcnd.drives.smartstep.profiles import SmartStepProfile
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP
-from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import LosingUnit, executes_in_a_fresh_mode_only, smartstep_line
 
 WITHIN_S = 30.0

@@ -2,15 +2,15 @@ import asyncio
 
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import OperatingMode
-from ldcnd.drivers.smartstep.commands import set_operating_mode
-from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.errors import BusyTracing, OutcomeUnknown, ReplyTimeout, WrongState
-from ldcnd.model.parameters import CounterName
+from ldcnd.contract.errors import BusyTracing, OutcomeUnknown, ReplyTimeout, WrongState
+from ldcnd.contract.parameters import CounterName
+from ldcnd.drives.smartstep.addresses import OperatingMode
+from ldcnd.drives.smartstep.commands import set_operating_mode
+from ldcnd.drives.smartstep.packet import ResponseStatus
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
-from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import executes_in_a_fresh_mode_only, losing_once, simulated, smartstep_line
 
 

@@ -2,8 +2,8 @@ import random
 
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import OperatingMode
-from ldcnd.drivers.smartstep.monitors import (
+from ldcnd.drives.smartstep.addresses import OperatingMode
+from ldcnd.drives.smartstep.monitors import (
     ALARMS,
     ELECTRICAL_ANGLE,
     GUARD_READS,
@@ -32,7 +32,7 @@ from ldcnd.drivers.smartstep.monitors import (
     run_is_on,
     signed_word,
 )
-from ldcnd.drivers.smartstep.profiles import SmartStepProfile
+from ldcnd.drives.smartstep.profiles import SmartStepProfile
 
 
 def test_monitors_fill_8000h_to_800fh():

@@ -5,20 +5,20 @@ import itertools
 
 import pytest
 
-from ldcnd.drivers.driver import AxisReading, Fault, Homes, Moves, ReadingListeners, TakesGains, Tracks
-from ldcnd.drivers.parameter_access import MonitorValue
-from ldcnd.drivers.smartstep.addresses import OperatingMode
-from ldcnd.drivers.smartstep.commands import reference
-from ldcnd.drivers.smartstep.network import SmartStepPort
-from ldcnd.drivers.smartstep.packet import add_parity, decode_command
-from ldcnd.drivers.smartstep.parameters import PN100
-from ldcnd.drivers.smartstep.poller import Basic, Listeners, UnitPoller
-from ldcnd.drivers.smartstep.profiles import Framing, SmartStepProfile, Wiring
-from ldcnd.errors import NetworkMismatch, WrongState
-from ldcnd.exchange import Timing
-from ldcnd.model.samples import MonitorName, TelemetryItem
+from ldcnd.contract.errors import NetworkMismatch, WrongState
+from ldcnd.contract.samples import MonitorName, TelemetryItem
+from ldcnd.drives.driver import AxisReading, Fault, Homes, Moves, ReadingListeners, TakesGains, Tracks
+from ldcnd.drives.parameter_access import MonitorValue
+from ldcnd.drives.smartstep.addresses import OperatingMode
+from ldcnd.drives.smartstep.commands import reference
+from ldcnd.drives.smartstep.network import SmartStepPort
+from ldcnd.drives.smartstep.packet import add_parity, decode_command
+from ldcnd.drives.smartstep.parameters import PN100
+from ldcnd.drives.smartstep.poller import Basic, Listeners, UnitPoller
+from ldcnd.drives.smartstep.profiles import Framing, SmartStepProfile, Wiring
+from ldcnd.line.exchange import Timing
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.smartstep.variant import SimulatedVariant
-from ldcnd.wirelog.recorder import WireEvent
 from tests.support.recording_receiver import RecordingReceiver
 from tests.support.scripted_line import ScriptedLine
 from tests.support.smartstep_line import SmartStepLine, simulated, smartstep_line

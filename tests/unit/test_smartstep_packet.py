@@ -1,6 +1,7 @@
 import pytest
 
-from ldcnd.drivers.smartstep.packet import (
+from ldcnd.contract.errors import BadReply, ValueOutOfRange
+from ldcnd.drives.smartstep.packet import (
     DAMAGED,
     Command,
     Function,
@@ -12,7 +13,6 @@ from ldcnd.drivers.smartstep.packet import (
     piece_bytes,
     strip_parity,
 )
-from ldcnd.errors import BadReply, ValueOutOfRange
 
 
 @pytest.mark.parametrize("unit", [-1, 16])

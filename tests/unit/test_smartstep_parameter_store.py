@@ -5,11 +5,7 @@ from contextlib import suppress
 
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import OperatingMode
-from ldcnd.drivers.smartstep.commands import set_operating_mode
-from ldcnd.drivers.smartstep.parameters import PN000, PN100, PN102, PN202, PN304, PN402
-from ldcnd.drivers.smartstep.profiles import EepromWrite, SmartStepProfile
-from ldcnd.errors import (
+from ldcnd.contract.errors import (
     AddressRefused,
     BusyTracing,
     DataRefused,
@@ -21,10 +17,14 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.parameters import Memory, WriteParameter
+from ldcnd.contract.parameters import Memory, WriteParameter
+from ldcnd.drives.smartstep.addresses import OperatingMode
+from ldcnd.drives.smartstep.commands import set_operating_mode
+from ldcnd.drives.smartstep.parameters import PN000, PN100, PN102, PN202, PN304, PN402
+from ldcnd.drives.smartstep.profiles import EepromWrite, SmartStepProfile
+from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.smartstep.variant import SimulatedVariant
-from ldcnd.wirelog.recorder import WireEvent, WireRecord
 from tests.support.smartstep_line import simulated, smartstep_line
 
 

@@ -1,6 +1,7 @@
 import pytest
 
-from ldcnd.drivers.smartstep.parameters import (
+from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.drives.smartstep.parameters import (
     PARAMETERS,
     PN000,
     PN10A,
@@ -14,8 +15,7 @@ from ldcnd.drivers.smartstep.parameters import (
     unit_number,
     with_digit,
 )
-from ldcnd.drivers.smartstep.profiles import Confidence
-from ldcnd.errors import ValueOutOfRange
+from ldcnd.drives.smartstep.profiles import Confidence
 
 MANUAL = """
 0000 0001 0100 0101 0102 0103 0109 010A 0110 0200 0202 0203 0204 0207 0208 0304 0401 0402 0403 0500 0505 0600

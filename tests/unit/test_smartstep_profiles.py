@@ -1,7 +1,7 @@
 import pytest
 
-from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS, SMARTSTEP, Assumption, SmartStepProfile, Verification
-from ldcnd.errors import ConfigError
+from ldcnd.contract.errors import ConfigError
+from ldcnd.drives.smartstep.profiles import ASSUMPTIONS, SMARTSTEP, Assumption, SmartStepProfile, Verification
 
 WITHOUT_SWITCH = {
     "unit_digit",

@@ -5,12 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import OperatingMode, Register
-from ldcnd.drivers.smartstep.monitors import ALARMS, MONITORS
-from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.drivers.smartstep.parameters import PARAMETERS, Fact, Parameter
-from ldcnd.drivers.smartstep.profiles import ASSUMPTIONS
-from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject
+from ldcnd.drives.smartstep.addresses import OperatingMode, Register
+from ldcnd.drives.smartstep.monitors import ALARMS, MONITORS
+from ldcnd.drives.smartstep.packet import ResponseStatus
+from ldcnd.drives.smartstep.parameters import PARAMETERS, Fact, Parameter
+from ldcnd.drives.smartstep.profiles import ASSUMPTIONS
+from ldcnd.drives.smartstep.trace_data import DataObject, IoObject
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "smartstep.md").read_text()

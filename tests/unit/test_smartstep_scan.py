@@ -2,11 +2,11 @@
 
 import pytest
 
-from ldcnd.drivers.smartstep.network import smartstep_opener
-from ldcnd.drivers.smartstep.profiles import Framing, Wiring
-from ldcnd.families.opened import show_findings
-from ldcnd.families.smartstep.family import SMARTSTEP, SOFT_PARITY
-from ldcnd.model.health import Verdict
+from ldcnd.contract.health import Verdict
+from ldcnd.drives.opened import show_findings
+from ldcnd.drives.smartstep.family import SMARTSTEP, SOFT_PARITY
+from ldcnd.drives.smartstep.network import smartstep_opener
+from ldcnd.drives.smartstep.profiles import Framing, Wiring
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.sim.smartstep.cable import smartstep_chain

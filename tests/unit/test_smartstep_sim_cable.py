@@ -6,15 +6,15 @@ from contextlib import asynccontextmanager, suppress
 
 import pytest
 
-from ldcnd.bus.bus import Bus
-from ldcnd.bus.resync import Resync
-from ldcnd.bus.settings import BusSettings
-from ldcnd.drivers.smartstep.commands import FLUSH, Refusal, probe, reference, string_reference, write_eeprom, write_ram
-from ldcnd.drivers.smartstep.packet import DAMAGED, ResponseStatus, add_parity, strip_parity
-from ldcnd.drivers.smartstep.parameters import PN000, PN100, PN102
-from ldcnd.drivers.smartstep.profiles import Framing, TraceWordLayout, Wiring
-from ldcnd.errors import OutcomeUnknown, ReplyTimeout
-from ldcnd.families.smartstep.config import SimulatedUnitConfig, simulated_units
+from ldcnd.contract.errors import OutcomeUnknown, ReplyTimeout
+from ldcnd.drives.smartstep.commands import FLUSH, Refusal, probe, reference, string_reference, write_eeprom, write_ram
+from ldcnd.drives.smartstep.config import SimulatedUnitConfig, simulated_units
+from ldcnd.drives.smartstep.packet import DAMAGED, ResponseStatus, add_parity, strip_parity
+from ldcnd.drives.smartstep.parameters import PN000, PN100, PN102
+from ldcnd.drives.smartstep.profiles import Framing, TraceWordLayout, Wiring
+from ldcnd.line.bus import Bus
+from ldcnd.line.resync import Resync
+from ldcnd.line.settings import BusSettings
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.line import open_simulated_line

@@ -1,7 +1,7 @@
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import OperatingMode
-from ldcnd.drivers.smartstep.monitors import (
+from ldcnd.drives.smartstep.addresses import OperatingMode
+from ldcnd.drives.smartstep.monitors import (
     ALARMS,
     MONITORS,
     NO_ALARM,
@@ -12,8 +12,8 @@ from ldcnd.drivers.smartstep.monitors import (
     output_levels,
     signed_word,
 )
-from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000, PN100, PN304, PN505
+from ldcnd.drives.smartstep.packet import ResponseStatus
+from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000, PN100, PN304, PN505
 from ldcnd.sim.smartstep.drive import EEPROM_LIFE, SimulatedDrive, SimulatedMemory, SimulatedMotor
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 

@@ -1,7 +1,7 @@
 import pytest
 
-from ldcnd.drivers.smartstep.profiles import TraceWordLayout
-from ldcnd.drivers.smartstep.trace_data import DataObject, IoObject, TracePoint, decode_word, first_point, unwrap
+from ldcnd.drives.smartstep.profiles import TraceWordLayout
+from ldcnd.drives.smartstep.trace_data import DataObject, IoObject, TracePoint, decode_word, first_point, unwrap
 from ldcnd.sim.smartstep.recorder import SimulatedRecorder
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
 

@@ -1,7 +1,7 @@
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import OperatingMode, TraceRegister
-from ldcnd.drivers.smartstep.commands import (
+from ldcnd.drives.smartstep.addresses import OperatingMode, TraceRegister
+from ldcnd.drives.smartstep.commands import (
     Refusal,
     RefusalReason,
     execute,
@@ -14,12 +14,12 @@ from ldcnd.drivers.smartstep.commands import (
     write_ram,
     write_trace_register,
 )
-from ldcnd.drivers.smartstep.monitors import Counter, CounterReading
-from ldcnd.drivers.smartstep.packet import DAMAGED, ResponseStatus, decode_command, decode_reply
-from ldcnd.drivers.smartstep.parameters import PN000, PN100, PN202
-from ldcnd.drivers.smartstep.profiles import ByteOrder, CountUnit, SmartStepProfile, StringChecksum
-from ldcnd.drivers.smartstep.trace_data import split_words
-from ldcnd.exchange import Exchange
+from ldcnd.drives.smartstep.monitors import Counter, CounterReading
+from ldcnd.drives.smartstep.packet import DAMAGED, ResponseStatus, decode_command, decode_reply
+from ldcnd.drives.smartstep.parameters import PN000, PN100, PN202
+from ldcnd.drives.smartstep.profiles import ByteOrder, CountUnit, SmartStepProfile, StringChecksum
+from ldcnd.drives.smartstep.trace_data import split_words
+from ldcnd.line.exchange import Exchange
 from ldcnd.sim.smartstep.unit import CHARACTER_S, SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 

@@ -4,20 +4,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.bus.queue import Lane
-from ldcnd.drivers.smartstep.commands import reference
-from ldcnd.drivers.smartstep.modes import EXECUTE_ATTEMPTS
-from ldcnd.drivers.smartstep.parameters import PN202, PN203
-from ldcnd.drivers.smartstep.profiles import (
-    SMARTSTEP,
-    CountUnit,
-    SmartStepProfile,
-    StringChecksum,
-    TraceWordLayout,
-    Verification,
-)
-from ldcnd.drivers.smartstep.trace_upload import TraceUpload
-from ldcnd.errors import (
+from ldcnd.contract.errors import (
     BadReply,
     BusError,
     ByteCountRefused,
@@ -28,11 +15,24 @@ from ldcnd.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.model.traces import TakeTrace, TraceTrigger, TriggerKind
+from ldcnd.contract.traces import TakeTrace, TraceTrigger, TriggerKind
+from ldcnd.drives.smartstep.commands import reference
+from ldcnd.drives.smartstep.modes import EXECUTE_ATTEMPTS
+from ldcnd.drives.smartstep.parameters import PN202, PN203
+from ldcnd.drives.smartstep.profiles import (
+    SMARTSTEP,
+    CountUnit,
+    SmartStepProfile,
+    StringChecksum,
+    TraceWordLayout,
+    Verification,
+)
+from ldcnd.drives.smartstep.trace_upload import TraceUpload
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.line.queue import Lane
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
-from ldcnd.wirelog.recorder import WireEvent
 from tests.support.smartstep_line import executes_in_a_fresh_mode_only, losing_once, simulated, smartstep_line
 
 RAMP = [(7 * point) & 0xFFFF for point in range(500)]

@@ -1,13 +1,14 @@
 import pytest
 
-from ldcnd.drivers.smartstep.profiles import (
+from ldcnd.contract.errors import BadReply, ValueOutOfRange
+from ldcnd.drives.smartstep.profiles import (
     SMARTSTEP,
     ByteOrder,
     CommandPulseGear,
     SmartStepProfile,
     TraceWordLayout,
 )
-from ldcnd.drivers.smartstep.trace_data import (
+from ldcnd.drives.smartstep.trace_data import (
     POINTS,
     Chunk,
     DataObject,
@@ -30,7 +31,6 @@ from ldcnd.drivers.smartstep.trace_data import (
     unit_of,
     unwrap,
 )
-from ldcnd.errors import BadReply, ValueOutOfRange
 
 MSB, SHIFT, MASK, RAW = TraceWordLayout
 

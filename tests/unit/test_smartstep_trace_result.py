@@ -1,10 +1,10 @@
 import pytest
 
-from ldcnd.drivers.smartstep.profiles import SMARTSTEP, SmartStepProfile
-from ldcnd.drivers.smartstep.trace_data import TraceConstants
-from ldcnd.drivers.smartstep.trace_result import CHANNELS, assign, trigger_condition, trigger_operand
-from ldcnd.errors import NotSupported, ValueOutOfRange
-from ldcnd.model.traces import TraceTrigger, TriggerKind
+from ldcnd.contract.errors import NotSupported, ValueOutOfRange
+from ldcnd.contract.traces import TraceTrigger, TriggerKind
+from ldcnd.drives.smartstep.profiles import SMARTSTEP, SmartStepProfile
+from ldcnd.drives.smartstep.trace_data import TraceConstants
+from ldcnd.drives.smartstep.trace_result import CHANNELS, assign, trigger_condition, trigger_operand
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP
 
 MAPPED = SmartStepProfile(trigger_map=BENCH_TRIGGER_MAP)

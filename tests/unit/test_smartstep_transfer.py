@@ -4,10 +4,10 @@ import asyncio
 
 import pytest
 
-from ldcnd.drivers.smartstep.parameters import PARAMETERS, PN000, PN102, PN304
-from ldcnd.drivers.smartstep.transfer import AT_ONCE, AT_POWER_ON
-from ldcnd.errors import DataRefused, LdcndError
-from ldcnd.model.parameters import Memory, PlanParameters, WriteParameter
+from ldcnd.contract.errors import DataRefused, LdcndError
+from ldcnd.contract.parameters import Memory, PlanParameters, WriteParameter
+from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000, PN102, PN304
+from ldcnd.drives.smartstep.transfer import AT_ONCE, AT_POWER_ON
 from tests.support.smartstep_line import simulated, smartstep_line
 
 OLD = {

@@ -4,10 +4,10 @@ import asyncio
 
 import pytest
 
-from ldcnd.drivers.smartstep.monitors import InputSignal
-from ldcnd.drivers.smartstep.profiles import TriggerMap
-from ldcnd.drivers.smartstep.trigger_search import Stimulus, find_trigger_map
-from ldcnd.errors import DriveFault
+from ldcnd.contract.errors import DriveFault
+from ldcnd.drives.smartstep.monitors import InputSignal
+from ldcnd.drives.smartstep.profiles import TriggerMap
+from ldcnd.drives.smartstep.trigger_search import Stimulus, find_trigger_map
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
 

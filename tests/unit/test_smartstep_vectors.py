@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drivers.smartstep.addresses import OperatingMode
-from ldcnd.drivers.smartstep.commands import StringReply, reference, string_reference
-from ldcnd.drivers.smartstep.packet import (
+from ldcnd.drives.smartstep.addresses import OperatingMode
+from ldcnd.drives.smartstep.commands import StringReply, reference, string_reference
+from ldcnd.drives.smartstep.packet import (
     Command,
     Function,
     Reply,
@@ -18,9 +18,9 @@ from ldcnd.drivers.smartstep.packet import (
     decode_command,
     decode_reply,
 )
-from ldcnd.drivers.smartstep.parameters import PN000, PN100
-from ldcnd.drivers.smartstep.profiles import StringChecksum
-from ldcnd.exchange import ReplyVerdict
+from ldcnd.drives.smartstep.parameters import PN000, PN100
+from ldcnd.drives.smartstep.profiles import StringChecksum
+from ldcnd.line.exchange import ReplyVerdict
 from ldcnd.sim.smartstep.unit import SimulatedUnit, string_reply
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 

@@ -7,8 +7,8 @@ import pytest
 
 from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import load_config
-from ldcnd.drivers.smartstep.parameters import PN202, PN203
-from ldcnd.drivers.smartstep.profiles import (
+from ldcnd.drives.smartstep.parameters import PN202, PN203
+from ldcnd.drives.smartstep.profiles import (
     SMARTSTEP,
     ByteOrder,
     CommandPulseGear,
@@ -16,8 +16,8 @@ from ldcnd.drivers.smartstep.profiles import (
     StringChecksum,
     TraceWordLayout,
 )
-from ldcnd.drivers.smartstep.verification import Stimulus, verify_traces
-from ldcnd.families.smartstep.tools import verified_tables
+from ldcnd.drives.smartstep.tools import verified_tables
+from ldcnd.drives.smartstep.verification import Stimulus, verify_traces
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.process import ROOT
 from tests.support.smartstep_line import simulated, smartstep_line

@@ -3,13 +3,13 @@ from typing import cast
 
 import pytest
 
-from ldcnd.bus.bus import Bus
-from ldcnd.drivers.smartstep.addresses import OperatingMode
-from ldcnd.drivers.smartstep.commands import Refusal, execute
-from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.drivers.smartstep.words import drive_error, stray_packets
-from ldcnd.errors import AddressRefused, BusyTracing, ByteCountRefused, DataRefused
-from ldcnd.wirelog.recorder import WireEvent, WireLog
+from ldcnd.contract.errors import AddressRefused, BusyTracing, ByteCountRefused, DataRefused
+from ldcnd.drives.smartstep.addresses import OperatingMode
+from ldcnd.drives.smartstep.commands import Refusal, execute
+from ldcnd.drives.smartstep.packet import ResponseStatus
+from ldcnd.drives.smartstep.words import drive_error, stray_packets
+from ldcnd.line.bus import Bus
+from ldcnd.line.flight_recorder import WireEvent, WireLog
 
 
 @pytest.mark.parametrize(

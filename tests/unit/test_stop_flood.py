@@ -7,11 +7,11 @@ from unittest.mock import Mock
 
 import pytest
 
-from ldcnd.daemon.command.dispatch import STOPS_AT_ONCE, Requests
-from ldcnd.errors import InternalError
-from ldcnd.messaging.hand_over import Answer, Query
-from ldcnd.messaging.keys import Keys
-from ldcnd.model.commands import Stop
+from ldcnd.contract.commands import Stop
+from ldcnd.contract.errors import InternalError
+from ldcnd.contract.keys import Keys
+from ldcnd.daemon.dispatch import STOPS_AT_ONCE, Requests
+from ldcnd.net.hand_over import Answer, Query
 from tests.support.session_pair import error_of
 
 KEYS = Keys("bench1")

@@ -6,9 +6,9 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ldcnd.daemon.axis.straight import LineAxis, Profile, deviation_of, straight_line
-from ldcnd.drivers.ldcn.profiles import PROFILES
-from ldcnd.drivers.ldcn.trajectory import quantised
+from ldcnd.axis.straight import LineAxis, Profile, deviation_of, straight_line
+from ldcnd.drives.ldcn.profiles import PROFILES
+from ldcnd.drives.ldcn.trajectory import quantised
 
 CYCLE_S = 0.000512
 

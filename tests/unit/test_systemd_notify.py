@@ -9,18 +9,18 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.bus.line import Phase
 from ldcnd.client.rig_client import RigClient
-from ldcnd.config.axis import AxisConfig
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.process.assembly import build_daemon
-from ldcnd.daemon.process.daemon import Daemon
-from ldcnd.daemon.process.service import Service, describe
-from ldcnd.daemon.process.systemd import Notifier, reloading, status
-from ldcnd.errors import ConfigError, VelocityLimit
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.commands import MoveAbsolute, Power
-from ldcnd.model.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.errors import ConfigError, VelocityLimit
+from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.service import Service, describe
+from ldcnd.daemon.systemd import Notifier, reloading, status
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.line.line import Phase
+from ldcnd.net.memory_session import MemoryBroker
 from tests.support.rig import EPOCH_NS, SIMULATED
 
 WATCHDOG_S = 5.0

@@ -4,9 +4,9 @@ import re
 import tomllib
 from pathlib import Path
 
-from ldcnd.families.smartstep.config import SmartStepTraceConfig
-from ldcnd.messaging.codec import decode
-from ldcnd.model.traces import TakeTrace
+from ldcnd.contract.codec import decode
+from ldcnd.contract.traces import TakeTrace
+from ldcnd.drives.smartstep.config import SmartStepTraceConfig
 
 TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "take-a-trace.md").read_text(encoding="utf-8")
 

@@ -4,9 +4,9 @@ from hypothesis import strategies as st
 
 from ldcnd.client.trace_file import load_trace, require_suffix, save_trace
 from ldcnd.client.traces import Trace
-from ldcnd.errors import ConfigError
-from ldcnd.model.samples import Quality
-from ldcnd.model.traces import TraceChannel, TraceHeader, TracePhase, TraceSource
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.samples import Quality
+from ldcnd.contract.traces import TraceChannel, TraceHeader, TracePhase, TraceSource
 
 HEADER = TraceHeader(
     t=1_700_000_000_000_000_000,

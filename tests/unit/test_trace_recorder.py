@@ -6,15 +6,23 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from ldcnd.daemon.clock import Clock
-from ldcnd.daemon.publish.publisher import Publisher
-from ldcnd.daemon.trace.recorder import TraceRecorder
-from ldcnd.drivers.tracer import ArmedTrace, Granted, Recorded, Tracer
-from ldcnd.errors import OutcomeUnknown
-from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding, encode
-from ldcnd.messaging.keys import Keys
-from ldcnd.messaging.memory_session import MemoryBroker
-from ldcnd.model.traces import MOST_CHANNELS, MOST_SAMPLES, AbortTrace, TakeTrace, TraceChannel, TracePhase, TraceSource
+from ldcnd.axis.clock import Clock
+from ldcnd.axis.recorder import TraceRecorder
+from ldcnd.contract.codec import MAX_PAYLOAD_BYTES, Encoding, encode
+from ldcnd.contract.errors import OutcomeUnknown
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.traces import (
+    MOST_CHANNELS,
+    MOST_SAMPLES,
+    AbortTrace,
+    TakeTrace,
+    TraceChannel,
+    TracePhase,
+    TraceSource,
+)
+from ldcnd.drives.tracer import ArmedTrace, Granted, Recorded, Tracer
+from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.net.publisher import Publisher
 
 LONG = -1.2345678901234567e-300
 REQUEST = TakeTrace(channels=("c0",))

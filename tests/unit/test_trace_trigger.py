@@ -1,7 +1,7 @@
 import pytest
 
-from ldcnd.drivers.tracer import TriggerWatch
-from ldcnd.model.traces import TraceTrigger, TriggerKind
+from ldcnd.contract.traces import TraceTrigger, TriggerKind
+from ldcnd.drives.tracer import TriggerWatch
 
 
 def first_firing(kind, values, *, level=10.0, signal=False, ready_from=0):

@@ -1,9 +1,9 @@
-from ldcnd.drivers.ldcn.packet import Command, Packet, Status, StatusFlag, StatusItem, encode_packet, encode_status
-from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_IO, PIC_SERVO_V4
-from ldcnd.drivers.ldcn.transcript import LdcnTranscript
-from ldcnd.drivers.smartstep.packet import Command as SmartStepCommand
-from ldcnd.drivers.smartstep.packet import Function, Reply, ResponseStatus, SmartStepTranscript
-from ldcnd.wirelog.recorder import WireEvent, WireRecord
+from ldcnd.drives.ldcn.packet import Command, Packet, Status, StatusFlag, StatusItem, encode_packet, encode_status
+from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_IO, PIC_SERVO_V4
+from ldcnd.drives.ldcn.transcript import LdcnTranscript
+from ldcnd.drives.smartstep.packet import Command as SmartStepCommand
+from ldcnd.drives.smartstep.packet import Function, Reply, ResponseStatus, SmartStepTranscript
+from ldcnd.line.flight_recorder import WireEvent, WireRecord
 
 
 def sent(data: bytes) -> WireRecord:

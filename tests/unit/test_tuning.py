@@ -5,11 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.drivers.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
-from ldcnd.errors import DriveFault, ValueOutOfRange
-from ldcnd.model.commands import SetGains
-from ldcnd.sim.plant import MotorPlant
-from ldcnd.tuning.ldcn.design import (
+from ldcnd.bench.tuning.ldcn.design import (
     GAIN_MARGIN_DB,
     LEAST_PHASE_DEG,
     MOST_OVERSHOOT,
@@ -19,11 +15,15 @@ from ldcnd.tuning.ldcn.design import (
     stiff_gains,
     within_authority,
 )
-from ldcnd.tuning.ldcn.excitation import PULSE_TICKS, Bounds, Excitation, Record, Shown
-from ldcnd.tuning.ldcn.identify import Identified, identify
-from ldcnd.tuning.ldcn.plant import Plant
-from ldcnd.tuning.ldcn.response import Figures, Move, Start, figures, simulate
-from ldcnd.tuning.ldcn.verdict import objection
+from ldcnd.bench.tuning.ldcn.excitation import PULSE_TICKS, Bounds, Excitation, Record, Shown
+from ldcnd.bench.tuning.ldcn.identify import Identified, identify
+from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.bench.tuning.ldcn.response import Figures, Move, Start, figures, simulate
+from ldcnd.bench.tuning.ldcn.verdict import objection
+from ldcnd.contract.commands import SetGains
+from ldcnd.contract.errors import DriveFault, ValueOutOfRange
+from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
+from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_plants import REFERENCE, SimulatedAxis, drawn_plants, tuned
 
 SMALL_MOTOR = Plant.of(MotorPlant())

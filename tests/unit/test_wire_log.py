@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.errors import MalformedRequest
-from ldcnd.wirelog.recorder import (
+from ldcnd.contract.errors import MalformedRequest
+from ldcnd.line.flight_recorder import (
     BLOCK,
     RECORD_BYTES,
     WireEvent,

@@ -8,8 +8,8 @@ from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
 from ldcnd.config.rig import load_config
-from ldcnd.messaging.zenoh_config import endpoints, root_certificate, zenoh_config
-from ldcnd.messaging.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_config import endpoints, root_certificate, zenoh_config
+from ldcnd.net.zenoh_settings import ZenohSettings
 
 ROOT = Path(__file__).parents[2]
 SIMULATED = (ROOT / "config" / "simulated.toml").read_text()

@@ -10,15 +10,15 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli.main import cli
-from ldcnd.daemon.publish.asyncapi import asyncapi_document, asyncapi_text
-from ldcnd.daemon.publish.contract import Kind, all_schemas, as_markdown, channels
-from ldcnd.messaging.codec import MAX_PAYLOAD_BYTES, Encoding
-from ldcnd.messaging.keys import Keys, matches
-from ldcnd.model.catalogue import AXIS_COMMANDS, RIG_COMMANDS
-from ldcnd.model.commands import Verb
-from ldcnd.model.frozen import Frozen, schema_name
-from ldcnd.model.samples import TelemetryItem
-from ldcnd.pki.access import RULES
+from ldcnd.contract.catalogue import AXIS_COMMANDS, RIG_COMMANDS
+from ldcnd.contract.codec import MAX_PAYLOAD_BYTES, Encoding
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.frozen import Frozen, schema_name
+from ldcnd.contract.keys import Keys, matches
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.daemon.asyncapi import asyncapi_document, asyncapi_text
+from ldcnd.daemon.contract import Kind, all_schemas, as_markdown, channels
+from ldcnd.ops.pki.access import RULES
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"

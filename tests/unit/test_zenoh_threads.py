@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.messaging.zenoh_session import open_zenoh_session
-from ldcnd.messaging.zenoh_settings import ZenohSettings
-from ldcnd.messaging.zenoh_threads import senders_wait
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_threads import senders_wait
 from tests.support.session_pair import free_endpoint
 
 
@@ -35,7 +35,7 @@ def threads() -> list[Path]:
 ENOUGH = 8
 LISTENING = """
 import asyncio, sys
-from ldcnd.messaging.zenoh_session import ZenohSettings, open_zenoh_session
+from ldcnd.net.zenoh_session import ZenohSettings, open_zenoh_session
 from pathlib import Path
 async def main():
     async with (

@@ -6,21 +6,21 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ldcnd.bench.person import Left
 from ldcnd.cli.connection import Target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.figure import save_figure, stacked_rows
 from ldcnd.cli.output import FAILED
 from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
 from ldcnd.client.rig_client import RigClient
-from ldcnd.errors import ConfigError
-from ldcnd.model.meta import AxisInfo
-from ldcnd.person import Left
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.meta import AxisInfo
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ldcnd.bench.tuning.ldcn.guided import Tuned
     from ldcnd.cli.tune import TuneOptions
-    from ldcnd.tuning.ldcn.guided import Tuned
 
 ROWS = 2
 """Of the picture: positions above, following errors below."""
@@ -31,9 +31,9 @@ def tune(target: Target, info: AxisInfo, options: "TuneOptions") -> None:
     """Tune an axis of an LDCN or NMC drive."""
     options.refuse("the gains of this drive are found, not typed; see `ldcnd axis gains`", "values", "record_s")
     _require_numpy()
-    from ldcnd.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
-    from ldcnd.tuning.ldcn import plan as plans  # noqa: PLC0415 - likewise
-    from ldcnd.tuning.ldcn import report as reports  # noqa: PLC0415 - likewise
+    from ldcnd.bench.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
+    from ldcnd.bench.tuning.ldcn import plan as plans  # noqa: PLC0415 - likewise
+    from ldcnd.bench.tuning.ldcn import report as reports  # noqa: PLC0415 - likewise
 
     axis = info.axis
     figure = stacked_rows(ROWS)[0] if options.plot else None  # missing matplotlib is said before anything moves

@@ -4,14 +4,14 @@ from typing import TYPE_CHECKING
 
 import click
 
+from ldcnd.bench.person import Left
+from ldcnd.bench.tuning.smartstep import guided, session
 from ldcnd.cli.connection import Target
 from ldcnd.cli.ending import end_as_interrupted
 from ldcnd.cli.output import FAILED
 from ldcnd.cli.terminal_person import TerminalPerson
 from ldcnd.client.rig_client import RigClient
-from ldcnd.model.meta import AxisInfo
-from ldcnd.person import Left
-from ldcnd.tuning.smartstep import guided, session
+from ldcnd.contract.meta import AxisInfo
 
 if TYPE_CHECKING:
     from ldcnd.cli.tune import TuneOptions

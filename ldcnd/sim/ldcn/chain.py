@@ -5,7 +5,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 
-from ldcnd.drivers.ldcn.profiles import (
+from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.drives.ldcn.profiles import (
     LS_173AP,
     LS_182AP,
     LS_231,
@@ -21,8 +22,7 @@ from ldcnd.drivers.ldcn.profiles import (
     Profile,
     Support,
 )
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.errors import ValueOutOfRange
+from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.drive import SimulatedDrive

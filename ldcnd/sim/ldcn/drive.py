@@ -17,8 +17,8 @@ Sources: LS-182AP manual, "Command description"; PIC-SERVO manual, 5.2, 5.3; PIC
 
 from dataclasses import dataclass, replace
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.controls import (
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import (
     EXCLUSIVE_OPTIONS,
     HomingControl,
     IoOption,
@@ -26,9 +26,9 @@ from ldcnd.drivers.ldcn.controls import (
     StartUp,
     StopControl,
 )
-from ldcnd.drivers.ldcn.packet import AuxFlag, Command, Status, StatusFlag, StatusItem, encode_status
-from ldcnd.drivers.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, Profile, at_clock
-from ldcnd.drivers.ldcn.received import (
+from ldcnd.drives.ldcn.packet import AuxFlag, Command, Status, StatusFlag, StatusItem, encode_status
+from ldcnd.drives.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, Profile, at_clock
+from ldcnd.drives.ldcn.received import (
     AddPathPoints,
     IoControl,
     LoadTrajectory,
@@ -39,8 +39,8 @@ from ldcnd.drivers.ldcn.received import (
     SetHomingMode,
     StopMotor,
 )
-from ldcnd.drivers.ldcn.registers import FRACTION
-from ldcnd.drivers.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.drives.ldcn.registers import FRACTION
+from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.power import Condition, LogosolPower, PicServoPower, PowerStage, ScPower
 from ldcnd.sim.ldcn.quirks import (

@@ -14,8 +14,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from ldcnd.drivers.ldcn.packet import StatusItem
-from ldcnd.drivers.ldcn.pic_io import (
+from ldcnd.drives.ldcn.packet import StatusItem
+from ldcnd.drives.ldcn.pic_io import (
     ALL_LINES,
     CHECKSUM_ERROR,
     COUNTER_LINE,
@@ -33,9 +33,9 @@ from ldcnd.drivers.ldcn.pic_io import (
     SynchOutput,
     encode_io_status,
 )
-from ldcnd.drivers.ldcn.profiles import PIC_STEP, SK_2310G2, Profile
-from ldcnd.drivers.ldcn.received import ReceivedCommand
-from ldcnd.drivers.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.drives.ldcn.profiles import PIC_STEP, SK_2310G2, Profile
+from ldcnd.drives.ldcn.received import ReceivedCommand
+from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 

@@ -18,7 +18,7 @@ Sources: PIC-SERVO manual, 4.1, 5.2; LS-182AP manual, "Serial command interface"
 import math
 from abc import abstractmethod
 
-from ldcnd.drivers.ldcn.packet import (
+from ldcnd.drives.ldcn.packet import (
     FRAME_BYTES,
     HEADER,
     MOST_DATA_BYTES,
@@ -27,8 +27,8 @@ from ldcnd.drivers.ldcn.packet import (
     PacketReader,
     StatusItem,
 )
-from ldcnd.drivers.ldcn.profiles import Profile, at_clock
-from ldcnd.drivers.ldcn.received import (
+from ldcnd.drives.ldcn.profiles import Profile, at_clock
+from ldcnd.drives.ldcn.received import (
     DefineStatus,
     HardReset,
     PlainCommand,
@@ -38,7 +38,7 @@ from ldcnd.drivers.ldcn.received import (
     SetBaudRate,
     received_command,
 )
-from ldcnd.drivers.ldcn.registers import RESET_BAUD, RESET_BAUD_CODE, actual_baud, module_baud
+from ldcnd.drives.ldcn.registers import RESET_BAUD, RESET_BAUD_CODE, actual_baud, module_baud
 from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, Reply
 from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings, UnknownBaud
 

@@ -6,7 +6,7 @@ Sources: LS-182AP manual, "Diagnostic bits", "Safety features and diagnostics"; 
 from abc import ABC, abstractmethod
 from enum import Enum, StrEnum
 
-from ldcnd.drivers.ldcn.packet import AuxFlag, StatusFlag
+from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag
 
 
 class Condition(StrEnum):

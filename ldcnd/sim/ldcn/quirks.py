@@ -7,7 +7,7 @@ on. docs/reference/simulator.md lists them with their reasons.
 from dataclasses import dataclass
 from enum import StrEnum
 
-from ldcnd.drivers.ldcn.profiles import CLOCK_HZ
+from ldcnd.drives.ldcn.profiles import CLOCK_HZ
 
 
 class CommandBuffer(StrEnum):

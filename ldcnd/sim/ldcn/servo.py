@@ -17,10 +17,10 @@ Where the manuals leave room:
 import math
 from dataclasses import dataclass
 
-from ldcnd.drivers.driver import Gains
-from ldcnd.drivers.ldcn.controls import HomingControl, IoOption
-from ldcnd.drivers.ldcn.profiles import Profile
-from ldcnd.drivers.ldcn.registers import FRACTION
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import HomingControl, IoOption
+from ldcnd.drives.ldcn.profiles import Profile
+from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.power import Condition, PowerStage, Trip
 from ldcnd.sim.ldcn.quirks import AnalogEnd, LimitInPath, ModuleSettings
 from ldcnd.sim.ldcn.trajectory import PathBuffer, ProfileGenerator

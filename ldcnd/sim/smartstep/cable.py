@@ -11,8 +11,8 @@ from collections.abc import Sequence
 
 from typing_extensions import override
 
-from ldcnd.drivers.smartstep.packet import DAMAGED, add_parity, strip_parity
-from ldcnd.drivers.smartstep.profiles import Framing, Wiring
+from ldcnd.drives.smartstep.packet import DAMAGED, add_parity, strip_parity
+from ldcnd.drives.smartstep.profiles import Framing, Wiring
 from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, Reply
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.smartstep.unit import CHARACTER_S, SimulatedUnit, Transmission

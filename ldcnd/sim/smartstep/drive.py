@@ -11,8 +11,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ldcnd.drivers.smartstep.addresses import EEPROM_AREA, RAM_AREA, RAM_OFFSET, OperatingMode, Register, operating_mode
-from ldcnd.drivers.smartstep.monitors import (
+from ldcnd.drives.smartstep.addresses import EEPROM_AREA, RAM_AREA, RAM_OFFSET, OperatingMode, Register, operating_mode
+from ldcnd.drives.smartstep.monitors import (
     HISTORY_LENGTH,
     NO_ALARM,
     AlarmKind,
@@ -22,8 +22,8 @@ from ldcnd.drivers.smartstep.monitors import (
     OutputSignal,
     alarm,
 )
-from ldcnd.drivers.smartstep.packet import HIGHEST_WORD, ResponseStatus
-from ldcnd.drivers.smartstep.parameters import (
+from ldcnd.drives.smartstep.packet import HIGHEST_WORD, ResponseStatus
+from ldcnd.drives.smartstep.parameters import (
     PARAMETERS,
     PN000,
     PN102,
@@ -37,8 +37,8 @@ from ldcnd.drivers.smartstep.parameters import (
     Parameter,
     unit_number,
 )
-from ldcnd.drivers.smartstep.profiles import CommandPulseGear
-from ldcnd.drivers.smartstep.trace_data import FULL_SCALE, DataObject, IoObject, TracePoint
+from ldcnd.drives.smartstep.profiles import CommandPulseGear
+from ldcnd.drives.smartstep.trace_data import FULL_SCALE, DataObject, IoObject, TracePoint
 from ldcnd.sim.smartstep.recorder import SimulatedRecorder
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 

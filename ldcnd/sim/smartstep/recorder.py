@@ -6,9 +6,9 @@ Source: manual 4. The bits of the trigger condition are those of the variant, as
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from ldcnd.drivers.smartstep.addresses import Register
-from ldcnd.drivers.smartstep.monitors import signed_word
-from ldcnd.drivers.smartstep.trace_data import (
+from ldcnd.drives.smartstep.addresses import Register
+from ldcnd.drives.smartstep.monitors import signed_word
+from ldcnd.drives.smartstep.trace_data import (
     HIGHEST_PRE_TRIGGER,
     POINTS,
     DataObject,

@@ -8,9 +8,9 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from ldcnd.drivers.smartstep.addresses import TRACE_1_AREA, TRACE_2_AREA
-from ldcnd.drivers.smartstep.monitors import FEEDBACK_COUNTER_LOW, INPUT_COUNTER_LOW
-from ldcnd.drivers.smartstep.packet import (
+from ldcnd.drives.smartstep.addresses import TRACE_1_AREA, TRACE_2_AREA
+from ldcnd.drives.smartstep.monitors import FEEDBACK_COUNTER_LOW, INPUT_COUNTER_LOW
+from ldcnd.drives.smartstep.packet import (
     END,
     PACKET_CHARACTERS,
     Command,
@@ -20,9 +20,9 @@ from ldcnd.drivers.smartstep.packet import (
     checksum,
     decode_command,
 )
-from ldcnd.drivers.smartstep.parameters import Parameter
-from ldcnd.drivers.smartstep.profiles import CountUnit, StringChecksum
-from ldcnd.drivers.smartstep.trace_data import join_words
+from ldcnd.drives.smartstep.parameters import Parameter
+from ldcnd.drives.smartstep.profiles import CountUnit, StringChecksum
+from ldcnd.drives.smartstep.trace_data import join_words
 from ldcnd.sim.smartstep.drive import SimulatedDrive
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 

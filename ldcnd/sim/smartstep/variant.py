@@ -5,8 +5,8 @@ The host's assumptions are in profiles.py; a test makes the two agree, or differ
 
 from dataclasses import dataclass
 
-from ldcnd.drivers.smartstep.packet import ResponseStatus
-from ldcnd.drivers.smartstep.profiles import (
+from ldcnd.drives.smartstep.packet import ResponseStatus
+from ldcnd.drives.smartstep.profiles import (
     ByteOrder,
     CommandPulseGear,
     CountUnit,

@@ -1,4 +1,4 @@
-/** Numbers that people type. The same rules as `ldcnd/number_text.py`; one table of cases tests both. */
+/** Numbers that people type. The same rules as `ldcnd/contract/number_text.py`; one table of cases tests both. */
 
 const NUMBER = /^([+\-−]?)(\d*)(?:([.,])(\d*))?(?:[eE]([+\-−]?\d+))?\s*([\s\S]*)$/;
 const NOT_FINITE = /^[+\-−]?\s*(?:inf|nan|∞)/i;

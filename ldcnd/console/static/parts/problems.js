@@ -9,7 +9,7 @@ const COUNTERS = ["timeouts", "corrupt_replies", "rejected_packets"];
 
 /** Return `{level, text, places: [{where, link, detail}]}` of everything that needs attention, "bad" before "warn".
 
- * What is wrong with axes has been decided by the console process, `ldcnd/model/condition.py`. Each cause stands once, with
+ * What is wrong with axes has been decided by the console process, `ldcnd/contract/condition.py`. Each cause stands once, with
  * the names of all that it concerns. Values that change are details of a place, so that the list stands still.
  */
 export function problems(rigs) {

@@ -1,0 +1,547 @@
+"""The commands of one axis: check, plan, send to the drive, update the tracker."""
+
+import math
+from dataclasses import replace
+
+from ldcnd.axis import guards
+from ldcnd.axis.guards import Permit, cannot
+from ldcnd.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
+from ldcnd.axis.procedure import NEVER_S, Procedure
+from ldcnd.axis.procedures.analog import AnalogMove
+from ldcnd.axis.procedures.approach import ApproachMove
+from ldcnd.axis.procedures.group import GroupMember, GroupMoveRequest
+from ldcnd.axis.procedures.home import HomeSequence
+from ldcnd.axis.procedures.jog import HeldJog, Holds, no_such_jog
+from ldcnd.axis.procedures.path import PathMember, PathShareRequest
+from ldcnd.axis.procedures.probe import ProbeMove
+from ldcnd.axis.procedures.pwm import PwmRun
+from ldcnd.axis.procedures.track import SetPoint
+from ldcnd.axis.procedures.velocity import COUNTER_SHARE, VelocityChange, runs
+from ldcnd.axis.state import Completion
+from ldcnd.contract.commands import (
+    AxisCommand,
+    BufferMode,
+    CommandReply,
+    Home,
+    Jog,
+    Move,
+    MoveAbsolute,
+    MoveAnalog,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    Probe,
+    Reset,
+    SetGains,
+    SetOutputs,
+    SetPosition,
+    SetPwm,
+    Track,
+    Verb,
+)
+from ldcnd.contract.errors import (
+    CommandAborted,
+    DriveFault,
+    LeaseRequired,
+    NotSupported,
+    OutcomeUnknown,
+    Remedy,
+    RequestRefused,
+    StopLatched,
+    ValueOutOfRange,
+    WrongState,
+    step,
+)
+from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, Motion, StopMode, TakesGains, Warns
+from ldcnd.line.exchange import Timing
+from ldcnd.line.transaction import only_while
+
+STEP_RETRY_S = 0.2
+"""Delay before a step whose packets were lost is taken again, seconds,"""
+BLIND_RETRY_S = 1.0
+"""and the delay while the drive does not reply at all."""
+MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
+"""Trapezoids in the drive."""
+
+
+class AxisCommands:
+    """The verbs of one axis, and the procedure that the last one may have begun.
+
+    Attributes:
+        procedure: what is under way and takes more than one step; None otherwise.
+        step_due: its next step is due.
+        holds: the jogs that are held.
+        own_gains: those of the axis while a client has lent it others; None otherwise.
+    """
+
+    def __init__(self, motion: AxisMotion) -> None:
+        self.step_due = False
+        self._motion = motion
+        self._config = motion.config
+        self._driver = motion.driver
+        self._tracker = motion.tracker
+        self.procedure: Procedure | None = None
+        self.holds = Holds(motion.config.name)
+        self.own_gains: Gains | None = None
+        self._moved: tuple[Permit, Motion, float] | None = None  # the last trapezoid, and the speed share of its plan
+        self._retry_s: float | None = None  # when the step that was not taken is taken again
+
+    async def carry_out(self, permit: Permit, request: AxisCommand[CommandReply]) -> CommandReply:
+        """Do what the request says; returns once the drive has acknowledged it.
+
+        Raises:
+            RequestRefused: it cannot be done; nothing was sent.
+            DriveFault: the drive's condition forbids it.
+            BusError: the line failed; `OutcomeUnknown` when the drive may have started.
+        """
+        if procedure := self._procedure_for(permit, request):
+            return await self._undertake(procedure)
+        match request:
+            case Power(on=True):
+                return await self._power_on(permit)
+            case MoveAbsolute():
+                return await self._move_absolute(permit, request)
+            case MoveRelative():
+                return await self._move_relative(permit, request)
+            case MoveVelocity():
+                return await self._move_velocity(permit, request)
+            case SetPosition():
+                return await self._set_position(permit, request.position)
+            case SetGains():
+                return await self._set_gains(permit, request)
+            case SetOutputs():
+                return await self._set_outputs(permit, request)
+            case Reset():
+                return await self._reset(permit, faults_only=request.faults_only)
+            case _:
+                raise NotSupported(f"axis {self._config.name} cannot {permit.verb}", axis=self._config.name)
+
+    def _procedure_for(self, permit: Permit, request: AxisCommand[CommandReply]) -> Procedure | None:
+        """Return what carries out a request that takes more than one step."""
+        match request:
+            case PathShareRequest():
+                return PathMember(self._motion, permit, request)
+            case GroupMoveRequest():
+                return GroupMember(self._motion, permit, request)
+            case Home():
+                return HomeSequence(self._motion, permit, request)
+            case Probe():
+                return ProbeMove(self._motion, permit, request)
+            case MoveAnalog():
+                return AnalogMove(self._motion, permit, request)
+            case SetPwm():
+                return PwmRun(self._motion, permit, request)
+            case Jog():
+                hold = self.holds.get(permit.command_id)
+                now_s = self._motion.clock.now_s()
+                return HeldJog(self._motion, permit, hold or self.holds.begin(permit.command_id, request, now_s))
+            case MoveVelocity() if runs(self._tracker) and not self._driver.retargets:
+                return VelocityChange(self._motion, permit, request)
+            case Track():
+                return SetPoint(self._motion, permit, request, self.procedure)
+            case _:
+                return None
+
+    def renew_jog(self, request: Jog, command_id: str) -> CommandReply:
+        """Take note that a jog is held; what it is to do from now on is its next step.
+
+        Raises:
+            LeaseExpired: the jog is over.
+            VelocityLimit, AccelerationLimit, ValueOutOfRange: the jog goes on as it was, and is not renewed.
+        """
+        hold, procedure = self.holds.get(command_id), self.procedure
+        if hold is None:
+            raise no_such_jog(self._config.name, command_id)
+        if hold.begun and not (isinstance(procedure, HeldJog) and procedure.is_of(hold)):
+            hold.over = True
+        now_s = self._motion.clock.now_s()
+        hold.check(now_s)
+        plan = self._motion.plan_at(request.velocity, request.acceleration)
+        hold.renew(request, now_s)
+        if isinstance(procedure, HeldJog) and procedure.wants_step:
+            self.step_due = True
+        return CommandReply(
+            command_id=command_id,
+            axis=self._config.name,
+            verb=request.verb,
+            velocity=plan.velocity,
+            acceleration=plan.acceleration,
+        )
+
+    def brought_to_rest(self, command_id: str, verb: Verb) -> None:
+        """The drive acknowledged a stop: watch the axis come to rest."""
+        self._drop_procedure()
+        self._motion.stopping(command_id, verb)
+
+    def switched_off(self) -> None:
+        """The drive acknowledged that its motor is off: nothing that was under way goes on."""
+        self._drop_procedure()
+        self._motion.target_counts = None
+
+    # -- procedures --------------------------------------------------------------------------------------------------
+
+    @property
+    def deadline_s(self) -> float:
+        """When the procedure takes its next step at the latest, in loop time; infinite without one."""
+        if self.procedure is None:
+            return NEVER_S
+        return self.procedure.deadline_s if self._retry_s is None else self._retry_s
+
+    @property
+    def watch_s(self) -> float:
+        """Longest time between two readings that the procedure allows, in seconds; infinite without one."""
+        return self.procedure.watch_s if self.procedure else NEVER_S
+
+    def observed(self, reading: AxisReading, timing: Timing) -> None:
+        """Let the procedure under way take the latest reading, after the tracker has."""
+        procedure = self.procedure
+        if procedure is None:
+            return
+        if procedure.outlived(self._tracker):
+            self._drop_procedure()
+        elif self._tracker.concerns(timing) and procedure.calls_for_step(reading):
+            self.step_due = True
+
+    async def step(self) -> None:
+        """Let the procedure take the step that is due.
+
+        Raises:
+            StopLatched: a stop has overtaken it.
+            BusError: the line failed; the step is taken again.
+        """
+        procedure, self.step_due = self.procedure, False
+        if procedure is None:
+            return
+        if procedure.outlived(self._tracker):
+            self._drop_procedure()
+            return
+        delay_s = STEP_RETRY_S if self._tracker.link is LinkState.UP else BLIND_RETRY_S
+        self._retry_s = self._motion.clock.now_s() + delay_s
+        try:
+            goes_on = await self._take_step(procedure)
+        finally:
+            self.step_due = False  # what was read during the step called for the one that is over
+        self._retry_s = None
+        if procedure is self.procedure and not goes_on:
+            self._drop_procedure()
+        self._motion.publish_state()
+
+    async def _take_step(self, procedure: Procedure) -> bool:
+        try:
+            return await procedure.step()
+        except OutcomeUnknown:
+            # what was started must not be started again: the readings tell how it goes
+            return self._tracker.command is not None and self._tracker.command.completion is Completion.PROCEDURE
+        except (StopLatched, CommandAborted):
+            raise
+        except (RequestRefused, DriveFault) as error:
+            if self._tracker.energised and not procedure.outlived(self._tracker):
+                await self._driver.stop(StopMode.SMOOTH)  # of the step before something may still run
+                self._motion.stopping(procedure.permit.command_id, procedure.permit.verb)
+                self._tracker.failing(error.message)
+            elif not procedure.outlived(self._tracker):
+                self._tracker.finished(error.message)
+            return False
+
+    def _drop_procedure(self) -> None:
+        self._take_up(None)
+
+    def _take_up(self, procedure: Procedure | None) -> None:
+        self.procedure, self._retry_s, self.step_due = procedure, None, False
+
+    async def _undertake(self, procedure: Procedure) -> CommandReply:
+        """Begin a procedure; it takes steps only from then on, also when it is unknown whether the drive has begun."""
+        try:
+            reply = await procedure.begin()
+        except OutcomeUnknown:
+            self._take_up(procedure)
+            raise
+        command = self._tracker.command
+        if command and command.command_id == procedure.permit.command_id:  # else a stop has ended it meanwhile
+            self._take_up(procedure)
+        return reply
+
+    # -- power -------------------------------------------------------------------------------------------------------
+
+    async def _power_on(self, permit: Permit) -> CommandReply:
+        tracker = self._tracker
+        guards.check_may_power_on(tracker)
+        guards.check_stands(tracker)
+        await self._motion.check_does_not_coast()
+        if isinstance(self._driver, TakesGains) and self._driver.gains is None:
+            raise WrongState(
+                f"axis {tracker.name} has no gains: its loop cannot close",
+                axis=tracker.name,
+                remedy=Remedy("configure gains or {}", step("set_gains")),
+            )
+        await permit.power_on()
+        self._drop_procedure()
+        self._motion.target_counts = None
+        self._tracker.powered(on=True, now_s=self._motion.clock.now_s())
+        self._motion.publish_state()
+        return self._motion.reply(permit)
+
+    async def _reset(self, permit: Permit, *, faults_only: bool) -> CommandReply:
+        """Recover from what has stopped the motor; mere warnings are cleared with a closed loop as it is.
+
+        A drive whose loop is open may hold a cause that it does not show: a Logosol drive hides a position error while
+        its power driver is off, and a host that took it over has not seen what came before.
+        """
+        tracker = self._tracker
+        guards.check_reachable(tracker)
+        (guards.check_not_latched if faults_only else guards.check_stop_confirmed)(tracker)
+        guards.check_stands(tracker)  # a stop that is under way keeps its latch
+        if tracker.state is AxisState.ERROR_STOP and self._moves_by_force():
+            raise WrongState(
+                f"axis {tracker.name} still moves, or may: a reset would switch its motor off at speed",
+                axis=tracker.name,
+                value=tracker.moving.value,
+                remedy=Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
+            )
+        stopped = tracker.state is AxisState.ERROR_STOP or any(fault.stops for fault in tracker.active_faults)
+        if stopped or not tracker.energised:
+            await self._driver.reset()
+            self._drop_procedure()
+            tracker.switched(on=False, now_s=self._motion.clock.now_s())
+        elif tracker.active_faults and isinstance(self._driver, Warns):
+            await self._driver.clear_warnings()
+        permit.still_wanted()  # a stop that came meanwhile keeps its latch
+        tracker.cleared(self._motion.clock.now_s())
+        self._motion.publish_state()
+        return self._motion.reply(permit)
+
+    def _moves_by_force(self) -> bool:
+        """Tell whether the motor has voltage and turns, or may, whatever the state says."""
+        return self._tracker.energised and self._tracker.moving is not Moving.NO
+
+    # -- motion ------------------------------------------------------------------------------------------------------
+
+    def retargets(self, request: Move) -> bool:
+        """Tell whether the drive goes on from the motion under way to this one, without a halt in between.
+
+        PIC-SERVO SC takes goal, velocity and acceleration of a trapezoid at any time and keeps both limits (later
+        vendor data sheets); on other drives a trapezoid loaded in mid-move is erratic (PIC-SERVO manual, 4.4).
+        """
+        tracker = self._tracker
+        return (
+            self._driver.retargets
+            and not isinstance(request, Jog)
+            and request.buffer_mode is BufferMode.ABORTING
+            and tracker.command is not None
+            and tracker.command.verb in MOVES
+            and tracker.state in (AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION)
+        )
+
+    def _check_may_start(self, request: Move) -> None:
+        if not (self.retargets(request) or (isinstance(request, MoveVelocity) and runs(self._tracker))):
+            guards.check_may_move(self._tracker)
+
+    def check(self, request: Move) -> None:
+        """Refuse a move that could not follow what the axis is doing now; nothing is halted for it.
+
+        Raises:
+            RequestRefused: as the move itself would be, once the axis stands.
+        """
+        guards.check_may_follow(self._tracker)
+        match request:
+            case MoveAbsolute():
+                goal = self._plan_absolute(request)
+                self._motion.before_approach(goal, request.velocity, request.acceleration)
+            case MoveRelative():
+                goal = self._plan_relative(request)
+                self._motion.before_approach(goal, request.velocity, request.acceleration)
+            case MoveVelocity():
+                self._plan_velocity(request)
+            case Jog():
+                self._motion.plan_at(request.velocity, request.acceleration)
+
+    async def _move_absolute(self, permit: Permit, request: MoveAbsolute) -> CommandReply:
+        self._check_may_start(request)
+        return await self._move_to(permit, request, self._plan_absolute(request))
+
+    async def _move_relative(self, permit: Permit, request: MoveRelative) -> CommandReply:
+        self._check_may_start(request)
+        if self._motion.target_counts is None:
+            here = (await self._motion.read()).position_counts  # one reading alone may be wrong
+            permit.still_wanted()
+            self._check_may_start(request)
+            return await self._move_to(permit, request, self._plan_relative(request, here))
+        return await self._move_to(permit, request, self._plan_relative(request))
+
+    async def _move_to(self, permit: Permit, request: MoveAbsolute | MoveRelative, goal: MotionPlan) -> CommandReply:
+        """Go to a goal, from the configured side where there is one."""
+        if self._motion.config.approach and (
+            first := self._motion.before_approach(goal, request.velocity, request.acceleration)
+        ):
+            return await self._undertake(ApproachMove(self._motion, permit, request, first, goal))
+        return await self._move(permit, goal, AxisState.DISCRETE_MOTION)
+
+    async def _move_velocity(self, permit: Permit, request: MoveVelocity) -> CommandReply:
+        self._check_may_start(request)
+        velocity, bounded = self._plan_velocity(request)
+        reply = await self._move(permit, bounded, AxisState.CONTINUOUS_MOTION)
+        return reply.model_copy(update={"velocity": velocity})
+
+    def _plan_absolute(self, request: MoveAbsolute) -> MotionPlan:
+        guards.check_referenced(self._tracker)
+        position = self._motion.unwrapped(request.position, request.direction)
+        return self._motion.plan_to(position, request.velocity, request.acceleration)
+
+    def _plan_relative(self, request: MoveRelative, here_counts: int | None = None) -> MotionPlan:
+        motion = self._motion
+        from_counts = here_counts if motion.target_counts is None else motion.target_counts
+        if from_counts is None:
+            from_counts = motion.latest().position_counts
+        position = motion.telemetry.position(from_counts) + request.distance
+        return motion.plan_to(position, request.velocity, request.acceleration)
+
+    def _plan_velocity(self, request: MoveVelocity) -> tuple[float, MotionPlan]:
+        """Return the velocity as the drive will have it, and a trapezoid that ends by itself even if this host dies."""
+        motion = self._motion
+        plan = motion.plan_at(request.velocity, request.acceleration)
+        end = motion.limit_ahead(request.velocity) if self._tracker.referenced else None
+        if end is None:
+            here = motion.telemetry.position(motion.latest().position_counts)
+            longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(plan.motion.velocity_counts_per_s)
+            end = here + plan.velocity * min(motion.config.jog_horizon_s, longest_s)
+        return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration)
+
+    async def _move(
+        self,
+        permit: Permit,
+        plan: MotionPlan,
+        state: AxisState,
+        completion: Completion = Completion.PROFILE,
+    ) -> CommandReply:
+        await permit.load(plan.motion)
+        self._moved = permit, plan.motion, self._tracker.speed_share
+        await self._motion.start(permit, state, completion, plan=plan)
+        self._motion.target_counts = plan.motion.target_counts
+        self._motion.approached = state is AxisState.DISCRETE_MOTION
+        return self._motion.reply(permit, plan)
+
+    async def change_speed(self) -> bool:
+        """Have a motion under way go on at the velocity that the speed override leaves; tell whether it does.
+
+        Only where a drive takes another velocity for a trapezoid under way: its goal stays, so nothing moves twice.
+
+        Raises:
+            RequestRefused: it may not be moved any more.
+            BusError: the line failed; it goes on at the one velocity or the other.
+        """
+        tracker, share = self._tracker, self._tracker.speed_share
+        command = tracker.command
+        if isinstance(self.procedure, HeldJog):
+            self.step_due = self.step_due or self.procedure.wants_step
+            return self.step_due
+        if self._moved is None or not self._driver.retargets or command is None or share <= 0:
+            return False
+        permit, motion, before = self._moved
+        if command.command_id != permit.command_id or command.completion is not Completion.PROFILE or share == before:
+            return False
+        changed = self._motion.quantise(
+            replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / before)
+        )
+        await permit.load(changed)
+        if tracker.command is not command:
+            return False  # it has ended meanwhile: what was loaded is not started
+        await permit.start()
+        self._moved = permit, changed, share
+        way = abs((changed.target_counts or 0) - self._motion.latest().position_counts)
+        tracker.ends_after(
+            rest_of_profile_s(
+                way, motion.velocity_counts_per_s, changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
+            ),
+            self._motion.clock.now_s(),
+            self._motion.clock.now_ns(),
+        )
+        return True
+
+    # -- registers ---------------------------------------------------------------------------------------------------
+
+    async def _set_position(self, permit: Permit, position: float) -> CommandReply:
+        motion = self._motion
+        tracker = self._tracker
+        guards.check_reachable(tracker)
+        guards.check_stands(tracker)
+        guards.check_position_kept(tracker)
+        here = await motion.read()  # one reading alone may be wrong
+        await motion.reference.forget()
+        permit.still_wanted()
+        guards.check_position_kept(self._tracker)
+        motion.telemetry.origin_counts = here.position_counts - position * motion.counts_per_unit
+        self._tracker.referenced, self._tracker.target = True, None
+        motion.publish_state()
+        return motion.reply(permit, position=position)
+
+    async def _set_gains(self, permit: Permit, request: SetGains) -> CommandReply:
+        tracker = self._tracker
+        guards.check_reachable(tracker)
+        asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name, None)) is not None}
+        held = self._driver.gains if isinstance(self._driver, TakesGains) else None
+        if held is None and not {"kp", "el"} <= asked.keys():
+            raise WrongState(
+                f"axis {self._config.name} has no gains yet",
+                axis=self._config.name,
+                remedy=Remedy("{}", step("set_gains", "send at least kp and el")),
+            )
+        gains = held or Gains(kp=0, kd=0, ki=0, il=0, ol=250, cl=0, el=0, sr=1, deadband=0)
+        changed = replace(gains, **asked)
+        if changed.sr != gains.sr:
+            guards.check_stands(tracker)
+        self._check_tracking_step(changed)
+        if not request.lent:
+            await permit.set_gains(changed)
+            self.own_gains = None
+            return self._motion.reply(permit)
+        if request.lease is None:
+            raise LeaseRequired(
+                f"axis {self._config.name}: gains are lent for as long as a lease lasts, and the command names none",
+                axis=self._config.name,
+                remedy=Remedy("{}", step("acquire", "acquire one first")),
+            )
+        self.own_gains = self.own_gains or gains  # before they are sent: a lost reply leaves open which ones act
+        await permit.set_gains(changed)
+        return self._motion.reply(permit)
+
+    def take_gains_back(self) -> bool:
+        """Have the drive hold the gains of the axis from its next motion on; tell whether others were lent to it."""
+        own, self.own_gains = self.own_gains, None
+        if own is None or not isinstance(self._driver, TakesGains):
+            return False
+        self._driver.gains = own
+        return True
+
+    @property
+    def gains_differ(self) -> bool:
+        """Whether the drive holds other gains than it should, or may."""
+        return isinstance(self._driver, TakesGains) and not self._driver.holds_gains
+
+    def _check_tracking_step(self, gains: Gains) -> None:
+        """Refuse a position error limit that the next set-point of `track` could exceed.
+
+        Raises:
+            ValueOutOfRange: names the lowest `el`.
+        """
+        config = self._motion.config
+        if config.tracking is None:
+            return
+        step_counts = math.ceil(config.tracking.step * abs(self._motion.counts_per_unit))
+        if gains.el <= step_counts:
+            raise ValueOutOfRange(
+                f"axis {config.name}: el {gains.el} is not above a tracking step of {step_counts} counts",
+                axis=config.name,
+                value=gains.el,
+                limit=step_counts,
+                nearest=step_counts + 1,
+                remedy="configure a shorter tracking step",
+            )
+
+    async def _set_outputs(self, permit: Permit, request: SetOutputs) -> CommandReply:
+        guards.check_reachable(self._tracker)
+        if not isinstance(self._driver, HasOutputs):
+            raise cannot(self._driver.spec, "set outputs")
+        with only_while(permit.ask):
+            await self._driver.set_outputs(request.limit1, request.limit2)
+        return self._motion.reply(permit)

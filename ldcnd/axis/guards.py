@@ -1,0 +1,618 @@
+"""Permission to move one axis: what must hold before a motion starts, the gate that asks, and the only way to send it.
+
+The checks are pure; each refusal says what, which limit, and what to do. A `Permit` is made when a command is admitted
+and travels with it, from its turn in the queue of its axis to its last step. The rest of the daemon holds a
+`QuietDrive`, which has no call that can move; those are methods of the permit. Each of them checks permission directly
+before its first packet, and the bus checks again when the turn of each such packet comes. So a move that waited (for
+its turn, for the motion ahead of it, for the other members of its group, for a step of a homing, for the line) is
+judged by the state at its start, not by the state at its arrival.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NoReturn, Protocol
+
+from typing_extensions import override
+
+from ldcnd.axis.state import MOTION_STATES, AxisTracker
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.errors import (
+    AccelerationLimit,
+    AxisUnreachable,
+    CommandAborted,
+    NotReferenced,
+    NotSupported,
+    PositionLimit,
+    Remedy,
+    RequestRefused,
+    ShuttingDown,
+    StopLatched,
+    VelocityLimit,
+    WrongState,
+    step,
+)
+from ldcnd.contract.meta import AxisLimits
+from ldcnd.contract.samples import AxisState, LinkState, TelemetryItem
+from ldcnd.drives.driver import (
+    NO_CEILING,
+    AnalogMotion,
+    AxisReading,
+    AxisSpec,
+    Ceiling,
+    Drive,
+    Gains,
+    HomeCapture,
+    Homes,
+    Motion,
+    Moves,
+    PathStatus,
+    PwmOutput,
+    StopMode,
+    TakesGains,
+    Tracks,
+    WalksPaths,
+)
+from ldcnd.drives.network import Network
+from ldcnd.line.exchange import Exchange
+from ldcnd.line.transaction import Condition, only_while
+
+
+def check_reachable(axis: AxisTracker) -> None:
+    """Refuse when the drive does not answer, or is not known to be the one that is configured."""
+    if axis.proof:
+        axis.proof.check()
+    if axis.link is LinkState.DOWN:
+        raise AxisUnreachable(
+            f"axis {axis.name}: the drive does not answer", axis=axis.name, remedy="check its power and the line"
+        )
+
+
+def check_not_latched(axis: AxisTracker) -> None:
+    """Refuse while a stop is latched, or not confirmed by the drive."""
+    check_stop_confirmed(axis)
+    if axis.stop_latched:
+        raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy=Remedy("{}", step("reset")))
+
+
+def check_stop_confirmed(axis: AxisTracker) -> None:
+    """Refuse while the drive has not confirmed a stop."""
+    if axis.stop_pending:
+        raise StopLatched(
+            f"axis {axis.name}: the drive has not confirmed a stop yet",
+            axis=axis.name,
+            remedy="wait: it is sent again until the drive confirms it; check the drive and its line",
+        )
+
+
+def check_not_in_error(axis: AxisTracker) -> None:
+    """Refuse while a fault, or a command that ended badly, waits to be acknowledged."""
+    if axis.state is AxisState.ERROR_STOP:
+        raise _faulted(axis)
+
+
+def check_enabled(axis: AxisTracker) -> None:
+    """Refuse a motion while the position loop is open."""
+    if axis.state is AxisState.DISABLED:
+        raise WrongState(
+            f"axis {axis.name} is disabled",
+            axis=axis.name,
+            value=axis.state,
+            remedy=Remedy("{}", step("power", 'send power {"on": true}', on=True)),
+        )
+
+
+def check_may_power_on(axis: AxisTracker) -> None:
+    """Refuse to close the loop of an axis that is unreachable, latched or faulted."""
+    check_reachable(axis)
+    check_not_latched(axis)
+    check_not_in_error(axis)
+
+
+def check_may_follow(axis: AxisTracker) -> None:
+    """Refuse a motion unless the axis is powered; it may still move."""
+    check_may_power_on(axis)
+    check_enabled(axis)
+
+
+def check_may_move(axis: AxisTracker) -> None:
+    """Refuse a motion unless the axis is powered and stands still."""
+    check_may_follow(axis)
+    check_stands(axis)
+
+
+def check_stands(axis: AxisTracker) -> None:
+    """Refuse while a motion runs: a trapezoid loaded in mid-move is erratic on most drives (PIC-SERVO manual, 4.4)."""
+    if axis.state in MOTION_STATES:
+        raise WrongState(
+            f"axis {axis.name} is in {axis.state}",
+            axis=axis.name,
+            value=axis.state,
+            remedy=Remedy("{} and wait", step("halt")),
+        )
+
+
+def check_does_not_coast(axis: AxisTracker) -> None:
+    """Refuse to close the loop while the shaft turns: the drive would hold it where it is, at once.
+
+    A shaft turns when its drive shows a velocity, which is more than a count in a servo cycle: one that creeps, as a
+    load that sinks, can be caught.
+    """
+    if axis.coasts:
+        raise WrongState(
+            f"axis {axis.name} turns with its motor off: its drive would hold it at once, whatever its speed",
+            axis=axis.name,
+            remedy=Remedy("wait until it stands, then {}", step("power", 'send power {"on": true}', on=True)),
+        )
+
+
+def check_referenced(axis: AxisTracker) -> None:
+    """Refuse an absolute position on an axis that is not referenced."""
+    if not axis.referenced:
+        kept = f"; what was kept of it was refused: {axis.refused}" if axis.refused else ""
+        raise NotReferenced(
+            f"axis {axis.name} is not homed: its position is not known{kept}",
+            axis=axis.name,
+            remedy=Remedy("{} or {}", step("home"), step("set_position", "set_position")),
+        )
+
+
+def check_position_kept(axis: AxisTracker) -> None:
+    """Refuse to give the position a meaning while the drive says that it has lost it."""
+    if axis.position_lost:
+        raise WrongState(
+            f"axis {axis.name}: its position is lost: {_said(axis)}",
+            axis=axis.name,
+            remedy=Remedy("{} first", step("reset")),
+        )
+
+
+def check_position(axis: AxisTracker, limits: AxisLimits, position: float) -> None:
+    """Refuse a target outside the software limits, naming the nearest that is inside."""
+    if limits.position_min is not None and position < limits.position_min:
+        limit, side = limits.position_min, "below"
+    elif limits.position_max is not None and position > limits.position_max:
+        limit, side = limits.position_max, "above"
+    else:
+        return
+    raise PositionLimit(
+        f"axis {axis.name}: target {position:g} {axis.unit} is {side} the limit {limit:g} {axis.unit}",
+        axis=axis.name,
+        value=position,
+        limit=limit,
+        nearest=limit,
+    )
+
+
+def check_velocity(axis: AxisTracker, limits: AxisLimits, velocity: float) -> None:
+    """Refuse a speed above the limit."""
+    if limits.velocity is not None and abs(velocity) > limits.velocity:
+        raise VelocityLimit(
+            f"axis {axis.name}: velocity {velocity:g} {axis.unit}/s is above the limit"
+            f" {limits.velocity:g} {axis.unit}/s",
+            axis=axis.name,
+            value=velocity,
+            limit=limits.velocity,
+            nearest=limits.velocity if velocity > 0 else -limits.velocity,
+        )
+
+
+def check_acceleration(axis: AxisTracker, limits: AxisLimits, acceleration: float) -> None:
+    """Refuse an acceleration above the limit."""
+    if limits.acceleration is not None and acceleration > limits.acceleration:
+        raise AccelerationLimit(
+            f"axis {axis.name}: acceleration {acceleration:g} {axis.unit}/s2 is above the limit"
+            f" {limits.acceleration:g} {axis.unit}/s2",
+            axis=axis.name,
+            value=acceleration,
+            limit=limits.acceleration,
+            nearest=limits.acceleration,
+        )
+
+
+def no_speed(axis: str) -> WrongState:
+    """Return the refusal of a motion while the speed override of the rig is 0."""
+    return WrongState(
+        f"axis {axis}: the speed override of the rig is 0 %",
+        axis=axis,
+        value=0.0,
+        remedy=Remedy("{} above 0 %", step("set_speed_override", "set the speed override")),
+    )
+
+
+def _faulted(axis: AxisTracker) -> WrongState:
+    causes = _said(axis) or "a command ended badly"
+    return WrongState(
+        f"axis {axis.name} is in error_stop: {causes}",
+        axis=axis.name,
+        value=axis.state,
+        remedy=Remedy("remove the cause, then {}", step("reset")),
+    )
+
+
+def _said(axis: AxisTracker) -> str:
+    return "; ".join(fault.text for fault in axis.active_faults)
+
+
+def always() -> None:
+    """Forbid nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Right:
+    """Conditions on the sender of a command, besides the state of the axis.
+
+    Attributes:
+        holds: checked before every motion of the command: its lease, no other daemon.
+        in_time: checked until its first motion has begun: its `not_after`.
+    """
+
+    holds: Condition = always
+    in_time: Condition = always
+
+    def also(self, condition: Condition) -> "Right":
+        """Return this right with one more condition, checked before every motion."""
+
+        def both() -> None:
+            self.holds()
+            condition()
+
+        return replace(self, holds=both)
+
+
+UNCONDITIONAL = Right()
+"""Right of commands that bring an axis to rest, and of callers inside the daemon."""
+
+
+class QuietDrive(Protocol):
+    """Calls to a drive that need no permission: none of them can make it move."""
+
+    spec: AxisSpec
+    adc_full_scale: int | None
+    retargets: bool
+
+    def quantise(self, motion: Motion, most: Ceiling = ...) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
+    def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
+    async def stop(self, mode: StopMode) -> StopMode: ...  # noqa: D102
+    async def reset(self) -> None: ...  # noqa: D102
+
+
+def homing(drive: QuietDrive) -> Homes:
+    """Return a drive as one that captures its position.
+
+    Raises:
+        NotSupported: it does not.
+    """
+    if isinstance(drive, Homes):
+        return drive
+    raise cannot(drive.spec, "home")
+
+
+def walking(drive: QuietDrive) -> WalksPaths:
+    """Return a drive as one that walks paths.
+
+    Raises:
+        NotSupported: it does not.
+    """
+    if isinstance(drive, WalksPaths):
+        return drive
+    raise cannot(drive.spec, "walk a path")
+
+
+def cannot(spec: AxisSpec, what: str) -> NotSupported:
+    """Return the refusal of what a drive cannot do."""
+    return NotSupported(f"axis {spec.name}: {spec.model} cannot {what}", axis=spec.name)
+
+
+class Unmoved(Moves):
+    """Stands for the motion of a drive that takes none over its line: everything is refused."""
+
+    def __init__(self, drive: Drive) -> None:
+        self.spec = drive.spec
+        self.identity = drive.identity
+        self.capabilities = drive.capabilities
+
+    @override
+    def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
+        self._refuse(f"read {', '.join(sorted(items))} at once")
+
+    @override
+    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+        self._refuse("move")
+
+    @override
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+        return ()
+
+    @override
+    async def power(self, *, on: bool) -> None:
+        self._refuse("be enabled" if on else "be disabled")
+
+    @override
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        self._refuse("move")
+
+    @override
+    async def start(self) -> None:
+        self._refuse("move")
+
+    @override
+    async def stop(self, mode: StopMode) -> StopMode:
+        self._refuse("be stopped")
+
+    @override
+    async def reset(self) -> None:
+        self._refuse("be reset")
+
+    def _refuse(self, what: str) -> NoReturn:
+        raise NotSupported(
+            f"axis {self.spec.name}: {self.spec.model} cannot {what} over its line",
+            axis=self.spec.name,
+            remedy="use the drive's own inputs",
+        )
+
+
+class Permit:
+    """Permission of one command, with all its steps, to move the drive of its axis; made by `Gate`.
+
+    Attributes:
+        command_id: names the command everywhere.
+        verb: what it is.
+    """
+
+    def __init__(self, gate: "Gate", command_id: str, verb: Verb, right: Right) -> None:
+        self.command_id = command_id
+        self.verb = verb
+        self._gate = gate
+        self._right = right
+        self._epoch = gate.epoch
+        self._begun = False
+
+    def still_wanted(self) -> None:
+        """Raise when the command was overtaken.
+
+        Raises:
+            StopLatched, CommandAborted: a stop has come since, or another command.
+            ShuttingDown: the daemon ends.
+        """
+        if self._gate.closed:
+            raise self._gate.ending()
+        if self._epoch != self._gate.epoch:
+            raise self._gate.overtaken(self.verb)
+
+    def renew(self) -> None:
+        """Go on after a stop that this command has requested itself."""
+        self._epoch = self._gate.epoch
+
+    def ask(self) -> None:
+        """Raise when the command must not be carried out any more.
+
+        Raises:
+            StopLatched, ShuttingDown: see `still_wanted`.
+            RequestRefused: its sender has lost the right to it, or it comes too late.
+        """
+        self._ask(begun=self._begun)
+
+    def _ask(self, *, begun: bool) -> None:
+        self.still_wanted()
+        self._right.holds()
+        if not begun:
+            self._right.in_time()
+
+    def ask_to_move(self) -> None:
+        """Raise when nothing of this command may move the axis now.
+
+        Raises:
+            CommandAborted,
+        LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop, and a
+                speed override of 0.
+        """
+        self.to_move()()
+
+    def to_move(self) -> Condition:
+        """Return the condition that `ask_to_move` checks, to be checked again when a packet's turn comes."""
+        energise, tracker = self._to_energise(), self._gate.tracker
+
+        def condition() -> None:
+            energise()
+            if tracker.speed_share <= 0:
+                raise no_speed(tracker.name)
+
+        return condition
+
+    def _to_energise(self) -> Condition:
+        """Return the condition that is checked before the loop is closed."""
+        begun, tracker = self._begun, self._gate.tracker
+
+        def condition() -> None:
+            self._ask(begun=begun)
+            check_may_power_on(tracker)
+
+        return condition
+
+    # -- what can move -----------------------------------------------------------------------------------------------
+
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator."""
+        self.ask_to_move()
+        self._gate.expect(motion)
+        with only_while(self.to_move()):
+            await self._gate.driver.load(motion, home=home)
+
+    async def start(self, *, stays: bool = False) -> None:
+        """Start what was loaded; see `Moves.start`.
+
+        Args:
+            stays: what was loaded ends where the axis stands, so the motion of the command has yet to begin.
+        """
+        condition = self.to_move()
+        if not stays:
+            self.begin()
+        with only_while(condition):
+            await self._gate.driver.start()
+
+    async def track(self, position_counts: int) -> None:
+        """Go to a position at once; see `Tracks`."""
+        drive = self._gate.driver
+        if not isinstance(drive, Tracks):
+            raise cannot(drive.spec, "track")
+        condition = self.to_move()
+        self.begin()
+        self._gate.expect(Motion(position_counts, math.inf, math.inf))
+        with only_while(condition):
+            await drive.track(position_counts)
+
+    async def add_points(self, steps: Sequence[int]) -> PathStatus:
+        """Fill the drive's buffer of path points; see `WalksPaths`. A motion begins only with `start_path`."""
+        drive = walking(self._gate.driver)
+        self.ask_to_move()
+        with only_while(self.to_move()):
+            return await drive.add_points(steps)
+
+    async def power_on(self) -> None:
+        """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
+        energise, tracker = self._to_energise(), self._gate.tracker
+
+        def condition() -> None:
+            energise()
+            check_does_not_coast(tracker)
+
+        condition()
+        was_on = tracker.enabled
+        try:
+            self.begin()
+            with only_while(condition):
+                await self._gate.driver.power(on=True)
+            self.still_wanted()
+        except RequestRefused:
+            if not was_on:
+                await self._gate.driver.stop(StopMode.OFF)
+            raise
+
+    async def set_gains(self, gains: Gains) -> None:
+        """Load the registers of the loop, which act at once; see `TakesGains`."""
+        self.ask()
+        drive = self._gate.driver
+        if not isinstance(drive, TakesGains):
+            raise cannot(drive.spec, "take gains")
+        with only_while(self.ask):
+            await drive.set_gains(gains)
+
+    def announce(self, motion: Motion, *, anywhere: bool = False) -> None:
+        """Have readings judged by a motion that the network is about to start; see `PlausibilityGate.expect`."""
+        self._gate.expect(motion, anywhere=anywhere)
+
+    def begin(self) -> None:
+        """Note that the next packet begins the motion: conditions made from now on do not ask `not_after`."""
+        self._begun = True
+
+
+class Expect(Protocol):
+    """See `PlausibilityGate.expect`."""
+
+    def __call__(self, motion: Motion | AnalogMotion | PwmOutput, *, anywhere: bool = False) -> None:
+        """Take a motion that is about to be loaded."""
+
+
+class Gate:
+    """The gate of one axis: makes permits, and makes them void.
+
+    Attributes:
+        driver: of the drive; nothing but permits and the axis's stops uses it.
+        tracker: of its state.
+        expect: takes each motion that is about to be loaded.
+        epoch: number of stops so far; a permit of an earlier epoch is void.
+        closed: the daemon ends; no permit holds.
+    """
+
+    def __init__(self, driver: Moves, tracker: AxisTracker, expect: Expect) -> None:
+        self.driver = driver
+        self.tracker = tracker
+        self.expect = expect
+        self.epoch = 0
+        self._cause = ""
+        self.closed = False
+
+    def permit(self, command_id: str, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
+        """Return the permit of a command, valid until the next stop."""
+        return Permit(self, command_id, verb, right)
+
+    def overtake(self, by: Permit | None, cause: str) -> None:
+        """Make all permits void, except the caller's; the refusals of the others name the cause."""
+        self.epoch += 1
+        self._cause = cause
+        if by is not None:
+            by.renew()
+
+    def close(self) -> None:
+        """Make all permits void permanently."""
+        self.closed = True
+
+    def ending(self) -> ShuttingDown:
+        """Return the refusal of a daemon that ends."""
+        name = self.tracker.name
+        return ShuttingDown(f"axis {name}: the daemon is stopping", axis=name)
+
+    def overtaken(self, what: str) -> StopLatched | CommandAborted:
+        """Return the refusal of a command that a stop has overtaken, or the latest cause that latches nothing."""
+        tracker = self.tracker
+        if tracker.stop_latched:
+            return StopLatched(
+                f"axis {tracker.name}: {what} was overtaken by a stop",
+                axis=tracker.name,
+                remedy=Remedy("{}", step("reset")),
+            )
+        in_error = tracker.state is AxisState.ERROR_STOP
+        return CommandAborted(
+            f"axis {tracker.name}: {what} was overtaken by {self._cause}",
+            axis=tracker.name,
+            remedy=Remedy("{}", step("reset")) if in_error else "send it again",
+        )
+
+
+async def start_path(network: Network, names: frozenset[str], permits: Sequence[Permit]) -> None:
+    """Start axes on their paths; every member's permission is checked directly before the packet that starts.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_path`.
+    """
+    conditions = [permit.to_move() for permit in permits]
+
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    for permit in permits:
+        permit.begin()
+    with only_while(ask_all):
+        await network.start_path(names, ask_all)
+
+
+async def start_together(
+    network: Network, motions: Mapping[str, Motion], permits: Sequence[Permit], announce: Callable[[], None]
+) -> None:
+    """Start axes in the same servo cycle; every member's permission is checked directly before the packet that starts.
+
+    Args:
+        network: of their line.
+        motions: by axis name.
+        permits: of all members.
+        announce: called between the last check and the first packet.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_group`.
+    """
+
+    def about_to_start() -> None:
+        ask_all()
+        announce()
+
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    conditions = [permit.to_move() for permit in permits]
+    ask_all()
+    with only_while(ask_all):
+        await network.start_group(motions, about_to_start)

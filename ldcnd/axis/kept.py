@@ -1,0 +1,126 @@
+"""Data of an axis on disk: its reference, with the values that prove it, and its past faults. One file each.
+
+A reference is removed from the disk before anything may change it, and written again afterwards: a crash in between
+costs the reference, and a file never says more than was true when it was written.
+"""
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import TypeVar
+
+from ldcnd import durable
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.meta import PastFault
+
+FORMAT = 1
+DISK_TIME_S = 2.0
+"""A disk that takes longer than this counts as failed."""
+ResultT = TypeVar("ResultT")
+
+
+class KeptReference(Frozen):
+    """Position 0 on the counter of a drive, and the conditions under which it is valid."""
+
+    format: int
+    """Format of this file; another one is refused."""
+    written: int
+    """Time of writing, UTC in ns since 1970."""
+    address: int
+    """Address of the drive on its line."""
+    identity: str
+    """Identity that the drive reports."""
+    baud: int
+    """Rate of the line: a drive that was reset is at another one."""
+    scale: tuple[float, str, float | None]
+    """Counts per unit, negative in reverse; unit; modulo."""
+    origin: float
+    """Position 0 on the drive's own counter."""
+    mark: int
+    """Value of the drive's mark register; a reset clears it."""
+    enabled: bool
+    """The position loop was closed."""
+    low: int
+    """Lower bound of the drive's counter,"""
+    high: int
+    """and its upper bound: both are the position at rest, or a motion under way lies between them."""
+
+
+class FaultFile(Frozen):
+    """The faults of one axis."""
+
+    faults: tuple[PastFault, ...]
+    """Oldest first."""
+
+
+class KeptFiles:
+    """The files of one rig.
+
+    One thread writes them, so that they change in the order of the requests.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self._directory = directory
+        self._worker = ThreadPoolExecutor(1, "kept files")
+
+    async def reference(self, axis: str) -> KeptReference | None:
+        """Return the reference that is kept of an axis; None without one.
+
+        Raises:
+            TimeoutError: the disk takes too long.
+            DamagedFile: it cannot be read, or makes no sense.
+        """
+        return await self._in_thread(_read(self._path("references", axis), KeptReference))
+
+    async def keep_reference(self, axis: str, reference: KeptReference) -> None:
+        """Write the reference of an axis; it is on the disk when this returns.
+
+        Raises:
+            OSError: it cannot be written; what was kept before still is.
+        """
+        path, text = self._path("references", axis), reference.model_dump_json()
+        await self._in_thread(lambda: durable.replace(path, text))
+
+    async def remove_reference(self, axis: str) -> None:
+        """Remove the reference of an axis; it has gone from the disk when this returns.
+
+        Raises:
+            OSError: it cannot be removed.
+        """
+        path = self._path("references", axis)
+        await self._in_thread(lambda: durable.remove(path))
+
+    async def faults(self, axis: str) -> tuple[PastFault, ...]:
+        """Return the faults that are kept of an axis, oldest first.
+
+        Raises:
+            TimeoutError: the disk takes too long.
+            DamagedFile: they cannot be read, or make no sense.
+        """
+        kept = await self._in_thread(_read(self._path("faults", axis), FaultFile))
+        return kept.faults if kept else ()
+
+    async def keep_faults(self, axis: str, faults: tuple[PastFault, ...]) -> None:
+        """Write the faults of an axis.
+
+        Raises:
+            OSError: they cannot be written.
+        """
+        path, text = self._path("faults", axis), FaultFile(faults=faults).model_dump_json()
+        await self._in_thread(lambda: durable.replace(path, text))
+
+    def _path(self, what: str, axis: str) -> Path:
+        return self._directory / what / f"{axis}.json"
+
+    async def _in_thread(self, work: Callable[[], ResultT]) -> ResultT:
+        future = asyncio.get_running_loop().run_in_executor(self._worker, work)
+        async with asyncio.timeout(DISK_TIME_S):  # TimeoutError is an OSError
+            return await asyncio.shield(future)
+
+
+ModelT = TypeVar("ModelT", bound=Frozen)
+
+
+def _read(path: Path, model: type[ModelT]) -> Callable[[], ModelT | None]:
+    return lambda: durable.read(path, model.model_validate_json)

@@ -1,0 +1,549 @@
+"""Motion of one axis, for all commands: plan, load, check the permit, start, bring to rest.
+
+A plan goes from a request in axis units to a motion in counts, checked against limits and quantised to the drive's
+registers. A preview is computed by the same code, and nothing is sent.
+"""
+
+import asyncio
+import math
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass, replace
+
+from ldcnd.axis.clock import Clock
+from ldcnd.axis.guards import (
+    Permit,
+    QuietDrive,
+    check_acceleration,
+    check_does_not_coast,
+    check_position,
+    check_velocity,
+    no_speed,
+)
+from ldcnd.axis.reference import ReferenceKeeper
+from ldcnd.axis.state import ActiveCommand, AxisTracker, Completion, Settling, window_counts
+from ldcnd.axis.straight import LineAxis
+from ldcnd.axis.telemetry import AxisTelemetry
+from ldcnd.contract.codec import error_reply
+from ldcnd.contract.commands import CommandReply, Direction, Preview, PreviewReply, Verb
+from ldcnd.contract.errors import (
+    BusError,
+    MalformedRequest,
+    NotSupported,
+    OutcomeUnknown,
+    Remedy,
+    RequestRefused,
+    ValueOutOfRange,
+    WrongState,
+    step,
+)
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, Homes, Motion, StopMode
+from ldcnd.line.bus import Bus
+
+LOOK_AGAIN_S = 0.02
+"""From one look at a shaft that turns to the next one, seconds."""
+
+
+@dataclass(frozen=True, slots=True)
+class MotionPlan:
+    """A motion that may be loaded as it is.
+
+    Attributes:
+        motion: in counts, as the registers hold it.
+        position: target in axis units; None for a motion without one.
+        velocity: in units a second, signed like the motion.
+        acceleration: in units a second squared.
+        duration_s: of the profile, without settling; None for a motion without an end.
+    """
+
+    motion: Motion
+    position: float | None
+    velocity: float
+    acceleration: float
+    duration_s: float | None
+
+
+def both_s(first: MotionPlan, goal: MotionPlan) -> float:
+    """Return how long a motion and the approach that follows it take, without settling."""
+    way = abs((goal.motion.target_counts or 0) - (first.motion.target_counts or 0))
+    motion = goal.motion
+    last_s = profile_duration_s(way, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
+    return (first.duration_s or 0.0) + last_s
+
+
+def profile_duration_s(distance: float, velocity: float, acceleration: float) -> float:
+    """Return how long a trapezoid takes, triangular when it is short; any consistent units, all positive."""
+    if distance * acceleration < velocity * velocity:
+        return 2 * math.sqrt(distance / acceleration)
+    return distance / velocity + velocity / acceleration
+
+
+def rest_of_profile_s(way: float, before: float, after: float, acceleration: float) -> float:
+    """Return how long a trapezoid takes that slews and goes on at another velocity; any consistent units, positive."""
+    change_s = (after - before) / acceleration
+    return way / after + after / (2 * acceleration) + change_s * abs(after - before) / (2 * after)
+
+
+class AxisMotion:
+    """Motions of one axis, shared by its commands and their procedures.
+
+    Attributes:
+        counts_per_unit: negative where forward in axis units is backward in counts.
+        reading: the latest; None before the first.
+        target_counts: target of the last motion; None when it had no end or was followed by something else.
+        approached: that motion came from the side that the configuration names.
+    """
+
+    def __init__(
+        self,
+        config: AxisConfig,
+        driver: QuietDrive,
+        tracker: AxisTracker,
+        telemetry: AxisTelemetry,
+        clock: Clock,
+        read: Callable[[], Awaitable[AxisReading]],
+        reference: ReferenceKeeper,
+    ) -> None:
+        """Take what an axis consists of.
+
+        Args:
+            config: of the axis.
+            driver: of its drive.
+            tracker: of its state.
+            telemetry: publishes it.
+            clock: of the daemon.
+            read: reads the drive's state at once.
+            reference: keeps its reference.
+        """
+        self.reference = reference
+        self.config = config
+        self._window_counts = window_counts(config)
+        self.driver = driver
+        self.counts_per_unit = config.signed_counts_per_unit
+        self.tracker = tracker
+        self.telemetry = telemetry
+        self.clock = clock
+        self.read = read
+        self.reading: AxisReading | None = None
+        self.target_counts: int | None = None
+        self.approached = False
+        self._loop = asyncio.get_running_loop()
+
+    def reconfigure(self, config: AxisConfig) -> None:
+        """Plan with other limits and speeds from now on."""
+        self.config = config
+        self._window_counts = window_counts(config)
+
+    async def check_does_not_coast(self, within_s: float = 0.0) -> None:
+        """Refuse to close the loop of a shaft that turns; where its rest is not proven, by a reading of now.
+
+        Args:
+            within_s: how long to wait until it stands.
+
+        Raises:
+            WrongState: it turns.
+            BusError: the line failed.
+        """
+        until_s = self._loop.time() + within_s
+        while not (self.tracker.enabled or self.tracker.at_rest):
+            self.tracker.looked_at(await self.read())
+            if not self.tracker.coasts or self._loop.time() >= until_s:
+                break
+            await asyncio.sleep(LOOK_AGAIN_S)
+        check_does_not_coast(self.tracker)
+
+    def latest(self) -> AxisReading:
+        """Return the latest reading.
+
+        Raises:
+            WrongState: there is none yet.
+        """
+        if self.reading is None:
+            raise WrongState(
+                f"axis {self.config.name}: its position has not been read yet",
+                axis=self.config.name,
+                remedy="wait a moment",
+            )
+        return self.reading
+
+    def counts_of(self, position: float) -> int:
+        """Return the count of the drive that a position stands for; on an axis with a modulo the nearest of them."""
+        position = self.unwrapped(position)
+        return round(position * self.counts_per_unit + self.telemetry.origin_counts)
+
+    def unwrapped(
+        self, position: float, direction: Direction | None = None, *, from_counts: int | None = None
+    ) -> float:
+        """Return the position, counted through all turns, to which a request means to go.
+
+        Without a modulo that is the position itself. With one it is counted from the commanded position: a position
+        equal to that, to a count, is no distance in any direction.
+
+        Args:
+            position: in axis units; any turn of it is meant.
+            direction: in which the axis turns; the shortest way if missing.
+            from_counts: where the axis will be when it turns there, in counts of the drive; the commanded position if
+                missing.
+
+        Raises:
+            NotSupported: a direction, and the axis has no modulo.
+        """
+        modulo = self.config.modulo
+        if modulo is None:
+            if direction is not None:
+                raise NotSupported(
+                    f"axis {self.config.name} has no modulo: its positions have no direction",
+                    axis=self.config.name,
+                    value=direction.value,
+                    remedy="leave direction out, or configure modulo",
+                )
+            return position
+        if from_counts is None:
+            from_counts = self.latest().position_counts if self.target_counts is None else self.target_counts
+        here = self.telemetry.position(from_counts)
+        forward = (position - here) % modulo
+        count = 1.0 / abs(self.counts_per_unit)
+        if forward < count or modulo - forward < count:
+            way = forward if forward < count else forward - modulo
+        elif direction is Direction.NEGATIVE or (direction is not Direction.POSITIVE and forward > modulo / 2):
+            way = forward - modulo
+        else:
+            way = forward
+        return here + way
+
+    def shown(self, position: float | None) -> float | None:
+        """Return a position as clients see it: on an axis with a modulo from 0 up to it."""
+        return None if position is None else self.telemetry.within_turn(position)[0]
+
+    # -- plans -------------------------------------------------------------------------------------------------------
+
+    def plan_to(self, position: float, velocity: float | None, acceleration: float | None) -> MotionPlan:
+        """Plan a trapezoid from where the axis is to a position in axis units, counted through all turns.
+
+        Raises:
+            PositionLimit, VelocityLimit, AccelerationLimit: a software limit forbids it; names the nearest value.
+            ValueOutOfRange: a register cannot hold it.
+            WrongState: the position has not been read yet.
+        """
+        if velocity is not None and velocity <= 0:
+            raise ValueOutOfRange(
+                f"axis {self.tracker.name}: velocity {velocity:g} {self.tracker.unit}/s is not above 0;"
+                " the target gives the direction",
+                axis=self.tracker.name,
+                value=velocity,
+                limit=0.0,
+                nearest=-velocity if velocity < 0 else None,
+                remedy="send a velocity above 0",
+            )
+        tracker, origin_counts, from_counts = self.tracker, self.telemetry.origin_counts, self.latest().position_counts
+        speed, rate = self._checked(velocity, acceleration)
+        if tracker.referenced:
+            check_position(tracker, self.config.limits, position)
+        target = round(position * self.counts_per_unit + origin_counts)
+        if abs(target - from_counts) > LARGEST_COUNT:
+            nearest = from_counts + math.copysign(LARGEST_COUNT, target - from_counts)
+            raise ValueOutOfRange(
+                f"axis {tracker.name}: target {position:g} {tracker.unit} is {abs(target - from_counts)} counts away,"
+                " farther than the drive's 32-bit counter reaches",
+                axis=tracker.name,
+                value=position,
+                limit=LARGEST_COUNT,
+                nearest=(nearest - origin_counts) / self.counts_per_unit,
+                remedy="move there in parts",
+            )
+        counts_per_unit = abs(self.counts_per_unit)
+        motion = self.quantise(Motion(target, speed * counts_per_unit, rate * counts_per_unit))
+        duration_s = profile_duration_s(
+            abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
+        )
+        return MotionPlan(
+            motion,
+            (target - origin_counts) / self.counts_per_unit,
+            motion.velocity_counts_per_s / counts_per_unit,
+            motion.acceleration_counts_per_s2 / counts_per_unit,
+            duration_s,
+        )
+
+    def plan_at(self, velocity: float, acceleration: float | None) -> MotionPlan:
+        """Plan a motion at a constant velocity in units a second, without an end.
+
+        Raises:
+            ValueOutOfRange: the velocity is 0, or a register cannot hold it.
+            VelocityLimit, AccelerationLimit: a software limit forbids it.
+        """
+        if velocity == 0:
+            raise ValueOutOfRange(
+                f"axis {self.tracker.name}: a velocity of 0 is not a motion",
+                axis=self.tracker.name,
+                value=0.0,
+                remedy=Remedy("{}", step("halt")),
+            )
+        speed, rate = self._checked(velocity, acceleration)
+        counts_per_unit = self.counts_per_unit
+        motion = self.quantise(Motion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
+        return MotionPlan(
+            motion,
+            None,
+            motion.velocity_counts_per_s / counts_per_unit,
+            motion.acceleration_counts_per_s2 / abs(counts_per_unit),
+            None,
+        )
+
+    def quantise(self, motion: Motion) -> Motion:
+        """Return a motion as the drive's registers will hold it, within the limits of the axis also after rounding.
+
+        Raises:
+            ValueOutOfRange: a register cannot hold it within the limits; names the nearest value.
+            RegisterUnknown: the scale of the registers is not known.
+        """
+        limits, counts = self.config.limits, abs(self.counts_per_unit)
+        return self.driver.quantise(
+            motion,
+            Ceiling(
+                math.inf if limits.velocity is None else limits.velocity * counts,
+                math.inf if limits.acceleration is None else limits.acceleration * counts,
+            ),
+        )
+
+    def limit_ahead(self, velocity: float) -> float | None:
+        """Return the software limit that a motion at this velocity runs towards, in axis units."""
+        limits = self.config.limits
+        return limits.position_max if velocity > 0 else limits.position_min
+
+    def _checked(self, velocity: float | None, acceleration: float | None) -> tuple[float, float]:
+        """Return the speed that the speed override leaves, and the acceleration, both within their limits."""
+        speed = self.config.velocity if velocity is None else velocity
+        rate = self.config.acceleration if acceleration is None else acceleration
+        check_velocity(self.tracker, self.config.limits, speed)
+        check_acceleration(self.tracker, self.config.limits, rate)
+        share = self.tracker.speed_share
+        if share <= 0:
+            raise no_speed(self.tracker.name)
+        return speed * share, rate
+
+    def before_approach(
+        self, goal: MotionPlan, velocity: float | None, acceleration: float | None
+    ) -> MotionPlan | None:
+        """Return the motion from which on a goal is approached from its side; None when one motion to it will do.
+
+        Args:
+            goal: the motion to it.
+            velocity: the requested one; None for the default of the axis.
+            acceleration: likewise.
+
+        Raises:
+            PositionLimit: that motion would leave the software limits.
+        """
+        approach = self.config.approach
+        if approach is None or goal.position is None:
+            return None
+        forward = approach.direction == "positive"
+        here_counts = self.target_counts
+        here = self.telemetry.position(self.latest().position_counts if here_counts is None else here_counts)
+        way = goal.position - here if forward else here - goal.position
+        if way >= approach.distance or (way >= 0 and self.approached and here_counts is not None):
+            return None
+        begin = goal.position - approach.signed
+        return self.plan_to(begin, velocity, acceleration)
+
+    def on_line(self, plan: MotionPlan) -> LineAxis:
+        """Return the share of this axis in a straight line that ends where a plan does, no faster than the plan."""
+        motion, here = plan.motion, self.target_counts
+        return LineAxis(
+            from_counts=self.latest().position_counts if here is None else here,
+            target_counts=motion.target_counts or 0,
+            counts_per_unit=abs(self.counts_per_unit),
+            most_velocity=motion.velocity_counts_per_s,
+            most_acceleration=motion.acceleration_counts_per_s2,
+            quantise=self.quantise,
+            cycle_s=self.driver.capture_s if isinstance(self.driver, Homes) else 0.0,
+        )
+
+    def replanned(self, plan: MotionPlan, motion: Motion) -> MotionPlan:
+        """Return a plan with another velocity and acceleration, to the same target."""
+        share = self.on_line(replace(plan, motion=motion))
+        counts_per_unit = abs(self.counts_per_unit)
+        return replace(
+            plan,
+            motion=motion,
+            velocity=motion.velocity_counts_per_s / counts_per_unit,
+            acceleration=motion.acceleration_counts_per_s2 / counts_per_unit,
+            duration_s=profile_duration_s(share.way, share.most_velocity, share.most_acceleration),
+        )
+
+    # -- motions -----------------------------------------------------------------------------------------------------
+
+    async def start(
+        self,
+        permit: Permit,
+        state: AxisState,
+        completion: Completion,
+        *,
+        opens_loop: bool = False,
+        plan: MotionPlan | None = None,
+    ) -> None:
+        """Start what was loaded, if that is still permitted; the state says so before the drive does."""
+        permit.ask_to_move()
+        in_motion = self.tracker.command is not None and not self.tracker.at_rest
+        self.begin(permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan)
+        try:
+            await permit.start()
+        except OutcomeUnknown:
+            self.tracker.started(self.clock.now_s())  # the next readings tell
+            raise
+        except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent
+            if in_motion:
+                await self._end_what_went_before(permit, error)
+            else:
+                self.tracker.finished(error.message)
+            self.publish_state()
+            raise
+        self.tracker.started(self.clock.now_s())
+
+    async def _end_what_went_before(self, permit: Permit, error: BusError | RequestRefused) -> None:
+        """The motion that was to be replaced still runs, and no command stands for it any more: bring it to rest."""
+        command = self.tracker.command
+        if command is None or command.command_id != permit.command_id:
+            return  # a stop has taken over
+        self.tracker.started(self.clock.now_s())
+        self.tracker.failing(error.message)
+        await self.driver.stop(StopMode.SMOOTH)
+        if self.tracker.command is command:
+            self.stopping(permit.command_id, permit.verb)
+            self.tracker.failing(error.message)
+
+    def begin(
+        self,
+        command_id: str,
+        verb: Verb,
+        state: AxisState,
+        completion: Completion,
+        *,
+        opens_loop: bool = False,
+        plan: MotionPlan | None = None,
+    ) -> None:
+        """Say what the axis is about to do; readings count again once `AxisTracker.started` was called."""
+        self.target_counts, self.approached = None, False
+        target, duration_s = (self.shown(plan.position), plan.duration_s) if plan else (None, None)
+        now_ns = self.clock.now_ns()
+        settling = self._settling(plan) if plan and completion is Completion.PROFILE else None
+        command = ActiveCommand(command_id, verb, now_ns, state, completion, opens_loop, target, duration_s, settling)
+        self.tracker.begin(command, float("inf"))
+        self.publish_state()
+
+    def _settling(self, plan: MotionPlan) -> Settling | None:
+        target, settle = plan.motion.target_counts, self.config.settle
+        if target is None:
+            return None
+        return Settling(
+            target, self._window_counts, settle.time_s, settle.timeout_s, faults=settle.unsettled == "fault"
+        )
+
+    def stopping(
+        self,
+        command_id: str,
+        verb: Verb,
+        state: AxisState = AxisState.STOPPING,
+        completion: Completion = Completion.REST,
+    ) -> None:
+        """The drive acknowledged a stop: watch the axis come to rest; only reset leads out of error_stop, though."""
+        if self.tracker.energised and self.tracker.state is not AxisState.ERROR_STOP:
+            self.begin(command_id, verb, state, completion)
+            self.tracker.started(self.clock.now_s())
+
+    async def end(self, permit: Permit, failure: str = "") -> None:
+        """Bring the motion of a command to rest; an axis that has lost its loop meanwhile is switched off instead.
+
+        Args:
+            permit: of the command.
+            failure: why the command has failed; empty when it has not.
+        """
+        ours = self.tracker.command is not None
+        await self.driver.stop(StopMode.SMOOTH if self.tracker.enabled else StopMode.OFF)
+        if ours:
+            self.stopping(permit.command_id, permit.verb)
+            if failure:
+                self.tracker.failing(failure)
+
+    def publish_state(self) -> None:
+        """Publish the state if it changed, once what is under way waits for the drive or its answer is on its way."""
+        self._loop.call_soon(self._publish_now)
+
+    def _publish_now(self) -> None:
+        self.reference.woken.set()
+        self.telemetry.state(self.clock.now_ns())
+
+    def reply(self, permit: Permit, plan: MotionPlan | None = None, **values: float | None) -> CommandReply:
+        """Return the reply to a command: what is planned, and what it says besides or instead, by field."""
+        planned: dict[str, float | None] = {}
+        if plan:
+            planned = {
+                "position": self.shown(plan.position),
+                "velocity": plan.velocity,
+                "acceleration": plan.acceleration,
+                "duration_s": plan.duration_s,
+            }
+        command = self.tracker.command
+        return CommandReply(
+            command_id=permit.command_id,
+            axis=self.config.name,
+            verb=permit.verb,
+            since=command.since_ns if command and command.command_id == permit.command_id else None,
+            **{**planned, **values},
+        )
+
+
+def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
+    """Plan a motion without sending anything.
+
+    Args:
+        motion: of the axis.
+        bus: its line.
+        request: the motion.
+        obstacles: the other obstacles now.
+
+    Raises:
+        MalformedRequest: it does not say which motion is meant.
+        WrongState: the position has not been read yet.
+    """
+    name = motion.config.name
+    try:
+        plan = _plan(motion, request)
+        first = motion.before_approach(plan, request.velocity, request.acceleration)
+    except MalformedRequest:
+        raise
+    except RequestRefused as error:
+        return PreviewReply(axis=name, refusal=error_reply(error), obstacles=obstacles)
+    exchanges = [each for leg in (first, plan) if leg for each in motion.driver.exchanges(leg.motion)]
+    asked_velocity = motion.config.velocity if request.velocity is None else request.velocity
+    asked_acceleration = motion.config.acceleration if request.acceleration is None else request.acceleration
+    return PreviewReply(
+        axis=name,
+        refusal=None,
+        obstacles=obstacles,
+        position=motion.shown(plan.position),
+        approach_from=motion.shown(first.position) if first else None,
+        velocity=plan.velocity,
+        velocity_error=plan.velocity - asked_velocity,
+        acceleration=plan.acceleration,
+        acceleration_error=plan.acceleration - asked_acceleration,
+        duration_s=both_s(first, plan) if first else plan.duration_s,
+        packets=tuple(exchange.request.hex(" ") for exchange in exchanges),
+        bus_s=sum(bus.longest_s(exchange) for exchange in exchanges),
+    )
+
+
+def _plan(motion: AxisMotion, request: Preview) -> MotionPlan:
+    match request.position, request.distance, request.velocity:
+        case float() as position, None, velocity:
+            return motion.plan_to(motion.unwrapped(position, request.direction), velocity, request.acceleration)
+        case None, float() as distance, velocity:
+            here = motion.telemetry.position(motion.latest().position_counts)
+            return motion.plan_to(here + distance, velocity, request.acceleration)
+        case None, None, float() as velocity:
+            return motion.plan_at(velocity, request.acceleration)
+    raise MalformedRequest(
+        f"axis {motion.config.name}: a plan needs exactly one of position, distance, or velocity alone",
+        axis=motion.config.name,
+    )

@@ -1,0 +1,97 @@
+"""A motion to a value of the analog position sensor, bounded by the daemon in time, distance and software limits.
+
+In the drive it is a motion at constant velocity that ends when the sensor reads the target (LS-182AP manual, "Load
+Trajectory"): with a sensor that does not follow, for which a slipped coupling is enough, it has no end there. Only
+limit switches stop it in the drive, where they are armed.
+"""
+
+from typing_extensions import override
+
+from ldcnd.axis import guards
+from ldcnd.axis.guards import Permit
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
+from ldcnd.axis.state import Completion
+from ldcnd.contract.commands import CommandReply, MoveAnalog
+from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.driver import AnalogMotion, AxisReading
+
+
+class AnalogMove(EndlessMotion):
+    """One such motion; it ends when the drive says so, and its only step is to stop at one of its bounds."""
+
+    def __init__(self, motion: AxisMotion, permit: Permit, request: MoveAnalog) -> None:
+        bounds = motion.config.analog
+        super().__init__(motion, permit)
+        self._request = request
+        self._speed = 0.0
+        self._timeout_s = request.timeout_s or bounds.timeout_s
+        self._distance = request.distance or bounds.distance
+        self._from_counts = 0
+        self._failure = ""
+
+    async def begin(self) -> CommandReply:
+        """See `Procedure`.
+
+        Raises:
+            ValueOutOfRange: the target is beyond full scale.
+            DriveFault: the sensor reads like a broken one.
+        """
+        motion, request = self._motion, self._request
+        tracker = motion.tracker
+        guards.check_may_move(tracker)
+        self._check_target()
+        speed = motion.config.velocity if request.velocity is None else request.velocity
+        plan = motion.plan_at(speed, request.acceleration)
+        self._speed, self.acceleration = abs(plan.velocity), plan.acceleration
+        self._distance = self._distance or abs(plan.velocity) * self._timeout_s
+        self._from_counts = motion.latest().position_counts
+        await self.permit.load(
+            AnalogMotion(request.target, abs(plan.motion.velocity_counts_per_s), plan.motion.acceleration_counts_per_s2)
+        )
+        self._until_s = motion.clock.now_s() + self._timeout_s
+        self._failure = f"not there within {self._timeout_s:g} s"
+        await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE)
+        return motion.reply(self.permit, target=request.target, velocity=plan.velocity, acceleration=plan.acceleration)
+
+    def calls_for_step(self, reading: AxisReading) -> bool:
+        """See `Procedure`: a bound is reached, or the axis lost its command while it was out of sight and may run."""
+        motion, tracker = self._motion, self._motion.tracker
+        if tracker.command is None:
+            return True
+        travelled = abs((reading.position_counts - self._from_counts) / motion.counts_per_unit)
+        if self._distance is not None and travelled > self._distance:
+            self._failure = f"not there within {self._distance:g} {motion.config.unit}"
+            return True
+        if self.ends_before_limit(reading):
+            self._failure = "stopped before a software limit"
+            return True
+        return False
+
+    @override
+    def fastest(self, velocity: float) -> tuple[float, float]:
+        """See `EndlessMotion`: the drive chooses the direction."""
+        gained = self.acceleration * LATENCY_S
+        forward, backward = min(self._speed, velocity + gained), min(self._speed, gained - velocity)
+        return max(0.0, velocity, forward), max(0.0, -velocity, backward)
+
+    async def step(self) -> bool:
+        """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""
+        await self._motion.end(self.permit, self._failure)
+        return False
+
+    def _check_target(self) -> None:
+        name, full_scale, target = (
+            self._motion.config.name,
+            self._motion.driver.adc_full_scale or 0,
+            self._request.target,
+        )
+        if target > full_scale:
+            raise ValueOutOfRange(
+                f"axis {name}: analog target {target} is above full scale {full_scale}",
+                axis=name,
+                value=target,
+                limit=full_scale,
+                nearest=full_scale,
+            )

@@ -1,0 +1,107 @@
+"""Motions that have no end in the drive: the daemon ends them after a time, and before a software limit.
+
+The limit must hold at any configured poll rate, so such an axis is read often while it moves, and the instant at which
+a stop would come too late is worked out anew from every reading: the stop goes out then even if no reading follows.
+"""
+
+from abc import abstractmethod
+
+from typing_extensions import override
+
+from ldcnd.axis.guards import Permit
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.procedure import NEVER_S, Procedure
+from ldcnd.axis.state import AxisTracker
+from ldcnd.contract.errors import PositionLimit
+from ldcnd.drives.driver import AxisReading
+
+LATENCY_S = 0.2
+"""Longest time from a reading to the stop that follows it; what is gone meanwhile must not reach the software limit."""
+WATCH_S = 0.05
+"""Time between two readings while such a motion runs, seconds, whatever the poll rates."""
+
+
+class EndlessMotion(Procedure):
+    """One such motion, from its start to the stop that ends it.
+
+    Attributes:
+        acceleration: at which a stop slows it down, in axis units a second squared.
+    """
+
+    watch_s = WATCH_S
+
+    def __init__(self, motion: AxisMotion, permit: Permit) -> None:
+        self.permit = permit
+        self.acceleration = 0.0
+        self._motion = motion
+        self._until_s = self._stop_at_s = NEVER_S
+
+    @property
+    @override
+    def deadline_s(self) -> float:  # type: ignore[override]
+        """See `Procedure`: when its time is over, or a stop would come too late before a limit."""
+        return min(self._until_s, self._stop_at_s)
+
+    @abstractmethod
+    def fastest(self, velocity: float) -> tuple[float, float]:
+        """Return how fast it can be until the next reading, forward and backward, both from 0 upwards.
+
+        Args:
+            velocity: as the latest reading shows it, in axis units a second.
+        """
+
+    def ends_before_limit(self, reading: AxisReading) -> bool:
+        """Tell whether it must be stopped now to stand before a software limit; if not, work out by when at last."""
+        motion, limits = self._motion, self._motion.config.limits
+        self._stop_at_s = NEVER_S
+        if not motion.tracker.referenced:
+            return False
+        here = motion.telemetry.position(reading.position_counts)
+        forward, backward = self.fastest(reading.velocity_counts_per_s / motion.counts_per_unit)
+        spare_s = NEVER_S
+        if limits.position_max is not None and forward > 0:
+            spare_s = self._spare_s(limits.position_max - here, forward)
+        if limits.position_min is not None and backward > 0:
+            spare_s = min(spare_s, self._spare_s(here - limits.position_min, backward))
+        self._stop_at_s = motion.clock.now_s() + spare_s
+        return spare_s <= 0
+
+    def _spare_s(self, way: float, speed: float) -> float:
+        """Return for how long it can go on at a speed and still be stopped within a way."""
+        brakes = speed * LATENCY_S + speed * speed / (2 * self.acceleration)
+        return (way - brakes) / speed
+
+    def check_room(self, velocity: float) -> None:
+        """Refuse a motion that could not be stopped before the software limit ahead.
+
+        Raises:
+            PositionLimit: there is not enough way left.
+        """
+        motion, tracker = self._motion, self._motion.tracker
+        limit = motion.limit_ahead(velocity) if tracker.referenced else None
+        if limit is None:
+            return
+        here = motion.telemetry.position(motion.latest().position_counts)
+        if self.ends_before_limit(motion.latest()) or (here >= limit if velocity > 0 else here <= limit):
+            raise PositionLimit(
+                f"axis {tracker.name} is at {here:g} {tracker.unit}: its limit {limit:g} {tracker.unit} is too near",
+                axis=tracker.name,
+                value=here,
+                limit=limit,
+                remedy="move the other way, or more slowly",
+            )
+
+    @override
+    def calls_for_step(self, reading: AxisReading) -> bool:
+        """See `Procedure`: a limit is near, the drive has stopped, or the command was lost while out of sight."""
+        lost = self._motion.tracker.command is None
+        return self.ends_before_limit(reading) or lost or bool(reading.cut_short)
+
+    async def step(self) -> bool:
+        """See `Procedure`: stop. An axis that has lost its loop meanwhile is switched off instead."""
+        await self._motion.end(self.permit, self._motion.latest().cut_short)
+        return False
+
+    def outlived(self, tracker: AxisTracker) -> bool:
+        """See `Procedure`; without a command the drive may still run until it is seen at rest."""
+        return tracker.at_rest if tracker.command is None else super().outlived(tracker)

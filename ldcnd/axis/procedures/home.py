@@ -1,0 +1,282 @@
+"""Homing step by step: off the switch if the axis stands on it, search, take the reference over, move on.
+
+Every leg is a trapezoid with an end in the drive, so that a search ends even if this host dies.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from enum import Enum
+
+from typing_extensions import override
+
+from ldcnd.axis import guards
+from ldcnd.axis.guards import Permit, QuietDrive, homing
+from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.procedure import Procedure
+from ldcnd.axis.procedures.probe import check_index_is_seen
+from ldcnd.axis.state import Completion
+from ldcnd.contract.commands import CommandReply, Home, HomeMethod, HomeStop
+from ldcnd.contract.errors import MalformedRequest, NotSupported
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.axis_config import AxisConfig, HomeConfig
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, HomeCapture, StopMode, Warns
+from ldcnd.log import get_logger
+
+log = get_logger("axis")
+
+DEFAULT_TIMEOUT_S = 60.0
+STOPS = {HomeStop.SMOOTH: StopMode.SMOOTH, HomeStop.ABRUPT: StopMode.ABRUPT, HomeStop.OFF: StopMode.OFF}
+REBOUND_S = 1.0
+"""Longest time for which a shaft may still turn after it has run onto its stop, seconds."""
+BEYOND = 1.1
+"""Length of a search without a distance, as a multiple of its time-out: the drive ends it if this host does not."""
+
+
+@dataclass(frozen=True, slots=True)
+class HomeSearch:
+    """One search.
+
+    Attributes:
+        method: what marks the reference position.
+        velocity: units a second, signed.
+        find_velocity: units a second, positive, for finding a limit switch beforehand; None without.
+        index_width: counts for which the index pulse lasts.
+        acceleration: units a second squared; None for the axis default.
+        position: what the position is called there, in axis units.
+        timeout_s: when to give up.
+        distance: how far it may go, in axis units; None for as far as the velocity goes in that time.
+        stop: how the motor stops there.
+        move_to: where to go afterwards, in axis units; None stays.
+        active_high: level of a limit switch input while the switch is actuated.
+    """
+
+    method: HomeMethod
+    velocity: float
+    find_velocity: float | None
+    index_width: int
+    acceleration: float | None
+    position: float
+    timeout_s: float
+    distance: float | None
+    stop: StopMode
+    move_to: float | None
+    active_high: bool
+
+    def runs_onto_switch(self, counts_per_unit: float) -> bool:
+        """Tell whether the search moves towards the limit switch that it looks for."""
+        forward = self.velocity * counts_per_unit > 0
+        return self.method is (HomeMethod.FORWARD_LIMIT if forward else HomeMethod.REVERSE_LIMIT)
+
+
+def plan_search(config: AxisConfig, driver: QuietDrive, request: Home) -> HomeSearch:
+    """Complete a request from the axis's configuration.
+
+    Raises:
+        MalformedRequest: neither says how to search, or it contradicts itself.
+        NotSupported: the drive cannot capture on that.
+    """
+    preset = config.home
+    method = request.method or (preset.method if preset else None)
+    velocity = request.velocity if request.velocity is not None else (preset.velocity if preset else None)
+    if method is None or velocity is None:
+        missing = "method" if method is None else "velocity"
+        raise MalformedRequest(
+            f"axis {config.name}: home needs a {missing}; neither the request nor the configuration has one",
+            axis=config.name,
+            remedy=f"send {missing}, or configure [bus.axis.home]",
+        )
+    methods = homing(driver).home_methods
+    if method not in methods:
+        raise NotSupported(
+            f"axis {config.name}: {config.model} cannot home on {method}; it can on {', '.join(sorted(methods))}",
+            axis=config.name,
+            value=method.value,
+        )
+    defaults = preset or HomeConfig(method=method, velocity=velocity, timeout_s=DEFAULT_TIMEOUT_S)
+    stop = request.stop or defaults.stop
+    move_to = request.move_to if request.move_to is not None else defaults.move_to
+    if stop is HomeStop.OFF and move_to is not None:
+        raise MalformedRequest(
+            f"axis {config.name}: home cannot both open the loop and move to {move_to:g} afterwards",
+            axis=config.name,
+            remedy="leave out move_to, or stop otherwise",
+        )
+    return HomeSearch(
+        method=method,
+        velocity=velocity,
+        find_velocity=request.find_velocity or (preset.find_velocity if preset and preset.method is method else None),
+        index_width=defaults.index_width,
+        acceleration=request.acceleration,
+        position=request.position if request.position is not None else defaults.position,
+        timeout_s=request.timeout_s or defaults.timeout_s,
+        distance=request.distance or defaults.distance,
+        stop=STOPS[stop],
+        move_to=move_to,
+        active_high=defaults.switch_active == "high",
+    )
+
+
+class Leg(Enum):
+    """Where a homing is."""
+
+    FIND = "find"
+    """Fast, onto the limit switch; what is captured there does not count."""
+    BRAKE = "brake"
+    """On the switch, coming to rest."""
+    OFF_SWITCH = "off_switch"
+    CLEAR = "clear"
+    """Off the switch, coming to rest."""
+    SEARCH = "search"
+    FOUND = "found"
+    """Coming to rest before moving on."""
+
+
+class HomeSequence(Procedure):
+    """One homing, from the request to the reference."""
+
+    def __init__(self, motion: AxisMotion, permit: Permit, request: Home) -> None:
+        self.permit = permit
+        self._motion = motion
+        self._search = plan_search(motion.config, motion.driver, request)
+        self._leg = Leg.SEARCH
+
+    @override
+    async def begin(self) -> CommandReply:
+        motion, tracker = self._motion, self._motion.tracker
+        guards.check_may_move(tracker)
+        search = self._search
+        plan = motion.plan_at(search.velocity, search.acceleration)
+        if search.method is HomeMethod.INDEX:
+            check_index_is_seen(motion, plan, search.index_width)
+        if search.move_to is not None:
+            guards.check_position(tracker, motion.config.limits, search.move_to)
+        # the limit switches may not have been in sight at the last poll
+        off_switch = search.runs_onto_switch(motion.counts_per_unit) and self._on_switch(await motion.read())
+        await motion.reference.forget()  # before the drive captures: the kept reference has another origin
+        finds = search.find_velocity is not None and search.runs_onto_switch(motion.counts_per_unit)
+        await self._set_out(Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
+        return motion.reply(
+            self.permit, position=search.position, velocity=plan.velocity, acceleration=plan.acceleration
+        )
+
+    @override
+    def calls_for_step(self, reading: AxisReading) -> bool:
+        resting = reading.profile_done and self._motion.tracker.at_rest
+        if self._leg in (Leg.BRAKE, Leg.CLEAR, Leg.FOUND):
+            return resting
+        return not reading.homing or resting
+
+    @override
+    async def step(self) -> bool:
+        reading = self._motion.latest()
+        match self._leg:
+            case Leg.CLEAR if self._motion.clock.now_s() >= self.deadline_s:
+                return await self._give_up(f"not at rest off the switch within {self._search.timeout_s:g} s")
+            case Leg.CLEAR if self._on_switch(reading):
+                return await self._give_up(f"the axis does not come off the {self._search.method} switch")
+            case Leg.CLEAR:
+                await self._set_out(Leg.SEARCH)
+                return True
+            case Leg.BRAKE:
+                await self._set_out(Leg.OFF_SWITCH)
+                return True
+            case Leg.FOUND:
+                return await self._move_on()
+        if reading.homing:
+            return await self._give_up(self._failure())
+        if self._leg is Leg.SEARCH:
+            return await self._take_over()
+        await self._motion.driver.stop(StopMode.SMOOTH)
+        self.permit.still_wanted()
+        self._leg = Leg.BRAKE if self._leg is Leg.FIND else Leg.CLEAR
+        self._motion.stopping(self.permit.command_id, self.permit.verb, AxisState.HOMING, Completion.PROCEDURE)
+        return True
+
+    async def _set_out(self, leg: Leg) -> None:
+        """Begin a leg that looks for the mark."""
+        motion, search = self._motion, self._search
+        away = leg is Leg.OFF_SWITCH
+        velocity = -search.velocity if away else search.velocity
+        if leg is Leg.FIND and search.find_velocity is not None:
+            velocity = math.copysign(search.find_velocity, search.velocity)
+        plan = motion.plan_at(velocity, search.acceleration)
+        capture = HomeCapture(search.method, search.stop if leg is Leg.SEARCH else StopMode.SMOOTH)
+        leg_motion = replace(
+            plan.motion,
+            target_counts=self._end_of_leg(plan),
+            velocity_counts_per_s=abs(plan.motion.velocity_counts_per_s),
+        )
+        await self.permit.load(leg_motion, home=capture)
+        self._leg = leg
+        motion.tracker.referenced = False
+        opens_loop = search.stop is StopMode.OFF or search.method is HomeMethod.POSITION_ERROR
+        self.deadline_s = motion.clock.now_s() + search.timeout_s
+        await motion.start(
+            self.permit, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH
+        )
+
+    def _end_of_leg(self, plan: MotionPlan) -> int:
+        search, here = self._search, self._motion.latest().position_counts
+        speed = plan.motion.velocity_counts_per_s
+        if search.distance is None:
+            reach = abs(speed) * search.timeout_s * BEYOND
+        else:
+            reach = search.distance * abs(self._motion.counts_per_unit)
+        return here + round(math.copysign(min(reach, LARGEST_COUNT), speed))
+
+    def _failure(self) -> str:
+        search = self._search
+        if search.distance is None or self._motion.clock.now_s() >= self.deadline_s:
+            return f"no {search.method} within {search.timeout_s:g} s"
+        return f"no {search.method} within {search.distance:g} {self._motion.config.unit}"
+
+    async def _give_up(self, failure: str) -> bool:
+        await self._motion.driver.stop(StopMode.SMOOTH)
+        self.permit.still_wanted()
+        log.warning("homing failed", axis=self._motion.config.name, reason=failure)
+        self._motion.stopping(self.permit.command_id, self.permit.verb)
+        self._motion.tracker.failing(failure)
+        return False
+
+    async def _take_over(self) -> bool:
+        """Read what was captured and make it the reference; the axis comes to rest meanwhile."""
+        motion, search = self._motion, self._search
+        driver, tracker = motion.driver, motion.tracker
+        if search.method is HomeMethod.POSITION_ERROR:
+            await driver.reset()  # the drive has tripped, as it was meant to
+        else:
+            await driver.stop(search.stop)
+        captured = await homing(driver).captured_home()
+        if isinstance(driver, Warns):
+            await driver.clear_warnings()  # homing on the current sets one
+        self.permit.still_wanted()
+        closed = search.stop is not StopMode.OFF
+        if search.method is HomeMethod.POSITION_ERROR and closed:
+            await motion.check_does_not_coast(REBOUND_S)
+            await self.permit.power_on()
+        tracker.switched(on=closed, now_s=motion.clock.now_s())
+        motion.telemetry.origin_counts = captured - search.position * motion.counts_per_unit
+        tracker.referenced = True
+        if not closed:
+            tracker.finished()
+            motion.publish_state()
+            return False
+        if search.move_to is None:
+            motion.stopping(self.permit.command_id, self.permit.verb, AxisState.HOMING)
+            return False
+        self._leg, self.deadline_s = Leg.FOUND, motion.clock.now_s() + search.timeout_s
+        return True
+
+    async def _move_on(self) -> bool:
+        motion, move_to = self._motion, self._search.move_to
+        if move_to is None or not motion.tracker.at_rest:
+            return await self._give_up(f"not at rest within {self._search.timeout_s:g} s")
+        plan = motion.plan_to(motion.unwrapped(move_to), None, None)
+        await self.permit.load(plan.motion)
+        await motion.start(self.permit, AxisState.HOMING, Completion.PROFILE, plan=plan)
+        motion.target_counts = plan.motion.target_counts
+        return False
+
+    def _on_switch(self, reading: AxisReading) -> bool:
+        level = reading.reverse_limit if self._search.method is HomeMethod.REVERSE_LIMIT else reading.forward_limit
+        return level is not None and level is self._search.active_high

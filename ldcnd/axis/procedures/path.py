@@ -1,0 +1,417 @@
+"""Several axes on one polyline: their drives walk through points that are sent to them ahead of time.
+
+Each member feeds its own drive, one packet when that has room for it, in the lane of commands: stops and polls go
+first. Permission is checked before every packet. An end of one member ends all: the first that notices stops them.
+"""
+
+import asyncio
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from typing_extensions import override
+
+from ldcnd.axis import guards
+from ldcnd.axis.guards import Permit, start_path, walking
+from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.polyline import PathAxis, Walk, walk
+from ldcnd.axis.procedure import Procedure
+from ldcnd.axis.procedures.group import Rendezvous
+from ldcnd.axis.state import Completion
+from ldcnd.contract.commands import CommandReply, MoveAbsolute
+from ldcnd.contract.errors import (
+    BusError,
+    LdcndError,
+    NotSupported,
+    OutcomeUnknown,
+    ShuttingDown,
+    ValueOutOfRange,
+    WrongState,
+)
+from ldcnd.contract.rig_commands import PathReply
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.driver import AxisReading, Homes, Motion, StopMode
+from ldcnd.drives.network import Network
+from ldcnd.line.bus import Bus
+from ldcnd.log import get_logger
+
+log = get_logger("axis")
+
+AHEAD_S = 1.0
+"""Part of the path that the drives hold in advance, seconds: they walk it to its end if the daemon dies."""
+LINE_SHARE = 0.5
+"""Most of a line's time for feeding paths."""
+LEVEL_POINTS = 3
+"""Largest difference between the points in a drive and those expected: from its start to when that was seen."""
+CLOCK_SHARE = 0.0005
+"""Largest difference between the clock rates of a drive and of this host, as a fraction."""
+LATE_S = 1.0
+"""Longest overrun of a path before it is stopped, seconds."""
+
+
+class PathShareRequest(MoveAbsolute):
+    """One member's share of a path; made by the daemon, never read from the network."""
+
+    via: tuple[float, ...] = ()
+    _rendezvous: "SharedPath"
+
+    @classmethod
+    def of(cls, move: MoveAbsolute, via: tuple[float, ...], path: "SharedPath") -> "PathShareRequest":
+        """Return the share of an axis."""
+        request = cls(**move.model_dump(), via=via)
+        request._rendezvous = path
+        return request
+
+    @property
+    def rendezvous(self) -> "SharedPath":
+        """The path with its other members."""
+        return self._rendezvous
+
+
+@dataclass(slots=True)
+class _Share:
+    """Progress of one member.
+
+    Attributes:
+        member: the procedure of its axis.
+        sent: points.
+        over: it has reached the last point.
+        tripped: its drive has opened its loop.
+    """
+
+    member: "PathMember"
+    sent: int = 0
+    over: bool = False
+    tripped: bool = False
+
+
+class SharedPath(Rendezvous):
+    """State shared by the members of one path.
+
+    Attributes:
+        plan: the points; None before all members have come.
+        broken: why it was stopped; empty while it was not.
+    """
+
+    def __init__(
+        self, network: Network, bus: Bus, names: frozenset[str], speed: float | None, max_deviation: float | None
+    ) -> None:
+        super().__init__(names, speed, max_deviation)
+        self.plan: Walk | None = None
+        self.broken = ""
+        self.begun_s = 0.0
+        self._network = network
+        self._bus = bus
+        self._names = names
+        self._speed = speed
+        self._max_deviation = max_deviation
+        self._shares: dict[str, _Share] = {}
+
+    async def join(self, name: str, member: "PathMember") -> None:
+        """Wait for the others; return once the drives walk.
+
+        Raises:
+            WrongState: another member did not come in time, or refused.
+            LdcndError: as `Network.start_path`.
+        """
+        self._shares[name] = _Share(member)
+        await self._arrived(name)
+
+    @override
+    async def _start(self) -> None:
+        fed = False
+        try:
+            members = {name: share.member for name, share in self._shares.items()}
+            plan = self.plan = self._planned({name: member.on_path() for name, member in members.items()})
+            self._check_line(members)
+            for member in members.values():
+                await member.prepare()
+            fed = True
+            ahead = round(AHEAD_S / plan.period_s)
+            while min(share.sent for share in self._shares.values()) < min(ahead, len(member.steps)):
+                for share in self._shares.values():
+                    await self.feed(share)
+            if self._started.done():
+                raise WrongState("a member of the path has left, so no axis was started")
+            for member in members.values():
+                member.announce()
+            await start_path(self._network, self._names, [member.permit for member in members.values()])
+        except LdcndError as error:
+            if fed:
+                await self.stop_all(error.message)
+            self.fail(error)
+        except asyncio.CancelledError:
+            self.fail(ShuttingDown("the daemon is stopping"))
+            raise
+        else:
+            self.begun_s = next(iter(members.values())).motion.clock.now_s()
+            if self._started.done():
+                await self.stop_all("a member has left while the drives were started")
+            else:
+                self._started.set_result(None)
+
+    def _planned(self, axes: Mapping[str, PathAxis]) -> Walk:
+        """Plan the points.
+
+        Raises:
+            ValueOutOfRange: the path would be left too far, or an axis would be too fast for path mode.
+        """
+        first = next(iter(self._shares.values())).member
+        drives = [walking(share.member.motion.driver) for share in self._shares.values()]
+        cycle_s = first.motion.driver.capture_s if isinstance(first.motion.driver, Homes) else 0.0
+        plan = walk(axes, max(drive.path_period_s for drive in drives), cycle_s, self._speed)
+        if self._max_deviation is not None and plan.deviation > self._max_deviation:
+            raise ValueOutOfRange(
+                f"axes {', '.join(sorted(axes))} would leave the path by {plan.deviation:.4g}, more than"
+                f" {self._max_deviation:g}",
+                value=plan.deviation,
+                limit=self._max_deviation,
+                remedy="walk it more slowly, or allow more",
+            )
+        for name, steps in plan.steps.items():
+            most = walking(self._shares[name].member.motion.driver).path_most_counts
+            if max(map(abs, steps)) > most:
+                raise ValueOutOfRange(
+                    f"axis {name}: a path point of {max(map(abs, steps))} counts; path mode takes {most} at most",
+                    axis=name,
+                    value=max(map(abs, steps)),
+                    limit=most,
+                    remedy="walk it more slowly",
+                )
+        return plan
+
+    def _check_line(self, members: Mapping[str, "PathMember"]) -> None:
+        drives = [walking(member.motion.driver) for member in members.values()]
+        feeding_s = sum(self._bus.longest_s(exchange) for drive in drives for exchange in drive.path_exchanges())
+        lasts_s = min(drive.path_packet * drive.path_period_s for drive in drives)
+        if feeding_s > LINE_SHARE * lasts_s:
+            raise NotSupported(
+                f"feeding {len(drives)} axes takes {feeding_s / lasts_s:.0%} of the line; a path gets"
+                f" {LINE_SHARE:.0%} at most",
+                value=feeding_s,
+                limit=LINE_SHARE * lasts_s,
+                remedy="raise the baud rate of the line",
+            )
+
+    def reply(self, replies: tuple[CommandReply, ...]) -> PathReply:
+        """Return the reply to the command whose members were answered so."""
+        plan = self.plan or Walk({}, 1.0, 0.0)
+        return PathReply(
+            replies=replies,
+            duration_s=plan.duration_s,
+            deviation=plan.deviation,
+            rate_hz=1.0 / plan.period_s,
+            ahead_s=min(AHEAD_S, plan.duration_s),
+        )
+
+    def share_of(self, member: "PathMember") -> _Share:
+        """Return what is known of a member."""
+        return next(share for share in self._shares.values() if share.member is member)
+
+    def holds(self, share: _Share, points: int, now_s: float) -> bool:
+        """Tell whether a drive has as many points left as it was sent and has not walked yet."""
+        if self.plan is None:
+            return False
+        elapsed_s = now_s - self.begun_s
+        expected = max(0.0, share.sent - elapsed_s / self.plan.period_s)
+        return abs(points - expected) <= LEVEL_POINTS + elapsed_s * CLOCK_SHARE / self.plan.period_s
+
+    async def feed(self, share: _Share) -> None:
+        """Send one more packet of points to the drive of a member, if there are any left.
+
+        Raises:
+            LdcndError: as `Permit.add_points`; WrongState when the drive does not hold what it was sent.
+        """
+        member = share.member
+        steps = member.steps[share.sent : share.sent + walking(member.motion.driver).path_packet]
+        if steps:
+            share.sent += len(steps)
+            await member.permit.add_points(steps)
+
+    def left(self) -> str:
+        """Say which member has left the path before its end; empty when none has."""
+        for name, share in self._shares.items():
+            if not share.over and share.member.outlived(share.member.motion.tracker):
+                return f"axis {name} has left the path"
+        return ""
+
+    async def stop_all(self, reason: str) -> None:
+        """Stop every drive of the path; what each axis says follows from its own step."""
+        if self.broken:
+            return
+        self.broken = reason
+        log.warning("path stopped", axes=sorted(self._names), reason=reason)
+        closed = {
+            name for name, share in self._shares.items() if share.member.motion.tracker.energised and not share.tripped
+        }
+        try:
+            await self._network.stop_together(StopMode.SMOOTH, frozenset(closed))
+        except BusError as error:
+            log.error("stop of a path not sent to the group", reason=error.message)
+        for name, share in self._shares.items():
+            try:  # a stop that holds would close the loop of a drive that has tripped
+                await share.member.motion.driver.stop(StopMode.SMOOTH if name in closed else StopMode.OFF)
+            except BusError as error:
+                log.error("stop of a path not confirmed", axis=share.member.motion.config.name, reason=error.message)
+
+
+class PathMember(Procedure):
+    """One axis of a path: feeds its drive until the last point, then settles like any move."""
+
+    def __init__(self, motion: AxisMotion, permit: Permit, request: PathShareRequest) -> None:
+        self.permit = permit
+        self.motion = motion
+        self.plan: MotionPlan
+        self._request = request
+        self._path = request.rendezvous
+        self._corners: tuple[float, ...] = ()
+        self._here = 0
+        self._announced = False
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        """The points of this axis."""
+        plan = self._path.plan
+        return plan.steps[self.motion.config.name] if plan else ()
+
+    async def begin(self) -> CommandReply:
+        """See `Procedure`; a member that cannot walk keeps the others from it.
+
+        Raises:
+            LdcndError: as `move_absolute` to each corner, or because another member could not.
+        """
+        path, motion = self._path, self.motion
+        try:
+            tracker = motion.tracker
+            guards.check_may_move(tracker)
+            guards.check_referenced(tracker)
+            walking(motion.driver).check_path()
+            status = await walking(motion.driver).path_status()
+            if status.points or status.running or not status.enabled:
+                raise WrongState(
+                    f"axis {motion.config.name}: {status.points} points of an earlier path are left in the drive",
+                    axis=motion.config.name,
+                    value=status.points,
+                    remedy="restart the drive",
+                )
+            self._here = status.commanded_counts
+            self._corners = self._planned_corners(status.commanded_counts)
+            await path.join(motion.config.name, self)
+        except LdcndError as error:
+            path.fail(error)
+            self._not_started(error)
+            raise
+        motion.tracker.started(motion.clock.now_s())
+        self._wait(path.share_of(self).sent)
+        return motion.reply(self.permit, self.plan, duration_s=path.plan.duration_s if path.plan else None)
+
+    def _planned_corners(self, here_counts: int) -> tuple[float, ...]:
+        """Plan the move to each corner from the one before; return where the path turns, in counts of the drive."""
+        motion, request = self.motion, self._request
+        corners = [here_counts]
+        for position in (*request.via, request.position):
+            corner = motion.unwrapped(position, request.direction, from_counts=corners[-1])
+            self.plan = motion.plan_to(corner, request.velocity, request.acceleration)
+            corners.append(self.plan.motion.target_counts or 0)
+        return tuple(map(float, corners))
+
+    def on_path(self) -> PathAxis:
+        """Return the share of this axis."""
+        motion = self.plan.motion
+        return PathAxis(
+            self._corners,
+            abs(self.motion.counts_per_unit),
+            abs(motion.velocity_counts_per_s),
+            motion.acceleration_counts_per_s2,
+        )
+
+    async def prepare(self) -> None:
+        """Put the acceleration in force by which a smooth stop ends the path: a trapezoid that goes nowhere."""
+        motion = self.plan.motion
+        here = Motion(self._here, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
+        await self.permit.load(here)
+        await self.permit.start(stays=True)
+
+    def announce(self) -> None:
+        """Say that the axis moves, before its drive does."""
+        self._announced = True
+        self.permit.announce(self.plan.motion, anywhere=True)
+        self.motion.begin(
+            self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROCEDURE, plan=self.plan
+        )
+
+    @override
+    def calls_for_step(self, reading: AxisReading) -> bool:
+        return bool(self._path.broken or self._path.left())
+
+    async def step(self) -> bool:
+        """See `Procedure`: send the next packet, or see whether the path has ended.
+
+        Raises:
+            WrongState: the path was stopped.
+        """
+        path, motion = self._path, self.motion
+        share, name = path.share_of(self), motion.config.name
+        try:
+            reason = path.broken or path.left()
+            if not reason:
+                await path.feed(share)
+                status = await walking(motion.driver).path_status()
+                now_s = motion.clock.now_s()
+                ends_s = path.begun_s + (path.plan.duration_s if path.plan else 0.0)
+                share.tripped = not status.enabled
+                if share.tripped:
+                    reason = f"axis {name} has opened its loop"
+                elif share.sent >= len(self.steps) and not status.running and not status.points:
+                    if now_s < ends_s - 2 * walking(motion.driver).path_period_s:
+                        reason = f"axis {name} ended its path early"
+                    else:
+                        share.over = True
+                        return self._settle(status.commanded_counts)
+                elif not status.running:
+                    reason = f"axis {name} ran out of points: they came too late"
+                elif not path.holds(share, status.points, now_s):
+                    reason = f"axis {name} has {status.points} points left, which is not what it was sent"
+                elif now_s > ends_s + LATE_S:
+                    reason = f"axis {name} still walks, {LATE_S:g} s later than planned"
+                else:
+                    self._wait(status.points)
+        except LdcndError as error:
+            reason = reason or f"axis {name}: {error.message}"
+        if not reason:
+            return True
+        await path.stop_all(reason)
+        raise WrongState(f"axis {name}: the path was stopped: {reason}", axis=name)
+
+    def _wait(self, points: int) -> None:
+        """Come again when the drive has room for another packet."""
+        drive = walking(self.motion.driver)
+        spare = points - (round(AHEAD_S / drive.path_period_s) - drive.path_packet)
+        self.deadline_s = self.motion.clock.now_s() + max(1, spare) * drive.path_period_s
+
+    def _settle(self, commanded_counts: int) -> bool:
+        """The last point was reached: the rest is as behind any move; the drive must have summed up what was sent."""
+        motion, target = self.motion, self.plan.motion.target_counts
+        name = motion.config.name
+        if target is None or abs(commanded_counts - target) > 1:
+            motion.tracker.finished(f"the drive ended its path at {commanded_counts} counts, not at {target}")
+            motion.publish_state()
+            return False
+        at_end = MotionPlan(self.plan.motion, self.plan.position, self.plan.velocity, self.plan.acceleration, 0.0)
+        motion.begin(
+            self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end
+        )
+        motion.tracker.started(motion.clock.now_s())
+        motion.target_counts = target
+        log.debug("path walked", axis=name)
+        return False
+
+    def _not_started(self, error: LdcndError) -> None:
+        motion = self.motion
+        if not self._announced or self.outlived(motion.tracker):
+            return
+        if isinstance(error, OutcomeUnknown):
+            motion.stopping(self.permit.command_id, self.permit.verb)
+            motion.tracker.failing(error.message)
+            return
+        motion.tracker.finished(error.message)
+        motion.publish_state()

@@ -1,0 +1,102 @@
+"""A raw duty on the motor for a limited time, then a controlled stop.
+
+Nothing in these drives bounds a duty: if this daemon dies, the motor runs on. That is why the time must be named and
+the axis must be configured for it.
+"""
+
+from typing_extensions import override
+
+from ldcnd.axis import guards
+from ldcnd.axis.guards import Permit
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
+from ldcnd.axis.state import AxisTracker, Completion
+from ldcnd.contract.commands import CommandReply, SetPwm, Verb
+from ldcnd.contract.errors import NotSupported, ValueOutOfRange
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.driver import AxisReading, Motion, PwmOutput, StopMode
+
+FULL_DUTY = 255
+"""Steps of the duty in one direction on these drives."""
+
+
+class PwmRun(EndlessMotion):
+    """One duty, from the request to the stop that ends it."""
+
+    def __init__(self, motion: AxisMotion, permit: Permit, request: SetPwm) -> None:
+        super().__init__(motion, permit)
+        self._request = request
+        self._seen: tuple[float, float] | None = None  # the latest velocity, and when it was read
+        self._gains = 0.0  # acceleration, as the latest two readings show it
+
+    async def begin(self) -> CommandReply:
+        """See `Procedure`. A duty under way may be replaced by another."""
+        motion, request = self._motion, self._request
+        tracker, active = motion.tracker, motion.tracker.command
+        if active is None or active.verb is not Verb.SET_PWM:
+            guards.check_may_move(tracker)
+        else:
+            guards.check_may_power_on(tracker)
+        self._check_bounds()
+        speed, rate = motion.config.velocity, motion.config.acceleration
+        counts_per_unit = abs(motion.counts_per_unit)
+        acceleration = motion.quantise(Motion(None, speed * counts_per_unit, rate * counts_per_unit))
+        self.acceleration = acceleration.acceleration_counts_per_s2 / counts_per_unit
+        self.check_room(request.duty)
+        duty = request.duty if motion.counts_per_unit > 0 else -request.duty
+        await self.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
+        self._until_s = motion.clock.now_s() + request.duration_s
+        await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
+        return motion.reply(
+            self.permit, duration_s=request.duration_s, duty=round(request.duty * FULL_DUTY) / FULL_DUTY
+        )
+
+    @override
+    def fastest(self, velocity: float) -> tuple[float, float]:
+        """See `EndlessMotion`: what a duty leads to depends on motor and load, so its readings tell."""
+        now_s = self._motion.clock.now_s()
+        if self._seen and now_s > self._seen[1]:
+            self._gains = abs(velocity - self._seen[0]) / (now_s - self._seen[1])
+        self._seen = velocity, now_s
+        most = abs(velocity) + self._gains * LATENCY_S
+        return (most, 0.0) if self._request.duty > 0 else (0.0, most)
+
+    @override
+    def calls_for_step(self, reading: AxisReading) -> bool:
+        """See `Procedure`: a limit is near, or the command was lost while out of sight; it may still be running."""
+        return self.ends_before_limit(reading) or self._motion.tracker.command is None
+
+    async def step(self) -> bool:
+        """See `Procedure`: its time is over, or a limit near. An axis that has failed meanwhile is switched off."""
+        ours = self._motion.tracker.command is not None
+        await self._motion.driver.stop(StopMode.SMOOTH if ours else StopMode.OFF)
+        if ours:
+            self._motion.stopping(self.permit.command_id, self.permit.verb)
+        return False
+
+    def outlived(self, tracker: AxisTracker) -> bool:
+        """See `Procedure`; without a command it is unknown whether the motor still runs."""
+        return tracker.command is not None and super().outlived(tracker)
+
+    def _check_bounds(self) -> None:
+        name, bounds, request = self._motion.config.name, self._motion.config.pwm, self._request
+        if bounds is None:
+            raise NotSupported(
+                f"axis {name} is not configured for raw duties", axis=name, remedy="configure [bus.axis.pwm]"
+            )
+        if abs(request.duty) > bounds.duty:
+            raise ValueOutOfRange(
+                f"axis {name}: duty {request.duty:g} is above the limit {bounds.duty:g}",
+                axis=name,
+                value=request.duty,
+                limit=bounds.duty,
+                nearest=bounds.duty if request.duty > 0 else -bounds.duty,
+            )
+        if request.duration_s > bounds.duration_s:
+            raise ValueOutOfRange(
+                f"axis {name}: {request.duration_s:g} s of duty is above the limit {bounds.duration_s:g} s",
+                axis=name,
+                value=request.duration_s,
+                limit=bounds.duration_s,
+                nearest=bounds.duration_s,
+            )

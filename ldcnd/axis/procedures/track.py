@@ -1,0 +1,123 @@
+"""A stream of set-points that an axis follows without a profile, bounded in step and rate."""
+
+from typing_extensions import override
+
+from ldcnd.axis import guards
+from ldcnd.axis.guards import Permit
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.procedure import Procedure
+from ldcnd.axis.state import Completion
+from ldcnd.contract.commands import CommandReply, Track, Verb
+from ldcnd.contract.errors import (
+    BusError,
+    NotSupported,
+    OutcomeUnknown,
+    RequestRefused,
+    TooManyRequests,
+    ValueOutOfRange,
+)
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.axis_config import TrackingConfig
+from ldcnd.drives.driver import AxisReading
+
+IDLE_PERIODS = 5
+SHORTEST_IDLE_S = 0.5
+"""A stream ends after this number of its shortest periods without a set-point, but not sooner than this."""
+EARLY = 0.5
+"""A set-point may come this share of a period early; the mean rate is kept."""
+
+
+class SetPoint(Procedure):
+    """One set-point; it takes the stream over from the one before it."""
+
+    def __init__(self, motion: AxisMotion, permit: Permit, request: Track, before: Procedure | None) -> None:
+        self.permit = permit
+        self._motion = motion
+        self._request = request
+        self._before = before if isinstance(before, SetPoint) and not before.outlived(motion.tracker) else None
+        self._due_s = 0.0  # when this one could have come at the configured rate
+
+    async def begin(self) -> CommandReply:
+        """See `Procedure`.
+
+        Raises:
+            TooManyRequests: faster than the configured rate.
+            ValueOutOfRange: farther from the last set-point than the configured step.
+        """
+        motion, tracker, position = self._motion, self._motion.tracker, self._request.position
+        bounds = self._bounds()
+        before, self._before = self._before, None  # a stream keeps only its last set-point
+        if before:
+            guards.check_may_power_on(tracker)
+        else:
+            guards.check_may_move(tracker)
+        guards.check_referenced(tracker)
+        guards.check_position(tracker, motion.config.limits, position)
+        self._check_rate(before, bounds)
+        target = motion.counts_of(position)
+        self._check_step(target, bounds)
+        self.permit.ask_to_move()
+        if tracker.command and tracker.command.verb is Verb.TRACK:
+            tracker.finished()  # the stream goes on under the new command's name
+        motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+        self.deadline_s = motion.clock.now_s() + max(SHORTEST_IDLE_S, IDLE_PERIODS / bounds.rate)
+        try:
+            await self.permit.track(target)
+        except OutcomeUnknown:
+            motion.target_counts = target  # if it was not executed the next set-point is still near enough
+            tracker.started(motion.clock.now_s())
+            raise
+        except (BusError, RequestRefused) as error:
+            tracker.finished(error.message)
+            motion.publish_state()
+            raise
+        motion.target_counts = target
+        tracker.started(motion.clock.now_s())
+        return motion.reply(self.permit, position=motion.shown(motion.telemetry.position(target)))
+
+    @override
+    def calls_for_step(self, reading: AxisReading) -> bool:
+        return False
+
+    async def step(self) -> bool:
+        """See `Procedure`: nothing came any more; the axis holds the last set-point."""
+        self._motion.tracker.finished()
+        self._motion.publish_state()
+        return False
+
+    def _bounds(self) -> TrackingConfig:
+        config = self._motion.config
+        if config.tracking is None:
+            raise NotSupported(
+                f"axis {config.name} is not configured for tracking",
+                axis=config.name,
+                remedy="configure [bus.axis.tracking]",
+            )
+        return config.tracking
+
+    def _check_rate(self, before: "SetPoint | None", bounds: TrackingConfig) -> None:
+        now_s, period_s = self._motion.clock.now_s(), 1.0 / bounds.rate
+        due_s = before._due_s + period_s if before else now_s  # noqa: SLF001 - the same stream
+        if now_s < due_s - EARLY * period_s:
+            raise TooManyRequests(
+                f"axis {self._motion.config.name}: more than {bounds.rate:g} set-points a second",
+                axis=self._motion.config.name,
+                limit=bounds.rate,
+                remedy="send them more slowly",
+            )
+        self._due_s = max(due_s, now_s)
+
+    def _check_step(self, target: int, bounds: TrackingConfig) -> None:
+        motion = self._motion
+        last = motion.latest().position_counts if motion.target_counts is None else motion.target_counts
+        step = (target - last) / motion.counts_per_unit
+        if abs(step) > bounds.step:
+            nearest = motion.telemetry.position(last) + (bounds.step if step > 0 else -bounds.step)
+            raise ValueOutOfRange(
+                f"axis {motion.config.name}: set-point {self._request.position:g} is {abs(step):g} from the last one,"
+                f" the limit is {bounds.step:g}",
+                axis=motion.config.name,
+                value=self._request.position,
+                limit=bounds.step,
+                nearest=nearest,
+            )

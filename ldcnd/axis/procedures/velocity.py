@@ -1,0 +1,57 @@
+"""A motion at constant velocity that gets another velocity on its way.
+
+It begins as a trapezoid, which ends in the drive. A trapezoid must not be changed in mid-move, while velocity mode
+may be entered and changed at any time (PIC-SERVO manual, 4.4): from its first change on it runs in velocity mode,
+which has no end in the drive. The daemon ends it before the software limit or at the jog horizon; only limit switches
+that are armed do so without it. PIC-SERVO SC takes a new trapezoid at any time: there it keeps its end in the drive.
+"""
+
+from typing_extensions import override
+
+from ldcnd.axis import guards
+from ldcnd.axis.guards import Permit
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.procedures.endless import EndlessMotion
+from ldcnd.axis.state import AxisTracker, Completion
+from ldcnd.contract.commands import CommandReply, MoveVelocity, Verb
+from ldcnd.contract.samples import AxisState
+
+COUNTER_SHARE = 0.99
+"""Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
+
+
+def runs(tracker: AxisTracker) -> bool:
+    """Tell whether the axis carries out a motion whose velocity may be changed."""
+    command = tracker.command
+    return command is not None and command.verb is Verb.MOVE_VELOCITY and tracker.state is AxisState.CONTINUOUS_MOTION
+
+
+class VelocityChange(EndlessMotion):
+    """A motion in velocity mode, from the change of its velocity to the stop that ends it."""
+
+    def __init__(self, motion: AxisMotion, permit: Permit, request: MoveVelocity) -> None:
+        super().__init__(motion, permit)
+        self._request = request
+        self._velocity = 0.0
+
+    async def begin(self) -> CommandReply:
+        """See `Procedure`.
+
+        Raises:
+            PositionLimit: the software limit ahead is too near to stop before it.
+        """
+        motion, request = self._motion, self._request
+        guards.check_may_follow(motion.tracker)
+        plan = motion.plan_at(request.velocity, request.acceleration)
+        self._velocity, self.acceleration = plan.velocity, plan.acceleration
+        self.check_room(plan.velocity)
+        await self.permit.load(plan.motion)
+        speed_counts = plan.motion.velocity_counts_per_s
+        room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
+        self._until_s = motion.clock.now_s() + min(motion.config.jog_horizon_s, COUNTER_SHARE * room_s)
+        await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
+        return motion.reply(self.permit, velocity=plan.velocity, acceleration=plan.acceleration)
+
+    @override
+    def fastest(self, velocity: float) -> tuple[float, float]:
+        return max(0.0, velocity, self._velocity), max(0.0, -velocity, -self._velocity)

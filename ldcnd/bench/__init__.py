@@ -1,0 +1,1 @@
+"""A drive on the bench: scan, accept, commission, tune, and the measures of its friction."""

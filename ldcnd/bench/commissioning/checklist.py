@@ -1,0 +1,316 @@
+"""The checklist of one axis: which steps there are, which are open, and what happens around the run of one."""
+
+import asyncio
+import difflib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+from pydantic import JsonValue
+
+from ldcnd.bench.commissioning import record as records
+from ldcnd.bench.commissioning.first_settings import FirstSettings
+from ldcnd.bench.commissioning.holding import HoldingOutput
+from ldcnd.bench.commissioning.homing import HomeRepeatability
+from ldcnd.bench.commissioning.limit_switches import LimitSwitches
+from ldcnd.bench.commissioning.motor import MotorDirection
+from ldcnd.bench.commissioning.questions import Gains, Load
+from ldcnd.bench.commissioning.record import Proposal, Record, Result, StepRecord, StepState
+from ldcnd.bench.commissioning.scale import Scale
+from ldcnd.bench.commissioning.speed import HighestSpeed
+from ldcnd.bench.commissioning.step import Site, Step
+from ldcnd.bench.commissioning.travel import Travel
+from ldcnd.bench.person import Person, said
+from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
+from ldcnd.client.lease import program_name
+from ldcnd.client.rig import Rig
+from ldcnd.client.standstill import seen
+from ldcnd.config.edit import edited_for_axis, write_over
+from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.contract.errors import LdcndError, UnknownAxis, WrongState
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.drives.axis_config import AxisConfig, MovedAxisConfig
+
+STEPS: dict[str, Step] = {
+    each.name: each
+    for each in (
+        Load(),
+        FirstSettings(),
+        MotorDirection(),
+        HoldingOutput(),
+        Scale(),
+        LimitSwitches(),
+        HomeRepeatability(),
+        Travel(),
+        HighestSpeed(),
+        Gains(),
+    )
+}
+"""All of them, in the order in which they build on each other."""
+CLIENT = program_name("ldcnd commission")
+LEASE_S = 2.0
+"""So soon the daemon applies `loss.client` of the axis when this program disappears, seconds."""
+WITHOUT_RUN = (StepState.NOT_POSSIBLE, StepState.NOT_NEEDED)
+SETTLED = (StepState.DONE, StepState.SKIPPED, *WITHOUT_RUN)
+SAME_IN_FILE = ("model", "address", "unit", "counts_per_unit", "direction", "modulo", "limits")
+"""Settings in which the running daemon and the file must agree, or lengths and limits would mean something else."""
+RELOADED = MovedAxisConfig.reloadable
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """What a step proposes, as a change of the file.
+
+    Attributes:
+        before: the file as it was.
+        text: as it would be.
+        lines: the difference, as `diff -u` shows it.
+        restarts: whether the daemon must be restarted for it; otherwise SIGHUP has it read the file again.
+    """
+
+    before: str
+    text: str
+    lines: tuple[str, ...]
+    restarts: bool
+
+
+class Checklist:
+    """The steps of one axis and what is known of them; made by `open_checklist`.
+
+    Attributes:
+        record: what is known, as it is on the disk.
+        path: of the record.
+    """
+
+    def __init__(
+        self, rig: Rig, config: Path, axis: str, person: Person, *, by: str, now: Callable[[], datetime] | None = None
+    ) -> None:
+        self.path = records.file_of(config, rig.name, axis)
+        self.record = records.read(self.path, rig.name, axis)
+        self._rig = rig
+        self._config = config
+        self._axis = axis
+        self._person = person
+        self._by = by
+        self._now = now or (lambda: datetime.now(UTC))
+
+    def next_open(self, after: str | None = None) -> str | None:
+        """Return the first step that is neither done nor settled otherwise; None when there is none.
+
+        Args:
+            after: only those behind this one.
+        """
+        names = list(STEPS)
+        behind = names[names.index(after) + 1 :] if after else names
+        return next((name for name in behind if self.record.of(name).result.state not in SETTLED), None)
+
+    async def refresh(self) -> list[str]:
+        """Compare the record with the drive and the configuration as they are now.
+
+        Returns:
+            In words what has been reopened, and why.
+        """
+        site = await self._site()
+        messages: list[str] = []
+        record = self.record
+        for name, step in STEPS.items():
+            kept = record.of(name)
+            begun = kept.result.state not in (StepState.OPEN, *WITHOUT_RUN)
+            if begun and (differs := records.changes(kept, _basis(step, site))):
+                why = f"{step.title} is open again: {'; '.join(differs)}"
+                messages.append(why)
+                opened = Result(state=StepState.OPEN, text="", proposals=())
+                record = record.with_step(StepRecord(step=name, result=opened, reopened=why))
+            elif not begun:
+                by_itself = _without_run(step, site)
+                if by_itself is None and kept.result.state is not StepState.OPEN:
+                    record = record.with_step(StepRecord(step=name))
+                elif by_itself is not None and by_itself != kept.result:
+                    record = record.with_step(self._kept(step, site, by_itself))
+        if record != self.record:
+            self._keep(record)
+        return messages
+
+    @property
+    def gains_to_put_back(self) -> KeptGains | None:
+        """Gains that a step, or a tuning, that was cut short has not put back; None without such.
+
+        Raises:
+            ConfigError: the file that keeps them cannot be read.
+        """
+        return kept_for(self._rig.name, self._axis)
+
+    async def put_back_gains(self) -> None:
+        """Put back what `gains_to_put_back` says; nothing without such.
+
+        Raises:
+            LdcndError: as the daemon refused it; they are still to be put back.
+            TimeoutError: it takes too long; likewise.
+        """
+        if kept := self.gains_to_put_back:
+            async with asyncio.timeout(PUT_BACK_S):
+                await put_back(self._rig, kept, CLIENT)
+
+    async def _put_back_or_say(self) -> None:
+        """Put back the gains that a step has left in the drive; where that fails, say why: they stay kept."""
+        try:
+            await self.put_back_gains()
+        except (LdcndError, TimeoutError) as error:
+            why = said(error) if isinstance(error, LdcndError) else f"it took longer than {PUT_BACK_S:g} s"
+            self._person.tell(
+                f"{self._axis}: its former gains could not be put back: {why}",
+                f"the drive has gains of this step until they are: begin a step, or {put_back_by_hand(self._axis)}",
+            )
+
+    async def preview(self, name: str) -> tuple[str, ...]:
+        """Return in words what a step would do now; nothing is sent to the drive.
+
+        Raises:
+            WrongState: the daemon runs with another configuration than the file.
+            LdcndError: it would be refused.
+        """
+        site = await self._site()
+        _require_same(site)
+        step = STEPS[name]
+        if obstacle := step.obstacle(site):
+            return (obstacle,)
+        return await step.preview(site)
+
+    async def run(self, name: str) -> StepRecord:
+        """Run a step that was confirmed, and keep its result; a failure is kept, too, before it is raised.
+
+        Raises:
+            LdcndError: it has failed.
+            Left: the person has left in its middle; it stays as it was.
+        """
+        site = await self._site()
+        _require_same(site)
+        step = STEPS[name]
+        if obstacle := step.obstacle(site):
+            return self._settle(step, site, Result(state=StepState.NOT_POSSIBLE, text=obstacle))
+        control = self._rig.control(self._axis, client=CLIENT, lease_s=LEASE_S)
+        try:
+            async with control if step.moves else self._rig.watch(self._axis) as axis:
+                result = await step.run(site, await seen(axis))
+        except LdcndError as error:
+            self._settle(step, site, Result(state=StepState.FAILED, text=said(error)))
+            raise
+        finally:
+            await self._put_back_or_say()
+        return self._settle(step, site, result)
+
+    async def settle(self, name: str, result: Result) -> StepRecord:
+        """Keep the result of a step that was carried out elsewhere, or skipped for a reason."""
+        return self._settle(STEPS[name], await self._site(), result)
+
+    def change(self, name: str) -> Change | None:
+        """Return how a step would change the configuration; None when it proposes nothing that is not there.
+
+        Raises:
+            ConfigError: it has to be put in by hand, or would make no configuration.
+        """
+        tables: dict[str, dict[str, str]] = {}
+        proposals = self.record.of(name).result.proposals
+        for each in proposals:
+            tables.setdefault(each.table, {})[each.key] = each.literal
+        if not tables:
+            return None
+        before, after = self._config.read_text(encoding="utf-8"), edited_for_axis(self._config, self._axis, tables)
+        if before == after:
+            return None
+        named = str(self._config)
+        lines = difflib.unified_diff(before.splitlines(), after.splitlines(), named, named, lineterm="", n=2)
+        return Change(before, after, tuple(lines), restarts=any(not _is_reloaded(each) for each in proposals))
+
+    def write(self, change: Change) -> None:
+        """Replace the configuration; it was checked whole when the change was made.
+
+        Raises:
+            ConfigError: it cannot be written, or was changed since; it is as it is.
+        """
+        write_over(self._config, change.before, change.text)
+
+    # -- what it stands on -------------------------------------------------------------------------------------------
+
+    async def _site(self) -> Site:
+        config = axis_of(load_config(self._config), self._axis)
+        infos = {info.axis: info for info in await self._rig.describe()}
+        if self._axis not in infos:
+            raise UnknownAxis(f"rig {self._rig.name} has no axis {self._axis!r}", axis=self._axis)
+        self.record = records.read(self.path, self._rig.name, self._axis)  # another session may have added to it
+        return Site(self._rig, infos[self._axis], config, self._person, self.record)
+
+    def _kept(self, step: Step, site: Site, result: Result) -> StepRecord:
+        at = self._now().isoformat(timespec="seconds")
+        return StepRecord(step=step.name, result=result, at=at, by=self._by, basis=_basis(step, site))
+
+    def _settle(self, step: Step, site: Site, result: Result) -> StepRecord:
+        kept = self._kept(step, site, result)
+        self.record = records.read(self.path, self._rig.name, self._axis)
+        self._keep(self.record.with_step(kept))
+        return kept
+
+    def _keep(self, record: Record) -> None:
+        records.write(self.path, record)
+        self.record = record
+
+
+def axis_of(rig: RigConfig, name: str) -> AxisConfig:
+    """Return the configuration of an axis.
+
+    Raises:
+        UnknownAxis: there is none of that name.
+    """
+    axes: dict[str, AxisConfig] = {axis.name: axis for bus in rig.bus for axis in bus.axis}
+    if name not in axes:
+        raise UnknownAxis(f"there is no axis {name!r}", axis=name, value=name, remedy=f"there are: {', '.join(axes)}")
+    return axes[name]
+
+
+def _without_run(step: Step, site: Site) -> Result | None:
+    """Return the result of a step that cannot be run, or need not be; None for any other."""
+    if obstacle := step.obstacle(site):
+        return Result(state=StepState.NOT_POSSIBLE, text=obstacle)
+    if unneeded := step.unneeded(site):
+        return Result(state=StepState.NOT_NEEDED, text=unneeded)
+    return None
+
+
+def _basis(step: Step, site: Site) -> dict[str, JsonValue]:
+    """Return what a step depends on: who the drive is, and some of its configuration."""
+    settings = site.config.model_dump(mode="json")
+    basis: dict[str, JsonValue] = {"model": site.info.model, "address": site.info.address}
+    if site.info.identity is not None:  # it answers
+        basis["drive"] = site.info.identity
+    for name in step.depends:
+        value: JsonValue = settings
+        for part in name.split("."):
+            value = value.get(part) if isinstance(value, dict) else None
+        basis[name] = value
+    return basis
+
+
+def _require_same(site: Site) -> None:
+    """Refuse a daemon that runs with another configuration than the file.
+
+    Raises:
+        WrongState: names the settings.
+    """
+    differ = list(_differing(site.info, site.config))
+    if differ:
+        raise WrongState(
+            f"axis {site.info.axis}: the daemon runs with another {' and '.join(differ)} than the file",
+            axis=site.info.axis,
+            remedy="restart the daemon with this file",
+        )
+
+
+def _differing(info: AxisInfo, config: AxisConfig) -> Iterator[str]:
+    for name in SAME_IN_FILE:
+        if getattr(info, name) != getattr(config, name):
+            yield name
+
+
+def _is_reloaded(proposal: Proposal) -> bool:
+    return (proposal.table or proposal.key).partition(".")[0] in RELOADED

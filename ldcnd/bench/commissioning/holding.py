@@ -1,0 +1,203 @@
+"""Holding output: friction and load of an axis, from the output that holds it at rest behind a motion each way.
+
+The loop has a position and a derivative gain only, so its output at rest is `kp` times the position error. A slow
+motion forward ends where output and load exceed friction no more, one back where they do so the other way: half of the
+difference of the two outputs is friction, their mean is what holds the load. Outputs are whole PWM steps, so both are
+known to half a step or so.
+"""
+
+import math
+from contextlib import suppress
+
+from typing_extensions import override
+
+from ldcnd.bench.commissioning.motor import (
+    CAUGHT,
+    DAMPING,
+    HOW_IT_ENDS,
+    OUTPUTS,
+    PWM_PER_GAIN,
+    REGISTER_MOST,
+    error_limit,
+    lent_gains,
+)
+from ldcnd.bench.commissioning.questions import powered_off
+from ldcnd.bench.commissioning.record import Figure, Result, Series, StepState
+from ldcnd.bench.commissioning.step import Site, Step, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.client.axis import Axis
+from ldcnd.client.kept_gains import open_loop
+from ldcnd.client.standstill import seen
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.errors import CommandAborted, DriveFault
+from ldcnd.contract.samples import AxisState
+
+WAY = 2.5
+"""Each motion goes this many times the position error limit: it counts from the goal before, which the axis may be one
+limit behind, so an axis that does not follow both ways exceeds the limit."""
+SATURATED_SHARE = 0.8
+"""The output is at its limit from this share of the position error limit on."""
+DURATION_S = 3.0
+"""Time for each motion, seconds: so slow that it ends with no more speed than friction takes at once."""
+RAMP_SHARE = 0.1
+APPROACHES = 2
+"""From each side."""
+GROWTH = 1.5
+CARRIED_GROWTH = 3.0
+"""Growth of the output limit where the axis stood, and where it went one way: by itself, or carried by a load."""
+HALF_A_STEP = 0.5
+UNIT = "of 255 PWM steps"
+
+
+class HoldingOutput(Step):
+    """Measures friction and load by the output that holds the axis."""
+
+    name = "hold"
+    title = "Friction and hanging load, measured"
+    about = (
+        "The axis moves slowly forward and back by a fraction of a turn, with as little output as that takes. What the"
+        " motor gives at rest behind each motion tells its friction, and how much of it a load takes."
+    )
+    needs = (Verb.POWER, Verb.MOVE_RELATIVE, Verb.SET_GAINS)
+    depends = ("direction",)
+
+    @override
+    def obstacle(self, site: Site) -> str:
+        if super().obstacle(site):
+            return super().obstacle(site)
+        if site.config.gains is None:
+            return "not possible without `gains` in the configuration: the loop stays open"
+        if site.config.settle.unsettled == "fault":
+            return 'not possible with `settle.unsettled = "fault"`: the axis rests beside its goals here'
+        return ""
+
+    @override
+    async def preview(self, site: Site) -> tuple[str, ...]:
+        el, way = error_limit(site), _way(site)
+        velocity, acceleration = _profile(site)
+        async with site.rig.watch(site.info.axis) as axis:
+            refuse_latched(await seen(axis))
+            for distance in (way, -way):
+                refuse_previewed(await axis.preview(distance=distance, velocity=velocity, acceleration=acceleration))
+        return (
+            (
+                f"{site.info.axis} moves {APPROACHES} times forward and back by {WAY * el:.0f} counts"
+                f" ({site.length(way)}), at {site.length(velocity)}/s, with {OUTPUTS[0]} to {OUTPUTS[-1]} {UNIT}"
+            ),
+            f"beyond a position error of {el} counts the drive opens its loop; then more output is tried",
+            "run the step motor first: this one takes for granted that motor and encoder agree",
+            *HOW_IT_ENDS,
+        )
+
+    @override
+    async def run(self, site: Site, axis: Axis) -> Result:
+        el = error_limit(site)
+        async with lent_gains(site, axis) as old:
+            origin, output = await rest_counts(axis), OUTPUTS[0]
+            while output <= min(OUTPUTS[-1], old["ol"]):
+                before = await rest_counts(axis)
+                if abs(before - origin) > CAUGHT * el:
+                    return _failed(f"a load carries it away: it went {abs(before - origin)} counts")
+                outputs = await self._approach(site, axis, output, el, origin)
+                if len(outputs) == 2 * APPROACHES:
+                    return _judged(site, outputs, old.get("cl"))
+                carried = abs(await rest_counts(axis) - before) > el / 2
+                output = math.ceil(output * (CARRIED_GROWTH if carried else GROWTH))
+        return _failed(
+            f"it does not follow with {min(OUTPUTS[-1], old['ol'])} {UNIT}: look for a closed brake, a jam, or a load"
+            " that is too heavy for it"
+        )
+
+    @staticmethod
+    async def _approach(site: Site, axis: Axis, output: int, el: int, origin: int) -> list[tuple[int, float]]:
+        """Move to and fro with an output limit; return direction and output at rest of each motion until it trips."""
+        kp = min(math.ceil(PWM_PER_GAIN * output / (SATURATED_SHARE * el)), REGISTER_MOST)
+        await axis.set_gains(kp=kp, kd=min(DAMPING * kp, REGISTER_MOST), ki=0, il=0, ol=output, el=el, lent=True)
+        velocity, acceleration = _profile(site)
+        sign = -1 if site.info.direction == "reverse" else 1
+        first = -1 if sign * (await rest_counts(axis) - origin) > 0 else 1
+        outputs: list[tuple[int, float]] = []
+        await axis.power(on=True)
+        for direction in (first, -first) * APPROACHES:
+            motion = await axis.move_relative(direction * _way(site), velocity=velocity, acceleration=acceleration)
+            with suppress(DriveFault, CommandAborted):  # its state tells more
+                await motion.done()
+            refuse_latched(axis)
+            if axis.state.state is AxisState.ERROR_STOP:
+                break
+            await rest_counts(axis)
+            error = ((motion.reply.position or 0.0) - axis.position.value) * site.counts_per_unit
+            outputs.append((direction, kp * error / PWM_PER_GAIN))
+        await open_loop(axis)
+        return outputs
+
+
+def _way(site: Site) -> float:
+    """Return how far each motion goes, in axis units."""
+    return WAY * error_limit(site) / site.counts_per_unit
+
+
+def _profile(site: Site) -> tuple[float, float]:
+    """Return velocity and acceleration of the motions, in axis units."""
+    limits = site.info.limits
+    velocity = min(_way(site) / DURATION_S, limits.velocity or math.inf)
+    return velocity, min(velocity / (RAMP_SHARE * DURATION_S), limits.acceleration or math.inf)
+
+
+def _held(outputs: list[tuple[int, float]], direction: int) -> float:
+    """Return the output that holds the axis behind motions in a direction, PWM steps; the drive gives whole ones."""
+    held = [math.trunc(output) for way, output in outputs if way == direction]
+    return sum(held) / len(held)
+
+
+def _judged(site: Site, outputs: list[tuple[int, float]], limit: int | None) -> Result:
+    forward, back = _held(outputs, 1), _held(outputs, -1)
+    # the next whole step would have moved it on
+    friction, load = max((forward - back) / 2 + HALF_A_STEP, 0.0), (forward + back) / 2
+    falls = forward * back > 0
+    pulls = f"a load pulls it {'back' if load > 0 else 'forward'} with {abs(load):.1f} {UNIT}"
+    if falls:
+        text = (
+            f"{pulls}, more than the {friction:.1f} of its friction: it falls without power, unless a brake holds it;"
+            f" it stood before, so a brake did, or the end of its travel{powered_off(site.config)}"
+        )
+        if _said(site) == "none":
+            text += "; you have said that nothing falls: run the step load again"
+    elif abs(load) < 1.0:
+        text = f"no load to speak of; friction takes {friction:.1f} {UNIT}"
+    else:
+        holds = "holds it without power" if min(abs(forward), abs(back)) >= 1.0 else "hardly holds it without power"
+        text = f"{pulls}; its friction of {friction:.1f} {holds}"
+    figures = (
+        Figure(what="output at rest behind a motion forward", value=forward, unit=UNIT),
+        Figure(what="output at rest behind a motion back", value=back, unit=UNIT),
+        Figure(what="friction, to half a step", value=friction, unit=UNIT),
+        Figure(what="output that holds the load, to half a step", value=load, unit=UNIT),
+        *_current_limit(limit),
+    )
+    points = tuple((float(number), output) for number, (_, output) in enumerate(outputs, 1))
+    series = (Series(title="Output at rest", x="motion", y="PWM steps of 255", points=points),)
+    return Result(state=StepState.DONE, text=text, figures=figures, series=series)
+
+
+def _said(site: Site) -> object:
+    """Return what the person has answered in the step `load`."""
+    figures = site.record.of("load").result.figures
+    return next((each.value for each in figures if each.what == "load"), None)
+
+
+def _current_limit(limit: int | None) -> tuple[Figure, ...]:
+    """Return what the drive does about its current, where it has a register for that."""
+    if limit is None:
+        return ()
+    side = "none" if not limit else f"at A/D readings {'above' if limit & 1 else 'below'} {limit}"
+    return (
+        Figure(
+            what="current limit (cl)",
+            value=f"{limit}: {side}; not proposed, because the scale of the current sensor is not known here: read"
+            " `adc` of the axis at the motor's rated current",
+        ),
+    )
+
+
+def _failed(text: str) -> Result:
+    return Result(state=StepState.FAILED, text=text)

@@ -1,0 +1,132 @@
+"""Limit switches and their polarity: a person presses each, and the inputs are watched."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from typing import Literal
+
+from pydantic import ValidationError
+from typing_extensions import override
+
+from ldcnd.bench.commissioning.record import Figure, Proposal, Result, StepState
+from ldcnd.bench.commissioning.step import Site, Step, done
+from ldcnd.client.axis import Axis
+from ldcnd.contract.errors import WrongState
+from ldcnd.contract.samples import InputsSample, TelemetryItem
+
+PRESS_S = 60.0
+"""Longest time in which a switch is pressed, seconds."""
+SIDES = ("reverse", "forward")
+LEVELS: Mapping[bool, Literal["high", "low"]] = {True: "high", False: "low"}
+STOPS = Proposal(table="", key="limit_switches", value="stop")
+"""The drive itself stops a motion that runs onto a switch, also without a host."""
+Levels = tuple[bool | None, bool | None]
+
+
+class LimitSwitches(Step):
+    """Watches the inputs while a person presses the switches."""
+
+    name = "limits"
+    title = "Limit switches and their polarity"
+    about = (
+        "You press each limit switch by hand; the inputs are watched. From that come level and order of the switches."
+    )
+    moves = False
+    depends = ("direction", "home.switch_active", "limit_switches")
+
+    @override
+    def obstacle(self, site: Site) -> str:
+        shows = TelemetryItem.INPUTS.value in site.info.items
+        return "" if shows else f"not possible on this model: a {site.info.model} shows no limit switch inputs"
+
+    @override
+    async def run(self, site: Site, axis: Axis) -> Result:
+        person = site.person
+        if not await person.confirm("has the axis limit switches?"):
+            return Result(state=StepState.SKIPPED, text="it has no limit switches")
+        idle = _levels(await site.rig.latest(axis.name, TelemetryItem.INPUTS))
+        if None in idle:
+            raise WrongState(
+                f"axis {axis.name}: this drive shows its limit switches only while its power driver is on",
+                axis=axis.name,
+                remedy=f"type `ldcnd axis power {axis.name} on`; it then holds its position while you press them",
+            )
+        pressed: list[int] = []
+        for side in SIDES:
+            person.tell(f"press the {side} limit switch, and let it go")
+            pressed.append(await self._pressed(site, idle, side))
+            await self._until(site, lambda levels: levels == idle, "did not come back to its level at rest")
+        return _judged(site, idle, pressed)
+
+    async def _pressed(self, site: Site, idle: Levels, side: str) -> int:
+        """Wait until one input differs from its level at rest; return which."""
+        changed = await self._until(
+            site,
+            lambda levels: levels != idle and None not in levels,
+            f"did not change: the {side} switch is not wired to it, or was not pressed",
+        )
+        which = [number for number in (0, 1) if changed[number] != idle[number]]
+        if len(which) > 1:
+            raise WrongState(
+                f"axis {site.info.axis}: both inputs change with the {side} switch",
+                axis=site.info.axis,
+                remedy="separate the wires of the two switches",
+            )
+        return which[0]
+
+    @staticmethod
+    async def _until(site: Site, wanted: Callable[[Levels], bool], otherwise: str) -> Levels:
+        """Watch the inputs until their levels are as wanted; return them."""
+        axis = site.info.axis
+        try:
+            async with asyncio.timeout(PRESS_S), site.rig.samples(axis, TelemetryItem.INPUTS) as samples:
+                levels = _levels(await site.rig.latest(axis, TelemetryItem.INPUTS))
+                while not wanted(levels):
+                    levels = _levels((await anext(samples))[1])
+        except TimeoutError:
+            raise WrongState(f"axis {axis}: no input {otherwise}, within {PRESS_S:g} s", axis=axis) from None
+        return levels
+
+
+def _levels(sample: object) -> Levels:
+    return (sample.reverse_limit, sample.forward_limit) if isinstance(sample, InputsSample) else (None, None)
+
+
+def _judged(site: Site, idle: Levels, pressed: list[int]) -> Result:
+    figures = tuple(
+        Figure(what=f"{side} switch", value=f"{SIDES[number]} input, {LEVELS[not idle[number]]} when pressed")
+        for side, number in zip(SIDES, pressed, strict=True)
+    )
+    if pressed[0] == pressed[1]:
+        text = f"both switches act on the {SIDES[pressed[0]]} input: one of them is not wired to its own"
+        return Result(state=StepState.FAILED, text=text, figures=figures)
+    if pressed != [0, 1]:
+        text = "the switches are swapped: exchange their wires, or correct `direction` first (step scale)"
+        return Result(state=StepState.FAILED, text=text, figures=figures)
+    if idle[0] != idle[1]:
+        text = "one switch opens and the other closes when pressed: wire both alike"
+        return Result(state=StepState.FAILED, text=text, figures=figures)
+    active: Literal["high", "low"] = LEVELS[not idle[0]]
+    result = done(f"both inputs are {active} when their switch is pressed").model_copy(update={"figures": figures})
+    proposals: list[Proposal] = []
+    text = result.text
+    if active != site.config.switch_active and site.config.home is None:
+        text += f': write `switch_active = "{active}"` into `home` when it gets one'
+    else:
+        if active != site.config.switch_active:
+            proposals.append(Proposal(table="home", key="switch_active", value=active))
+        if site.config.limit_switches != STOPS.value and _can_stop(site, active):
+            text += "; the drive can stop on them by itself"
+            proposals.append(STOPS)
+    return result.model_copy(update={"text": text, "proposals": tuple(proposals)})
+
+
+def _can_stop(site: Site, active: str) -> bool:
+    """Return whether the configuration may say that the drive stops on its switches."""
+    document = site.config.model_dump(mode="json") | {STOPS.key: STOPS.value}
+    if document["home"]:
+        document["home"]["switch_active"] = active
+    try:
+        type(site.config).model_validate(document)
+    except ValidationError:
+        return False
+    return True

@@ -1,0 +1,3 @@
+"""The devices for Bluesky plans, under the name by which plans import them."""
+
+from ldcnd.lab.bluesky import *  # noqa: F403

@@ -1,0 +1,120 @@
+"""The checklist of one axis on a page: its steps, and tuning in the place of the step that only points to it."""
+
+from pathlib import Path
+
+from typing_extensions import override
+
+from ldcnd.bench.commissioning import record as records
+from ldcnd.bench.commissioning.checklist import STEPS, Checklist
+from ldcnd.bench.commissioning.record import Record, StepRecord, StepState
+from ldcnd.bench.commissioning.walk import Walk
+from ldcnd.client.rig import Rig
+from ldcnd.config.rig import load_config
+from ldcnd.console.commissioning.conversation import Conversation
+from ldcnd.console.commissioning.messages import CurveView, FromPage, StepView, View
+from ldcnd.console.commissioning.tuning import OfferedTuning, offered
+from ldcnd.console.rigs import Rigs
+from ldcnd.contract.errors import UnknownVerb
+
+TUNING = "gains"
+"""The step that a page carries out by tuning."""
+
+
+class AxisConversation(Conversation):
+    """One page and one axis.
+
+    Args:
+        rigs: of the console.
+        config: the configuration of the rig.
+        axis: its name.
+        visitor: who has the page, where the person gives no name.
+    """
+
+    def __init__(self, rigs: Rigs, config: Path, axis: str, visitor: str) -> None:
+        super().__init__()
+        self._rigs = rigs
+        self._config = config
+        self._axis = axis
+        self._visitor = visitor
+        self._record = Record(rig="", axis=axis)
+        self._curves: tuple[CurveView, ...] = ()
+        self._unit = ""
+        self._seen: object = None
+        self._tuning: OfferedTuning | None = None
+
+    @override
+    def shown(self) -> View:
+        return View(
+            steps=tuple(self._step_view(self._record.of(name)) for name in STEPS),
+            unit=self._unit,
+            curves=self._curves,
+        )
+
+    @override
+    async def refresh(self) -> None:
+        self._seen = self._outside()
+        config = load_config(self._config)
+        self._tuning = offered(config, self._axis)
+        self._record = records.read(records.file_of(self._config, config.rig, self._axis), config.rig, self._axis)
+        if config.rig in self._rigs.names:
+            await self._opened(self._visitor)
+
+    @override
+    def is_stale(self) -> bool:
+        return self._outside() != self._seen
+
+    @override
+    async def carry_out(self, begun: FromPage) -> None:
+        if begun.begin not in STEPS:
+            raise UnknownVerb(f"there is no step {begun.begin!r}", value=begun.begin)
+        checklist = await self._opened(begun.by.strip() or self._visitor)
+        walk = Walk(checklist, self.person, str(self._config), lambda kept: self._keep(checklist, kept))
+        await walk.put_back_gains()
+        possible = checklist.record.of(begun.begin).result.state is not StepState.NOT_POSSIBLE
+        if begun.begin == TUNING and self._tuning and possible:
+            await self._tune(self._tuning, checklist, walk)
+        else:
+            await walk.one(begun.begin)
+
+    async def _opened(self, by: str) -> Checklist:
+        """Return the checklist as it is now, compared with drive and file."""
+        client = self._rigs.client(load_config(self._config).rig)
+        rig = Rig(client, await client.daemon())
+        checklist = Checklist(rig, self._config, self._axis, self.person, by=by)
+        await checklist.refresh()
+        self._record = checklist.record
+        return checklist
+
+    def _keep(self, checklist: Checklist, kept: StepRecord) -> None:
+        self._record = checklist.record
+        self.person.tell(kept.result.text)
+
+    async def _tune(self, offer: OfferedTuning, checklist: Checklist, walk: Walk) -> None:
+        """Tune the axis, keep the result as that of the step, and offer its gains for the configuration."""
+        tuning = await offer.tune(self._rigs.client(self._record.rig), self.person, self._axis)
+        if tuning is None:
+            return
+        self._curves, self._unit = tuning.curves, tuning.unit
+        if tuning.result:
+            self._keep(checklist, await checklist.settle(TUNING, tuning.result))
+            await walk.offer(TUNING)
+
+    def _outside(self) -> object:
+        """Return what tells when file or daemon have changed."""
+        changed_ns = self._config.stat().st_mtime_ns if self._config.exists() else 0
+        return changed_ns, {rig: self._rigs.instance(rig) for rig in self._rigs.names}
+
+    def _step_view(self, kept: StepRecord) -> StepView:
+        step, result = STEPS[kept.step], kept.result
+        tuning = self._tuning
+        impossible = result.state is StepState.NOT_POSSIBLE
+        return StepView(
+            name=kept.step,
+            title=step.title,
+            about=tuning.about if tuning and kept.step == TUNING and not impossible else step.about,
+            state=result.state.value.replace("_", " "),
+            text=kept.reopened or result.text,
+            at=kept.at,
+            by=kept.by,
+            obstacle=result.text if impossible else "",
+        )

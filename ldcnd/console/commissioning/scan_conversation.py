@@ -1,0 +1,88 @@
+"""The search for drives on a page: what `ldcnd scan` finds on a port, and a configuration begun with it."""
+
+import difflib
+from pathlib import Path
+
+from typing_extensions import override
+
+from ldcnd.bench.begun import SCANNED, begun_with, scan_port, write
+from ldcnd.console.commissioning.conversation import Conversation
+from ldcnd.console.commissioning.messages import FromPage, View
+from ldcnd.contract.errors import UnknownVerb
+from ldcnd.contract.health import Finding
+from ldcnd.drives.family import ScannedDrive
+from ldcnd.line.adapter import ports
+
+SCAN = "scan"
+ANY = "any"
+CONSENT = (
+    "no drive has an address: reset the line and give addresses? That is done only where nothing can be moving; the"
+    " motors lose their positions"
+)
+
+
+class ScanConversation(Conversation):
+    """One page that looks for drives; only a port that no daemon has is opened.
+
+    Args:
+        config: the configuration that is begun, or added to.
+    """
+
+    def __init__(self, config: Path) -> None:
+        super().__init__()
+        self._config = config
+
+    @override
+    def shown(self) -> View:
+        return View()
+
+    @override
+    async def refresh(self) -> None:
+        """Nothing: all that it shows is what was said."""
+
+    @override
+    def is_stale(self) -> bool:
+        return False
+
+    @override
+    async def carry_out(self, begun: FromPage) -> None:
+        if begun.begin != SCAN:
+            raise UnknownVerb(f"there is no {begun.begin!r} here", value=begun.begin)
+        person = self.person
+        port = ""
+        while not port:
+            port = await person.pick("on which port", ports())
+        families = {**{name: f"{name} drives" for name in SCANNED}, ANY: "not known: search for all of them"}
+        wanted = await person.choose("which drives", families)
+        names = list(SCANNED) if wanted == ANY else [wanted]
+        for give_addresses in (False, True):
+            if give_addresses and not await person.confirm(CONSENT):
+                return
+            for name in names:
+                if drives := await self._found(name, port, give_addresses=give_addresses):
+                    await self._offer(name, port, drives)
+                    return
+        person.tell("no drive was found: the lines above say what to check")
+
+    async def _found(self, name: str, port: str, *, give_addresses: bool) -> list[ScannedDrive]:
+        self.person.tell(f"searching for {name} drives on {port}: 10 to 20 seconds")
+        drives = await scan_port(SCANNED[name], port, self._show, give_addresses=give_addresses)
+        return list(drives)
+
+    def _show(self, finding: Finding) -> None:
+        self.person.tell(f"{finding.axis} {finding.what}: {finding.text}")
+        if finding.remedy:
+            self.person.tell(f"    {finding.remedy}")
+
+    async def _offer(self, name: str, port: str, drives: list[ScannedDrive]) -> None:
+        """Show the configuration with these drives in it, and write it if the person agrees."""
+        begun = begun_with(self._config, name, port, drives)
+        self.person.tell(*begun.remarks[:-1])
+        if begun.before == begun.text:
+            self.person.tell(f"{self._config} has all of them")
+            return
+        file = str(self._config)
+        before, after = begun.before.splitlines(), begun.text.splitlines()
+        if await self.person.approve(file, list(difflib.unified_diff(before, after, file, file, lineterm="", n=2))):
+            write(begun)
+            self.person.tell(f"{file} is written: {len(drives)} drives. Start its daemon with the command on this page")

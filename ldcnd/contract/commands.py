@@ -1,0 +1,757 @@
+"""The commands of an axis: one class for each command, and the base classes that they share.
+
+A command is sent as the payload of a query on `@cmd/<axis>/<verb>`, or on `@cmd/_/<verb>` when it is about the rig. Its
+class is the only definition: keys, schemas, time-outs, access rules and the tables of the command line, the console
+and the documentation are derived from its attributes. Commands about parameters, traces and events are defined beside
+their replies; `ldcnd.contract.catalogue` has them all.
+"""
+
+from enum import StrEnum
+from functools import cache
+from types import GenericAlias
+from typing import TYPE_CHECKING, ClassVar, Generic, Literal, TypeVar, get_args
+
+from pydantic import ConfigDict, Field
+
+from ldcnd.contract.errors import ErrorCode
+from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
+from ldcnd.contract.samples import MOST_SHADOW_FIGURES, ShadowFigure
+
+LATEST_NS = 2**63 - 1
+"""The latest instant that every encoding takes, UTC in ns since 1970."""
+LONGEST_NAME = 64
+"""Longest name or id that a client may give, in characters."""
+ANSWER_S = 5.0
+"""Longest wait of a client for the reply to a command that is a few exchanges with its drive, in seconds."""
+REPLAYED_WITHIN_S = 3600.0
+"""Time for which a command id is remembered after the command has arrived, in seconds."""
+
+
+class Verb(StrEnum):
+    """The commands of an axis and the last chunks of their keys; a drive without the capability: not_supported."""
+
+    POWER = "power"
+    MOVE_ABSOLUTE = "move_absolute"
+    MOVE_RELATIVE = "move_relative"
+    MOVE_VELOCITY = "move_velocity"
+    JOG = "jog"
+    HALT = "halt"
+    STOP = "stop"
+    QUICK_STOP = "quick_stop"
+    HOME = "home"
+    PROBE = "probe"
+    RESET = "reset"
+    SET_POSITION = "set_position"
+    SET_GAINS = "set_gains"
+    LIST_PARAMETERS = "list_parameters"
+    READ_PARAMETER = "read_parameter"
+    READ_ALL_PARAMETERS = "read_all_parameters"
+    WRITE_PARAMETER = "write_parameter"
+    CLEAR_COUNTER = "clear_counter"
+    RESTART_EEPROM_COUNT = "restart_eeprom_count"
+    READ_ALARMS = "read_alarms"
+    READ_PROFILE = "read_profile"
+    READ_MONITORS = "read_monitors"
+    PLAN_PARAMETERS = "plan_parameters"
+    MOVE_ANALOG = "move_analog"
+    SET_PWM = "set_pwm"
+    TRACK = "track"
+    SET_OUTPUTS = "set_outputs"
+    TRACE = "trace"
+    TRACE_ABORT = "trace_abort"
+
+
+class About(StrEnum):
+    """Target of a command: an axis, or the rig as a whole."""
+
+    AXIS = "axis"
+    RIG = "rig"
+
+
+class Effect(StrEnum):
+    """Effect of a command on the rig."""
+
+    QUESTION = "question"
+    """Changes nothing: it needs no lease and leaves no event."""
+    REST = "rest"
+    """Brings an axis to rest: it needs no lease, is never late, and is carried out as often as it is sent."""
+    MOTION = "motion"
+    """May make an axis move: it is carried out at most once for each command id."""
+    CHANGE = "change"
+    """Changes something else: it is carried out at most once for each command id."""
+
+
+class Ends(StrEnum):
+    """When a command is over."""
+
+    WITH_REPLY = "with_reply"
+    """With its reply: the drive has acknowledged it and nothing is left to do."""
+    BY_READING = "by_reading"
+    """When a later reading of the drive shows it, such as a move that has settled."""
+
+
+class Capability(StrEnum):
+    """Function of a drive that a command needs."""
+
+    MOTION = "motion"
+    """A position loop that takes commands over its line."""
+    PARAMETERS = "parameters"
+    """Parameters that can be read over its line."""
+    TRACES = "traces"
+    """Values that can be polled."""
+
+
+class Role(StrEnum):
+    """Permissions of a login."""
+
+    VIEWER = "viewer"
+    """Reads everything, and may stop."""
+    OPERATOR = "operator"
+    """Reads, stops and commands."""
+    DAEMON = "daemon"
+    """Serves a rig; listens."""
+    ROUTER = "router"
+    """Carries messages between the others, and keeps viewers and operators apart; listens."""
+
+
+ReplyT_co = TypeVar("ReplyT_co", bound=Frozen, covariant=True)
+
+
+def _schema_title(command: type) -> str:
+    """Return the title of a command's schema: `MoveAbsoluteRequest` for `move_absolute`."""
+    verb = getattr(command, "verb", None)
+    return command.__name__ if verb is None else "".join(map(str.capitalize, verb.split("_"))) + "Request"
+
+
+class Command(Frozen, Generic[ReplyT_co]):
+    """The base of all commands, generic in the type of the reply.
+
+    Attributes:
+        verb: last chunk of its key.
+        about: whether it names an axis.
+        effect: what it does to the rig.
+        needs_lease: where leases are required, it is refused without one.
+        ends: when it is over.
+        answer_s: longest wait of a client for its reply, in seconds.
+        role: the lowest role of a login that may send it.
+    """
+
+    model_config = ConfigDict(model_title_generator=_schema_title)
+
+    verb: ClassVar[str]
+    about: ClassVar[About]
+    effect: ClassVar[Effect] = Effect.CHANGE
+    needs_lease: ClassVar[bool] = False
+    ends: ClassVar[Ends] = Ends.WITH_REPLY
+    answer_s: ClassVar[float] = ANSWER_S
+    role: ClassVar[Role] = Role.OPERATOR
+
+    if not TYPE_CHECKING:  # the reply is no part of the fields: pydantic need not make a model for each
+
+        def __class_getitem__(cls, reply: object) -> GenericAlias:
+            """Return the class with the type of its reply."""
+            return GenericAlias(cls, reply)
+
+    @classmethod
+    def reply_model(cls) -> type[ReplyT_co]:
+        """Return the type of the command's reply."""
+        return _reply_model(cls)
+
+    @classmethod
+    def summary(cls) -> str:
+        """Return the first line of the class's docstring."""
+        return (cls.__doc__ or "").strip().partition("\n")[0]
+
+
+@cache
+def _reply_model(command: type[Command[ReplyT_co]]) -> type[ReplyT_co]:
+    for base in command.__mro__:
+        for generic in vars(base).get("__orig_bases__", ()):
+            for reply in get_args(generic):
+                if isinstance(reply, type):
+                    return reply
+    raise TypeError(f"{command.__name__} does not say what it is answered with")
+
+
+class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
+    """The base of commands to one axis, with the fields that prove permission and prevent a second execution.
+
+    Attributes:
+        capability: function of a drive that it needs.
+    """
+
+    about: ClassVar[About] = About.AXIS
+    needs_lease: ClassVar[bool] = True
+    capability: ClassVar[Capability] = Capability.MOTION
+    verb: ClassVar[Verb]
+
+    command_id: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
+    """Names the command; the same id is carried out at most once and answered alike. Given by the daemon if missing.
+    Remembered for an hour, and under a lease with a sequence for as long as the daemon runs; what may be delivered
+    later than that carries `not_after` or `instance`."""
+    client: str | None = Field(default=None, max_length=LONGEST_NAME)
+    """Sender: a name for people, in events and the log; not authenticated. A lease has its own."""
+    lease: str | None = None
+    """The lease under which it is sent."""
+    sequence: int | None = Field(default=None, ge=0, le=LARGEST_INTEGER)
+    """Grows with every command under the lease; an older one that comes later is refused."""
+    instance: str | None = None
+    """The run of the daemon for which it is meant, as in `meta/daemon`. A restart discards all command ids; with this
+    field a command that is sent again after a restart is refused instead of being carried out twice."""
+    not_after: int | None = Field(default=None, ge=0, le=LATEST_NS)
+    """Do not start it after this instant, UTC in ns since 1970; needs clocks that agree."""
+
+
+class CommandReply(Frozen):
+    """The drive acknowledged the command, or it waits for another one to end.
+
+    Values are those requested, as rounded by the drive's registers.
+    """
+
+    command_id: str
+    """Names the command in `state`, in events and in the log."""
+    status: Literal["accepted"] = "accepted"
+    """Accepted: acknowledged by the drive, or waiting as `waits_for` says; not yet complete."""
+    waits_for: str | None = None
+    """The command that must end before this one begins, by id; its planned values are not known before. An event says
+    when it begins, or why it does not. Null when the drive has acknowledged it."""
+    axis: str
+    """The axis."""
+    verb: str
+    """The command."""
+    position: float | None = None
+    """Target in axis units."""
+    velocity: float | None = None
+    """Velocity in axis units a second."""
+    acceleration: float | None = None
+    """Acceleration in axis units a second squared."""
+    duration_s: float | None = Field(default=None, ge=0)
+    """How long the profile takes, without settling; for set_pwm how long the duty stays on."""
+    target: int | None = None
+    """Target in A/D counts, for an analog move."""
+    duty: float | None = None
+    """Duty as the drive's register makes it, -1 to 1."""
+    since: int | None = None
+    """When the motion was accepted, as in the command of `state`; null for a command that begins none."""
+
+
+class StopReply(Frozen):
+    """The stop was sent; which axes confirmed it by the time of this answer."""
+
+    status: Literal["stopping"] = "stopping"
+    """Stopping: latched, nothing moves again before reset."""
+    axes: tuple[str, ...]
+    """The axes concerned."""
+    confirmed: tuple[str, ...]
+    """The axes whose drives acknowledged the stop."""
+
+
+class RemedyStep(Frozen):
+    """A command that a remedy names, so that it can be said as what is typed or pressed."""
+
+    verb: str
+    """The command."""
+    said: str
+    """The words of the remedy that name it."""
+    arguments: dict[str, bool | float | str] = Field(default_factory=dict)
+    """The arguments of the command."""
+
+
+class ReceivedError(Frozen):
+    """Why a query was not carried out, as a client reads it: a newer daemon may have more codes."""
+
+    code: str = Field(description="what went wrong")
+    message: str = Field(description="one sentence for a person: what, to whom, which value, which limit")
+    retryable: bool = Field(description="the same request may be sent again without harm and may then succeed")
+    axis: str | None = Field(default=None, description="the axis concerned")
+    value: float | str | None = Field(default=None, description="the offending value, in the unit that the caller used")
+    limit: float | str | None = Field(default=None, description="the limit that the value broke")
+    nearest: float | None = Field(default=None, description="the closest value that would be accepted")
+    remedy: str | None = Field(default=None, description="what to do about it")
+    steps: tuple[RemedyStep, ...] = Field(default=(), description="the commands that the remedy names, in their order")
+    page: str | None = Field(default=None, description="where its page is, below a console or the documentation")
+
+
+class ErrorReply(ReceivedError):
+    """Why a query was not carried out; sent as JSON in an error reply, whatever the query's encoding."""
+
+    code: ErrorCode = Field(description="what went wrong, out of a closed list")
+
+
+# -- motion ----------------------------------------------------------------------------------------------------------
+
+
+class Power(AxisCommand[CommandReply]):
+    """Close or open the position loop; nothing moves."""
+
+    verb = Verb.POWER
+
+    on: bool
+    """True closes the loop at the present position, false opens it and disables the amplifier."""
+
+
+class BufferMode(StrEnum):
+    """Effect of a move on an axis that moves already; PLCopen's buffer modes, and a refusal."""
+
+    REFUSE = "refuse"
+    """The move is refused: the sender was not aware of the motion under way."""
+    ABORTING = "aborting"
+    """The command under way ends as aborted. The axis is halted first, but for a PIC-SERVO SC on a move or jog: that
+    drive goes on to the new goal within the new velocity and acceleration, without a halt."""
+    BUFFERED = "buffered"
+    """The move waits until the command under way has ended. It is answered at once, with the command it waits for; a
+    halt or a stop withdraws it."""
+
+
+class Move(AxisCommand[CommandReply]):
+    """The base of the moves."""
+
+    effect = Effect.MOTION
+    ends = Ends.BY_READING
+
+    buffer_mode: BufferMode = BufferMode.REFUSE
+    """Effect if the axis moves already."""
+
+
+class Direction(StrEnum):
+    """Which way an axis with a modulo turns to a position; PLCopen's directions."""
+
+    SHORTEST_WAY = "shortest_way"
+    POSITIVE = "positive"
+    NEGATIVE = "negative"
+
+
+class MoveAbsolute(Move):
+    """Move to a position on a trapezoidal profile."""
+
+    verb = Verb.MOVE_ABSOLUTE
+
+    position: float
+    """Target in axis units; on an axis with a modulo any turn of it is meant."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Speed in units a second; the axis default when missing."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+    direction: Direction | None = None
+    """Which way to turn, on an axis with a modulo only; the shortest when missing."""
+
+
+class MoveRelative(Move):
+    """Move by a distance from the commanded position; becomes absolute when it is admitted."""
+
+    verb = Verb.MOVE_RELATIVE
+
+    distance: float
+    """Distance in axis units, signed."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Speed in units a second; the axis default when missing."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+
+
+class MoveVelocity(Move):
+    """Move at a constant velocity until the next command, the software limit, or the axis's `jog_horizon_s`.
+
+    On an axis that jogs already it changes velocity and acceleration on the fly.
+    """
+
+    verb = Verb.MOVE_VELOCITY
+
+    velocity: float
+    """Velocity in units a second, positive forward, not 0."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+
+
+SHORTEST_HOLD_S, LONGEST_HOLD_S = 0.2, 1.0
+"""Bounds of `Jog.hold_s`, in seconds."""
+
+
+class Jog(Move):
+    """Run at a velocity for as long as the client renews the hold; ends by itself when no renewal arrives.
+
+    The first one begins the jog. Later ones that carry its `command_id` in `renews` keep it alive, and may change its
+    velocity; they begin nothing: a jog that is over stays over. `halt` ends it.
+    """
+
+    verb = Verb.JOG
+
+    velocity: float
+    """Velocity in units a second, positive forward, not 0."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+    hold_s: float = Field(default=0.4, ge=SHORTEST_HOLD_S, le=LONGEST_HOLD_S)
+    """Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog."""
+    renews: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
+    """The command id of the jog that goes on; without it a new one begins. A renewal leaves no event."""
+
+
+class Halt(AxisCommand[CommandReply]):
+    """Decelerate to standstill; another command may follow."""
+
+    verb = Verb.HALT
+    effect = Effect.REST
+    needs_lease = False
+    ends = Ends.BY_READING
+
+
+class Stop(AxisCommand[CommandReply]):
+    """Decelerate to standstill and latch: nothing moves again before reset."""
+
+    verb = Verb.STOP
+    effect = Effect.REST
+    needs_lease = False
+
+
+class QuickStop(AxisCommand[CommandReply]):
+    """Stop without a ramp, holding position, and latch: nothing moves again before reset."""
+
+    verb = Verb.QUICK_STOP
+    effect = Effect.REST
+    needs_lease = False
+
+
+class HomeMethod(StrEnum):
+    """Signal that marks the reference position."""
+
+    INDEX = "index"
+    FORWARD_LIMIT = "forward_limit"
+    REVERSE_LIMIT = "reverse_limit"
+    POSITION_ERROR = "position_error"
+    CURRENT = "current"
+
+
+class HomeStop(StrEnum):
+    """How the motor stops when the reference position was found."""
+
+    SMOOTH = "smooth"
+    """Decelerate, then hold."""
+    ABRUPT = "abrupt"
+    """Hold at once."""
+    OFF = "off"
+    """Open the loop: the motor coasts and the axis is disabled afterwards."""
+
+
+class Home(AxisCommand[CommandReply]):
+    """Find the reference position; missing values come from the axis's configuration.
+
+    An axis that stands on the limit switch it is to run onto moves off it first.
+    """
+
+    verb = Verb.HOME
+    effect = Effect.MOTION
+    ends = Ends.BY_READING
+
+    method: HomeMethod | None = None
+    """Signal that marks the reference position."""
+    velocity: float | None = None
+    """Search velocity in units a second, positive forward, not 0. On the index at most 0.75 of an index width in a \
+servo cycle: a faster search is refused with the nearest velocity."""
+    find_velocity: float | None = Field(default=None, gt=0)
+    """Speed at which a limit switch is found first, in units a second; the axis then moves off it and comes back at \
+`velocity` to take the reference over. A missing one, and any other method, searches at `velocity` alone."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared."""
+    position: float | None = None
+    """Value of the reference position, in axis units."""
+    timeout_s: float | None = Field(default=None, gt=0, le=3600)
+    """Longest search, in seconds; moving off a limit switch first counts as a search of its own."""
+    distance: float | None = Field(default=None, gt=0)
+    """Longest search, in axis units; a missing one is as far as the velocity goes in that time."""
+    stop: HomeStop | None = None
+    """How the motor stops there."""
+    move_to: float | None = None
+    """Where to go afterwards, in axis units; a missing one stays where the motor stopped."""
+
+
+class ProbeSource(StrEnum):
+    """Signal that latches the position of a probe."""
+
+    INDEX = "index"
+    FORWARD_LIMIT = "forward_limit"
+    REVERSE_LIMIT = "reverse_limit"
+    CURRENT = "current"
+
+
+class ProbeStop(StrEnum):
+    """How the motor stops when something was latched."""
+
+    SMOOTH = "smooth"
+    """Decelerate, then hold."""
+    ABRUPT = "abrupt"
+    """Hold at once."""
+
+
+class Probe(AxisCommand[CommandReply]):
+    """Move until an input changes and latch the position there; it is published on `latch`, the reference stays.
+
+    Exactly one of position and distance says where the move ends when no input comes; then the command has failed.
+    """
+
+    verb = Verb.PROBE
+    effect = Effect.MOTION
+    ends = Ends.BY_READING
+
+    sources: tuple[ProbeSource, ...] = Field(min_length=1, max_length=4)
+    """Signals that latch: any change of a limit switch input, an index pulse, the current limit; the first counts."""
+    position: float | None = None
+    """Where the move ends at the latest, in axis units; needs a referenced axis."""
+    distance: float | None = None
+    """How far it goes at most, in axis units, signed."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Speed in units a second; the axis default when missing. On the index at most 0.75 of an index width in a servo \
+cycle. The latched position is surer the slower it is."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+    stop: ProbeStop = ProbeStop.SMOOTH
+    """How the motor stops there."""
+
+
+class Reset(AxisCommand[CommandReply]):
+    """Clear the stop latch and the drive's faults; after a drive fault the axis is disabled. Nothing moves."""
+
+    verb = Verb.RESET
+
+    faults_only: bool = False
+    """Clear faults, and no latch: refused while a stop is latched. Programs that go on by themselves send it so."""
+
+
+class SetPosition(AxisCommand[CommandReply]):
+    """Set the position of an axis at standstill; afterwards it is referenced."""
+
+    verb = Verb.SET_POSITION
+
+    position: float
+    """New value of the present position, in axis units."""
+
+
+class SetGains(AxisCommand[CommandReply]):
+    """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are."""
+
+    verb = Verb.SET_GAINS
+
+    kp: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Position gain."""
+    kd: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Velocity gain."""
+    ki: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Integral gain."""
+    il: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Integration limit."""
+    ol: int | None = Field(default=None, ge=0, le=0xFF)
+    """Output limit."""
+    cl: int | None = Field(default=None, ge=0, le=0xFF)
+    """Current limit: 0 is off; odd where the sense voltage rises with the current, even where it falls."""
+    el: int | None = Field(default=None, ge=0, le=0x7FFF)
+    """Position error limit, in counts; at most 16383, PIC-SERVO SC 32767."""
+    deadband: int | None = Field(default=None, ge=0, le=0xFF)
+    """Amplifier deadband compensation."""
+    sr: int | None = Field(default=None, ge=1, le=0xFF)
+    """Servo rate divisor; it changes the unit of velocities in the drive, so only an axis at standstill accepts it."""
+    lent: bool = False
+    """The gains are for a trial: when control of the axis ends in any way, its loop is opened at rest, and the gains of
+    before are loaded again before it closes. It needs a lease."""
+
+
+class MoveAnalog(AxisCommand[CommandReply]):
+    """Move until the analog position sensor reads a value; the drive finds the direction itself."""
+
+    verb = Verb.MOVE_ANALOG
+    effect = Effect.MOTION
+    ends = Ends.BY_READING
+
+    target: int = Field(ge=0, le=LARGEST_INTEGER)
+    """A/D counts, 0 to full scale; the ends of the range mean a broken sensor and are refused."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Speed in units a second; the axis default when missing."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
+    timeout_s: float | None = Field(default=None, gt=0, le=3600)
+    """Longest motion, in seconds; the axis's `analog.timeout_s` when missing. The daemon ends it, not the drive."""
+    distance: float | None = Field(default=None, gt=0)
+    """Longest way from where it begins, in axis units, and the way to stop behind it; the axis's `analog.distance` when
+    missing, and without that as far as the velocity goes in the time. The daemon ends it, not the drive."""
+
+
+class SetPwm(AxisCommand[CommandReply]):
+    """Put a raw duty on the motor, with the position loop open, for a limited time; then the axis stops and holds."""
+
+    verb = Verb.SET_PWM
+    effect = Effect.MOTION
+    ends = Ends.BY_READING
+
+    duty: float = Field(ge=-1, le=1)
+    """Share of the supply voltage, positive forward."""
+    duration_s: float = Field(gt=0)
+    """Duration, in seconds."""
+
+
+class Track(AxisCommand[CommandReply]):
+    """Go to a position at once, without a profile: one set-point of a stream."""
+
+    verb = Verb.TRACK
+    effect = Effect.MOTION
+    ends = Ends.BY_READING
+
+    position: float
+    """Set-point in axis units."""
+
+
+class PinMode(StrEnum):
+    """Use of a limit switch pin."""
+
+    INPUT = "input"
+    HIGH = "high"
+    LOW = "low"
+
+
+class SetOutputs(AxisCommand[CommandReply]):
+    """Use limit switch pins as outputs, or as inputs again; a missing pin stays as it is."""
+
+    verb = Verb.SET_OUTPUTS
+
+    limit1: PinMode | None = None
+    """The pin of limit switch 1 (reverse)."""
+    limit2: PinMode | None = None
+    """The pin of limit switch 2 (forward)."""
+
+
+# -- questions about an axis -----------------------------------------------------------------------------------------
+
+
+class Cause(Frozen):
+    """One thing that forbids a motion."""
+
+    code: str
+    """The error code that a motion would be refused with."""
+    text: str
+    """The obstacle, in one sentence."""
+    remedy: str | None
+    """The command, or the hand, that clears it."""
+    steps: tuple[RemedyStep, ...] = ()
+    """The commands that the remedy names, in their order."""
+    page: str | None = None
+    """Where its page is, below a console or the documentation."""
+
+
+class WhyReply(Frozen):
+    """The causal chain: the reply to `@cmd/<axis>/why`."""
+
+    axis: str
+    """The axis."""
+    can_move: bool
+    """Whether a motion within the limits would be accepted from the sender."""
+    causes: tuple[Cause, ...]
+    """The obstacles, in the order in which they have to be cleared."""
+    first_fault: str | None
+    """The first fault since the last reset; null when there was none."""
+
+
+class Why(Command[WhyReply]):
+    """Report why an axis cannot move."""
+
+    verb = "why"
+    about = About.AXIS
+    effect = Effect.QUESTION
+
+    lease: str | None = None
+    """The lease under which the motion would be sent."""
+    absolute: bool = True
+    """Whether the motion would name a position, which needs a referenced axis."""
+
+
+class PreviewReply(Frozen):
+    """The motion as it would be; nothing was sent: the reply to `@cmd/<axis>/preview`."""
+
+    axis: str
+    """The axis."""
+    refusal: ErrorReply | None
+    """Why its values would be refused, with the nearest that would not; null when they would be accepted."""
+    obstacles: tuple[str, ...]
+    """The other obstacles now; see `why`."""
+    position: float | None = None
+    """Where it would end, in axis units; null when it has no end."""
+    approach_from: float | None = None
+    """Where it would go first, to come to its end from the configured side; null when one motion will do."""
+    velocity: float | None = None
+    """Velocity that the registers would hold, units a second."""
+    velocity_error: float | None = None
+    """Held minus requested velocity, units a second."""
+    acceleration: float | None = None
+    """Acceleration that the registers would hold, units a second squared."""
+    acceleration_error: float | None = None
+    """Held minus requested acceleration, units a second squared."""
+    duration_s: float | None = None
+    """Of the profile, without settling; null when it has no end."""
+    packets: tuple[str, ...] = ()
+    """The packets that would be sent, in hexadecimal."""
+    bus_s: float | None = None
+    """For how long that would occupy the line at most, in seconds."""
+
+
+class Preview(Command[PreviewReply]):
+    """Compute what a motion would do; exactly one of position, distance and velocity alone selects the motion."""
+
+    verb = "preview"
+    about = About.AXIS
+    effect = Effect.QUESTION
+
+    position: float | None = None
+    """A move to this position, in axis units."""
+    direction: Direction | None = None
+    """With a position on an axis with a modulo: which way to turn."""
+    distance: float | None = None
+    """A move by this distance, in axis units."""
+    velocity: float | None = None
+    """Speed of the move; alone: a motion at this velocity, signed. Units a second."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Units a second squared; the axis default when missing."""
+
+
+class ShadowReply(Frozen):
+    """What an observer says was published: the reply to `@cmd/<axis>/report_shadow`."""
+
+    axis: str
+    """The axis."""
+
+
+class ReportShadow(Command[ShadowReply]):
+    """Publish what an observer has found in the motions of an axis, on `tele/<axis>/shadow`; it stops nothing."""
+
+    verb = "report_shadow"
+    about = About.AXIS
+    effect = Effect.QUESTION
+
+    t: int = Field(ge=0, le=LATEST_NS)
+    """Of the last position that the observer has seen, UTC in ns since 1970."""
+    learning: bool
+    """It still learns what is usual."""
+    judged: int = Field(ge=0, le=LARGEST_INTEGER)
+    """Motions that have taught or were judged since the observer began."""
+    figures: tuple[ShadowFigure, ...] = Field(default=(), max_length=MOST_SHADOW_FIGURES)
+    """Those of which enough is known."""
+
+
+COMMANDS: tuple[type[Command[Frozen]], ...] = (
+    Power,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Jog,
+    Halt,
+    Stop,
+    QuickStop,
+    Home,
+    Probe,
+    Reset,
+    SetPosition,
+    SetGains,
+    MoveAnalog,
+    SetPwm,
+    Track,
+    SetOutputs,
+    Why,
+    Preview,
+    ReportShadow,
+)
+"""The commands of this file."""

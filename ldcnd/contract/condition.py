@@ -1,0 +1,418 @@
+"""The condition of an axis: whether its place is known, and all that is to be said of it, in words.
+
+Every face shows what this module decides: command line, console, gateways, metrics, notebooks. None has a rule or a
+sentence of its own; the console's pages get the result from the console's server.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import Enum, IntEnum, StrEnum, auto
+from typing import Protocol
+
+from ldcnd.contract.health import AxisHealth
+from ldcnd.contract.samples import AxisState, CurrentCommand, FaultEntry, LinkState, Moving, Quality, TelemetryItem
+
+ENOUGH = 0.9
+"""Minimum share of the requested rate at which a rate counts as kept."""
+EDGE_HZ = 1.0
+"""A report is about one second, at whose edges it sees a sample more or less."""
+OLD_S = 1.5
+"""Age from which a position is old, seconds, besides `OLD_PERIODS`."""
+OLD_PERIODS = 4
+"""Periods of a position's rate that may pass besides: a poll may be lost or late."""
+FULL_SPEED = 100.0
+"""Speed override at which nothing is slowed, percent."""
+UNKNOWN_HOLDER = ""
+"""Stands for a holder of control of whom this face knows nothing."""
+
+
+class Severity(IntEnum):
+    """The priority of a trouble; the highest is shown first."""
+
+    FINE = 0
+    NOTICE = 1
+    """It works with a reservation: missed polls, a warning, a latched stop."""
+    WRONG = 2
+    """It does not work: a fault, a drive or a line that does not answer."""
+
+
+class Kind(Enum):
+    """The kind of a trouble."""
+
+    UNKNOWN = auto()
+    STOP_PENDING = auto()
+    SILENCE = auto()
+    LINE_DOWN = auto()
+    NO_ANSWER = auto()
+    NOT_IDENTIFIED = auto()
+    FAULT = auto()
+    ERROR_STOP = auto()
+    OLD = auto()
+    REFERENCE_LOST = auto()
+    NOT_HOMED = auto()
+    STOP_LATCHED = auto()
+    UNCOMMANDED = auto()
+    STANDS_BY_OVERRIDE = auto()
+    WARNING = auto()
+    MISSED_POLLS = auto()
+    SLOW = auto()
+    SLOWED = auto()
+    CONTROL = auto()
+
+
+@dataclass(frozen=True, slots=True)
+class Trouble:
+    """One thing that is to be said.
+
+    Attributes:
+        kind: what it is about.
+        severity: its priority.
+        text: what it is, without a name: the axis or the line goes before it.
+        short: the same in a few words, for a cell of a table.
+    """
+
+    kind: Kind
+    severity: Severity
+    text: str
+    short: str
+
+
+class Place(StrEnum):
+    """Whether the position of an axis says where it is."""
+
+    KNOWN = "known"
+    NOT_HOMED = "not_homed"
+    """It was never homed, or has lost its reference: the number says by how much it moved at best."""
+    OLD = "old"
+    """Nothing newer came."""
+    NOT_ANSWERING = "not_answering"
+    """The drive, its line or its daemon does not answer, or something else answers in its place."""
+    CONTRADICTED = "contradicted"
+    """The drive answers, and its readings cannot be true."""
+
+
+class Alarm(IntEnum):
+    """Severity of a condition, as alarm systems count it."""
+
+    NONE = 0
+    MINOR = 1
+    MAJOR = 2
+    INVALID = 3
+    """The values are not to be believed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """The condition of an axis.
+
+    Attributes:
+        place: whether its position says where it is.
+        mark: what goes beside the number where it does not, in a few words; empty where it does.
+        state: the state in a word, for people.
+        live: state and velocity are to be believed.
+        alarm: how bad it is.
+        troubles: everything that is to be said, the worst first.
+    """
+
+    place: Place
+    mark: str
+    state: str
+    live: bool
+    alarm: Alarm
+    troubles: tuple["Trouble", ...]
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Everything that is to be said, in a few words each."""
+        return tuple(trouble.short for trouble in self.troubles)
+
+    @property
+    def summary(self) -> str:
+        """The state and everything that is to be said besides, in one line."""
+        return ", ".join((self.state, *self.notes))
+
+    @property
+    def wrong(self) -> tuple["Trouble", ...]:
+        """What deserves attention."""
+        return tuple(trouble for trouble in self.troubles if trouble.severity is not Severity.FINE)
+
+    def position(self, number: str | None, unit: str, age_s: float | None = None) -> str:
+        """Return a position for people: in brackets and with its mark where it does not say where the axis is.
+
+        Args:
+            number: its digits; None before the first position.
+            unit: the axis unit.
+            age_s: its age, which is named where it matters; None when it is not known.
+        """
+        if number is None:
+            return f"? {self.mark}".rstrip()
+        if self.place is Place.KNOWN:
+            return f"{number} {unit}"
+        age = f", {age_s:.0f} s old" if age_s is not None and self.place in _AGED else ""
+        return f"({number}) {unit} {self.mark}{age}"
+
+
+_AGED = frozenset({Place.OLD, Place.NOT_ANSWERING, Place.CONTRADICTED})
+STATE_WORDS = {
+    AxisState.DISCRETE_MOTION: "moving",
+    AxisState.CONTINUOUS_MOTION: "running",
+    AxisState.ERROR_STOP: "error stop",
+}
+
+
+class State(Protocol):
+    """The known state of an axis: a state sample, or the daemon's own knowledge."""
+
+    @property
+    def quality(self) -> Quality:
+        """How much its values are worth."""
+
+    @property
+    def link(self) -> LinkState:
+        """Whether the drive answers."""
+
+    @property
+    def state(self) -> AxisState:
+        """PLCopen state."""
+
+    @property
+    def moving(self) -> Moving:
+        """Whether it moves."""
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether it can be referenced at all."""
+
+    @property
+    def referenced(self) -> bool:
+        """The position is valid."""
+
+    @property
+    def reference_lost(self) -> bool:
+        """It was, and is not any more."""
+
+    @property
+    def stop_latched(self) -> bool:
+        """A stop is latched."""
+
+    @property
+    def stop_pending(self) -> bool:
+        """The drive has not confirmed a stop."""
+
+    @property
+    def command(self) -> "CurrentCommand | object | None":
+        """The command under way."""
+
+    @property
+    def last_error(self) -> str | None:
+        """How the last command ended, other than done."""
+
+    @property
+    def speed_override(self) -> float:
+        """Percent of every velocity."""
+
+
+class Faults(Protocol):
+    """The faults of an axis: a fault sample, or the daemon's own knowledge."""
+
+    @property
+    def active(self) -> Sequence[FaultEntry]:
+        """Those that are active now."""
+
+    @property
+    def first(self) -> FaultEntry | None:
+        """The one that came first."""
+
+
+_WRONG, _NOTICE, _FINE = Severity.WRONG, Severity.NOTICE, Severity.FINE
+_NOT_CONFIRMED = Trouble(
+    Kind.STOP_PENDING,
+    _WRONG,
+    "a stop is NOT confirmed by the drive: use the machine's emergency stop",
+    "stop NOT CONFIRMED by the drive",
+)
+_NO_ANSWER = Trouble(Kind.NO_ANSWER, _WRONG, "the drive does not answer", "no answer")
+_ON_DEAD_LINE = Trouble(Kind.LINE_DOWN, _WRONG, "the line is not up", "line down")
+_NOT_IDENTIFIED = Trouble(
+    Kind.NOT_IDENTIFIED,
+    _WRONG,
+    "what answers is not known to be its drive: only what stops it is sent",
+    "not identified",
+)
+_NEVER_SEEN = Trouble(Kind.UNKNOWN, _NOTICE, "nothing was received from it yet", "nothing received")
+_OLD = Trouble(Kind.OLD, _WRONG, "its position is old: nothing newer came", "old")
+_REFERENCE_LOST = Trouble(
+    Kind.REFERENCE_LOST,
+    _WRONG,
+    "has lost its reference: its position is not known before it is homed",
+    "reference lost",
+)
+_NOT_HOMED = Trouble(Kind.NOT_HOMED, _NOTICE, "not homed: its position is not known", "not homed")
+_HOMING = Trouble(Kind.NOT_HOMED, _NOTICE, "it is being homed: its position is not known yet", "homing")
+_LATCHED = Trouble(Kind.STOP_LATCHED, _NOTICE, "a stop is latched: nothing moves before reset", "stop latched")
+_UNCOMMANDED = Trouble(Kind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command")
+_OVERRIDE_ZERO = Trouble(
+    Kind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: nothing moves", "speed override 0 %"
+)
+_MISSED_POLLS = Trouble(Kind.MISSED_POLLS, _NOTICE, "the drive missed its latest polls", "missed polls")
+SHARED = frozenset({Kind.SILENCE, Kind.NOT_HOMED, Kind.STANDS_BY_OVERRIDE})
+"""Troubles of which several axes have one cause, or which are said once for all; so is a line that is down."""
+_MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
+"""Faults whose name says best why the position is lost."""
+_AT_REST = frozenset({AxisState.DISABLED, AxisState.STANDSTILL, AxisState.ERROR_STOP})
+
+
+def line_troubles(*, up: bool, problem: str = "") -> tuple[Trouble, ...]:
+    """Return what is wrong with a line; empty when it is up.
+
+    Args:
+        up: whether its drives are polled.
+        problem: why it is not up; empty when that is not known.
+    """
+    text = f"{_ON_DEAD_LINE.text}: {problem}" if problem else _ON_DEAD_LINE.text
+    return () if up else (Trouble(Kind.LINE_DOWN, _WRONG, text, _ON_DEAD_LINE.short),)
+
+
+def assess(
+    state: State | None,
+    faults: Faults | None = None,
+    health: AxisHealth | None = None,
+    *,
+    age_s: float | None = None,
+    line_up: bool = True,
+    silence: str = "",
+    holder: str | None = UNKNOWN_HOLDER,
+) -> Condition:
+    """Return the condition of an axis.
+
+    Of an axis that does not answer nothing else is said but a stop that it has not confirmed: what was known of it may
+    be over. How its last command ended is an event, not a state: it is given only where it explains an error stop.
+
+    Args:
+        state: its last state; None before the first.
+        faults: its last faults; None when they are not known.
+        health: its last report; None when there is none.
+        age_s: age of its position, seconds; None where the face cannot tell.
+        line_up: its line is up, as far as the face knows.
+        silence: why nothing comes from its daemon; empty while it reports.
+        holder: who controls it; None when no client does, `UNKNOWN_HOLDER` where the face does not know.
+    """
+    if state is None:
+        lost = (_silent(silence),) if silence else () if line_up else (_ON_DEAD_LINE,)
+        return _unanswered("unknown", lost or (_NEVER_SEEN,), lost[0].short if lost else "no data")
+    word = state_word(state.state)
+    gone = _unreachable(state, faults, silence=silence, line_up=line_up)
+    pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
+    if gone:
+        return _unanswered(f"unknown, was {word}", (*pending, gone), gone.short)
+    place, mark = _place(state, faults, is_old=_is_old(age_s, health))
+    troubles = (*pending, *_found(state, faults, health, place), *_beside(state, holder))
+    worst = max((trouble.severity for trouble in troubles), default=_FINE)
+    alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
+    return Condition(place, mark, word, place is not Place.OLD, alarm, troubles)
+
+
+def state_word(state: AxisState) -> str:
+    """Return a state in a word."""
+    return STATE_WORDS.get(state, state.value.replace("_", " "))
+
+
+def _unanswered(state: str, troubles: tuple[Trouble, ...], mark: str) -> Condition:
+    return Condition(Place.NOT_ANSWERING, mark, state, live=False, alarm=Alarm.INVALID, troubles=troubles)
+
+
+def _silent(why: str) -> Trouble:
+    return Trouble(Kind.SILENCE, _WRONG, why, "daemon silent")
+
+
+def _unreachable(state: State, faults: Faults | None, *, silence: str, line_up: bool) -> Trouble | None:
+    """Return why nothing is known of an axis; None when it answers."""
+    if silence:
+        return _silent(silence)
+    if faults and any(fault.code == "not_identified" for fault in faults.active):
+        return _NOT_IDENTIFIED
+    if state.link is not LinkState.DOWN:
+        return None  # a report on its line may be a second older than this
+    return _NO_ANSWER if line_up else _ON_DEAD_LINE
+
+
+def _is_old(age_s: float | None, health: AxisHealth | None) -> bool:
+    rate_hz = (health.rate_wanted_hz if health else 0.0) or 1.0
+    return age_s is not None and age_s > OLD_S + OLD_PERIODS / rate_hz
+
+
+def _place(state: State, faults: Faults | None, *, is_old: bool) -> tuple[Place, str]:
+    """Return whether the position of an axis that answers says where it is, and its mark."""
+    if state.link is LinkState.UP and state.quality is Quality.UNCERTAIN:
+        codes = [fault.code for fault in faults.active if fault.code in _MARKING_FAULTS] if faults else []
+        return Place.CONTRADICTED, _words(codes[0]) if codes else "position lost"
+    if is_old:
+        return Place.OLD, _OLD.short
+    if state.referenced or not state.has_reference:
+        return Place.KNOWN, ""
+    if state.state is AxisState.HOMING:
+        return Place.NOT_HOMED, _HOMING.short
+    return Place.NOT_HOMED, _REFERENCE_LOST.short if state.reference_lost else _NOT_HOMED.short
+
+
+def _found(state: State, faults: Faults | None, health: AxisHealth | None, place: Place) -> tuple[Trouble, ...]:
+    """Return what deserves attention on an axis that answers."""
+    entries = _first_cause_first(faults) if faults else []
+    found = [_of_fault(entry, Kind.FAULT, _WRONG) for entry in entries if entry.stops]
+    if state.state is AxisState.ERROR_STOP and not found:
+        text = f"in error stop: {state.last_error or 'reset it to go on'}"
+        found.append(Trouble(Kind.ERROR_STOP, _WRONG, text, "error stop"))
+    if place is Place.OLD:
+        found.append(_OLD)
+    if state.has_reference and not state.referenced and place is not Place.CONTRADICTED:  # that is its cause
+        lost = _REFERENCE_LOST if state.reference_lost else _NOT_HOMED
+        found.append(_HOMING if state.state is AxisState.HOMING else lost)
+    if state.stop_latched and not state.stop_pending:
+        found.append(_LATCHED)
+    if state.moving is Moving.YES and state.command is None and state.state in _AT_REST:
+        found.append(_UNCOMMANDED)
+    if not state.speed_override:
+        found.append(_OVERRIDE_ZERO)
+    found += [_of_fault(entry, Kind.WARNING, _NOTICE) for entry in entries if not entry.stops]
+    if state.link is LinkState.DEGRADED:
+        found.append(_MISSED_POLLS)
+    elif health:
+        found += _slowness(health)
+    return tuple(sorted(found, key=lambda trouble: -trouble.severity))
+
+
+def _beside(state: State, holder: str | None) -> tuple[Trouble, ...]:
+    """Return what is to be known and is not wrong."""
+    said = []
+    if 0 < state.speed_override < FULL_SPEED:
+        short = f"speed override {state.speed_override:g} %"
+        said.append(Trouble(Kind.SLOWED, _FINE, f"{short} of every velocity", short))
+    if holder is None:
+        said.append(Trouble(Kind.CONTROL, _FINE, "no client controls it", "not controlled"))
+    elif holder:
+        moves = "moved" if state.moving is Moving.YES else "controlled"
+        said.append(Trouble(Kind.CONTROL, _FINE, f"{moves} by {holder}", f"{moves} by {holder}"))
+    return tuple(said)
+
+
+def _first_cause_first(faults: Faults) -> list[FaultEntry]:
+    first = faults.first.code if faults.first else None
+    return sorted(faults.active, key=lambda entry: entry.code != first)
+
+
+def _of_fault(entry: FaultEntry, kind: Kind, severity: Severity) -> Trouble:
+    return Trouble(kind, severity, f"{entry.code}: {entry.text}", _words(entry.code))
+
+
+def _words(code: str) -> str:
+    return code.replace("_", " ")
+
+
+def _slowness(health: AxisHealth) -> list[Trouble]:
+    """Compare the rate of positions with the configured one."""
+    asked = {item.item: item.asked_hz for item in health.items}
+    wanted_hz = asked.get(TelemetryItem.POSITION, health.rate_wanted_hz)
+    if health.rate_hz + EDGE_HZ >= ENOUGH * wanted_hz:
+        return []
+    text = f"fewer samples a second than asked for: {health.rate_hz:.1f} of {wanted_hz:.1f}"
+    return [Trouble(Kind.SLOW, _NOTICE, text, "slow")]

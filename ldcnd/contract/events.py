@@ -1,0 +1,147 @@
+"""Events of commands: who moved what, when, with which result."""
+
+from enum import StrEnum
+
+from pydantic import Field
+
+from ldcnd.contract.commands import About, Command, Effect
+from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
+
+ALARM_HISTORY = "alarm_history"
+"""The verb of an event that no command has caused: a drive has entered an alarm in its own history."""
+REFERENCE = "reference"
+"""The verb of an event of the start: the reference that an earlier daemon has kept holds, or was refused."""
+DRIVE_CHANGED = "drive_changed"
+"""The verb of an event that no command has caused: a drive was reset, or changed by another program."""
+UNSETTLED = "unsettled"
+"""The verb of an event beside that of a motion that did not settle in its time."""
+
+
+class CommandStatus(StrEnum):
+    """How far a command has got; the last five are final."""
+
+    ACCEPTED = "accepted"
+    """Admitted: not refused yet."""
+    EXECUTING = "executing"
+    """The drive acknowledged it."""
+    DONE = "done"
+    """It ended as requested."""
+    ABORTED = "aborted"
+    """Another command, a stop or a loss policy ended it early."""
+    REFUSED = "refused"
+    """Nothing was sent to any drive."""
+    FAILED = "failed"
+    """The drive or the line failed."""
+    UNKNOWN = "unknown"
+    """It may or may not have been executed; the outcome is unknown."""
+
+
+FINAL = frozenset(
+    {
+        CommandStatus.DONE,
+        CommandStatus.ABORTED,
+        CommandStatus.REFUSED,
+        CommandStatus.FAILED,
+        CommandStatus.UNKNOWN,
+    }
+)
+
+
+class CommandEvent(Frozen):
+    """A command got further: published on `tele/<axis>/event`."""
+
+    t: int
+    """When, UTC in ns since 1970; published up to 5 ms later."""
+    seq: int = Field(ge=0)
+    """Grows by one with every event of the axis."""
+    run: str
+    """The run of the daemon, as in `meta/daemon`: with another one, numbers restart."""
+    number: int = Field(ge=0)
+    """Grows by one with every event of the rig: a gap is filled by a request for what is missing."""
+    axis: str
+    """The axis."""
+    command_id: str
+    """Which command."""
+    verb: str
+    """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
+    motion that did not settle, `reference` for what became of a kept reference, `drive_changed` for a drive that was
+    reset or that another program has changed: these have no request."""
+    client: str | None
+    """The client, as it calls itself; not authenticated."""
+    login: str | None = None
+    """Common name of the certificate of the link that it came over; null behind a router, on links without certificates
+    and when the sender does not say which link is its own: then nothing about it is authenticated."""
+    status: CommandStatus
+    """How far it has got."""
+    reason: str | None = None
+    """Why, when it did not end as requested."""
+    code: str | None = None
+    """The error code, when there is one."""
+    position: float | None = None
+    """Where the axis was at the end of a motion, in axis units, measured after it; null where none was measured."""
+    following_error: float | None = None
+    """Target minus that position, in axis units; without a target what the drive reports, null where it does not."""
+    settled: bool | None = None
+    """Whether the axis came to rest within its window around the target in time; null for what has no target."""
+
+
+class CommandOutcome(Frozen):
+    """The outcome of a command: the reply to `@cmd/_/outcome`."""
+
+    command_id: str
+    """Which command."""
+    axis: str
+    """The axis."""
+    verb: str
+    """The verb of the command."""
+    status: CommandStatus
+    """How far it has got."""
+    reason: str | None
+    """Why, when it did not end as requested."""
+    position: float | None = None
+    """As in the event of its end."""
+    following_error: float | None = None
+    """As in the event of its end."""
+    settled: bool | None = None
+    """As in the event of its end."""
+
+
+class EventList(Frozen):
+    """Events, oldest first: the reply to `@cmd/_/events`."""
+
+    run: str
+    """The run of the daemon that they are of."""
+    first_number: int = Field(ge=0)
+    """From here on nothing was left out; above the requested number when that was discarded."""
+    next_number: int = Field(ge=0)
+    """First number of the next request."""
+    end_number: int = Field(ge=0)
+    """The number of the event that comes next."""
+    events: tuple[CommandEvent, ...]
+    """The events."""
+
+
+class ReadOutcome(Command[CommandOutcome]):
+    """Query the outcome of a command."""
+
+    verb = "outcome"
+    about = About.RIG
+    effect = Effect.QUESTION
+
+    command_id: str
+    """Which command."""
+
+
+class ReadEvents(Command[EventList]):
+    """Query events: the latest, or those from a number on."""
+
+    verb = "events"
+    about = About.RIG
+    effect = Effect.QUESTION
+
+    axis: str | None = None
+    """Only this axis."""
+    count: int = Field(default=100, ge=1, le=1000)
+    """Maximum number, and never more than one reply takes."""
+    from_number: int | None = Field(default=None, ge=0, le=LARGEST_INTEGER)
+    """The first of these and later ones; the latest when missing."""

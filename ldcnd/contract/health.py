@@ -1,0 +1,172 @@
+"""How well a rig is doing, once a second: what a monitoring system watches."""
+
+from enum import StrEnum
+from typing import Literal
+
+from pydantic import Field
+
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.samples import LinkState
+
+
+class LaneHealth(Frozen):
+    """Waiting exchanges and latency of one lane of a line."""
+
+    lane: Literal["stop", "command", "poll", "background"]
+    """Stops go before commands, commands before polls, background work comes last."""
+    waiting: int = Field(ge=0)
+    """Exchanges that wait now; polls are scheduled, not queued, and never counted here."""
+    exchanges: int = Field(ge=0)
+    """Replies since the daemon started."""
+    p50_s: float = Field(ge=0)
+    """Half of them came within this time after they were queued (polls: after they were due), in seconds."""
+    p99_s: float = Field(ge=0)
+    """The same for 99 %."""
+    longest_s: float = Field(ge=0)
+    """The longest one."""
+    total_s: float = Field(default=0.0, ge=0)
+    """All of them together."""
+    counts: tuple[int, ...] = ()
+    """How many took how long: the first counts those of less than 64 us, each further one those of less than twice the
+    limit before, the last all others."""
+
+
+class ItemHealth(Frozen):
+    """How often one telemetry item comes."""
+
+    item: str
+    """Last chunk of its key."""
+    asked_hz: float = Field(ge=0)
+    """Its polling rate."""
+    granted_hz: float = Field(ge=0)
+    """How often it was published in the last period."""
+
+
+class StopWaitHealth(Frozen):
+    """How long a single stop waits for the line, to its first bit: measured by questions in its place."""
+
+    bound_s: float | None = Field(ge=0)
+    """Upper bound by the plan while no reply is lost; null where the line has no plan."""
+    probes: int = Field(ge=0)
+    """How often it was measured since the daemon started."""
+    p99_s: float = Field(ge=0)
+    """99 % waited no longer."""
+    longest_s: float = Field(ge=0)
+    """The longest one; after a lost reply it may exceed the bound."""
+
+
+class AxisHealth(Frozen):
+    """How fresh an axis's samples are."""
+
+    axis: str
+    """The axis."""
+    link: LinkState
+    """Whether its drive answers."""
+    sample_age_s: float | None = Field(ge=0)
+    """Age of the latest position, in seconds; null before the first."""
+    rate_wanted_hz: float = Field(ge=0)
+    """The configured rate of the position."""
+    rate_hz: float = Field(ge=0)
+    """How often it was published in the last period."""
+    faults: int = Field(ge=0)
+    """Faults that stand now."""
+    items: tuple[ItemHealth, ...] = ()
+    """Its polled items; empty for a drive family that paces itself."""
+    eeprom_writes: int | None = Field(default=None, ge=0)
+    """How often its drive's EEPROM was written, ever; null for drives without one and where no ledger is kept."""
+
+
+class BusHealth(Frozen):
+    """One line and its axes: published each second on `meta/health/<bus>`."""
+
+    t: int
+    """When, UTC in ns since 1970."""
+    seq: int = Field(ge=0)
+    """Grows by one with every report."""
+    bus: str
+    """The line."""
+    up: bool
+    """Its drives are polled."""
+    utilisation: float = Field(ge=0)
+    """Share of the last period for which bytes were on the wire, 0 to 1; waiting for drives is not counted."""
+    exchanges: int = Field(ge=0)
+    """Requests sent since the daemon started, the other counters likewise."""
+    timeouts: int = Field(ge=0)
+    """Exchanges without a complete reply."""
+    corrupt_replies: int = Field(ge=0)
+    """Replies that could not be trusted."""
+    rejected_packets: int = Field(ge=0)
+    """Packets that a node received damaged and did not execute."""
+    resent: int = Field(ge=0)
+    """Exchanges sent again."""
+    resynchronisations: int = Field(ge=0)
+    """How often the line was resynchronised."""
+    stray_bytes: int = Field(ge=0)
+    """Bytes that belong to no request."""
+    losses: int = Field(ge=0)
+    """How often the port was lost."""
+    lanes: tuple[LaneHealth, ...]
+    """The most urgent first."""
+    stop_wait: StopWaitHealth
+    """How long a stop would have to wait."""
+    axes: tuple[AxisHealth, ...]
+    """The axes on the line."""
+
+
+class HeartbeatHealth(Frozen):
+    """The wire that changes its level while the daemon works."""
+
+    beating: bool
+    """Whether it changes now."""
+    why: str = ""
+    """Why it does not, for a person; empty while it does."""
+    changes: int = Field(ge=0)
+    """How often it has changed since the daemon started."""
+
+
+class DaemonHealth(Frozen):
+    """The daemon's process: published each second on `meta/health`."""
+
+    t: int
+    """When, UTC in ns since 1970."""
+    seq: int = Field(ge=0)
+    """Grows by one with every report."""
+    loop_lag_s: float = Field(ge=0)
+    """The longest that a timer of the daemon came too late in the last period, in seconds."""
+    published: int = Field(ge=0)
+    """Samples and events handed to the network since the daemon started; what is lost there, `seq` tells receivers."""
+    missed_reports: int = Field(ge=0)
+    """Reports that were left out since the daemon started because it was held up for longer than a period."""
+    waiting_queries: int = Field(default=0, ge=0)
+    """Queries that have no answer yet: questions, commands and stops."""
+    dropped: int = Field(default=0, ge=0)
+    """Queries that were refused for being too many, and lost changes of clients' presence, since the daemon started."""
+    heartbeat: HeartbeatHealth | None = None
+    """The heartbeat; None where none is configured."""
+
+
+class Verdict(StrEnum):
+    """Meaning of a finding."""
+
+    FINE = "fine"
+    LOOK = "look"
+    """Nothing is wrong for certain, but it deserves attention."""
+    WRONG = "wrong"
+    """It must be put right before the line is used."""
+
+
+class Finding(Frozen):
+    """One thing that was examined."""
+
+    axis: str
+    """The drive, or the line where it is no single one."""
+    what: str
+    """The subject of the check."""
+    verdict: Verdict
+    """Meaning of the result."""
+    text: str
+    """The result, for a person."""
+    verifies: str | None = None
+    """The assumption of the drive's profile that it says something about."""
+    remedy: str | None = None
+    """Command, or entry of the configuration, that corrects it."""

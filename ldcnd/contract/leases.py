@@ -1,0 +1,96 @@
+"""Control of axes: leases, and who holds them."""
+
+from pydantic import ConfigDict, Field
+
+from ldcnd.contract.commands import About, Command, Effect
+from ldcnd.contract.frozen import Frozen
+
+SHORTEST_LEASE_S = 0.2
+"""Seconds that a lease lasts at least."""
+
+
+class LeaseReply(Frozen):
+    """A lease that holds."""
+
+    lease: str
+    """To be carried by every command."""
+    client: str
+    """Who holds it."""
+    axes: tuple[str, ...]
+    """The axes it covers."""
+    lease_s: float
+    """Its duration from the daemon's receipt of this request, in seconds, unless renewed."""
+
+
+class Acquire(Command[LeaseReply]):
+    """Take control of axes, or of the whole rig."""
+
+    verb = "acquire"
+    about = About.RIG
+
+    client: str = Field(min_length=1, max_length=64)
+    """The requester: a name for people, shown to others and in the log."""
+    axes: tuple[str, ...] = ()
+    """Which axes, or groups of them; none means all."""
+    lease_s: float = Field(default=1.0, ge=SHORTEST_LEASE_S, le=60)
+    """For how long, in seconds; it must be renewed before."""
+    force: bool = False
+    """Take control from its present holder; that is logged."""
+
+
+class LeaseRequest(Frozen):
+    """Renew or release a lease."""
+
+    lease: str
+    """As the reply to acquire named it."""
+
+
+class Renew(LeaseRequest, Command[LeaseReply]):
+    """Keep a lease for its duration from now on."""
+
+    model_config = ConfigDict(title="LeaseRequest")
+
+    verb = "renew"
+    about = About.RIG
+
+
+class Release(Command[LeaseReply]):
+    """Give a lease back; an axis that still moves does what its policy for the loss of a client says."""
+
+    verb = "release"
+    about = About.RIG
+
+    lease: str
+    """As the reply to acquire named it."""
+    leave_running: bool = False
+    """Let what moves go on to its own end, without a holder of control."""
+
+
+class Holder(Frozen):
+    """Who controls an axis."""
+
+    axis: str
+    """The axis."""
+    client: str | None
+    """The client in control; null without one."""
+
+
+class HolderList(Frozen):
+    """Who controls what: the reply to `@cmd/_/holders`."""
+
+    required: bool
+    """Whether a lease is needed to move anything."""
+    holders: tuple[Holder, ...]
+    """Every axis."""
+
+
+class ListHolders(Command[HolderList]):
+    """Query who controls what."""
+
+    verb = "holders"
+    about = About.RIG
+    effect = Effect.QUESTION
+
+
+COMMANDS: tuple[type[Command[Frozen]], ...] = (Acquire, Renew, Release, ListHolders)
+"""The commands of this file."""

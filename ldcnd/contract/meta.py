@@ -1,0 +1,232 @@
+"""The description of a rig for clients without prior knowledge: served under `meta/`."""
+
+from enum import StrEnum
+from typing import Literal
+
+from pydantic import Field
+
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.plan import PollPriority
+
+
+class DaemonInfo(Frozen):
+    """The daemon that serves a rig: `meta/daemon`."""
+
+    rig: str
+    """The rig id, second chunk of every key."""
+    version: str
+    """Version of ldcnd."""
+    api: int
+    """Version of keys and payloads; fields are only ever added within one."""
+    instance: str
+    """Names this run of the daemon, as in its liveliness token."""
+    started: int
+    """When it started, UTC in ns since 1970."""
+    encoding: str
+    """How telemetry is encoded."""
+    axes: tuple[str, ...]
+    """The configured axes."""
+    buses: tuple[str, ...]
+    """The configured lines."""
+
+
+class CommandInfo(Frozen):
+    """One command: what to send and what comes back."""
+
+    verb: str
+    """Last chunk of the key."""
+    key: str
+    """Key of the request: `@cmd/<axis>/<verb>`, or `@cmd/_/<verb>` when it concerns the rig."""
+    summary: str
+    """Effect of the request."""
+    request_schema: str
+    """Name of the payload's schema under `meta/schema/`."""
+    reply_schema: str
+    """Name of the reply's schema under `meta/schema/`."""
+
+
+class CommandList(Frozen):
+    """All commands and all error codes: `meta/commands`."""
+
+    commands: tuple[CommandInfo, ...]
+    """The commands and queries."""
+    errors: tuple[str, ...]
+    """Every code that an error reply can carry."""
+    encodings: tuple[str, ...]
+    """How payloads may be encoded; the reply uses the query's."""
+
+
+class ModuleInfo(Frozen):
+    """Something that answers on a line, axis or not."""
+
+    address: int
+    """Node address."""
+    title: str
+    """Its title in the profile."""
+    model: str | None
+    """Model name as in the configuration; null for an unknown device: it is never moved."""
+    device_id: int
+    """As it reports."""
+    version: int
+    """As it reports."""
+    axis: str | None
+    """The axis that it is; null for a module that is only kept on the line."""
+    name: str | None = None
+    """Under which an I/O module is served; null for others."""
+    status: int | None
+    """Latest status byte of a module that is no axis; null while it does not answer, and for axes."""
+
+
+class BusInfo(Frozen):
+    """One line: `meta/buses/<bus>`."""
+
+    bus: str
+    """Its name."""
+    port: str
+    """Where it is connected."""
+    baud: int
+    """The rate in use."""
+    up: bool
+    """Its drives are polled."""
+    problem: str
+    """Why it is not up; empty while it is."""
+    remarks: tuple[str, ...]
+    """Warnings although it is up."""
+    started_by: Literal["reset", "adoption"] | None = None
+    """Whether the drives were reset, so that positions count from 0, or taken over as they were; null while down."""
+    modules: tuple[ModuleInfo, ...] = ()
+    """Modules found on the line, by address; empty while that is not known."""
+    exchanges: int
+    """Requests sent since the daemon started, the other counters likewise."""
+    replies: int
+    """Intact replies."""
+    timeouts: int
+    """Exchanges without a complete reply."""
+    corrupt_replies: int
+    """Replies that could not be trusted."""
+    rejected_packets: int
+    """Packets that a node received damaged and did not execute."""
+    resent: int
+    """Exchanges sent again."""
+    resynchronisations: int
+    """How often the line was resynchronised."""
+    stray_bytes: int
+    """Bytes that belong to no request."""
+    losses: int
+    """How often the port was lost."""
+    wire_busy_s: float
+    """Seconds for which bytes were on the wire."""
+    poll_p99_s: float
+    """99 % of all polls were complete within this time after they were due, in seconds."""
+    command_p99_s: float
+    """The same for commands, from queueing."""
+    stop_p50_s: float
+    """Half of all stops had their reply within this time, in seconds; the bound is in `meta/budget`."""
+    stop_p99_s: float
+    """99 % of all stops had their reply within this time, in seconds."""
+    stop_longest_s: float
+    """The longest time from queueing a stop to its reply."""
+
+
+class Provenance(StrEnum):
+    """The source of the daemon's copy of a register that cannot be read back."""
+
+    WRITTEN_AND_ACKNOWLEDGED = "written_and_acknowledged"
+    """This daemon wrote it and the drive acknowledged."""
+    RESET = "reset"
+    """The drive was reset, and its manual says what is in it then."""
+    READ_BACK = "read_back"
+    """The drive has shown it."""
+    ASSUMED = "assumed"
+    """From the configuration, for a drive that was taken over as it is; not confirmed."""
+    UNKNOWN = "unknown"
+    """Anything may be in it."""
+
+
+class RegisterInfo(Frozen):
+    """One register of a drive that cannot be read back."""
+
+    name: str
+    """Its name in the drive's manual."""
+    value: int | None
+    """Raw value; null when it is unknown."""
+    provenance: Provenance
+    """How the value is known."""
+    why: str = ""
+    """The evidence for the value, or the reason why it is not known."""
+
+
+class AxisLimits(Frozen):
+    """Software limits, in axis units; a missing one does not limit."""
+
+    position_min: float | None = None
+    """Lowest target of any move."""
+    position_max: float | None = None
+    """Highest target of any move."""
+    velocity: float | None = Field(default=None, gt=0)
+    """Highest speed, in units a second."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Highest acceleration, in units a second squared."""
+
+
+class PastFault(Frozen):
+    """A fault that an axis has had."""
+
+    code: str
+    """Stable code of the fault."""
+    text: str
+    """Meaning and remedy."""
+    since: int
+    """When the daemon first saw it, UTC in ns since 1970."""
+    source: str
+    """Who said so: drive or daemon."""
+
+
+class AxisInfo(Frozen):
+    """The description of an axis: served on `meta/axes/<axis>`."""
+
+    axis: str
+    """Its name, the chunk in every key."""
+    bus: str
+    """The line it is on."""
+    address: int = Field(ge=0, le=127)
+    """Its node address or unit number on that line."""
+    family: str
+    """The drive family that speaks for it."""
+    model: str
+    """The configured drive model."""
+    identity: str | None
+    """The identity that the drive reported; null while it has not answered."""
+    unit: str
+    """Unit of all its values; "count" when no scale is configured."""
+    counts_per_unit: float | None
+    """Encoder counts per unit; null when no scale is configured and the axis works in counts."""
+    direction: str
+    """forward or reverse: the sign between counts and units."""
+    modulo: float | None = None
+    """A rotary axis: positions repeat after this distance, in axis units; null for others."""
+    limits: AxisLimits
+    """Software limits in axis units."""
+    limit_stop: Literal["high", "low"] | None = None
+    """Level of the limit switch inputs at which the drive stops a motion towards the switch; null when it does not."""
+    approach: float | None = None
+    """Signed distance over which moves come to their goal, in axis units; null without an approach from one side."""
+    group: str | None = None
+    """Its group: axes that `move_together` starts in the same servo cycle; null when it is in none."""
+    capabilities: tuple[Verb, ...]
+    """The commands it takes."""
+    items: tuple[str, ...]
+    """The telemetry items it publishes."""
+    adc_full_scale: int | None
+    """Counts of the A/D converter at full scale; null without one."""
+    monitors: tuple[str, ...] = ()
+    """The monitors it publishes below `monitor/`."""
+    trace_channels: tuple[str, ...] = ()
+    """The channels that a trace can record."""
+    priority: PollPriority = "normal"
+    """How its polls fare while its line cannot carry all of them."""
+    registers: tuple[RegisterInfo, ...] = ()
+    """The contents of the drive's write-only registers, as far as they are known to the daemon."""
+    past_faults: tuple[PastFault, ...] = ()
+    """The latest faults, oldest first; with a `state_dir` also those before the daemon was started."""

@@ -1,0 +1,144 @@
+"""The composition root: builds a daemon that is ready to run from a configuration; the only place with all parts."""
+
+import secrets
+import time
+from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import asynccontextmanager
+from types import MappingProxyType
+from typing import Any
+
+from ldcnd.axis.axis import AxisService
+from ldcnd.axis.clock import Clock
+from ldcnd.axis.kept import KeptFiles
+from ldcnd.config.plan import demand_of
+from ldcnd.config.rig import RigConfig
+from ldcnd.contract.codec import Encoding
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.keys import Keys
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.dispatch import Dispatcher, EarlyStops
+from ldcnd.daemon.heartbeat import Heartbeat
+from ldcnd.daemon.leases import Authority, random_token
+from ldcnd.daemon.ledger import EventLog, Ledger
+from ldcnd.daemon.line import BusService
+from ldcnd.daemon.rig import ModuleService, Rig
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.driver import Drive
+from ldcnd.drives.family import OpenLine
+from ldcnd.drives.known import FAMILIES, chain_of
+from ldcnd.drives.line_config import BusConfig
+from ldcnd.line.bus import Bus
+from ldcnd.line.transport import Opener
+from ldcnd.net.publisher import Publisher
+from ldcnd.net.session import Session
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.sim.chain import Chain
+
+ENCODINGS = {"msgpack": Encoding.MSGPACK, "json": Encoding.JSON}
+
+
+@asynccontextmanager
+async def open_daemon(config: RigConfig) -> AsyncIterator[Daemon]:
+    """Open the session and build the daemon on it; nothing is sent to any line before it runs.
+
+    Raises:
+        SessionError: the session cannot be opened.
+    """
+    async with open_zenoh_session(session_settings(config)) as session:
+        stops = EarlyStops()
+        await stops.declare(session, Keys(config.rig))  # clients can connect by now; a daemon takes a while
+        yield build_daemon(config, session, time.time_ns, secrets.token_hex(4), stops=stops)
+
+
+def session_settings(config: RigConfig) -> ZenohSettings:
+    """Return how the daemon of a rig joins the network."""
+    zenoh = config.zenoh
+    return ZenohSettings(mode="peer", listen=zenoh.listen, connect=zenoh.connect, config_file=zenoh.config_file)
+
+
+def build_daemon(
+    config: RigConfig,
+    session: Session,
+    now_ns: Callable[[], int],
+    instance: str,
+    chains: Mapping[str, Chain] = MappingProxyType({}),
+    openers: Mapping[str, Opener] = MappingProxyType({}),
+    next_token: Callable[[], str] = random_token,
+    stops: EarlyStops | None = None,
+) -> Daemon:
+    """Build a daemon on an open session.
+
+    Args:
+        config: the rig.
+        session: where clients are.
+        now_ns: the wall clock, UTC in ns since 1970.
+        instance: names this run of the daemon.
+        chains: simulated lines that exist already, by name; the others are built from the configuration.
+        openers: what opens a line instead of its port, by the name of the bus.
+        next_token: makes what a lease is known by.
+        stops: what takes stops already.
+    """
+    clock = Clock(now_ns)
+    publisher = Publisher(session, Keys(config.rig), ENCODINGS[config.telemetry.encoding])
+    events = EventLog(publisher, clock, instance)
+    ledger = Ledger(events.changed, clock.now_s)
+
+    def note(axis: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
+        events.note(axis, verb, status, reason, code=code)
+
+    kept = KeptFiles(config.state_dir) if config.state_dir else None
+    taken_over = frozenset(axis.name for bus in config.bus if bus.takes_over for axis in bus.axis)
+
+    def make_axis(axis: AxisConfig, bus: Bus, driver: Drive) -> AxisService:
+        return AxisService(
+            axis,
+            bus,
+            driver,
+            publisher,
+            clock,
+            events.next_command_id,
+            ledger.ended,
+            note,
+            kept=kept,
+            keeps_reference=axis.name in taken_over,
+        )
+
+    open_lines = {name: FAMILIES[name].open_lines(config.state_dir) for name in {bus.family for bus in config.bus}}
+    groups = {group.name: group.axes for bus in config.bus for group in bus.group}
+    buses = tuple(_build_bus(config, bus, open_lines[bus.family], make_axis, chains, openers) for bus in config.bus)
+    modules = tuple(
+        ModuleService(driver, publisher, clock, tuple(axis.config.name for axis in bus.axes))
+        for bus in buses
+        for driver in bus.network.io.values()
+    )
+    rig = Rig(config.rig, buses, groups, modules)
+    authority = Authority(rig.axes, required=config.authority == "leased", next_token=next_token)
+    dispatcher = Dispatcher(rig, authority, ledger, events, clock, instance)
+
+    heartbeat = Heartbeat(config.heartbeat, rig) if config.heartbeat else None
+    return Daemon(config, session, rig, dispatcher, publisher, clock, instance, stops=stops, heartbeat=heartbeat)
+
+
+def _build_bus(
+    config: RigConfig,
+    settings: BusConfig,
+    open_line: OpenLine[Any],
+    make_axis: Callable[[AxisConfig, Bus, Drive], AxisService],
+    chains: Mapping[str, Chain],
+    openers: Mapping[str, Opener],
+) -> BusService:
+    opener = openers.get(settings.name)
+    chain = None
+    if opener is None:
+        chain = chains.get(settings.simulated) or chain_of(settings, config.sim)
+    line = open_line(settings, opener, chain)
+    axes = tuple(make_axis(axis, line.bus, line.network.axes[axis.name]) for axis in settings.axis)
+    return BusService(
+        line.bus,
+        line.network,
+        axes,
+        port=settings.port,
+        family=settings.family,
+        stop_probe_hz=demand_of(settings).stop_probe_hz,
+    )

@@ -1,0 +1,286 @@
+"""The daemon as a whole: in which order things start and stop."""
+
+import asyncio
+import contextlib
+from collections.abc import Coroutine
+from functools import partial
+from typing import Any
+
+from ldcnd.axis.axis import AxisService
+from ldcnd.axis.clock import Clock
+from ldcnd.config.plan import plan_rig
+from ldcnd.config.rig import RigConfig
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.meta import DaemonInfo
+from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.samples import LinkState
+from ldcnd.daemon.capture import CaptureStore, CaptureWatch, Run, capture_of, snapshot_of
+from ldcnd.daemon.dispatch import Dispatcher, EarlyStops, Requests
+from ldcnd.daemon.health import HealthWatch
+from ldcnd.daemon.heartbeat import Heartbeat
+from ldcnd.daemon.leases import apply_policy
+from ldcnd.daemon.meta import Describing
+from ldcnd.daemon.rig import Rig
+from ldcnd.line.capture import Capture
+from ldcnd.log import get_logger
+from ldcnd.net.hand_over import Load
+from ldcnd.net.publisher import Publisher
+from ldcnd.net.session import Declaration, Session
+from ldcnd.version import version
+
+log = get_logger("daemon")
+
+API = 1
+"""Version of keys and payloads: within one, fields are only ever added."""
+TOKEN_PERIOD_S = 0.2
+STOP_AGAIN_S = 0.02
+"""Pause between two attempts at a stop that no drive has confirmed, at the end of the daemon, seconds."""
+STOP_TIME_S = 2.0
+"""Time for the axes to confirm their loss policies when the daemon is ended."""
+
+
+class Daemon:
+    """Serves one rig over one session until it is ended.
+
+    Attributes:
+        rig: what it serves.
+        captures: writes captures when something goes wrong; None where there is no place for them.
+    """
+
+    def __init__(
+        self,
+        config: RigConfig,
+        session: Session,
+        rig: Rig,
+        dispatcher: Dispatcher,
+        publisher: Publisher,
+        clock: Clock,
+        instance: str,
+        *,
+        stops: EarlyStops | None = None,
+        heartbeat: Heartbeat | None = None,
+    ) -> None:
+        self.rig = rig
+        self._stops = stops
+        self._dispatcher = dispatcher
+        self._config = config
+        self._session = session
+        self._keys = Keys(config.rig)
+        self._publisher = publisher
+        self._run = Run(instance, clock.now_ns(), clock)
+        self._serving = asyncio.Event()
+        self._ending = asyncio.Event()
+        self._failure: Exception | None = None
+        self.captures = _capture_watch(self, self._run)
+        self._declarations: list[Declaration] = []
+        self._health = HealthWatch(rig, self._keys, publisher, clock, self._load)
+        plan = plan_rig(config)
+        self._health.stop_bounds_s = _stop_bounds_s(plan)
+        self._heartbeat = heartbeat
+        if heartbeat:
+            self._health.heartbeat = lambda: heartbeat.health
+        self._describing = Describing(
+            rig, self._keys, publisher, self._info, lambda: self._config, plan, self._health, clock
+        )
+
+    @property
+    def config(self) -> RigConfig:
+        """With what it runs at present."""
+        return self._config
+
+    def end(self) -> None:
+        """Request the daemon to stop its axes and to leave; `run` returns when that is done."""
+        self._ending.set()
+
+    def capture(self, bus: str, cause: str) -> Capture:
+        """Return what the flight recorder of a line holds.
+
+        Raises:
+            ValueOutOfRange: there is no such line.
+        """
+        return capture_of(snapshot_of(self.rig.lines[bus], self._run.clock), self._config, self._run, cause)
+
+    def reconfigure(self, config: RigConfig, plan: RigBudget) -> None:
+        """Take other limits, speeds, rates and priorities of axes; everything else is as before, see `plan_reload`.
+
+        Args:
+            config: the rig.
+            plan: of its lines; to work it out takes longer than lines should be held up.
+        """
+        self._config = config
+        self._describing.plan = plan
+        self._health.stop_bounds_s = _stop_bounds_s(plan)
+        axes = {axis.name: axis for bus in config.bus for axis in bus.axis}
+        for bus in self.rig.buses:
+            bus.reconfigure(axes)
+
+    async def wait_serving(self) -> None:
+        """Return as soon as questions and commands are answered, whether or not any line is up."""
+        await self._serving.wait()
+
+    async def wait_up(self) -> None:
+        """Return as soon as every line is up."""
+        for bus in self.rig.buses:
+            await bus.wait_up()
+
+    async def run(self) -> None:
+        """Serve until `end` is called or the caller is cancelled.
+
+        Start: stops first, so that no line is open that cannot be stopped; then lines, questions, and commands. Stop:
+        commands are refused, what moves comes to rest, tokens go, lines close.
+        """
+        async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
+            declared.callback(self._dispatcher.events.flush)  # last of all
+            leases = self._dispatcher.leases
+            leases.group = group
+            requests = Requests(self.rig, self._keys, group, self._dispatcher)
+            for each in self.rig.axes.values():
+                each.returned = partial(self._returned, each, group)
+            serving: list[asyncio.Task[None]] = []
+            try:
+                await self._declare_stops(declared, requests)
+                serving += [
+                    group.create_task(self._guarded(bus.run()), name=f"line {bus.bus.settings.name}")
+                    for bus in self.rig.buses
+                ]
+                await self._declare(declared, requests)
+                serving.append(group.create_task(self._guarded(self._watch_axes()), name="liveliness"))
+                serving.append(group.create_task(self._guarded(leases.run()), name="leases"))
+                serving.append(group.create_task(self._guarded(self._health.run()), name="health"))
+                if self._heartbeat:
+                    serving.append(group.create_task(self._guarded(self._heartbeat.run()), name="heartbeat"))
+                if self.captures:
+                    serving.append(group.create_task(self._guarded(self.captures.run()), name="captures"))
+                self._serving.set()
+                log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._run.instance)
+                await self._ending.wait()
+                requests.close()
+                for axis in self.rig.axes.values():
+                    axis.close()  # first: what waits now would begin behind the stop that its policy sends
+                await self._come_to_rest()
+                await self._keep_references()
+                if self._failure:
+                    raise self._failure
+            finally:
+                for task in serving:
+                    task.cancel()
+                for name in (*self.rig.axes, *self.rig.modules):
+                    self._publisher.withdraw(name)
+        log.info("ended", rig=self.rig.name)
+
+    async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
+        """Do part of the daemon's work; if it fails, end in order, so that axes come to rest, and fail only then."""
+        try:
+            await work
+        except Exception as error:  # noqa: BLE001 - whatever is wrong in here, axes must not go on unwatched
+            log.error("internal error, the daemon ends", reason=repr(error))
+            self._failure = error
+            self._ending.set()
+
+    async def _declare_stops(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
+        stops = self._stops
+        if stops is None:
+            stops = EarlyStops()
+            await stops.declare(self._session, self._keys)
+        for declaration in stops.hand_over(requests.on_stop):
+            self._declarations.append(declaration)
+            declared.push_async_callback(declaration.close)
+
+    async def _declare(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
+        keys, session = self._keys, self._session
+        describing = self._describing
+
+        async def until_end(declaration: Declaration) -> None:
+            self._declarations.append(declaration)
+            declared.push_async_callback(declaration.close)
+
+        await until_end(await session.serve_reads(keys.all_telemetry, describing.on_telemetry, complete=False))
+        await until_end(await session.serve_reads(keys.all_meta, describing.on_meta, complete=True))
+        await until_end(await session.serve(keys.all_commands, requests.on_command, complete=True))
+        await until_end(await session.watch_tokens(keys.all_alive, self._on_daemon))
+        await until_end(await session.declare_token(keys.alive(self._run.instance)))
+
+    def _load(self) -> Load:
+        """Return how the daemon keeps up with its load."""
+        loads = [declaration.load for declaration in self._declarations]
+        return Load(sum(load.waiting for load in loads), sum(load.lost for load in loads))
+
+    def _on_daemon(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's signature
+        """Note which other daemons serve this rig: two of them would move every axis twice."""
+        address = self._keys.parse_alive(key)
+        if address.axis is not None or address.instance == self._run.instance:
+            return
+        log.error("another daemon serves this rig", rig=self.rig.name, instance=address.instance, alive=alive)
+        (self._dispatcher.rivals.add if alive else self._dispatcher.rivals.discard)(address.instance)
+
+    async def _come_to_rest(self) -> None:
+        """The daemon ends: do to each axis what its policy says; bounded."""
+        try:
+            async with asyncio.timeout(STOP_TIME_S), asyncio.TaskGroup() as group:
+                for name, axis in self.rig.axes.items():
+                    group.create_task(self._bring_to_rest(axis), name=f"rest {name}")
+        except TimeoutError:
+            log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
+        for name, axis in self.rig.axes.items():
+            if axis.stop_is_pending:
+                log.error("stop not confirmed at the end of the daemon, the axis may move", axis=name)
+
+    async def _bring_to_rest(self, axis: AxisService) -> None:
+        await apply_policy(axis, axis.config.loss.daemon, "the daemon ends")
+        while axis.stop_is_pending:  # as long as there is time for it: after that nothing sends it again
+            await axis.send_pending_stop()
+            await asyncio.sleep(STOP_AGAIN_S)
+        await axis.take_gains_back()
+
+    async def _keep_references(self) -> None:
+        """Keep where each axis is while its line is still up; bounded."""
+        async with asyncio.TaskGroup() as group:
+            for name, axis in self.rig.axes.items():
+                group.create_task(axis.reference.finish(), name=f"keep {name}")
+
+    def _returned(self, axis: AxisService, group: asyncio.TaskGroup) -> None:
+        """A drive answers again that was out of reach: if it still moves, do what its policy says."""
+        policy = apply_policy(axis, axis.config.loss.bus, "the drive was out of reach")
+        group.create_task(policy, name=f"bus loss {axis.config.name}")
+
+    async def _watch_axes(self) -> None:
+        """Keep one liveliness token for each axis whose drive answers."""
+        tokens: dict[str, Declaration] = {}
+        try:
+            while True:
+                for name, axis in self.rig.axes.items():
+                    alive = axis.tracker.link is not LinkState.DOWN
+                    if alive and name not in tokens:
+                        tokens[name] = await self._session.declare_token(
+                            self._keys.alive_axis(self._run.instance, name)
+                        )
+                    elif not alive and name in tokens:
+                        await tokens.pop(name).close()
+                await asyncio.sleep(TOKEN_PERIOD_S)
+        finally:
+            for token in tokens.values():
+                await token.close()
+
+    def _info(self) -> DaemonInfo:
+        return DaemonInfo(
+            rig=self.rig.name,
+            version=version(),
+            api=API,
+            instance=self._run.instance,
+            started=self._run.started_ns,
+            encoding=self._config.telemetry.encoding,
+            axes=tuple(self.rig.axes),
+            buses=tuple(bus.bus.settings.name for bus in self.rig.buses),
+        )
+
+
+def _capture_watch(daemon: Daemon, run: Run) -> CaptureWatch | None:
+    directory, bounds = daemon.config.captures_dir, daemon.config.captures
+    if directory is None:
+        return None
+    store = CaptureStore(directory, bounds.files, bounds.total_mb * 1_000_000)
+    return CaptureWatch(daemon.rig, lambda: daemon.config, run, store)
+
+
+def _stop_bounds_s(plan: RigBudget) -> dict[str, float]:
+    return {bus.bus: bus.stop_wait_s for bus in plan.buses if bus.stops}

@@ -1,0 +1,527 @@
+"""Commands and stops: from a query to its answer, the only place where an exception becomes an error reply.
+
+A command is decoded, admitted (who may, whether again, whether in time), written into the flight recorder of its line,
+carried out by its axis, and entered into the ledger. What is not for one axis alone is in rig_commands.py.
+"""
+
+import asyncio
+import hashlib
+import json
+from collections.abc import Awaitable, Callable
+from functools import partial
+
+from ldcnd.axis.axis import AxisService
+from ldcnd.axis.clock import Clock
+from ldcnd.axis.guards import UNCONDITIONAL, Permit, Right
+from ldcnd.contract.catalogue import BY_VERB, RENAMED
+from ldcnd.contract.codec import decode, encode, reply_encoding, to_json
+from ldcnd.contract.commands import (
+    About,
+    AxisCommand,
+    BufferMode,
+    Command,
+    CommandReply,
+    Effect,
+    Ends,
+    Jog,
+    Move,
+    Stop,
+    StopReply,
+)
+from ldcnd.contract.errors import (
+    CommandAborted,
+    CommandExpired,
+    DuplicateDaemon,
+    InternalError,
+    LdcndError,
+    OutcomeUnknown,
+    RequestRefused,
+    ShuttingDown,
+    TooManyRequests,
+    UnknownVerb,
+)
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.keys import RIG_ITSELF, CommandAddress, Keys
+from ldcnd.contract.leases import Acquire
+from ldcnd.daemon.leases import Authority, LeaseWatch
+from ldcnd.daemon.ledger import Entry, EventLog, Ledger
+from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig_commands import RigCommands
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.log import LogLimit, get_logger
+from ldcnd.net.hand_over import OnQuery, Query
+from ldcnd.net.session import Declaration, Session
+
+log = get_logger("requests")
+
+Accept = Callable[[CommandReply], None]
+STOP = "@stop"
+STOPS_AT_ONCE = 8
+"""Maximum number of concurrent stops of the same axes; further ones join."""
+REPLY_S = 1.0
+"""Time left for a drive's acknowledgement and the reply when a command begins; who gets none by then gives up."""
+PENDING_REQUESTS = 64
+"""Maximum number of concurrent commands; stops are not counted."""
+
+
+class Journal:
+    """Writes the requests of clients into the flight recorders of the lines concerned, between the packets.
+
+    A line of it is `axis/verb {payload}`, or `@stop/axis {}`, with the payload as JSON; requests that concern the whole
+    rig are written to all lines. A lease is named by a fingerprint: a reader of a wire log must not be able to command
+    with what it contains.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        logs = [(line.bus.wire_log, [axis.config.name for axis in line.axes]) for line in rig.buses]
+        self._logs = {name: [log] for log, names in logs for name in names}
+        self._logs[RIG_ITSELF] = [log for log, _ in logs]
+
+    def asked(self, axis: str, command: Command[Frozen], lease: str | None = None) -> None:
+        """Note a command of an axis or of the rig; `lease` is the token that was given in return."""
+        token = lease or getattr(command, "lease", None)
+        if token is None:
+            payload = to_json(command, exclude_defaults=True)
+        else:
+            fields = command.model_dump(mode="json", exclude_defaults=True)
+            payload = json.dumps({**fields, "lease": fingerprint(token)}, separators=(",", ":")).encode()
+        self._note(axis, f"{axis}/{command.verb} ".encode() + payload)
+
+    def stopped(self, axis: str | None) -> None:
+        """Note a stop of an axis, or of the rig."""
+        what = f"{STOP}/{axis}" if axis else STOP
+        self._note(axis or RIG_ITSELF, f"{what} {{}}".encode())
+
+    def _note(self, axis: str, line: bytes) -> None:
+        now_s = asyncio.get_running_loop().time()
+        for log in self._logs[axis]:
+            log.add(now_s, WireEvent.COMMAND, line)
+
+
+def fingerprint(token: str) -> str:
+    """Return a name for a lease that does not give it away."""
+    return hashlib.sha256(token.encode()).hexdigest()[:16]
+
+
+class EarlyStops:
+    """Takes stops from the moment on at which clients can connect; they wait until there is a daemon to answer them."""
+
+    def __init__(self) -> None:
+        self._declarations: list[Declaration] = []
+        self._held: list[Query] = []
+        self._take: OnQuery = self._held.append
+
+    async def declare(self, session: Session, keys: Keys) -> None:
+        """Serve the stops of a rig."""
+        for stop in keys.all_stops:
+            self._declarations.append(await session.serve(stop, self._pass_on, complete=True, urgent=True))
+
+    def hand_over(self, take: OnQuery) -> list[Declaration]:
+        """Give the stops that wait, and all that come from now on, to a daemon; return what it has to close."""
+        self._take = take
+        held, self._held = self._held, []
+        for query in held:
+            take(query)
+        return self._declarations
+
+    def _pass_on(self, query: Query) -> None:
+        self._take(query)
+
+
+class Requests:
+    """Answers the command and stop queries of one rig, each exactly once."""
+
+    def __init__(self, rig: Rig, keys: Keys, group: asyncio.TaskGroup, dispatcher: "Dispatcher") -> None:
+        self._rig = rig
+        self._dispatcher = dispatcher
+        self._keys = keys
+        self._group = group
+        self._journal = Journal(rig)
+        self._pending = 0
+        self._stops: dict[tuple[str, ...], list[asyncio.Future[tuple[str, ...]]]] = {}
+        self._closing = False
+        self._refusals_logged = LogLimit(now_s=asyncio.get_running_loop().time)
+
+    def close(self) -> None:
+        """Refuse further commands; stops are still taken."""
+        self._closing = True
+
+    def on_command(self, query: Query) -> None:
+        """Take a query on `@cmd/**`."""
+        self._dispatcher.leases.expire()  # before anything that waited while this process or its client was frozen
+        if self._pending >= PENDING_REQUESTS and not self._brings_to_rest(query):
+            self._refuse(
+                query,
+                TooManyRequests(
+                    f"{PENDING_REQUESTS} commands are under way already; nothing was done",
+                    limit=PENDING_REQUESTS,
+                    remedy="wait for replies before sending more",
+                ),
+            )
+            return
+        self._pending += 1
+        task = self._group.create_task(self._answer(query, self._command), name=f"command {query.key}")
+        task.add_done_callback(self._done)
+
+    def _brings_to_rest(self, query: Query) -> bool:
+        """Tell whether a query is to bring an axis to rest, which no flood of others may keep from being sent."""
+        try:
+            return _command_class(self._keys.parse_command(query.key)).effect is Effect.REST
+        except LdcndError:
+            return False
+
+    def on_stop(self, query: Query) -> None:
+        """Take a query on `@stop` or `@stop/<axis>`."""
+        self._group.create_task(self._answer(query, self._stop), name=f"stop {query.key}")
+
+    def _done(self, _task: "asyncio.Task[None]") -> None:
+        self._pending -= 1
+
+    async def _answer(self, query: Query, run: Callable[[Query], Awaitable[Frozen]]) -> None:
+        try:
+            reply = await run(query)
+        except LdcndError as error:
+            self._refuse(query, error)
+        except asyncio.CancelledError:
+            self._refuse(query, ShuttingDown("the daemon is stopping"))
+            raise
+        except Exception:
+            log.exception("bug while answering", key=query.key)
+            self._refuse(query, InternalError("an error inside ldcnd; its log has the details"))
+        else:
+            self._reply(query, reply)
+
+    @staticmethod
+    def _reply(query: Query, reply: Frozen) -> None:
+        """Answer unless it was answered when the command came to wait; events say how it went on."""
+        if not query.answered:
+            query.reply(*encode(reply, reply_encoding(query.encoding)))
+
+    async def _command(self, query: Query) -> Frozen:
+        address = self._keys.parse_command(query.key)
+        if self._closing:
+            raise ShuttingDown("the daemon is stopping", axis=address.axis)
+        if address.axis != RIG_ITSELF:
+            _ = self._rig.axes[address.axis]  # an unknown axis is refused before an unknown verb
+        kind = _command_class(address)
+        command = decode(kind, query.payload, query.encoding)
+        return await self._dispatcher.answer(address.axis, command, query.login, partial(self._reply, query))
+
+    async def _stop(self, query: Query) -> Frozen:
+        """Stop even if the payload is nonsense: a stop is always accepted."""
+        name = self._keys.parse_stop(query.key)
+        names = tuple(self._rig.axes) if name is None else (self._rig.axes[name].config.name,)
+        try:
+            self._journal.stopped(name)
+        except Exception:
+            log.exception("stop not recorded", key=query.key)  # it is carried out all the same
+        return StopReply(axes=names, confirmed=await self._stop_once(names, query))
+
+    async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
+        """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.
+
+        Hundreds of clients may request a stop at once, and a few stops serve all. Only a stop whose latches still hold
+        is joined: since they were set nothing has begun to move, so there is nothing that it does not stop. What joins
+        leaves no event of its own.
+        """
+        under_way = self._stops.setdefault(names, [])
+        if len(under_way) >= STOPS_AT_ONCE and self._are_latched(names):
+            confirmed = await asyncio.shield(under_way[-1])
+            if self._are_latched(names):
+                return confirmed
+            # a reset that was under way has taken the latch from this stop
+        for axis in (self._rig.axes[name] for name in names):
+            if axis.stoppable:
+                axis.tracker.latch_stop()  # at once, for requests of this same loop iteration
+        own: asyncio.Future[tuple[str, ...]] = asyncio.get_running_loop().create_future()
+        under_way.append(own)
+        try:
+            confirmed = await self._rig.stop(names)
+        except BaseException:
+            own.set_exception(InternalError("the stop that this one had joined was cut short"))
+            own.exception()  # perhaps no other stop has joined
+            raise
+        else:
+            own.set_result(confirmed)
+            self._enter_stop(query, names, confirmed)
+            return confirmed
+        finally:
+            under_way.remove(own)
+
+    def _enter_stop(self, query: Query, names: tuple[str, ...], confirmed: tuple[str, ...]) -> None:
+        """Record the requester of a stop in the events, as far as that can be read; nothing has waited for this."""
+        try:
+            request = decode(Stop, query.payload, query.encoding)
+        except LdcndError:
+            request = Stop()
+        try:
+            self._dispatcher.stopped(names, confirmed, request, query.login)
+        except Exception:
+            log.exception("stop not entered into the events", key=query.key)
+
+    def _are_latched(self, names: tuple[str, ...]) -> bool:
+        axes = (self._rig.axes[name] for name in names)
+        return all(axis.tracker.stop_latched or not axis.stoppable for axis in axes)
+
+    def _refuse(self, query: Query, error: LdcndError) -> None:
+        if query.answered:
+            return
+        if (fields := self._refusals_logged.admit()) is not None:
+            log.info("refused", key=query.key, code=error.code.value, reason=error.message, **fields)
+        query.refuse(error)
+
+
+def _command_class(address: CommandAddress) -> type[Command[Frozen]]:
+    """Return what a key stands for.
+
+    Raises:
+        UnknownVerb: there is no such command.
+    """
+    axis = None if address.axis == RIG_ITSELF else address.axis
+    known = BY_VERB[About.RIG if axis is None else About.AXIS]
+    if command := known.get(address.verb):
+        return command
+    if now := RENAMED.get(address.verb):
+        raise UnknownVerb(
+            f"the command {address.verb!r} is called {now!r} now", axis=axis, value=address.verb, remedy=f"send {now}"
+        )
+    whose = "the rig has" if axis is None else "there is"
+    raise UnknownVerb(f"{whose} no command {address.verb!r}, only {', '.join(known)}", axis=axis, value=address.verb)
+
+
+class Dispatcher:
+    """Hands every command to what carries it out, each command id at most once, and keeps the outcomes.
+
+    Attributes:
+        authority: the leases of the rig.
+        leases: gives control and ends it.
+        events: what happens to its commands.
+        rivals: instances of the other daemons that serve the same rig; while there is one, nothing is moved.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        authority: Authority,
+        ledger: Ledger,
+        events: EventLog,
+        clock: Clock,
+        instance: str,
+    ) -> None:
+        self.authority = authority
+        self.leases = LeaseWatch(rig, authority, events, clock)
+        self.events = events
+        self.rivals: set[str] = set()
+        self._journal = Journal(rig)
+        self._instance = instance
+        self._rig = rig
+        self._ledger = ledger
+        self._clock = clock
+        self._under_way: dict[str, asyncio.Event] = {}
+        self._rig_commands = RigCommands(
+            rig, authority, self.leases, ledger, events, clock, self.carry_out, self._admit_lease
+        )
+
+    async def answer(
+        self, axis: str, command: Command[Frozen], login: str | None = None, accept: Accept = lambda _: None
+    ) -> Frozen:
+        """Carry out a command that has just arrived, and return its reply.
+
+        Args:
+            axis: which axis, or `RIG_ITSELF`.
+            command: the request.
+            login: whose link it came over, for the record.
+            accept: takes the reply of a command that waits for another one; no caller need wait as long.
+
+        Raises:
+            LdcndError: as it was refused.
+        """
+        if isinstance(command, AxisCommand) or (
+            command.effect is not Effect.QUESTION and not isinstance(command, Acquire)
+        ):
+            self._journal.asked(axis, command)
+        match command:
+            case AxisCommand():
+                return await self.carry_out(axis, command, login, accept)
+            case Acquire():
+                lease = self.leases.acquire(command)
+                self._journal.asked(RIG_ITSELF, command, lease.token)
+                return lease.reply()
+            case _:
+                return await self._rig_commands.answer(axis, command, login)
+
+    async def carry_out(
+        self,
+        axis_name: str,
+        command: AxisCommand[CommandReply],
+        login: str | None = None,
+        accept: Accept = lambda _: None,
+    ) -> CommandReply:
+        """Carry out a command of an axis, or answer as the first time when its id is known.
+
+        Raises:
+            LdcndError: as the axis refused it, or because it is not admitted.
+        """
+        axis = self._rig.axes[axis_name]
+        if command.effect is Effect.QUESTION:
+            return await axis.execute(command)
+        if isinstance(command, Jog) and command.renews is not None:
+            self._admit(axis_name, command)
+            return axis.renew_jog(command, command.renews)
+        command_id = command.command_id or self.events.next_command_id()
+        if entry := self._ledger.repeated(command_id, axis_name, command):
+            if command.effect is not Effect.REST:
+                return await self._answer_again(entry)
+            command_id = self.events.next_command_id()
+        client = self._admit(axis_name, command) or command.client
+        accepted = asyncio.Event()
+        right = UNCONDITIONAL if command.effect is Effect.REST else self._right(axis_name, command, accepted)
+        hold = axis.begin_hold(command_id, command) if isinstance(command, Jog) else None
+        if hold:
+            right = right.also(lambda: hold.check(self._clock.now_s()))
+        permit = axis.permit(command_id, command.verb, right)
+        self._ledger.open(Entry(command_id, axis_name, command, client, login))
+        over = self._under_way[command_id] = asyncio.Event()
+        try:
+            if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
+
+                def waits(ahead: str) -> None:
+                    accepted.set()
+                    accept(self._ledger.waits(command_id, ahead))
+
+                return await axis.in_turn(command, permit, lambda: self._start(axis, command, permit), waits)
+            return await self._start(axis, command, permit)
+        except LdcndError as error:
+            self._ledger.answered(command_id, error, _status(error))
+            raise
+        except BaseException:
+            self._ledger.answered(command_id, OutcomeUnknown("the command was cut short"), CommandStatus.UNKNOWN)
+            raise
+        finally:
+            del self._under_way[command_id]
+            over.set()
+            if hold and not hold.begun:
+                hold.over = True
+
+    async def _start(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
+        reply = await axis.execute(command, permit)
+        moving = axis.tracker.command is not None and axis.tracker.command.command_id == permit.command_id
+        ends_later = command.ends is Ends.BY_READING and moving
+        status = CommandStatus.EXECUTING if ends_later else CommandStatus.DONE
+        self._ledger.answered(permit.command_id, reply, status)
+        return reply
+
+    def stopped(self, names: tuple[str, ...], confirmed: tuple[str, ...], command: Stop, login: str | None) -> None:
+        """Enter stops that were carried out already, with their requester: one event for each axis.
+
+        Args:
+            names: the axes that were stopped.
+            confirmed: those whose drives acknowledged it.
+            command: the stop request; only its `client` is used.
+            login: whose link it came over, for the record.
+        """
+        for name in names:
+            status, reason = CommandStatus.DONE, None
+            if not self._rig.axes[name].stoppable:
+                status, reason = CommandStatus.REFUSED, "its drive cannot be stopped over its line"
+            elif name not in confirmed:
+                status, reason = (
+                    CommandStatus.UNKNOWN,
+                    "the drive did not confirm it yet; the axis is latched",
+                )
+            command_id = self.events.next_command_id()
+            self._ledger.open(Entry(command_id, name, command, command.client, login, status, reason))
+
+    async def _answer_again(self, entry: Entry) -> CommandReply:
+        """Answer a repeated id as the first time, once there is an answer."""
+        under_way = self._under_way.get(entry.command_id)
+        if under_way and entry.answer is None:
+            await under_way.wait()
+            entry = self._ledger.get(entry.command_id)
+        if isinstance(entry.answer, CommandReply):
+            return entry.answer
+        raise entry.answer or OutcomeUnknown(
+            f"axis {entry.axis}: the outcome of {entry.verb} is unknown", axis=entry.axis
+        )
+
+    def _admit(self, axis: str, command: AxisCommand[CommandReply]) -> str | None:
+        """Refuse a command that is stale, late or sent by another client; return its sender, if it names one."""
+        if command.effect is Effect.REST:
+            return None
+        self._refuse_rival(axis)
+        if command.instance not in (None, self._instance):
+            raise CommandExpired(
+                f"axis {axis}: {command.verb} was sent to another run of the daemon;"
+                " it is unknown whether it was carried out",
+                axis=axis,
+                value=command.instance,
+                limit=self._instance,
+                remedy="look where the axis is, then send a new command to this run",
+            )
+        self._refuse_late(axis, command)
+        return self.authority.admit(axis, command.lease, command.sequence, self._clock.now_s())
+
+    def _admit_lease(self, axis: str, lease: str | None) -> None:
+        """Refuse whatever could move an axis to another client than its holder."""
+        self._refuse_rival(axis)
+        self.authority.admit(axis, lease, None, self._clock.now_s())
+
+    def _right(self, axis: str, command: AxisCommand[CommandReply], accepted: asyncio.Event) -> Right:
+        """Return what must still hold of the sender when a motion of its command begins.
+
+        Args:
+            axis: which axis.
+            command: the request.
+            accepted: set once its sender has the reply that it waits for its turn.
+        """
+        arrived_s = self._clock.now_s()
+
+        def holds() -> None:
+            self._refuse_rival(axis)
+            self.authority.check_held(axis, command.lease, self._clock.now_s())
+
+        def in_time() -> None:
+            self._refuse_late(axis, command)
+            if not accepted.is_set() and self._clock.now_s() - arrived_s > command.answer_s - REPLY_S:
+                raise CommandExpired(
+                    f"axis {axis}: the turn of {command.verb} came later than its sender waits for a reply",
+                    axis=axis,
+                    value=self._clock.now_s() - arrived_s,
+                    limit=command.answer_s - REPLY_S,
+                    remedy="send it again if it is still wanted",
+                )
+
+        return Right(holds, in_time)
+
+    def _refuse_late(self, axis: str, command: AxisCommand[CommandReply]) -> None:
+        if command.not_after is not None and self._clock.now_ns() > command.not_after:
+            late_s = (self._clock.now_ns() - command.not_after) / 1e9
+            raise CommandExpired(
+                f"axis {axis}: {command.verb} is {late_s:.3f} s later than its sender allows",
+                axis=axis,
+                value=command.not_after,
+                remedy="send it again if it is still wanted",
+            )
+
+    def _refuse_rival(self, axis: str) -> None:
+        if self.rivals:
+            others = ", ".join(sorted(self.rivals))
+            raise DuplicateDaemon(
+                f"axis {axis}: rig {self._rig.name} is served by other daemons, too ({others}); nothing is moved",
+                axis=axis,
+                value=others,
+                remedy="end all but one of the daemons",
+            )
+
+
+def _status(error: LdcndError) -> CommandStatus:
+    match error:
+        case OutcomeUnknown():
+            return CommandStatus.UNKNOWN
+        case CommandAborted():
+            return CommandStatus.ABORTED
+        case RequestRefused():
+            return CommandStatus.REFUSED
+        case _:
+            return CommandStatus.FAILED

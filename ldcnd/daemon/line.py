@@ -1,0 +1,354 @@
+"""One line at work: brings its drives up whenever it opens, has them polled, tells the axes when it is gone."""
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+from ldcnd.axis.axis import AxisService
+from ldcnd.axis.clock import Clock
+from ldcnd.axis.polling import AxisPoller
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch, WrongState
+from ldcnd.contract.rig_commands import CapturedInputs, SnapshotReply
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.driver import PollsItself, Readable, ReadingListeners, StopMode
+from ldcnd.drives.network import BringUpReport, Network
+from ldcnd.line.bus import Bus
+from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.line.poller import Poller, Priority
+from ldcnd.log import get_logger
+
+log = get_logger("bus")
+
+FIRST_RETRY_S = 0.5
+LONGEST_RETRY_S = 10.0
+FIRST_SCAN_PAUSE_S = 0.25
+LONGEST_SCAN_PAUSE_S = 2.0
+"""Longest pause between two scans for lost drives: a drive that powers up must be back within 3 s."""
+CAPTURING = frozenset({Verb.HOME, Verb.PROBE})
+"""Commands that wait for a capture in the drive's home register."""
+SCAN_SHARE = 0.01
+"""Share of the line's time for these scans; more where the longest pause requires it."""
+
+
+class BusService:
+    """One bus, its network and its axes.
+
+    Attributes:
+        port: where it is connected, as configured.
+        family: the drive family on it.
+        report: how the line came up; None while it is not up.
+        problem: why it is not up; empty while it is.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        network: Network,
+        axes: tuple[AxisService, ...],
+        *,
+        port: str,
+        family: str,
+        stop_probe_hz: float = 0.0,
+    ) -> None:
+        self.bus = bus
+        self.port = port
+        self.family = family
+        self.network = network
+        self.axes = axes
+        self.report: BringUpReport | None = None
+        self.problem = "not opened yet"
+        self._pollers: dict[str, Poller[Any]] = {}
+        self._stop_probe_hz = stop_probe_hz
+        self._was_up = False
+        self._up = asyncio.Event()
+        self._down = asyncio.Event()
+        self._down.set()
+        self._baud: int | None = None  # at which the line was up last
+        self._stop_wanted = asyncio.Event()
+        for axis in axes:
+            axis.stop_wanted = self._stop_wanted
+        bus.resync = network.resync
+
+    async def run(self) -> None:
+        """Serve the line until cancelled."""
+        name = self.bus.settings.name
+        async with asyncio.TaskGroup() as group:
+            group.create_task(self.bus.run(), name=f"bus {name}")
+            group.create_task(self._supervise(), name=f"bring up {name}")
+            if self._stop_probe_hz:
+                group.create_task(self._probe_stop_lane(1.0 / self._stop_probe_hz), name=f"stop probes {name}")
+            for axis in self.axes:
+                group.create_task(axis.run(), name=f"axis {axis.config.name}")
+                group.create_task(axis.reference.run(), name=f"reference {axis.config.name}")
+                group.create_task(axis.traces.run(), name=f"traces {axis.config.name}")
+
+    async def wait_up(self) -> None:
+        """Return as soon as the drives are polled."""
+        await self._up.wait()
+
+    async def wait_down(self) -> None:
+        """Return as soon as the axes are informed of the line's loss."""
+        await self._down.wait()
+
+    async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
+        """Stop axes with closed loops by one packet if they form groups; each must be stopped by itself besides."""
+        if self.report is None:
+            return
+        try:
+            await self.network.stop_together(mode, names)
+        except BusError as error:
+            log.warning("group stop not sent", bus=self.bus.settings.name, reason=error.message)
+
+    async def snapshot(self, clock: Clock) -> SnapshotReply:
+        """Return the positions of all axes at one instant; moves nothing.
+
+        Raises:
+            NotSupported, WrongState, BusError: as `Network.snapshot`; BusDown while the line is not up.
+        """
+        name = self.bus.settings.name
+        self.check_up()
+        instant = await self.network.snapshot(self._check_registers)
+        t, t_error_ns = clock.stamp_between(instant.from_s, instant.until_s)
+        positions = tuple(axis.frozen_at(instant.counts[axis.config.name]) for axis in self.axes)
+        io = tuple(
+            CapturedInputs(module=each.name, levels=each.levels, counter=each.counter, proven=each.proven)
+            for each in instant.io
+        )
+        return SnapshotReply(bus=name, t=t, t_error_ns=t_error_ns, positions=positions, io=io)
+
+    def check_up(self) -> None:
+        """Refuse what needs the line while it is not up.
+
+        Raises:
+            BusDown: it is not.
+        """
+        name = self.bus.settings.name
+        if self.report is None:
+            raise BusDown(f"bus {name} is not up: {self.problem}", value=name, remedy="see `ldcnd bus list`")
+
+    def _check_registers(self) -> None:
+        """Refuse to overwrite a register in which a command waits for a capture.
+
+        Raises:
+            WrongState: an axis is homing or probing.
+        """
+        for axis in self.axes:
+            command = axis.tracker.command
+            if command and command.verb in CAPTURING:
+                name = axis.config.name
+                raise WrongState(
+                    f"axis {name} carries out {command.verb}: its home register is in use",
+                    axis=name,
+                    value=command.verb.value,
+                    remedy="wait until it has ended",
+                )
+
+    def reconfigure(self, configs: Mapping[str, AxisConfig]) -> None:
+        """Take other limits, speeds, rates and priorities of axes, by name."""
+        for axis in self.axes:
+            config, before = configs[axis.config.name], axis.config
+            axis.reconfigure(config)
+            polled_anew = (config.rates, config.priority) != (before.rates, before.priority)
+            if polled_anew and self.report is not None:
+                self._poll(axis, asyncio.get_running_loop().time())
+
+    def asked_hz(self, axis: str) -> Mapping[TelemetryItem, float]:
+        """Return the current rates at which the items of an axis are polled."""
+        poller = self._pollers.get(axis)
+        return poller.rates_hz if poller else {}
+
+    async def _supervise(self) -> None:
+        retry_s = FIRST_RETRY_S
+        while True:
+            await self.bus.wait_opened()
+            if self.bus.baud == (self._baud or self.bus.baud):
+                await self._send_pending_stops()  # first: at another rate the drives would not receive it
+            try:
+                report = await self.network.bring_up()
+            except LdcndError as error:  # also a stop that took one of its packets off the queue
+                self._not_up(error)
+                await self._pause(retry_s)
+                retry_s = min(2 * retry_s, LONGEST_RETRY_S)
+                continue
+            retry_s, self.problem = FIRST_RETRY_S, ""
+            for name in report.restarted:
+                self._restarted(name)
+            for axis in self.axes:
+                if report.reset:
+                    axis.cannot_move()
+                elif axis.config.name in report.open_loops:
+                    axis.switch_off()  # nothing in the drive ends a raw duty that an earlier host has left
+                else:
+                    axis.taken_over()
+            await self._send_pending_stops()
+            if not self._was_up:
+                for axis in self.axes:
+                    await axis.recall(report)
+            self.report, self._baud = report, report.baud
+            self._connect(report)
+            await self._scan_for_lost_drives()
+            self.report, self.problem = None, "the line was lost"
+            self._up.clear()
+            self._down.set()
+            for axis in self.axes:
+                axis.line_up = False
+                axis.disconnected()
+
+    def _not_up(self, error: LdcndError) -> None:
+        """Keep why the line is not up; its axes show whether nothing answers, or something that is not theirs."""
+        if error.message != self.problem:
+            log.error("line not up", bus=self.bus.settings.name, reason=error.message, remedy=error.remedy)
+        self.problem = error.message
+        self.bus.proofs.lose_all(error.message, silent=not isinstance(error, NetworkMismatch))
+        for axis in self.axes:
+            axis.disconnected()
+
+    async def _send_pending_stops(self) -> None:
+        """Send what no drive has confirmed, to all axes that wait for it at once."""
+        self._stop_wanted.clear()
+        waiting = [axis for axis in self.axes if axis.stop_is_pending]
+        if not waiting:
+            return
+        async with asyncio.TaskGroup() as stops:
+            for axis in waiting:
+                stops.create_task(axis.send_pending_stop(), name=f"pending stop {axis.config.name}")
+
+    async def _pause(self, pause_s: float) -> None:
+        """Wait before the next attempt to bring the line up; a stop that comes meanwhile is tried at once."""
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + pause_s
+        while loop.time() < until_s:
+            try:
+                async with asyncio.timeout_at(until_s):
+                    await self._stop_wanted.wait()
+            except TimeoutError:
+                return
+            await self._send_pending_stops()
+
+    async def _scan_for_lost_drives(self) -> None:
+        """Scan for drives that lost power and came back; return when the line is lost."""
+        pause_s = FIRST_SCAN_PAUSE_S
+        loop = asyncio.get_running_loop()
+        while not await self._closed_within(pause_s):
+            pause_s = FIRST_SCAN_PAUSE_S
+            self.bus.proofs.heard_again.clear()
+            await self._send_pending_stops()
+            if not self.network.incomplete():
+                continue
+            began_s = loop.time()
+            heard: frozenset[str] = frozenset()
+            try:
+                heard = await self._search()
+            except LdcndError as error:
+                log.warning("search for lost drives failed", bus=self.bus.settings.name, reason=error.message)
+            self.problem = self.network.problem
+            now_s = loop.time()
+            if not heard:
+                pause_s = min((now_s - began_s + self.bus.quarantine_s) / SCAN_SHARE, LONGEST_SCAN_PAUSE_S)
+
+    async def _search(self) -> frozenset[str]:
+        """Search once for lost drives; a stop that waits goes out meanwhile, first to each drive that answers again.
+
+        Returns the axes that answer again.
+
+        Raises:
+            LdcndError: as `Network.rejoin`.
+        """
+        back: set[str] = set()
+
+        def heard(name: str) -> None:
+            back.add(name)
+            self._poll(self._axis(name), asyncio.get_running_loop().time())
+            self._stop_wanted.set()
+
+        search = asyncio.create_task(self.network.rejoin(self._restarted, heard), name="search for lost drives")
+        try:
+            while not search.done():
+                wanted = asyncio.ensure_future(self._stop_wanted.wait())
+                try:
+                    await asyncio.wait((search, wanted), return_when=asyncio.FIRST_COMPLETED)
+                    stops = wanted.done()
+                finally:
+                    wanted.cancel()
+                if stops:
+                    await self._send_pending_stops()
+            await search
+        finally:
+            search.cancel()
+        return frozenset(back)
+
+    def _axis(self, name: str) -> AxisService:
+        return next(axis for axis in self.axes if axis.config.name == name)
+
+    async def _probe_stop_lane(self, period_s: float) -> None:
+        """Keep measuring how long a stop would wait."""
+        while True:
+            await asyncio.sleep(period_s)
+            await self.wait_up()
+            try:
+                await self.bus.probe_stop_wait()
+            except LdcndError as error:  # a lost reply is counted and reported by the drive's owner
+                log.debug("stop probe lost", bus=self.bus.settings.name, reason=error.message)
+
+    async def _closed_within(self, pause_s: float) -> bool:
+        """Tell whether the line is lost within a time, before a stop must be sent again or a node is heard again."""
+        closed = asyncio.ensure_future(self.bus.wait_closed())
+        wanted = asyncio.ensure_future(self._stop_wanted.wait())
+        heard = asyncio.ensure_future(self.bus.proofs.heard_again.wait())
+        try:
+            await asyncio.wait((closed, wanted, heard), timeout=pause_s, return_when=asyncio.FIRST_COMPLETED)
+            return closed.done()
+        finally:
+            for each in (closed, wanted, heard):
+                each.cancel()
+
+    def _restarted(self, name: str) -> None:
+        """A drive has lost power and is about to answer again: it is disabled, whatever its axis was doing."""
+        log.warning("drive lost power", axis=name, bus=self.bus.settings.name)
+        axis = self._axis(name)
+        axis.restarted()
+        axis.disconnected()
+        axis.cannot_move()
+        axis.tracker.powered(on=False, now_s=asyncio.get_running_loop().time())
+        axis.tracker.finished()
+
+    def _connect(self, report: BringUpReport) -> None:
+        """Start polling. Only the very first reset can be a reference, and only where its place is proven."""
+        log.info(
+            "line up",
+            bus=self.bus.settings.name,
+            baud=report.baud,
+            drives=dict(report.identities),
+            remarks=report.remarks,
+        )
+        now_s = asyncio.get_running_loop().time()
+        for axis in self.axes:
+            trusted = axis.config.reference == "at_reset" and axis.config.name in report.placed and not self._was_up
+            axis.connected(placed=trusted)
+            self._poll(axis, now_s)
+        for watch in self.network.watches:
+            self.bus.add_poller(watch)
+        self._was_up = True
+        self._down.clear()
+        self._up.set()
+
+    def _poll(self, axis: AxisService, now_s: float) -> None:
+        """Poll the axis from now on; an existing poller is replaced."""
+        if previous := self._pollers.get(axis.config.name):
+            self.bus.remove_poller(previous)
+        poller: Poller[Any]
+        drive = axis.driver
+        if isinstance(drive, PollsItself):
+            poller = drive.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed, axis.alarmed))
+        elif isinstance(drive, Readable):
+            rates_hz = axis.config.rates.wanted_hz(adc=bool(drive.adc_full_scale))
+            poller = AxisPoller(drive, rates_hz, now_s, axis.judged, axis.missed, self.bus.add_poller)
+            axis.ask_at = poller.ask_at
+        else:
+            raise TypeError(f"axis {axis.config.name}: its drive can be read in no way")
+        poller.priority = Priority[axis.config.priority.upper()]
+        self._pollers[axis.config.name] = poller
+        self.bus.wire_log.add(now_s, WireEvent.POLLED, note=axis.config.name)
+        self.bus.add_poller(poller)

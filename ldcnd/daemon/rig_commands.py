@@ -1,0 +1,552 @@
+"""Commands of several axes, of a module or of the rig as a whole, and questions: what is not for one axis alone."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Protocol
+
+from ldcnd.axis import guards
+from ldcnd.axis.axis import AxisService
+from ldcnd.axis.clock import Clock
+from ldcnd.axis.procedures.group import GroupMoveRequest, Meeting, Rendezvous, plans_on_line
+from ldcnd.axis.procedures.path import PathShareRequest, SharedPath
+from ldcnd.axis.state import AxisTracker
+from ldcnd.contract.codec import remedy_steps
+from ldcnd.contract.commands import (
+    AxisCommand,
+    Cause,
+    Command,
+    CommandReply,
+    MoveAbsolute,
+    Preview,
+    ReportShadow,
+    Verb,
+    Why,
+    WhyReply,
+)
+from ldcnd.contract.errors import (
+    DriveFault,
+    InternalError,
+    LdcndError,
+    MalformedRequest,
+    NotSupported,
+    Remedy,
+    step,
+)
+from ldcnd.contract.events import CommandOutcome, ReadEvents, ReadOutcome
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.leases import Holder, HolderList, ListHolders, Release, Renew
+from ldcnd.contract.rig_commands import (
+    AxisShare,
+    GroupMoves,
+    LinePath,
+    MoveTogether,
+    MoveTogetherReply,
+    PathReply,
+    PreviewTogether,
+    PreviewTogetherReply,
+    ReadWireLog,
+    Rehearsal,
+    RehearsalReply,
+    Rehearse,
+    SetIo,
+    SetIoTimer,
+    SetSpeedOverride,
+    Snapshot,
+    SpeedOverrideReply,
+    WalkPath,
+    WireLogReply,
+)
+from ldcnd.contract.samples import FaultEntry
+from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy
+from ldcnd.daemon.ledger import EventLog, Ledger
+from ldcnd.daemon.line import BusService
+from ldcnd.daemon.rig import ModuleService, Rig
+from ldcnd.line.flight_recorder import WireRecord
+from ldcnd.log import get_logger
+
+log = get_logger("commands")
+
+PAGE_BYTES = 12_000
+"""Text in one reply: with its other fields it stays below what a payload may have."""
+LONGEST_DATA_BYTES = 2_000
+"""Of a longer burst, such as noise on a broken line, only the beginning is shown."""
+BACK_WITHIN_S = 20.0
+"""Time for a line to come up again whose loss was rehearsed, seconds."""
+LINE_OVERHEAD_BYTES = 3
+"""Quotation marks and comma in JSON."""
+
+
+class Execute(Protocol):
+    """Carries out a command of an axis, after all checks of the daemon."""
+
+    def __call__(  # noqa: D102 - see above
+        self, axis_name: str, command: AxisCommand[CommandReply], login: str | None = None
+    ) -> Awaitable[CommandReply]: ...
+
+
+Admit = Callable[[str, str | None], None]
+"""Raises when nothing may be moved on an axis under a lease, or without one."""
+
+
+class RigCommands:
+    """Carries out what concerns several axes, a module or the rig, and answers questions."""
+
+    def __init__(
+        self,
+        rig: Rig,
+        authority: Authority,
+        leases: LeaseWatch,
+        ledger: Ledger,
+        events: EventLog,
+        clock: Clock,
+        execute: Execute,
+        admit: Admit,
+    ) -> None:
+        """Take what the daemon consists of.
+
+        Args:
+            rig: all lines and axes.
+            authority: the leases.
+            leases: gives control and ends it.
+            ledger: the outcomes of commands.
+            events: what has happened to them.
+            clock: of the daemon.
+            execute: how a command of one axis is carried out.
+            admit: raises when the holder of a lease, or who has none, may not move an axis.
+        """
+        self._rig = rig
+        self._authority = authority
+        self._leases = leases
+        self._ledger = ledger
+        self._events = events
+        self._clock = clock
+        self._execute = execute
+        self._admit = admit
+
+    async def answer(self, axis: str, command: Command[Frozen], login: str | None) -> Frozen:
+        """Carry out a command that is not for one axis, or answer a question; see `Dispatcher.answer`.
+
+        Raises:
+            LdcndError: as it was refused.
+        """
+        match command:
+            case MoveTogether() | WalkPath():
+                return await self._move_together(command, login)
+            case SetSpeedOverride():
+                return await self._set_speed_override(command)
+            case Snapshot():
+                return await self._rig.lines[command.bus].snapshot(self._clock)
+            case SetIo():
+                module = self._rig.modules[command.module]
+                return await module.set_io(command, lambda: self._admit_module(module, command))
+            case SetIoTimer():
+                module = self._rig.modules[command.module]
+                return await module.set_timer(command, lambda: self._admit_module(module, command))
+            case Rehearse():
+                for name in concerned(self._rig, command):
+                    self._admit(name, command.lease)
+                return await rehearse(self._rig, command)
+            case Renew():
+                return self._authority.renew(command.lease, self._clock.now_s()).reply()
+            case Release():
+                return self._leases.release(command.lease, leave_running=command.leave_running).reply()
+            case _:
+                return self._question(axis, command)
+
+    def _question(self, axis: str, command: Command[Frozen]) -> Frozen:
+        """Answer what moves and changes nothing."""
+        match command:
+            case Why():
+                return self._why(self._rig.axes[axis], command)
+            case Preview():
+                why = self._why(self._rig.axes[axis], Why(absolute=command.position is not None))
+                return self._rig.axes[axis].preview(command, tuple(cause.text for cause in why.causes))
+            case ReportShadow():
+                return self._rig.axes[axis].report_shadow(command)
+            case PreviewTogether():
+                return preview_together(self._rig, command)
+            case ListHolders():
+                return self._holders()
+            case ReadOutcome():
+                return self._outcome(command)
+            case ReadEvents():
+                return self._events.page(command)
+            case ReadWireLog():
+                return wire_page(self._rig, command, self._clock)
+            case _:
+                raise InternalError(f"nothing carries out {command.verb}")
+
+    def _why(self, axis: AxisService, request: Why) -> WhyReply:
+        """Tell why a motion of this axis would be refused now, and what would clear that."""
+        return explain(
+            axis.tracker,
+            lambda: self._admit(axis.config.name, request.lease),
+            axis.driver.capabilities,
+            absolute=request.absolute,
+        )
+
+    def _own(self, axis: str, leases: tuple[str, ...]) -> str | None:
+        """Return which of these leases is the one on an axis; None when another one is, or none."""
+        holder = self._authority.holder(axis)
+        return holder.token if holder and holder.token in leases else None
+
+    def _admit_module(self, module: ModuleService, command: SetIo | SetIoTimer) -> None:
+        """Refuse outputs to who may not move the axes of the module's line, and while one of them is stopped.
+
+        What an output switches is not known: it may move something.
+        """
+        for name in module.axes:
+            self._admit(name, self._own(name, command.leases) or command.lease)
+            guards.check_not_latched(self._rig.axes[name].tracker)
+
+    async def _set_speed_override(self, command: SetSpeedOverride) -> SpeedOverrideReply:
+        """Scale the velocities of all axes; to lower them needs no right, as a stop needs none."""
+        share = command.percent / 100.0
+        axes = list(self._rig.axes.values())
+        if any(share > axis.tracker.speed_share for axis in axes):
+            for name in self._rig.axes:
+                self._admit(name, self._own(name, command.leases))
+        log.info("speed override", percent=command.percent, client=command.client)
+        changed, halted = [], []
+
+        async def change(axis: AxisService) -> None:
+            name = axis.config.name
+            try:
+                other_speed, at_rest = await axis.set_speed_share(share)
+            except LdcndError as error:
+                log.warning("motion goes on at its speed", axis=name, reason=error.message)
+                return
+            if other_speed:
+                changed.append(name)
+            if at_rest:
+                halted.append(name)
+
+        async with asyncio.TaskGroup() as group:
+            for axis in axes:
+                group.create_task(change(axis), name=f"speed override {axis.config.name}")
+        return SpeedOverrideReply(percent=command.percent, changed=tuple(sorted(changed)), halted=tuple(sorted(halted)))
+
+    async def _move_together(
+        self, command: MoveTogether | WalkPath, login: str | None
+    ) -> MoveTogetherReply | PathReply:
+        execute = partial(self._execute, login=login)
+        reply: MoveTogetherReply | PathReply
+        if isinstance(command, WalkPath):
+            reply = await walk_path(self._rig, command, execute)
+        else:
+            straight, deviation = command.path is LinePath.LINEAR, command.max_deviation
+            reply = await move_together(
+                self._rig, _shares(command), execute, straight=straight, max_deviation=deviation
+            )
+        share = self._ledger.get(reply.replies[0].command_id).command
+        # the ledger decides which request was the first: of two that come at once it knows neither before
+        if isinstance(share, (GroupMoveRequest, PathShareRequest)):
+            reply = share.rendezvous.reply(reply.replies)
+        return reply
+
+    def _holders(self) -> HolderList:
+        holders = [(axis, self._authority.holder(axis)) for axis in self._rig.axes]
+        return HolderList(
+            required=self._authority.required,
+            holders=tuple(Holder(axis=axis, client=lease.client if lease else None) for axis, lease in holders),
+        )
+
+    def _outcome(self, request: ReadOutcome) -> CommandOutcome:
+        entry = self._ledger.get(request.command_id)
+        arrival = entry.arrival
+        return CommandOutcome(
+            command_id=entry.command_id,
+            axis=entry.axis,
+            verb=entry.verb.value,
+            status=entry.status,
+            reason=entry.reason,
+            position=arrival.position if arrival else None,
+            following_error=arrival.following_error if arrival else None,
+            settled=arrival.settled if arrival else None,
+        )
+
+
+async def move_together(
+    rig: Rig,
+    moves: Mapping[str, MoveAbsolute],
+    execute: Execute,
+    *,
+    straight: bool = False,
+    max_deviation: float | None = None,
+) -> MoveTogetherReply:
+    """Start absolute moves of several axes together; returns once every drive has proven that it started.
+
+    Args:
+        rig: the daemon's.
+        moves: by axis name; exactly the members of one configured group.
+        execute: how a single command is carried out.
+        straight: they keep to a straight line.
+        max_deviation: the line is refused if they would leave it by more, in axis units.
+
+    Raises:
+        UnknownAxis: there is no such axis.
+        NotSupported: the axes are on different lines, or are no group.
+        RequestRefused: a member cannot move, or they would leave the line; nothing was started.
+        BusError: the line failed; `OutcomeUnknown` when a drive may have started, then all were commanded to stop.
+    """
+    line = _line_of(rig, moves)
+    meeting = Meeting(line.network, frozenset(moves), straight=straight, max_deviation=max_deviation)
+
+    requests = {name: GroupMoveRequest.of(move, meeting) for name, move in moves.items()}
+    return meeting.reply(await _all_of(requests, meeting, execute))
+
+
+async def walk_path(rig: Rig, command: WalkPath, execute: Execute) -> PathReply:
+    """Walk axes along a polyline; returns once every drive walks.
+
+    Raises:
+        MalformedRequest: an axis is named twice, or the axes have differently many corners.
+        UnknownAxis, NotSupported, RequestRefused, BusError: as `move_together`.
+    """
+    via = {move.axis: move.via for move in command.moves}
+    if len({len(corners) for corners in via.values()}) > 1 or len(via) < len(command.moves):
+        raise MalformedRequest("a path names each axis once, with equally many corners", remedy="see `via`")
+    line = _line_of(rig, via)
+    path = SharedPath(line.network, line.bus, frozenset(via), command.speed, command.max_deviation)
+    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis", "via"})) for move in command.moves}
+
+    requests = {name: PathShareRequest.of(move, via[name], path) for name, move in moves.items()}
+    return path.reply(await _all_of(requests, path, execute))
+
+
+async def _all_of(
+    requests: Mapping[str, AxisCommand[CommandReply]], rendezvous: Rendezvous, execute: Execute
+) -> tuple[CommandReply, ...]:
+    """Have each axis carry out its part; returns once all have started, and raises why none did."""
+
+    async def take_part(name: str, request: AxisCommand[CommandReply]) -> CommandReply | LdcndError:
+        try:
+            return await execute(name, request)
+        except LdcndError as error:
+            rendezvous.fail(error)
+            return error
+
+    async with asyncio.TaskGroup() as group:
+        tasks = [
+            group.create_task(take_part(name, request), name=f"{request.verb} {name}")
+            for name, request in requests.items()
+        ]
+    replies = []
+    for task in tasks:
+        result = task.result()
+        if isinstance(result, LdcndError):
+            raise rendezvous.failure or result
+        replies.append(result)
+    return tuple(replies)
+
+
+def preview_together(rig: Rig, request: PreviewTogether) -> PreviewTogetherReply:
+    """Plan moves of a group without sending anything.
+
+    Raises:
+        UnknownAxis, NotSupported, RequestRefused: as `move_together`, but for what is in the way only now.
+    """
+    moves = _shares(request)
+    _line_of(rig, moves)
+    axes = {name: rig.axes[name].planned(move) for name, move in moves.items()}
+    plans, deviation = {name: plan for name, (_, plan) in axes.items()}, None
+    if request.path is LinePath.LINEAR:
+        plans, deviation = plans_on_line(axes, request.max_deviation)
+    shares = tuple(
+        AxisShare(
+            axis=name,
+            position=axes[name][0].shown(plan.position) or 0.0,
+            velocity=plan.velocity,
+            acceleration=plan.acceleration,
+            duration_s=plan.duration_s or 0.0,
+        )
+        for name, plan in plans.items()
+    )
+    longest_s = max(share.duration_s for share in shares)
+    return PreviewTogetherReply(shares=shares, duration_s=longest_s, deviation=deviation)
+
+
+def _shares(command: GroupMoves) -> dict[str, MoveAbsolute]:
+    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis"})) for move in command.moves}
+    if len(moves) < len(command.moves):
+        raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
+    return moves
+
+
+def _line_of(rig: Rig, names: Iterable[str]) -> BusService:
+    """Return the line that all these axes are on.
+
+    Raises:
+        UnknownAxis, NotSupported: as `move_together`.
+    """
+    wanted = list(names)
+    lines = {bus for bus in rig.buses for name in wanted if rig.axes[name] in bus.axes}
+    if len(lines) != 1:
+        raise NotSupported(f"axes {', '.join(wanted)} are not on one line, so they cannot start together")
+    (line,) = lines
+    return line
+
+
+def concerned(rig: Rig, request: Rehearse) -> tuple[str, ...]:
+    """Return the axes that a rehearsed loss concerns: a lost line is lost for all on it.
+
+    Raises:
+        UnknownAxis: there is no such axis.
+    """
+    axis = rig.axes[request.axis]
+    if request.kind is Rehearsal.BUS_LOSS:
+        return tuple(each.config.name for each in _bus_of(rig, request.axis).axes)
+    return (axis.config.name,)
+
+
+async def rehearse(rig: Rig, request: Rehearse) -> RehearsalReply:
+    """Play a loss; returns once it was played, the axis may still be coming to rest.
+
+    Raises:
+        UnknownAxis: there is no such axis.
+        BusDown: its line is not up, or has not come up again.
+    """
+    axis = rig.axes[request.axis]
+    log.warning("rehearsal", axis=request.axis, kind=request.kind.value)
+    if request.kind is Rehearsal.DAEMON_STOP:
+        await apply_policy(axis, axis.config.loss.daemon, "rehearsed end of the daemon")
+        policy = axis.config.loss.daemon
+    else:
+        bus = _bus_of(rig, request.axis)
+        bus.check_up()
+        bus.bus.drop("rehearsed loss")
+        try:
+            async with asyncio.timeout(BACK_WITHIN_S):  # also where the daemon ends meanwhile: then it never does
+                await bus.wait_down()
+                await bus.wait_up()
+        except TimeoutError:
+            bus.check_up()
+        policy = axis.config.loss.bus
+    return RehearsalReply(kind=request.kind, axis=request.axis, policy=policy.value)
+
+
+def _bus_of(rig: Rig, name: str) -> BusService:
+    return next(bus for bus in rig.buses if any(axis.config.name == name for axis in bus.axes))
+
+
+MOTIONS = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY, Verb.JOG, Verb.SET_PWM})
+"""Commands of which a drive that can be moved at all takes one at least."""
+OF_DRIVES = frozenset({*MOTIONS, Verb.POWER, Verb.HALT, Verb.HOME, Verb.SET_POSITION, Verb.RESET, Verb.SET_GAINS})
+"""Commands that only some drives take."""
+NO_COMMAND_HELPS = "the drive takes no command for that: use its own inputs and its own tool"
+
+
+def explain(
+    tracker: AxisTracker, admit: Callable[[], None], capabilities: Collection[Verb], *, absolute: bool
+) -> WhyReply:
+    """Evaluate every guard for a motion.
+
+    Args:
+        tracker: what is known of the axis.
+        admit: raises what the authority would refuse the sender with.
+        capabilities: the commands that its drive takes: no remedy names another one.
+        absolute: whether the motion would name a position.
+    """
+    checks: list[Callable[[], None]] = [
+        admit,
+        lambda: guards.check_reachable(tracker),
+        lambda: guards.check_not_latched(tracker),
+        *(_fault(tracker.name, fault) for fault in tracker.active_faults if fault.source == "drive"),
+        lambda: guards.check_not_in_error(tracker),
+    ]
+    if MOTIONS.isdisjoint(capabilities):
+        checks.append(lambda: _refuse_motion(tracker.name))
+    else:
+        checks += [lambda: guards.check_enabled(tracker), lambda: guards.check_stands(tracker)]
+    if absolute and Verb.MOVE_ABSOLUTE in capabilities:
+        checks.append(lambda: guards.check_referenced(tracker))
+    causes = []
+    for check in checks:
+        try:
+            check()
+        except LdcndError as error:
+            steps = remedy_steps(error)
+            possible = all(each.verb in capabilities or each.verb not in OF_DRIVES for each in steps)
+            causes.append(
+                Cause(
+                    code=error.code.value,
+                    text=error.message,
+                    remedy=error.remedy if possible else NO_COMMAND_HELPS,
+                    steps=steps if possible else (),
+                    page=error.page,
+                )
+            )
+    first = tracker.first_fault
+    return WhyReply(
+        axis=tracker.name,
+        can_move=not causes,
+        causes=tuple(causes),
+        first_fault=f"{first.code}: {first.text}" if first else None,
+    )
+
+
+def _refuse_motion(axis: str) -> None:
+    raise NotSupported(f"axis {axis}: its drive takes no motion over the line", axis=axis, remedy=NO_COMMAND_HELPS)
+
+
+def _fault(axis: str, fault: FaultEntry) -> Callable[[], None]:
+    def check() -> None:
+        raise DriveFault(
+            f"axis {axis}: {fault.text}",
+            axis=axis,
+            value=fault.code,
+            remedy=Remedy("remove the cause, then {}", step("reset")),
+        )
+
+    return check
+
+
+def wire_page(rig: Rig, request: ReadWireLog, clock: Clock) -> WireLogReply:
+    """Return the requested records of one line, the oldest first, as many as one reply takes.
+
+    Raises:
+        ValueOutOfRange: the rig has no such line.
+    """
+    service = rig.lines[request.bus]
+    log = service.bus.wire_log
+    entries = log.entries()
+    oldest = log.added - len(entries)
+    if request.from_record is None:
+        skipped = entries.first_since(clock.now_s() - request.seconds)
+    else:
+        skipped = min(max(0, request.from_record - oldest), len(entries))
+    page = _page(WireRecord(*entry) for entry in entries.behind(skipped))
+    return WireLogReply(
+        bus=request.bus,
+        family=service.family,
+        zero=clock.wall_ns(0.0),
+        started=clock.started_s,
+        now=clock.now_s(),
+        first_record=oldest + skipped,
+        next_record=oldest + skipped + len(page),
+        end_record=log.added,
+        lines=page,
+    )
+
+
+def _page(records: Iterable[WireRecord]) -> tuple[str, ...]:
+    """Return as many lines as one reply takes, one at least."""
+    lines: list[str] = []
+    room = PAGE_BYTES
+    for record in records:
+        line = str(_shortened(record))
+        room -= len(line.encode()) + LINE_OVERHEAD_BYTES
+        if lines and room < 0:
+            break
+        lines.append(line)
+    return tuple(lines)
+
+
+def _shortened(record: WireRecord) -> WireRecord:
+    left_out = len(record.data) - LONGEST_DATA_BYTES
+    if left_out <= 0:
+        return record
+    note = f"{record.note} {left_out} more bytes left out".lstrip()
+    return replace(record, data=record.data[:LONGEST_DATA_BYTES], note=note)

@@ -1,0 +1,387 @@
+"""The daemon as a service: reports readiness and state, feeds the watchdog, reloads on request, ends in order.
+
+The watchdog is fed only while every bus keeps to its own plan. So it ends a daemon whose loop hangs and one whose loop
+runs while a line does not; a line without adapter or without drives is no reason, and appears in the status instead.
+
+A reload takes changes that affect only later commands and polls: limits, velocities and accelerations that requests
+omit, polling rates and priorities. A motion under way keeps the values that it was started with. All the rest says
+where drives are, what they are, or how the daemon was built, and needs a restart.
+"""
+
+import asyncio
+import gc
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+from typing import NamedTuple
+
+from pydantic import BaseModel, ValidationError
+
+from ldcnd.config.plan import require_plan
+from ldcnd.config.rig import RigConfig
+from ldcnd.contract.condition import Kind, assess, line_troubles
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.samples import FaultEntry, LinkState
+from ldcnd.daemon import systemd
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.systemd import Notifier
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.line_config import BusConfig
+from ldcnd.log import get_logger
+
+log = get_logger("service")
+
+CPU_LATENCY = Path("/dev/cpu_dma_latency")
+"""Linux: while it is held open with a number of microseconds in it, the processor wakes up within that time."""
+
+LoopFactory = Callable[[], asyncio.AbstractEventLoop]
+
+
+def loop_factory(*, uvloop: bool) -> LoopFactory:
+    """Return what makes the event loop: uvloop's where it is wanted and installed, asyncio's otherwise."""
+    if uvloop:
+        try:
+            import uvloop as fast  # noqa: PLC0415 - an optional package
+        except ImportError:
+            log.warning("no uvloop", remedy="install ldcnd[fast], or set uvloop = false")
+        else:
+            return _finely_timed(fast.Loop)
+    return asyncio.new_event_loop
+
+
+def require_writable(rig: RigConfig) -> None:
+    """Check that the daemon can keep what must outlive it, before anything is opened.
+
+    Raises:
+        ConfigError: it may not write where the configuration says; names where a service manager lets it.
+    """
+    for key, directory in (("state_dir", rig.state_dir), ("captures.directory", rig.captures.directory)):
+        if directory is None:
+            continue
+        there = next(place for place in (directory.absolute(), *directory.absolute().parents) if place.exists())
+        if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
+            allowed = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+            raise ConfigError(
+                f"{key}: {directory} cannot be written by this user or service",
+                value=str(directory),
+                remedy=f'{key} = "{allowed}", where the service may write' if allowed else "choose a writable place",
+            )
+
+
+@contextmanager
+def held_awake(*, wanted: bool, device: Path = CPU_LATENCY) -> Iterator[None]:
+    """Keep the processor out of idle states that take long to leave, for as long as the context lasts.
+
+    Where that is refused the daemon runs all the same, a little slower, and says so.
+    """
+    descriptor = _hold(device) if wanted else None
+    try:
+        yield
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+@contextmanager
+def last_words(speak: Callable[[], object]) -> Iterator[None]:
+    """Have something done when the process is aborted, as a service manager does whose watchdog was not fed.
+
+    It is done wherever the interpreter is just then, also in an event loop that hangs; then the process dies as it
+    would have without.
+    """
+
+    def aborted(number: int, _frame: FrameType | None) -> None:
+        signal.signal(number, signal.SIG_DFL)
+        try:
+            speak()
+        finally:
+            os.kill(os.getpid(), number)
+
+    before = signal.signal(signal.SIGABRT, aborted)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGABRT, before)
+
+
+def settle_heap() -> None:
+    """Exempt objects left by start-up from garbage collection: they stay as long as the process.
+
+    A full collection of it would hold up several polls.
+    """
+    gc.collect()
+    gc.freeze()
+
+
+def _finely_timed(loop: type[asyncio.AbstractEventLoop]) -> LoopFactory:
+    """Give a loop the clock of asyncio's own.
+
+    uvloop tells the time in whole milliseconds, of when its present turn began. That is longer than many a packet: a
+    reply would seem to come before its request was over. The zero of both clocks is the same.
+    """
+
+    class FinelyTimed(loop):  # type: ignore[valid-type, misc] # a class that is known at run time only
+        time = staticmethod(time.monotonic)  # read several times for each exchange: no Python frame round it
+
+    return FinelyTimed
+
+
+def _hold(device: Path) -> int | None:
+    try:
+        descriptor = os.open(device, os.O_WRONLY | os.O_CLOEXEC)
+    except OSError as error:
+        log.warning(
+            "processor not held awake",
+            device=str(device),
+            reason=error.strerror,
+            remedy="give the daemon write access, or set hold_cpu_awake = false",
+        )
+        return None
+    os.write(descriptor, bytes(4))
+    log.info("processor held awake", device=str(device))
+    return descriptor
+
+
+STATUS_PERIOD_S = 1.0
+FEEDINGS = 3
+"""Number of watchdog notifications within its time-out."""
+TRIES, TRY_PERIOD_S = 50, 0.1
+RELOAD_TIME_S = 10.0
+"""A configuration that takes longer to be read is given up: TimeoutStartSec= bounds a reload, too."""
+
+
+class Service:
+    """Runs a daemon and keeps its service manager informed.
+
+    Args:
+        daemon: what to run.
+        notifier: where to say it.
+        load: reads the configuration again, as it was read at the start.
+        monotonic_ns: CLOCK_MONOTONIC, which the service manager compares with its own.
+    """
+
+    def __init__(
+        self,
+        daemon: Daemon,
+        notifier: Notifier,
+        load: Callable[[], RigConfig],
+        monotonic_ns: Callable[[], int] = time.monotonic_ns,
+    ) -> None:
+        self._daemon = daemon
+        self._notifier = notifier
+        self._load = load
+        self._monotonic_ns = monotonic_ns
+        self._asked = asyncio.Event()
+        self._ending = False
+        self._stuck: tuple[str, ...] = ()
+        self._remark = ""
+
+    def reload(self) -> None:
+        """Request a reload of the configuration; requests that come meanwhile are merged."""
+        self._asked.set()
+
+    def end(self) -> None:
+        """Say that the daemon ends, and end it; `run` returns when its axes have come to rest."""
+        self._ending = True
+        self._notifier.tell(systemd.STOPPING, systemd.status(self._status()))
+        self._daemon.end()
+
+    async def run(self) -> None:
+        """Serve until `end` is called or the caller is cancelled."""
+        async with asyncio.TaskGroup() as group:
+            beside = [group.create_task(self._reload_when_asked(), name="reload")]
+            if self._notifier.is_heard:
+                beside.append(group.create_task(self._report(), name="service manager"))
+            try:
+                await self._daemon.run()
+            finally:
+                for task in beside:
+                    task.cancel()
+
+    async def _report(self) -> None:
+        await self._daemon.wait_serving()
+        watchdog_s = self._notifier.watchdog_s
+        period_s = min(STATUS_PERIOD_S, watchdog_s / FEEDINGS) if watchdog_s else STATUS_PERIOD_S
+        told = self._status()
+        await self._assure(systemd.READY, systemd.status(told))
+        while True:
+            messages = [systemd.WATCHDOG] if self._lines_on_time() else []
+            if (now := self._status()) != told:
+                messages.append(systemd.status(now))
+                told = now
+            self._notifier.tell(*messages)
+            await asyncio.sleep(period_s)
+
+    async def _assure(self, *messages: str) -> None:
+        """Send a one-time message, repeatedly for a while if the service manager is too busy to take it."""
+        for _ in range(TRIES):
+            if self._notifier.tell(*messages):
+                return
+            await asyncio.sleep(TRY_PERIOD_S)
+
+    def _lines_on_time(self) -> bool:
+        now_s = asyncio.get_running_loop().time()
+        stuck = tuple(bus.bus.settings.name for bus in self._daemon.rig.buses if not bus.bus.on_time(now_s))
+        if stuck and stuck != self._stuck:
+            log.error("a line has missed its deadline", buses=stuck, watchdog_s=self._notifier.watchdog_s)
+        self._stuck = stuck
+        return not stuck
+
+    def _status(self) -> str:
+        if self._ending:
+            return "stopping: axes come to rest"
+        stuck = [f"bus {name} has missed its deadline" for name in self._stuck]
+        return "; ".join(filter(None, [describe(self._daemon.rig), *stuck, self._remark]))
+
+    # -- reloading ---------------------------------------------------------------------------------------------------
+
+    async def _reload_when_asked(self) -> None:
+        await self._daemon.wait_serving()
+        while True:
+            await self._asked.wait()
+            self._asked.clear()
+            await self._assure(systemd.reloading(self._monotonic_ns()))
+            self._remark = await self._reload()
+            await self._assure(systemd.READY, systemd.status(self._status()))
+
+    async def _reload(self) -> str:
+        """Take what can be taken; return what the status must say about the rest."""
+        try:
+            async with asyncio.timeout(RELOAD_TIME_S):
+                reload, plan = await asyncio.to_thread(self._prepare, self._daemon.config)
+        except TimeoutError:
+            log.error("configuration not reloaded", reason=f"not read within {RELOAD_TIME_S:g} s")
+            return "configuration not reloaded: it cannot be read"
+        except ConfigError as error:
+            log.error("configuration not reloaded", reason=error.message, code=error.code.value)
+            return f"configuration not reloaded: {error.message.splitlines()[0]}"
+        self._daemon.reconfigure(reload.config, plan)
+        log.info("configuration reloaded", changed=reload.changed)
+        if not reload.refused:
+            return ""
+        log.warning("changes need a restart", keys=reload.refused)
+        return f"restart needed for {', '.join(reload.refused)}"
+
+    def _prepare(self, running: RigConfig) -> "tuple[Reload, RigBudget]":
+        """Read and judge the file, beside the loop: lines go on meanwhile."""
+        reload = plan_reload(running, self._load())
+        return reload, require_plan(reload.config)
+
+
+def describe(rig: Rig) -> str:
+    """Return in one line what of a rig works and what does not; what is true of several axes is said once.
+
+    Polls that a drive missed are left out: a status is for what lasts.
+    """
+    wrong: dict[str, list[str]] = {}
+    for bus in rig.buses:
+        name, up = bus.bus.settings.name, bus.report is not None
+        why = bus.problem if bus.bus.is_open else bus.bus.loss_reason or bus.problem
+        for trouble in line_troubles(up=up, problem=why):
+            wrong.setdefault(trouble.text, []).append(name)
+        for axis in bus.axes if up else ():
+            tracker = axis.tracker
+            troubles = assess(tracker, _Faults(tracker.active_faults, tracker.first_fault)).wrong
+            for trouble in [each for each in troubles if each.kind is not Kind.MISSED_POLLS][:1]:
+                wrong.setdefault(trouble.text, []).append(axis.config.name)
+    buses_up = sum(bus.report is not None for bus in rig.buses)
+    axes_up = sum(axis.tracker.link is not LinkState.DOWN for axis in rig.axes.values())
+    parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {axes_up}/{len(rig.axes)} axes up"]
+    return "; ".join(parts + [f"{', '.join(names)}: {text}" for text, names in wrong.items()])
+
+
+class _Faults(NamedTuple):
+    active: tuple[FaultEntry, ...]
+    first: FaultEntry | None
+
+
+@dataclass(frozen=True, slots=True)
+class Reload:
+    """The effect of a changed configuration.
+
+    Attributes:
+        config: to run with from now on.
+        changed: keys that have another value in it.
+        refused: keys that differ in the file and keep their value until the daemon is started again.
+    """
+
+    config: RigConfig
+    changed: tuple[str, ...]
+    refused: tuple[str, ...]
+
+
+def plan_reload(running: RigConfig, wanted: RigConfig) -> Reload:
+    """Decide which changes apply.
+
+    Keys name buses and axes: `bus.line0.axis.x.limits.velocity`; a bus or axis that was added or removed is one key.
+
+    Raises:
+        ConfigError: what can be changed contradicts what cannot, such as a velocity limit that the bounds of `track`
+            no longer keep.
+    """
+    wanted_buses = {bus.name: bus for bus in wanted.bus}
+    buses = tuple(_bus(bus, wanted_buses.get(bus.name, bus)) for bus in running.bus)
+    config = running.model_copy(update={"bus": buses})
+    return Reload(config, tuple(_differences(running, config, "")), tuple(_differences(config, wanted, "")))
+
+
+def _bus(running: BusConfig, wanted: BusConfig) -> BusConfig:
+    if running.family != wanted.family:
+        return running
+    wanted_axes = {axis.name: axis for axis in wanted.axis}
+    axes = tuple(_axis(axis, wanted_axes.get(axis.name, axis)) for axis in running.axis)
+    return running.model_copy(update={"axis": axes})
+
+
+def _axis(running: AxisConfig, wanted: AxisConfig) -> AxisConfig:
+    """Take the keys over, unless a unit means something else than before: then every number does."""
+    if not running.reloadable or (running.unit, running.counts_per_unit, running.direction) != (
+        wanted.unit,
+        wanted.counts_per_unit,
+        wanted.direction,
+    ):
+        return running
+    merged = running.model_copy(update={key: getattr(wanted, key) for key in running.reloadable})
+    try:
+        return type(running).model_validate(merged.model_dump())
+    except ValidationError as error:
+        reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors())
+        raise ConfigError(
+            f"axis {running.name}: what needs no restart cannot work without what does: {reasons}", axis=running.name
+        ) from error
+
+
+def _differences(one: object, other: object, key: str) -> Iterator[str]:
+    """Yield the keys at which two parts of a configuration differ, as deep down as they can be named."""
+    if one == other:
+        return
+    if isinstance(one, BaseModel) and isinstance(other, BaseModel):
+        for name in type(one).model_fields:
+            yield from _differences(getattr(one, name), getattr(other, name), f"{key}.{name}" if key else name)
+        return
+    ours, theirs = _by_name(one), _by_name(other)
+    if ours is None or theirs is None or list(ours) == list(theirs) == []:
+        yield key
+        return
+    for name in ours | theirs:
+        if name in ours and name in theirs:
+            yield from _differences(ours[name], theirs[name], f"{key}.{name}")
+        else:
+            yield f"{key}.{name}"
+    if list(ours) != list(theirs) and ours.keys() == theirs.keys():
+        yield key  # only their order has changed
+
+
+def _by_name(items: object) -> dict[str, BaseModel] | None:
+    """Return the parts of a list that are known by name, or None for anything else."""
+    if not isinstance(items, Sequence) or isinstance(items, str):
+        return None
+    named = {str(getattr(item, "name", "")): item for item in items if isinstance(item, BaseModel)}
+    return named if len(named) == len(items) and "" not in named else None

@@ -1,4 +1,0 @@
-"""Traces of one axis: by its drive's recorder or by polling.
-
-Serves `axis`. Start with `recorder.py`: armed, recorded, published.
-"""

@@ -1,5 +1,0 @@
-"""LDCN (Logosol) and NMC (J R Kerr): one binary protocol, dialects chosen by profile.
-
-Serves the family in `families/ldcn`. Start with `packet` and `commands`, the protocol; then `network` (a line) and
-`servo` (one drive).
-"""

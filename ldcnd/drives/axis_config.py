@@ -1,0 +1,301 @@
+"""The configuration of one axis: its drive, its machine, and what it may do."""
+
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import ClassVar, Literal, Self
+
+from pydantic import Field, model_validator
+
+from ldcnd.contract.commands import HomeMethod, HomeStop
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.meta import AxisLimits
+from ldcnd.contract.plan import PollPriority
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.drives.toml import DeviceIdentity, Name
+
+LEAST_TURN_COUNTS = 4
+"""Of a rotary axis: one count must be no larger than the way to the other side."""
+
+
+class GainsConfig(Frozen):
+    """Registers of the position loop, as in the drive's manual; 0 < kp and 0 < el or the loop cannot close."""
+
+    kp: int = Field(gt=0, le=0x7FFF)
+    """Position gain."""
+    kd: int = Field(default=0, ge=0, le=0x7FFF)
+    """Derivative gain."""
+    ki: int = Field(default=0, ge=0, le=0x7FFF)
+    """Integral gain."""
+    il: int = Field(default=0, ge=0, le=0x7FFF)
+    """Integration limit; the drive multiplies it by 256."""
+    ol: int = Field(default=250, gt=0, le=0xFF)
+    """Output limit, of 255."""
+    cl: int = Field(default=0, ge=0, le=0xFF)
+    """Current limit: odd values for a sense voltage that rises with the current, 0 for none; PIC-SERVO only."""
+    el: int = Field(gt=0, le=0x7FFF)
+    """Position error, in counts, beyond which the drive opens its loop; at most 16383, PIC-SERVO SC 32767."""
+    sr: int = Field(default=1, ge=1, le=0xFF)
+    """Servo rate divisor: the servo cycle is this number times 0.512 ms."""
+    deadband: int = Field(default=0, ge=0, le=0xFF)
+    """Added to the amplifier's output around zero."""
+
+
+class HomeConfig(Frozen):
+    """How `home` searches when the request does not say."""
+
+    method: HomeMethod
+    """Signal that marks the reference position."""
+    velocity: float
+    """Units a second, positive forward; on the index at most 0.75 of an index width in a servo cycle."""
+    find_velocity: float | None = Field(default=None, gt=0)
+    """Speed at which a limit switch is found first, units a second; the reference is then taken over at `velocity`."""
+    index_width: int = Field(default=1, ge=1)
+    """Counts for which the index pulse lasts: 1 for one that is gated with both tracks, 4 for one that is not."""
+    position: float = 0.0
+    """Value of the reference position, in axis units."""
+    timeout_s: float = Field(default=60.0, gt=0, le=3600)
+    """Longest search, in seconds."""
+    distance: float | None = Field(default=None, gt=0)
+    """Longest search, in axis units."""
+    stop: HomeStop = HomeStop.SMOOTH
+    """How the motor stops there."""
+    move_to: float | None = None
+    """Where to go afterwards, in axis units."""
+    switch_active: Literal["high", "low"] = "high"
+    """Level of a limit switch input while the switch is actuated."""
+
+
+class SettleConfig(Frozen):
+    """When a motion to a target is done: its profile has ended and the axis has stayed near the target."""
+
+    window: float | None = Field(default=None, gt=0)
+    """How far from the target it may be, in axis units; without it 1/400 of the position error limit `el`, at least 5 \
+counts."""
+    time_s: float = Field(default=0.05, ge=0, le=10)
+    """For how long it must have stayed within the window, in seconds."""
+    timeout_s: float = Field(default=1.0, gt=0, le=60)
+    """Longest time for that, from the end of the profile, in seconds."""
+    unsettled: Literal["report", "fault"] = "report"
+    """Reaction when it takes longer: report ends the motion as done with `settled` false, and an event; fault \
+ends it as failed with the fault `not_settled`."""
+
+    @model_validator(mode="after")
+    def _reachable(self) -> Self:
+        if self.timeout_s <= self.time_s:
+            raise ValueError(f"settle.timeout_s {self.timeout_s:g} is not above settle.time_s {self.time_s:g}")
+        return self
+
+
+class PwmConfig(Frozen):
+    """Bounds of `set_pwm`; without this table the axis refuses it."""
+
+    duty: float = Field(gt=0, le=1)
+    """Highest duty in either direction."""
+    duration_s: float = Field(default=10.0, gt=0, le=600)
+    """Longest time that a duty stays on."""
+
+
+class AnalogConfig(Frozen):
+    """Bounds of `move_analog` when the request names none; the daemon keeps them, the drive has none."""
+
+    timeout_s: float = Field(default=10.0, gt=0, le=3600)
+    """Longest motion, in seconds."""
+    distance: float | None = Field(default=None, gt=0)
+    """Longest way from where it begins, in axis units; without it as far as the velocity goes in the time."""
+
+
+class TrackingConfig(Frozen):
+    """Bounds of `track`; without this table the axis refuses it."""
+
+    step: float = Field(gt=0)
+    """Longest way from one set-point to the next, in axis units; must stay below the position error limit `el`."""
+    rate: float = Field(gt=0, le=500)
+    """Most set-points a second."""
+
+
+class ApproachConfig(Frozen):
+    """From which side a move comes to its goal, where the mechanics have play."""
+
+    direction: Literal["positive", "negative"]
+    """The direction of the last motion."""
+    distance: float = Field(gt=0)
+    """How far before the goal it begins, in axis units: more than the play."""
+
+    @property
+    def signed(self) -> float:
+        """The last motion, in axis units."""
+        return self.distance if self.direction == "positive" else -self.distance
+
+
+class LossPolicy(StrEnum):
+    """Reaction of an axis to the loss of a client, the line or the daemon."""
+
+    RUN_TO_TARGET = "run_to_target"
+    """Let the motion end by itself; every motion of a referenced axis with limits ends in the drive."""
+    HALT = "halt"
+    """Decelerate, then hold."""
+    QUICK_STOP = "quick_stop"
+    """Hold the present position at once."""
+    POWER_OFF = "power_off"
+    """Open the loop: the motor coasts, a hanging load falls."""
+
+
+class LossConfig(Frozen):
+    """Reaction of the axis to the loss of a client, the line or the daemon in mid-motion."""
+
+    client: LossPolicy = LossPolicy.HALT
+    """The lease under which it moves was not renewed."""
+    bus: LossPolicy = LossPolicy.HALT
+    """The line was lost; acts as soon as it is back and the drive still moves."""
+    daemon: LossPolicy = LossPolicy.HALT
+    """The daemon is shut down."""
+
+
+class RatesConfig(Frozen):
+    """How often an item is published, in Hz; 0 for never."""
+
+    position: float = Field(default=10.0, ge=0, le=2000)
+    """Position, with the following error where the drive reports it."""
+    velocity: float = Field(default=10.0, ge=0, le=2000)
+    """Velocity."""
+    adc: float = Field(default=2.0, ge=0, le=2000)
+    """Analog input."""
+    state: float = Field(default=5.0, gt=0, le=2000)
+    """The drive's status and state; cannot be switched off, faults come with it."""
+
+    def wanted_hz(self, *, adc: bool) -> Mapping[TelemetryItem, float]:
+        """Return the items that are polled and how often; `adc` tells whether the drive has a converter."""
+        wanted = {
+            TelemetryItem.POSITION: self.position,
+            TelemetryItem.VELOCITY: self.velocity,
+            TelemetryItem.ADC: self.adc if adc else 0.0,
+            TelemetryItem.STATE: self.state,
+        }
+        return {item: rate for item, rate in wanted.items() if rate > 0}
+
+
+class AxisConfig(Frozen):
+    """One drive on a line; a family says which keys its drives need or do not have."""
+
+    reloadable: ClassVar[tuple[str, ...]] = ()
+    """Keys that may change while the daemon runs."""
+
+    name: Name
+    """Its chunk in every key; unique on the rig."""
+    model: str
+    """The drive model."""
+    address: int = Field(ge=0, le=127)
+    """Node address or unit number."""
+    unit: str = "count"
+    """Unit of everything that concerns this axis."""
+    counts_per_unit: float | None = Field(default=None, ge=1e-9, le=1e12)
+    """Encoder counts per unit, 1e-9 to 1e12: every count is a finite position then. There is no default: without it
+    the axis works in counts and says so."""
+    direction: Literal["forward", "reverse"] = "forward"
+    """reverse: forward in axis units is backward in encoder counts."""
+    modulo: float | None = Field(default=None, gt=0)
+    """A rotary axis: positions repeat after this distance in axis units, such as 360. It turns endlessly, and takes no
+    position limits."""
+    velocity: float = Field(default=0.0, ge=0)
+    """Velocity of moves that do not name one, units a second; 0 for a drive that takes no motion over its line."""
+    acceleration: float = Field(default=0.0, ge=0)
+    """Acceleration of moves that do not name one, units a second squared; 0 likewise."""
+    limits: AxisLimits = AxisLimits()
+    """Software limits, in axis units."""
+    gains: GainsConfig | None = None
+    """Without gains the loop of this drive stays open."""
+    reference: Literal["required", "at_reset"] = "required"
+    """Whether absolute moves need home or set_position first, or the place where the drive was powered on \
+counts as 0. The latter only for a line that no host has used since: after a restart with powered drives, home again."""
+    home: HomeConfig | None = None
+    """How `home` searches when the request does not say."""
+    pwm: PwmConfig | None = None
+    """Bounds of `set_pwm`; without them the axis takes no raw duty."""
+    analog: AnalogConfig = AnalogConfig()
+    """Bounds of `move_analog`."""
+    tracking: TrackingConfig | None = None
+    """Bounds of `track`; without them the axis follows no set-points."""
+    settle: SettleConfig = SettleConfig()
+    """When a motion to a target is done."""
+    approach: ApproachConfig | None = None
+    """`move_absolute` and `move_relative` come to their goal from one side, by two motions where one would not do; \
+other motions, also those of a group, do not."""
+    rates: RatesConfig = RatesConfig()
+    """How often each item is published."""
+    priority: PollPriority = "normal"
+    """How its polls fare while the line cannot carry all of them: the highest go first; low ones give way, but still \
+come now and then."""
+    loss: LossConfig = LossConfig()
+    """Reaction of the axis to the loss of a client, the line or the daemon in mid-motion."""
+    limit_switches: Literal["ignore", "stop"] = "ignore"
+    """stop: the drive itself decelerates when a motion runs onto the limit switch ahead, also if the host is dead; \
+moving off a switch stays possible. Not for `track`, nor on drives that do not stop on their limit inputs."""
+    jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)
+    """Time after which the drive itself ends a motion at constant velocity that no software limit ends, seconds."""
+    jog_reach_s: float = Field(default=5.0, gt=0, le=3600)
+    """How far ahead the goal of a jog is, in seconds, in a drive that takes no other goal before it stands: if the \
+daemon dies it runs on for as long, and a jog that is held for longer pauses there. PIC-SERVO SC gets nearer goals."""
+    adc_volts: float = Field(default=5.0, gt=0)
+    """Voltage at full scale of the A/D converter."""
+    identity: DeviceIdentity | None = None
+    """Id and version of this drive, when they are not among those known for its model: it is treated as that model."""
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        limits = self.limits
+        if self.counts_per_unit is None and self.unit != "count":
+            raise ValueError(f"unit {self.unit!r} needs counts_per_unit")
+        if (
+            limits.position_min is not None
+            and limits.position_max is not None
+            and limits.position_min >= limits.position_max
+        ):
+            raise ValueError(
+                f"limits: position_min {limits.position_min} is not below position_max {limits.position_max}"
+            )
+        if self.modulo is not None and (limits.position_min, limits.position_max) != (None, None):
+            raise ValueError("modulo: an axis that turns without an end has no position limits")
+        if self.modulo is not None and self.modulo * abs(self.signed_counts_per_unit) < LEAST_TURN_COUNTS:
+            raise ValueError(f"modulo {self.modulo:g} is less than {LEAST_TURN_COUNTS} encoder counts")
+        if limits.velocity is not None and self.velocity > limits.velocity:
+            raise ValueError(f"velocity {self.velocity} is above limits.velocity {limits.velocity}")
+        if limits.acceleration is not None and self.acceleration > limits.acceleration:
+            raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
+        self._check_tracking()
+        return self
+
+    @property
+    def signed_counts_per_unit(self) -> float:
+        """Encoder counts per unit, 1 when the axis works in counts; negative where forward is backward in counts."""
+        counts_per_unit = self.counts_per_unit or 1.0
+        return -counts_per_unit if self.direction == "reverse" else counts_per_unit
+
+    @property
+    def switch_active(self) -> Literal["high", "low"]:
+        """Level of a limit switch input while the switch is actuated."""
+        return self.home.switch_active if self.home else "high"
+
+    def _check_tracking(self) -> None:
+        """Refuse bounds of `track` that would trip the drive or outrun the axis."""
+        tracking, limits = self.tracking, self.limits
+        if tracking is None:
+            return
+        step_counts = tracking.step * abs(self.signed_counts_per_unit)
+        if self.gains and step_counts >= self.gains.el:
+            raise ValueError(f"tracking.step is {step_counts:g} counts, not below gains.el {self.gains.el}")
+        if limits.velocity is not None and tracking.step * tracking.rate > limits.velocity:
+            raise ValueError(
+                f"tracking.step x rate is {tracking.step * tracking.rate:g}, above limits.velocity {limits.velocity}"
+            )
+
+
+class MovedAxisConfig(AxisConfig):
+    """A drive that takes motion over its line."""
+
+    reloadable: ClassVar[tuple[str, ...]] = ("limits", "velocity", "acceleration", "settle", "rates", "priority")
+    """Read by every command, or by the poller that is made when they change."""
+
+    velocity: float = Field(gt=0)
+    """Velocity of moves that do not name one, units a second."""
+    acceleration: float = Field(gt=0)
+    """Acceleration of moves that do not name one, units a second squared."""

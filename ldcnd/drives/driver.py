@@ -1,0 +1,570 @@
+"""The contracts between the daemon and one drive: a `Drive` for each that is configured, and what it can do.
+
+The line that it is on is a `Network`, in network.py. Values are encoder counts and
+seconds; units, limits, states and authority are the daemon's.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from ldcnd.contract.commands import HomeMethod, PinMode, Verb
+from ldcnd.contract.errors import BusError
+from ldcnd.contract.meta import Provenance
+from ldcnd.contract.samples import MonitorName, TelemetryItem
+from ldcnd.drives.parameter_access import MonitorValue, ParameterAccess
+from ldcnd.drives.tracer import Tracer
+from ldcnd.line.exchange import Exchange, Timing
+from ldcnd.line.poller import Poller
+
+LARGEST_COUNT = 0x7FFF_FFFF
+"""Of a position counter of 32 bits, in either direction."""
+
+
+class StopMode(Enum):
+    """How a motor is brought to rest."""
+
+    SMOOTH = "smooth"
+    """Decelerate, then hold."""
+    ABRUPT = "abrupt"
+    """Hold the present position at once."""
+    OFF = "off"
+    """Open the loop and disable the amplifier: the motor coasts."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fault:
+    """Something the drive complains about.
+
+    Attributes:
+        code: stable code.
+        text: what it means and what to do.
+        stops: the drive has switched the motor off; false for a warning.
+        loses_position: what the drive counts from then on is not where the axis is: it needs a new reference.
+    """
+
+    code: str
+    text: str
+    stops: bool = True
+    loses_position: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class AxisReading:
+    """The values of one poll; position, velocity and state always, other items None when they were not polled.
+
+    Attributes:
+        position_counts: actual position.
+        following_error_counts: commanded minus actual position.
+        velocity_counts_per_s: actual velocity, positive in counting direction.
+        velocity_resolution_counts_per_s: the smallest velocity the drive can report.
+        adc_counts: analog input.
+        enabled: the position loop is closed.
+        profile_done: no profile is running (in velocity mode: the commanded velocity is reached).
+        homing: armed for a home capture that has not come yet.
+        faults: what the drive complains about.
+        reverse_limit: level of that limit switch input, `forward_limit` of the other; None while it is not shown.
+        index: level of the encoder's index; None while it is not shown.
+        stop_input: the drive's stop input is open; None while it is not shown.
+        amplifier_enable: what the drive holds; None while that is not known.
+        asked: the items of this poll; the line may have requested others since.
+        cut_short: why the drive ended the motion before its end, by itself; empty when it did not.
+        begun_anew: its own counter reads about 0, as after a reset.
+        altered: what this host has not done to it and yet shows; empty when nothing does.
+        velocity_uncertain: the servo rate, on which the scale of the velocity depends, is not confirmed: the velocity
+            is the highest that it can be.
+    """
+
+    position_counts: int
+    following_error_counts: int | None
+    velocity_counts_per_s: float
+    velocity_resolution_counts_per_s: float
+    adc_counts: int | None
+    enabled: bool
+    profile_done: bool
+    homing: bool
+    faults: tuple[Fault, ...]
+    reverse_limit: bool | None = None
+    forward_limit: bool | None = None
+    index: bool | None = None
+    stop_input: bool | None = None
+    amplifier_enable: bool | None = None
+    asked: frozenset[TelemetryItem] = frozenset()
+    cut_short: str = ""
+    begun_anew: bool = False
+    altered: str = ""
+    velocity_uncertain: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """A motion in counts: a target for a trapezoid, None for a constant velocity.
+
+    Attributes:
+        target_counts: where to stop, or None to run on.
+        velocity_counts_per_s: positive for a trapezoid; signed for a constant velocity.
+        acceleration_counts_per_s2: positive.
+    """
+
+    target_counts: int | None
+    velocity_counts_per_s: float
+    acceleration_counts_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class Ceiling:
+    """Limits that hold after rounding to registers, too; infinite for none.
+
+    Attributes:
+        velocity_counts_per_s: highest speed.
+        acceleration_counts_per_s2: highest acceleration.
+    """
+
+    velocity_counts_per_s: float = math.inf
+    acceleration_counts_per_s2: float = math.inf
+
+
+NO_CEILING = Ceiling()
+
+
+@dataclass(frozen=True, slots=True)
+class AnalogMotion:
+    """A motion to a value of the analog position sensor; the drive finds the direction.
+
+    Attributes:
+        target_counts: of the A/D converter.
+        velocity_counts_per_s: encoder counts, positive.
+        acceleration_counts_per_s2: positive.
+    """
+
+    target_counts: int
+    velocity_counts_per_s: float
+    acceleration_counts_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class PwmOutput:
+    """A raw duty on the motor, with the position loop open.
+
+    Attributes:
+        duty: -1 to 1, positive in counting direction.
+        acceleration_counts_per_s2: at which a smooth stop ends it.
+    """
+
+    duty: float
+    acceleration_counts_per_s2: float
+
+
+@dataclass(frozen=True, slots=True)
+class HomeCapture:
+    """The signal that captures the home position during the motion, and how the motor stops then.
+
+    A drive that cannot stop by itself runs on until it is stopped.
+
+    Attributes:
+        method: what captures.
+        stop: how the motor stops.
+        also: what else does; the first that comes counts.
+        guarded: the limit switch ahead captures and stops, too, where the configuration has the drive stop on it.
+    """
+
+    method: HomeMethod
+    stop: StopMode = StopMode.SMOOTH
+    also: frozenset[HomeMethod] = frozenset()
+    guarded: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Register:
+    """What is published of a register that cannot be read back.
+
+    Attributes:
+        name: of the register.
+        value: what it holds; None when that is unknown.
+        provenance: how that is known.
+        why: the evidence, or the reason why there is none.
+    """
+
+    name: str
+    value: int | None
+    provenance: Provenance
+    why: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Gains:
+    """Registers of the position loop, as in the manuals of the drives (Set Gain).
+
+    Attributes:
+        kp: position gain, 0 to 0x7FFF.
+        kd: derivative gain, 0 to 0x7FFF.
+        ki: integral gain, 0 to 0x7FFF.
+        il: integration limit, 0 to 0x7FFF; the drive multiplies it by 256.
+        ol: PWM output limit, 0 to 255; the LS-182AP manual recommends 250.
+        cl: current limit, 0 to 255, odd when the sense voltage rises with the current; 0 is off, and the only value on
+            Logosol drives.
+        el: position error limit, 0 to 0x3FFF counts; 0x7FFF on PIC-SERVO SC.
+        sr: servo rate divisor, 1 to 255.
+        deadband: amplifier deadband compensation, 0 to 255; 0 on PIC-SERVO versions 1 to 3.
+        step_multiplier: 1 to 255; 1 on everything but PIC-SERVO SC.
+    """
+
+    kp: int
+    kd: int
+    ki: int
+    il: int
+    ol: int
+    cl: int
+    el: int
+    sr: int
+    deadband: int = 0
+    step_multiplier: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class AxisSpec:
+    """The configuration of one drive.
+
+    Attributes:
+        name: of the axis.
+        address: node address, 1 to 127.
+        model: profile name of the family.
+        gains: loaded at power-on; without them the loop stays open.
+        identity: id and version that this drive reports although the family's table does not list them for the model.
+        limit_stop: level of the limit switch inputs at which the drive itself stops a motion towards them; None when
+            they are left alone.
+    """
+
+    name: str
+    address: int
+    model: str
+    gains: Gains | None
+    identity: tuple[int, int] | None = None
+    limit_stop: bool | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingListeners:
+    """Whom a family's own poller tells; none of them waits.
+
+    Attributes:
+        observed: of a reading and the items that are new in it.
+        monitored: of a monitor.
+        missed: of a poll that brought nothing.
+        alarmed: of an alarm that the drive has entered in its own history since that was last read.
+    """
+
+    observed: Callable[[AxisReading, frozenset[TelemetryItem], Timing], None]
+    monitored: Callable[[MonitorValue, Timing], None]
+    missed: Callable[[BusError], None]
+    alarmed: Callable[[Fault], None]
+
+
+class Drive(ABC):
+    """One drive, as far as all are alike; what it can do it inherits from the contracts below.
+
+    An exchange says what it does (`Exchange.effect`): the bus checks the permit of one that changes anything when its
+    turn has come, and that the drive is known to be this one.
+
+    Attributes:
+        spec: what the configuration says.
+        identity: what the drive said it is; None before bring-up.
+        capabilities: the truth about what the family and the model can do.
+        adc_full_scale: counts of the A/D converter at full scale; None without one.
+        shows_inputs: its readings carry the levels of its inputs.
+        monitors: what is published beside the common items.
+    """
+
+    spec: AxisSpec
+    identity: str | None
+    capabilities: frozenset[Verb]
+    adc_full_scale: int | None = None
+    shows_inputs: bool = False
+    monitors: tuple[MonitorName, ...] = ()
+
+
+class Readable(Drive):
+    """One exchange reads it."""
+
+    @abstractmethod
+    def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
+        """Build the exchange that reads these items besides position, velocity and the drive's state."""
+
+
+class PollsItself(Drive):
+    """One exchange cannot read it: its family has a poller for it."""
+
+    @abstractmethod
+    def own_poller(self, start_at_s: float, listeners: ReadingListeners) -> Poller[Any]:
+        """Return the poller, which begins at an instant of the loop's clock."""
+
+
+class Moves(Readable):
+    """It moves. Commands raise the `BusError` that befell them; none is repeated when that could move twice.
+
+    Attributes:
+        retargets: it takes a new trapezoid in mid-move and keeps velocity and acceleration within their limits.
+    """
+
+    retargets: bool = False
+
+    @abstractmethod
+    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+        """Return the motion as the drive's registers will hold it: the nearest values that are not above these.
+
+        Raises:
+            ValueOutOfRange: a value does not fit its register, or the smallest one is above; says which one would do.
+        """
+
+    @abstractmethod
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+        """Return what `load` and `start` would send for a motion; nothing is sent."""
+
+    def room_counts(self, *, forward: bool) -> int:  # noqa: ARG002 - part of the contract
+        """Return how far the position counter reaches in a direction, from where the axis was last."""
+        return LARGEST_COUNT
+
+    @abstractmethod
+    async def power(self, *, on: bool) -> None:
+        """Close the loop at the present position, or open it and disable the amplifier; nothing moves."""
+
+    @abstractmethod
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        """Prepare a motion, and the capture of a home position on the way; nothing moves.
+
+        Raises:
+            NotSupported: the drive has no such motion.
+            ValueOutOfRange: a value does not fit its register.
+            DriveFault: the sensor that the motion relies on is out of its range.
+        """
+
+    @abstractmethod
+    async def start(self) -> None:
+        """Start what was loaded; never repeated."""
+
+    @abstractmethod
+    async def stop(self, mode: StopMode) -> StopMode:
+        """Bring the motor to rest, before anything else that waits for the line; cancels an armed homing.
+
+        Returns:
+            How: a motor that was switched off, or is being, is switched off again whatever the request, as a stop that
+            holds would close its loop.
+        """
+
+    @abstractmethod
+    async def reset(self) -> None:
+        """Clear the drive's faults as its manual prescribes; the loop is open afterwards if there were any."""
+
+
+class Tracks(ABC):
+    """It follows set-points."""
+
+    @abstractmethod
+    async def track(self, position_counts: int) -> None:
+        """Go to a position at once, without a profile; never repeated."""
+
+
+@dataclass(frozen=True, slots=True)
+class PathStatus:
+    """What a drive shows of a path.
+
+    Attributes:
+        commanded_counts: where it commands its motor to be.
+        points: still in its buffer.
+        running: it walks through them.
+        enabled: its loop is closed.
+    """
+
+    commanded_counts: int
+    points: int
+    running: bool
+    enabled: bool
+
+
+class WalksPaths(ABC):
+    """It walks through points that are sent to it, at a fixed rate, and stands at the last one when none is left.
+
+    Attributes:
+        path_period_s: between two points.
+        path_packet: maximum number of points in one packet.
+        path_most_counts: largest step from one point to the next.
+    """
+
+    path_period_s: float
+    path_packet: int
+    path_most_counts: int
+
+    @abstractmethod
+    def check_path(self) -> None:
+        """Refuse a path that this drive cannot walk.
+
+        Raises:
+            NotSupported: it has no path mode.
+            WrongState: what it holds of its options is not known.
+        """
+
+    @abstractmethod
+    def path_exchanges(self) -> tuple[Exchange[Any], ...]:
+        """Return what `add_points` sends for a full packet, for looking at only."""
+
+    @abstractmethod
+    async def path_status(self) -> PathStatus:
+        """Read what it shows."""
+
+    @abstractmethod
+    async def add_points(self, steps: Sequence[int]) -> PathStatus:
+        """Append points, counts from one to the next; never repeated."""
+
+
+class TakesGains(ABC):
+    """The registers of its position loop can be loaded.
+
+    Attributes:
+        gains: what is loaded at power-on, and before a motion where the drive is not known to hold it: what was
+            acknowledged last, before that the configuration's; None without either. It may be set to others.
+        holds_gains: the drive is known to hold them.
+    """
+
+    gains: Gains | None
+    holds_gains: bool
+
+    @abstractmethod
+    async def set_gains(self, gains: Gains) -> None:
+        """Load the registers; they act at once.
+
+        Raises:
+            WrongState: the servo rate would change while the axis moves.
+        """
+
+
+class Records(ABC):
+    """It has a recorder of its own.
+
+    Attributes:
+        tracer: of the recorder.
+    """
+
+    tracer: Tracer
+
+
+class HasParameters(ABC):
+    """Its parameters can be read."""
+
+    @property
+    @abstractmethod
+    def parameters(self) -> ParameterAccess:
+        """The drive's parameters."""
+
+
+class RemembersRegisters(ABC):
+    """It has registers that cannot be read back."""
+
+    @abstractmethod
+    def registers(self) -> tuple[Register, ...]:
+        """Return what is known of them."""
+
+
+class Homes(ABC):
+    """It captures its position at a mark.
+
+    Attributes:
+        home_methods: what can mark the reference position.
+        capture_s: sampling period of the capture inputs: a shorter pulse can be missed, and the captured position
+            lags by up to the distance moved in this time.
+    """
+
+    home_methods: frozenset[HomeMethod]
+    capture_s: float = 0.0
+
+    @abstractmethod
+    async def captured_home(self) -> int:
+        """Return the captured home position, in counts."""
+
+    @abstractmethod
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:
+        """Tell whether a reading shows the axis on a limit switch that ends its motions."""
+
+
+class Warns(ABC):
+    """It remembers what has not stopped anything."""
+
+    @abstractmethod
+    async def clear_warnings(self) -> None:
+        """Clear what is remembered; the loop stays as it is."""
+
+
+class HasOutputs(ABC):
+    """Its limit switch pins can be outputs."""
+
+    @abstractmethod
+    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
+        """Use limit switch pins as outputs or inputs; None leaves a pin as it is.
+
+        Raises:
+            NotSupported: the model cannot.
+            RegisterUnknown: what a pin that is not named is used as is not known.
+        """
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """The drive's evidence about the time since its position was last known.
+
+    Attributes:
+        counts: position, in counts since the drive was reset, as this host counts them.
+        counter: the same as the drive itself counts it, which another host reads, too.
+        mark: what the register for marks holds; 0 after a reset.
+        enabled: the position loop is closed.
+        position_lost: it may have missed counts.
+    """
+
+    counts: int
+    counter: int
+    mark: int
+    enabled: bool
+    position_lost: bool
+
+
+async def nothing() -> None:
+    """Do nothing."""
+
+
+class KeepsMark(ABC):
+    """It has a register that a host can set to the present position, and that a reset clears.
+
+    A mark that is still there proves that the drive was not reset since, so that its counter goes on from where it was.
+
+    Attributes:
+        about_to_renumber: awaited before the drive's counter is given another number; it may refuse that.
+    """
+
+    about_to_renumber: Callable[[], Awaitable[None]] = staticmethod(nothing)
+
+    @abstractmethod
+    async def evidence(self) -> Evidence:
+        """Read what the drive shows.
+
+        Raises:
+            BusError: the line failed.
+        """
+
+    @abstractmethod
+    async def leave_mark(self) -> None:
+        """Have the drive set the register to its position; nothing moves. The register may be that of captures.
+
+        Raises:
+            BusError: the line failed.
+        """
+
+
+def registers_of(drive: Drive) -> tuple[Register, ...]:
+    """Return what is known of the registers of a drive that cannot be read back."""
+    return drive.registers() if isinstance(drive, RemembersRegisters) else ()
+
+
+def parameters_of(drive: Drive) -> ParameterAccess | None:
+    """Return the parameters of a drive; None for one without."""
+    return drive.parameters if isinstance(drive, HasParameters) else None

@@ -1,0 +1,498 @@
+"""LDCN/NMC commands as the host sends them: for each a function from a destination and values to an `Exchange`.
+
+A destination is one answering module (`Node`) or a silent `Group`. No state of a module is kept here: its default
+status items travel with its `Node`. The other direction is in received.py. Commands that not every dialect has
+are refused for the others, and so is everything that could move a module which ldcnd only identifies.
+Sources: LS-182AP manual, "Addressing", "Command Description"; PIC-SERVO manual, 4.1, 5.2; for PIC-SERVO SC later vendor
+data sheets.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Generic, TypeVar
+
+from ldcnd.contract.errors import NotSupported, ValueOutOfRange
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import (
+    HomingControl,
+    IoOption,
+    LimitPins,
+    PositionReset,
+    StartUp,
+    StopControl,
+    check_homing,
+    check_options,
+    check_stop,
+)
+from ldcnd.drives.ldcn.packet import (
+    ADDRESS,
+    GROUP_ADDRESS,
+    GROUP_MEMBER,
+    MOST_ADDRESS,
+    POSITION,
+    STATUS_BYTE_ONLY,
+    Command,
+    Packet,
+    Status,
+    StatusItem,
+    check_status,
+    encode_packet,
+    status_bytes,
+    status_decoder,
+)
+from ldcnd.drives.ldcn.path import PathPoint, encode_points
+from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile, Support
+from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, BaudCodes, baud_divisor, encode_gains
+from ldcnd.drives.ldcn.trajectory import Trajectory, encode_trajectory
+from ldcnd.line.exchange import Effect, Exchange, ReplyVerdict
+from ldcnd.line.settings import HOST_LATE_S
+
+ReplyT = TypeVar("ReplyT")
+
+
+class Destination(ABC, Generic[ReplyT]):
+    """Who takes a packet, and with what type of reply.
+
+    Attributes:
+        address: the address byte.
+        profile: the dialect of everyone concerned; None when it is not known.
+    """
+
+    __slots__ = ()
+
+    address: int
+    profile: Profile | None
+
+    @abstractmethod
+    def exchange(
+        self, request: bytes, items: StatusItem | None, *, repeatable: bool, effect: Effect = Effect.CHANGES
+    ) -> Exchange[ReplyT]:
+        """Pair a request with its reply: these status items, or those sent by default when None."""
+
+
+@dataclass(frozen=True, slots=True)
+class Node(Destination[Status]):
+    """One module, or a group whose leader answers as if it had been meant alone.
+
+    Attributes:
+        address: 0 (no address yet) to 127; 128 to 255 for a group with a leader.
+        profile: the dialect of the answering module; in a group the others share it where the command depends on it.
+        items: what it adds to every reply, that is, the mask of the last Define Status.
+    """
+
+    address: int
+    profile: Profile
+    items: StatusItem = STATUS_BYTE_ONLY
+
+    def __post_init__(self) -> None:
+        """Refuse an address that does not fit its byte."""
+        if not 0 <= self.address <= MOST_ADDRESS:
+            raise ValueOutOfRange(
+                f"node address {self.address} is outside 0 to {MOST_ADDRESS}", value=self.address, limit=MOST_ADDRESS
+            )
+
+    def exchange(
+        self, request: bytes, items: StatusItem | None, *, repeatable: bool, effect: Effect = Effect.CHANGES
+    ) -> Exchange[Status]:
+        """See `Destination`.
+
+        Raises:
+            NotSupported: of this module nothing but status byte and identity can be decoded.
+        """
+        asked = self.items if items is None else items
+        if self.profile.support is Support.IDENTIFY and asked & ~StatusItem.IDENTITY:
+            raise NotSupported(f"{self.profile.title}: only status byte and identity can be decoded, not {asked!r}")
+        reply_bytes, total_bytes = status_bytes(self.profile, asked), None
+        if asked != self.items:
+            total_bytes = partial(_total_bytes, status_bytes(self.profile, self.items), reply_bytes)
+        return Exchange(
+            node=self.address,
+            request=request,
+            reply_bytes=reply_bytes,
+            check=check_status,
+            decode=status_decoder(self.profile, asked),
+            response_s=CYCLE_CLOCKS / self.profile.clock_hz,
+            repeatable=repeatable,
+            total_bytes=total_bytes,
+            effect=effect,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Group(Destination[None]):
+    """All modules of a group without a leader: none answers, and the line rests until the command is executed.
+
+    Attributes:
+        address: 0x80 to 0xFF.
+        profile: the dialect that all members share; needed only for what not every dialect has alike.
+        cycle_s: their servo cycle.
+    """
+
+    address: int
+    profile: Profile | None = None
+    cycle_s: float = SERVO_CYCLE_S
+
+    def __post_init__(self) -> None:
+        """Refuse what is not a group address."""
+        GROUP_ADDRESS.check(self.address)
+
+    def exchange(
+        self,
+        request: bytes,
+        items: StatusItem | None,  # noqa: ARG002 - no module answers
+        *,
+        repeatable: bool,
+        effect: Effect = Effect.CHANGES,
+    ) -> Exchange[None]:
+        """See `Destination`; the manuals require 0.51 ms of quiet."""
+        return unanswered(self.address, request, group_quiet_s(self.cycle_s), repeatable=repeatable, effect=effect)
+
+
+def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:
+    """A module that rejects a packet has not read its status mask: it answers with the default items."""
+    return rejected_bytes if data[0] & 0x02 else reply_bytes  # StatusFlag.CHECKSUM_ERROR
+
+
+def unanswered(
+    address: int, request: bytes, quiet_s: float, *, repeatable: bool, effect: Effect = Effect.CHANGES
+) -> Exchange[None]:
+    """Return an exchange that draws no reply and keeps the line quiet for a while."""
+    return Exchange(
+        node=address,
+        request=request,
+        reply_bytes=0,
+        check=_unexpected,
+        decode=_nothing,
+        response_s=quiet_s,
+        repeatable=repeatable,
+        effect=effect,
+    )
+
+
+def spaced(packets: Sequence[bytes], byte_s: float, cycle_s: float = SERVO_CYCLE_S) -> bytes:
+    """Return group packets as one piece in which each is executed before the next one comes.
+
+    "The host should wait for at least 0.51 milliseconds before sending another command to keep from overwriting the
+    previous command" (PIC-SERVO manual, 4.1). Nulls fill the time: outside a packet modules skip them, and they keep
+    the distance whatever an adapter does to the piece as a whole.
+    """
+    gap = bytes(math.ceil(cycle_s / byte_s))
+    return gap.join(packets)
+
+
+def _unexpected(_data: bytes) -> ReplyVerdict:
+    return ReplyVerdict.CORRUPT
+
+
+def _nothing(_data: bytes) -> None:
+    return None
+
+
+def group_quiet_s(cycle_s: float = SERVO_CYCLE_S) -> float:
+    """Return the pause behind a packet to a silent group.
+
+    0.51 ms (PIC-SERVO manual, 4.1), which is a servo cycle, from when an adapter has sent it.
+    """
+    return cycle_s + HOST_LATE_S
+
+
+RESET_SETTLE_S = 0.1
+"""Time for a module to restart after Hard Reset, seconds; the manuals name no time."""
+COMMON_TOP_BAUD = 125_000
+"""The highest rate of any model but PIC-SERVO SC; which rates a model has is checked with the configuration."""
+EEPROM_SETTLE_S = 0.3
+"""Time for PIC-SERVO SC to write its EEPROM and to restart, seconds; the data sheet names no time."""
+COMMON_COMMANDS = frozenset(
+    {
+        Command.SET_ADDRESS,
+        Command.DEFINE_STATUS,
+        Command.READ_STATUS,
+        Command.SET_BAUD_RATE,
+        Command.NO_OPERATION,
+        Command.HARD_RESET,
+    }
+)
+"""Commands of every module, servo or not."""
+EFFECTS = {
+    Command.READ_STATUS: Effect.READS,
+    Command.NO_OPERATION: Effect.READS,
+    Command.SET_ADDRESS: Effect.ARRANGES,
+    Command.SET_BAUD_RATE: Effect.ARRANGES,
+    Command.HARD_RESET: Effect.ARRANGES,
+}
+"""All others change something; Stop Motor, which does not only stop, by its control byte."""
+RELIEVING = frozenset(
+    {
+        StopControl(0),
+        StopControl.MOTOR_OFF,
+        StopControl.ABRUPT,
+        StopControl.SMOOTH,
+        StopControl.AMP_ENABLE | StopControl.ABRUPT,
+        StopControl.AMP_ENABLE | StopControl.SMOOTH,
+    }
+)
+"""Control bytes of Stop Motor that stop a motor or switch it off, and do nothing else."""
+
+
+def reset_position(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Set position counter and command position to 0; not to be sent during a trapezoidal move."""
+    return _exchange(to, Command.RESET_POSITION, repeatable=False)
+
+
+def reset_position_relative_to_home(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Make the captured home position the new zero.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO SC.
+    """
+    _require_sc(to, "resetting the position relative to home")
+    return _exchange(to, Command.RESET_POSITION, bytes((PositionReset.RELATIVE_TO_HOME,)), repeatable=False)
+
+
+def set_position(to: Destination[ReplyT], position: int) -> Exchange[ReplyT]:
+    """Set the position counter, in counts.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO SC.
+        ValueOutOfRange: the position does not fit.
+    """
+    _require_sc(to, "setting the position counter")
+    data = bytes((PositionReset.SET_POSITION,)) + POSITION.encode(position)
+    return _exchange(to, Command.RESET_POSITION, data, repeatable=False)
+
+
+def set_address(to: Destination[ReplyT], address: int, group: int, *, leader: bool = False) -> Exchange[ReplyT]:
+    """Give a module its addresses; the first time, the next module in the chain wakes up at address 0.
+
+    Args:
+        to: the module, `Node(0, ...)` while it has no address. It answers, in the old layout, from its new address.
+        address: individual address, 1 to 127.
+        group: group address, 0x80 to 0xFF.
+        leader: this module answers for its group.
+
+    Raises:
+        ValueOutOfRange: an address is outside its range.
+    """
+    GROUP_ADDRESS.check(group)
+    data = ADDRESS.encode(address) + bytes((group & ~GROUP_MEMBER if leader else group,))
+    return _exchange(to, Command.SET_ADDRESS, data, repeatable=False)
+
+
+def define_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT]:
+    """Choose what the module adds to every reply, this one included; keep `Node.items` in step.
+
+    Raises:
+        NotSupported: the layout of these items is not known for this module.
+    """
+    return _exchange(to, Command.DEFINE_STATUS, bytes((items,)), items=items)
+
+
+def read_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT]:
+    """Request these items once instead of the default ones.
+
+    Raises:
+        NotSupported: the layout of these items is not known for this module.
+    """
+    return _exchange(to, Command.READ_STATUS, bytes((items,)), items=items)
+
+
+def load_trajectory(to: Destination[ReplyT], trajectory: Trajectory) -> Exchange[ReplyT]:
+    """Load motion registers, and start at once if the trajectory says so; only then it must not be repeated.
+
+    Raises:
+        ValueOutOfRange: a value does not fit its register.
+        NotSupported: see `encode_trajectory`.
+    """
+    data = encode_trajectory(_dialect(to), trajectory)
+    return _exchange(to, Command.LOAD_TRAJECTORY, data, repeatable=not trajectory.start_now)
+
+
+def start_motion(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Execute the trajectory loaded last."""
+    return _exchange(to, Command.START_MOTION, repeatable=False)
+
+
+def set_gain(to: Destination[ReplyT], gains: Gains) -> Exchange[ReplyT]:
+    """Load the position loop, its limits and the servo rate; they act from the next servo tick on.
+
+    Raises:
+        ValueOutOfRange: a value does not fit its register.
+        NotSupported: the module lacks a register that is not at its default.
+    """
+    return _exchange(to, Command.SET_GAIN, encode_gains(_dialect(to), gains))
+
+
+def stop_motor(to: Destination[ReplyT], control: StopControl, position: int | None = None) -> Exchange[ReplyT]:
+    """Stop in one stop mode, or only switch the amplifier; always safe to repeat.
+
+    With the loop open the modes that stop close it, for which there is `close_loop`.
+
+    Args:
+        to: who stops.
+        control: amplifier enable and at most one stop mode.
+        position: in counts, where HERE goes without a profile; absolute.
+
+    Raises:
+        ValueOutOfRange: a bad combination of bits, or the position is missing, superfluous or does not fit.
+        NotSupported: the module lacks this stop mode.
+    """
+    check_stop(control, to.profile)
+    if (position is not None) != bool(control & StopControl.HERE):
+        raise ValueOutOfRange("Stop Motor takes a position exactly with the bit for stopping here", value=position)
+    data = bytes((control,)) + (POSITION.encode(position) if position is not None else b"")
+    effect = Effect.RELIEVES if control in RELIEVING else Effect.CHANGES
+    return _exchange(to, Command.STOP_MOTOR, data, effect=effect)
+
+
+def close_loop(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Close the loop at the present position: the bytes of an abrupt stop, which take energy out of a closed loop."""
+    control = StopControl.AMP_ENABLE | StopControl.ABRUPT
+    return _exchange(to, Command.STOP_MOTOR, bytes((control,)), effect=Effect.CHANGES)
+
+
+def io_control(to: Destination[ReplyT], pins: LimitPins, *, fast_path: bool = False) -> Exchange[ReplyT]:
+    """Set direction and level of the limit switch pins, on PIC-SERVO CMC the path rate, too.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO version 4 or CMC; elsewhere the command is unused or means something
+            else. Or it has no fast path.
+    """
+    profile = _dialect(to)
+    if not profile.limit_outputs:
+        raise NotSupported(f"{profile.title} has no limit pins that can be outputs")
+    if fast_path and not profile.path_points:
+        raise NotSupported(f"{profile.title} has no path mode")
+    return _exchange(to, Command.IO_CONTROL, bytes((pins | (IoOption.FAST_PATH if fast_path else 0),)))
+
+
+def set_options(to: Destination[ReplyT], options: IoOption) -> Exchange[ReplyT]:
+    """Choose limit protection, output mode and path rate of a PIC-SERVO SC; what is left out is switched off.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO SC.
+        ValueOutOfRange: options that exclude each other.
+    """
+    _require_sc(to, "options of I/O Control")
+    check_options(options)
+    return _exchange(to, Command.IO_CONTROL, bytes((options,)))
+
+
+def add_path_points(
+    to: Destination[ReplyT], points: Sequence[PathPoint], *, fast_path: bool = False
+) -> Exchange[ReplyT]:
+    """Append 1 to 7 points to the path; the host sees to it that the buffer has room for them.
+
+    Raises:
+        NotSupported: the module has no path mode.
+        ValueOutOfRange: a point does not fit, or there are too many.
+    """
+    data = encode_points(_dialect(to), points, fast_path=fast_path)
+    return _exchange(to, Command.ADD_PATH_POINTS, data, repeatable=False)
+
+
+def start_path(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Start the path through the points loaded until now.
+
+    Raises:
+        NotSupported: the module has no path mode.
+    """
+    if not _dialect(to).path_points:
+        raise NotSupported(f"{_dialect(to).title} has no path mode")
+    return _exchange(to, Command.ADD_PATH_POINTS, repeatable=False)
+
+
+def set_homing(to: Destination[ReplyT], control: HomingControl) -> Exchange[ReplyT]:
+    """Arm the capture of the home position on a change of any of the sources; 0 disarms.
+
+    Raises:
+        ValueOutOfRange: a bad combination of bits.
+        NotSupported: the module lacks a source, or does not stop on home.
+    """
+    check_homing(control, to.profile)
+    return _exchange(to, Command.SET_HOMING_MODE, bytes((control,)))
+
+
+def set_baud(to: Group, baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int = CLOCK_HZ) -> Exchange[None]:
+    """Change the rate of all modules; the host changes its own before it sends anything else.
+
+    Only for a group without a leader, as the manuals insist: a reply would come at the new rate.
+
+    Raises:
+        ValueOutOfRange: no code is known for this rate, or the modules do not reach it.
+    """
+    top = to.profile.top_baud if to.profile else COMMON_TOP_BAUD
+    if baud > top:
+        raise ValueOutOfRange(f"{baud} baud is above {top}", value=baud, limit=top, nearest=top)
+    return _exchange(to, Command.SET_BAUD_RATE, bytes((baud_divisor(baud, codes, clock_hz),)), repeatable=False)
+
+
+def clear_sticky_bits(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Clear position error, position wrap, servo overrun and current limiting as far as their causes are gone."""
+    return _exchange(to, Command.CLEAR_STICKY_BITS)
+
+
+def save_home(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Save the present position in the home register."""
+    return _exchange(to, Command.SAVE_CURRENT_POSITION_AS_HOME, repeatable=False)
+
+
+def no_operation(to: Destination[ReplyT]) -> Exchange[ReplyT]:
+    """Do nothing but draw a reply."""
+    return _exchange(to, Command.NO_OPERATION)
+
+
+def hard_reset(to: Node | Group) -> Exchange[None]:
+    """Put modules back into the state after power-up: 19200 baud, address 0, motor off; not answered."""
+    request = encode_packet(Packet(to.address, Command.HARD_RESET))
+    return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False, effect=EFFECTS[Command.HARD_RESET])
+
+
+def configure_start_up(to: Node, start_up: StartUp) -> Exchange[None]:
+    """Save gains, velocity, acceleration and these options in the EEPROM, or erase it without `SAVE`; then reset.
+
+    The module restarts as after Hard Reset. Saved values are restored by a loss of its supply only. With
+    `AMPLIFIER_ON` and `SERVO_ON` it energises its motor then, at the latest when it is given an address.
+
+    Raises:
+        NotSupported: the module is no PIC-SERVO SC.
+        ValueOutOfRange: the address is a group's: it would rewrite every module in it.
+    """
+    _require_sc(to, "saving its configuration")
+    ADDRESS.check(to.address)
+    request = encode_packet(Packet(to.address, Command.HARD_RESET, bytes((start_up,))))
+    return unanswered(to.address, request, EEPROM_SETTLE_S, repeatable=False)
+
+
+def _exchange(
+    to: Destination[ReplyT],
+    command: Command,
+    data: bytes = b"",
+    *,
+    items: StatusItem | None = None,
+    repeatable: bool = True,
+    effect: Effect | None = None,
+) -> Exchange[ReplyT]:
+    if to.profile and to.profile.support is Support.IDENTIFY and command not in COMMON_COMMANDS:
+        raise NotSupported(f"{to.profile.title} is only identified: it takes no {command.name}")
+    request = encode_packet(Packet(to.address, command, data))
+    effect = effect or EFFECTS.get(command, Effect.CHANGES)
+    return to.exchange(request, items, repeatable=repeatable, effect=effect)
+
+
+def _dialect(to: Destination[ReplyT]) -> Profile:
+    """Return the profile that decides the layout.
+
+    Raises:
+        NotSupported: the destination is a group of unknown members.
+    """
+    if to.profile is None:
+        raise NotSupported(f"group {to.address:02X}: this command differs between dialects, so the profile is needed")
+    return to.profile
+
+
+def _require_sc(to: Destination[ReplyT], what: str) -> None:
+    if not _dialect(to).sc_extensions:
+        raise NotSupported(f"{_dialect(to).title} does not support {what}")

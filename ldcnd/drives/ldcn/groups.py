@@ -1,0 +1,298 @@
+"""Joint operations of axes of one LDCN/NMC line: start in the same servo cycle, stop by one packet, show one instant.
+
+A group without a leader does not answer: whatever was done is proven afterwards by each drive's own status.
+Source: LS-182AP manual, "Addressing"; PIC-SERVO manual, 4.1 "Group Commands", 5.2 "Start Motion", "Save Current
+Position As Home".
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping
+
+from ldcnd.contract.errors import (
+    BusError,
+    DriveFault,
+    LdcndError,
+    NotSupported,
+    OutcomeUnknown,
+    ReplyTimeout,
+    RequestRefused,
+    WrongState,
+)
+from ldcnd.drives.driver import Motion, StopMode
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
+from ldcnd.drives.ldcn.commands import Node, unanswered
+from ldcnd.drives.ldcn.io_module import IoModule
+from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem
+from ldcnd.drives.ldcn.pic_io import LINES, IoStatus
+from ldcnd.drives.ldcn.servo import STOP_CONTROLS, LdcnAxis
+from ldcnd.drives.network import CapturedIo, Instant
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Effect
+from ldcnd.line.queue import Lane
+from ldcnd.log import get_logger
+
+log = get_logger("ldcn")
+
+READY_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+FROZEN_ITEMS = StatusItem.POSITION | StatusItem.HOME
+
+
+class Groups:
+    """The groups of one line at work.
+
+    Attributes:
+        proven: the modules are known to be in the groups of the plan: after addressing, not after an adoption.
+        servos_only: nothing but configured axes is in the group of everybody.
+        all_capture: nothing is in it but what captures positions or inputs by Save Current Position as Home, which is
+            Synch Input for a PIC-I/O.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        plan: GroupPlan,
+        addressing: Addressing,
+        drives: Mapping[str, LdcnAxis],
+        io: tuple[IoModule, ...] = (),
+        *,
+        snapshots: bool,
+    ) -> None:
+        self.proven = False
+        self.servos_only = False
+        self.all_capture = False
+        self._io = io
+        self._bus = bus
+        self._plan = plan
+        self._addressing = addressing
+        self._rate = addressing.rate
+        self._drives = drives
+        self._snapshots = snapshots
+
+    async def stop(self, mode: StopMode, names: frozenset[str]) -> None:
+        """See `Network.stop_together`: one burst for all groups whose members all stop.
+
+        Raises:
+            BusError: the line failed.
+        """
+        names = frozenset(name for name in names if not self._drives[name].switched_off)  # it would close their loops
+        groups = [group for group in self._plan.within(names) if self._usable(group)] if self.proven else []
+        if not groups:
+            return
+        control = STOP_CONTROLS[mode]
+        packets = [commands.stop_motor(commands.Group(group.address), control).request for group in groups]
+        burst = self._rate.spaced(packets)
+        stop = unanswered(groups[0].address, burst, self._quiet_s(groups), repeatable=True, effect=Effect.RELIEVES)
+        try:
+            await self._bus.execute(stop, Lane.STOP)
+        finally:
+            for group in groups:
+                for name in group.members:
+                    self._drives[name].state.switched_unconfirmed()
+
+    async def start(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:
+        """See `Network.start_group`.
+
+        Raises:
+            NotSupported, DriveFault, OutcomeUnknown, BusError: as there.
+        """
+        group = self.group_of(frozenset(motions))
+        names = frozenset(motions)
+        await self._prove()
+        before: dict[str, int] = {}
+        for name, motion in motions.items():
+            before[name] = self._counts(name, await self._ready(name))
+            await self._drives[name].load(motion)
+        still_wanted()
+        sent = False
+        try:
+            await self._start_motion(group)
+            sent = True
+            stuck = [name for name, motion in motions.items() if not await self._started(name, motion, before[name])]
+        except LdcndError as error:  # also a stop of one member that came between
+            if isinstance(error, RequestRefused) and not sent:
+                raise  # refused when its turn on the line came
+            await self._stop_all(group)
+            raise OutcomeUnknown(
+                f"group of {', '.join(sorted(names))}: {error.message}; not all axes are known to have started, so all"
+                " were commanded to stop",
+                remedy="read the axis states before anything else",
+            ) from error
+        if stuck:
+            await self._stop_all(group)
+            raise OutcomeUnknown(
+                f"group of {', '.join(sorted(names))}: {', '.join(stuck)} did not start, so all were commanded to stop",
+                remedy="read the axis states before anything else",
+            )
+
+    async def start_path(self, names: frozenset[str], still_wanted: Callable[[], None]) -> None:
+        """See `Network.start_path`.
+
+        Raises:
+            NotSupported, OutcomeUnknown, BusError: as there.
+        """
+        group = self.group_of(names)
+        await self._prove()
+        still_wanted()
+        profile = self._drives[min(names)].profile
+        sent = False
+        try:
+            if group.leader is None:
+                await self._bus.execute(commands.start_path(commands.Group(group.address, profile, self._rate.cycle_s)))
+            else:
+                await self._bus.execute(commands.start_path(Node(group.address, profile)))
+            sent = True
+            stuck = [name for name in sorted(names) if not (await self._drives[name].path_status()).running]
+        except LdcndError as error:
+            if isinstance(error, RequestRefused) and not sent:
+                raise
+            await self._stop_all(group)
+            raise OutcomeUnknown(
+                f"path of {', '.join(sorted(names))}: {error.message}; not all axes are known to have started, so all"
+                " were told to stop",
+                remedy="read the axis states before anything else",
+            ) from error
+        if stuck:
+            await self._stop_all(group)
+            raise OutcomeUnknown(
+                f"path of {', '.join(sorted(names))}: {', '.join(stuck)} did not start, so all were told to stop",
+                remedy="read the axis states before anything else",
+            )
+
+    async def snapshot(self, still_free: Callable[[], None]) -> Instant:
+        """See `Network.snapshot`: Save Current Position as Home freezes, the home registers tell.
+
+        A capture that only guards a motion (`limit_switches`) does not need the register; if it comes meanwhile it
+        overwrites what was frozen, and the instant is missed.
+
+        Raises:
+            NotSupported, WrongState, BusError: as there; ReplyTimeout when a drive missed the packet.
+        """
+        groups = [group for group in self._plan.groups if group.address != EVERYBODY or self.all_capture]
+        if not self._snapshots or sum(len(group.members) for group in groups) < len(self._drives):
+            raise NotSupported(
+                "positions cannot be frozen on this line: it is not configured, or other modules share the group",
+                remedy="set snapshot = true on the bus",
+            )
+        homing = [name for name, drive in self._drives.items() if drive.state.homing_armed and not drive.state.guard]
+        if homing:
+            raise WrongState(f"axis {homing[0]} is homing: its home register is in use", axis=homing[0])
+        still_free()
+        await self._prove()
+        before = {name: await self._frozen(name) for name in self._drives}
+        io_before = {module.name: await module.captured() for module in self._io} if self.all_capture else {}
+        addresses = dict.fromkeys(group.address for group in groups) | ({EVERYBODY: None} if io_before else {})
+        packets = [commands.save_home(commands.Group(address)).request for address in addresses]
+        save = unanswered(EVERYBODY, self._rate.spaced(packets), self._quiet_s(groups), repeatable=False)
+        still_free()
+        _, timing = await self._bus.execute_timed(save)
+        positions = {}
+        for name in self._drives:
+            status = await self._frozen(name)
+            position, home = status.position or 0, status.home or 0
+            captured = (before[name].flags ^ status.flags) & StatusFlag.HOME_IN_PROGRESS
+            if captured or (home == before[name].home and position != home):
+                raise ReplyTimeout(f"axis {name}: the drive missed the instant", axis=name)
+            positions[name] = home + self._drives[name].state.offset_counts
+        io = [await self._captured(module, io_before[module.name]) for module in self._io if module.name in io_before]
+        return Instant(positions, timing.sent_at_s, timing.received_at_s, tuple(io))
+
+    def group_of(self, names: frozenset[str]) -> Group:
+        """Return the group that has exactly these members.
+
+        Raises:
+            NotSupported: there is none.
+        """
+        group = self._plan.exactly(names)
+        if group is None or not self._usable(group):
+            raise NotSupported(
+                f"axes {', '.join(sorted(names))} are not exactly the members of one group",
+                remedy="configure a [[bus.group]] of these axes",
+            )
+        return group
+
+    # -- steps -------------------------------------------------------------------------------------------------------
+
+    def _usable(self, group: Group) -> bool:
+        return group.address != EVERYBODY or self.servos_only
+
+    def _quiet_s(self, groups: list[Group]) -> float:
+        """Return how long the line rests after a burst: a servo cycle, and replies of leaders, which are not read."""
+        leaders = sum(group.leader is not None for group in groups)
+        return (
+            commands.group_quiet_s(self._rate.cycle_s) + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud
+        )
+
+    async def _prove(self) -> None:
+        """Tell every drive its group again, unless it was this daemon that did."""
+        if self.proven:
+            return
+        for name, drive in self._drives.items():
+            if not await self._addressing.regroup(drive.spec.address):
+                raise ReplyTimeout(f"axis {name}: the drive does not take its group address", axis=name)
+        self.proven = True
+
+    async def _ready(self, name: str) -> Status:
+        """Read a drive that is about to be started.
+
+        Raises:
+            DriveFault: its loop is open.
+        """
+        status = await self._read(name, READY_ITEMS)
+        if status.aux is None or not status.aux & AuxFlag.SERVO_ON:
+            raise DriveFault(f"axis {name}: its loop is open, so the group was not started", axis=name)
+        if not status.flags & StatusFlag.MOVE_DONE:
+            raise WrongState(f"axis {name} moves already, so the group was not started", axis=name)
+        return status
+
+    async def _start_motion(self, group: Group) -> None:
+        """Start Motion, once; a leader's reply proves that the packet was understood, and its loss proves nothing."""
+        if group.leader is None:
+            await self._bus.execute(commands.start_motion(commands.Group(group.address, cycle_s=self._rate.cycle_s)))
+            return
+        leader = self._drives[group.leader]
+        await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)))
+
+    async def _started(self, name: str, motion: Motion, came_from: int) -> bool:
+        """Tell from the drive's status whether it has set out, or has arrived already."""
+        status = await self._read(name, READY_ITEMS)
+        if not status.flags & StatusFlag.MOVE_DONE:
+            return True
+        if motion.target_counts is None:
+            return bool(status.velocity)
+        is_at = self._counts(name, status)
+        return abs(is_at - motion.target_counts) <= abs(is_at - came_from)
+
+    async def _stop_all(self, group: Group) -> None:
+        """Stop every member, first together, then each by itself; what fails is logged, the rest goes on."""
+        try:
+            await self.stop(StopMode.SMOOTH, group.members)
+        except BusError as error:
+            log.error("group stop not sent", bus=self._bus.settings.name, reason=error.message)
+        async with asyncio.TaskGroup() as stops:
+            for name in sorted(group.members):
+                stops.create_task(self._stop_one(name), name=f"stop {name}")
+
+    async def _stop_one(self, name: str) -> None:
+        try:
+            await self._drives[name].stop(StopMode.SMOOTH)
+        except BusError as error:
+            log.error("stop not confirmed", axis=name, reason=error.message)
+
+    def _counts(self, name: str, status: Status) -> int:
+        """Return a position in counts since the reset of the drive."""
+        return (status.position or 0) + self._drives[name].state.offset_counts
+
+    async def _captured(self, module: IoModule, before: IoStatus) -> CapturedIo:
+        """Read what a PIC-I/O has captured; only a count that runs proves that it was this time."""
+        status = await module.captured()
+        levels, counter = status.captured_levels or 0, status.captured_counter or 0
+        proven = counter != before.captured_counter
+        return CapturedIo(module.name, tuple(bool(levels & 1 << bit) for bit in range(LINES)), counter, proven)
+
+    async def _frozen(self, name: str) -> Status:
+        return await self._read(name, FROZEN_ITEMS)
+
+    async def _read(self, name: str, items: StatusItem) -> Status:
+        drive = self._drives[name]
+        return await self._bus.execute(commands.read_status(Node(drive.spec.address, drive.profile), items))

@@ -1,0 +1,244 @@
+"""One PIC-I/O of a line: polls its inputs, sets its outputs, and records in a book what cannot be read back.
+
+Set Direction and Set Output write all lines at once. So that a line keeps its state when another one is written, that
+state must be known: of an output whose level is not, the level of its pin is read ("should match", data sheet, 2.2);
+what is an output cannot be read, and neither can PWM values.
+
+Nothing is written at start-up, after a reset or when the module comes back after a loss of power: its lines are inputs
+then and stay so until a request changes them. Source: PIC-I/O data sheet, 2.2, 3.1.
+"""
+
+import asyncio
+from collections.abc import Callable, Iterable, Mapping
+
+from typing_extensions import override
+
+from ldcnd.contract.errors import BusError, RegisterUnknown, ValueOutOfRange
+from ldcnd.contract.meta import Provenance
+from ldcnd.drives.ldcn.pic_io import (
+    ALL_LINES,
+    LINES,
+    MOST_PWM,
+    IoItem,
+    IoNode,
+    IoStatus,
+    SetDirection,
+    SetOutput,
+    SetPwm,
+    SetSynchOutput,
+    SetTimerMode,
+    SynchOutput,
+    read_io_status,
+    send_io_command,
+    timer_control,
+)
+from ldcnd.drives.ldcn.registers import TAKEN_OVER, RegisterBook
+from ldcnd.drives.network import IoDriver, IoReading, ModuleEntry
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange, Timing
+from ldcnd.line.poller import Poller, next_on_grid
+
+CAPTURED = IoItem.CAPTURED_LEVELS | IoItem.CAPTURED_COUNTER
+DIRECTIONS = {line: f"direction {line}" for line in range(1, LINES + 1)}
+"""By line: whether it is an output."""
+LEVELS = {line: f"output {line}" for line in range(1, LINES + 1)}
+"""By line: the level that it has, or would have, as an output."""
+PWM = ("pwm 1", "pwm 2")
+TIMER = "timer"
+ITEMS = IoItem.LEVELS | IoItem.ADC1 | IoItem.ADC2 | IoItem.ADC3 | IoItem.COUNTER
+
+
+def poll_io(address: int) -> Exchange[IoStatus]:
+    """Return the question for all inputs of a PIC-I/O."""
+    return read_io_status(IoNode(address), ITEMS)
+
+
+class IoModule(Poller[IoStatus], IoDriver):
+    """One such module.
+
+    Attributes:
+        status: the latest status byte; None while it does not answer.
+    """
+
+    def __init__(self, bus: Bus, entry: ModuleEntry) -> None:
+        self.name = entry.name
+        self.node = entry.address
+        self.status: int | None = None
+        self.due_at_s = asyncio.get_running_loop().time()
+        self.deadline_at_s = self.due_at_s
+        self.observed: Callable[[IoReading, Timing], None] = lambda _reading, _timing: None
+        self.lost: Callable[[], None] = lambda: None
+        self.proof = bus.proofs.expect(entry.address, f"module {entry.name}")
+        self._bus = bus
+        self._node = IoNode(entry.address)
+        self._period_s = 1.0 / entry.rate_hz
+        self._allowed = _mask(entry.outputs)
+        self._exchange = poll_io(entry.address)
+        names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)
+        self._book = RegisterBook(names, lambda: asyncio.get_running_loop().time())
+        self.forget()
+
+    def forget(self) -> None:
+        """The module was reset or lost power: all lines are inputs, PWM is 0, the timer is off (data sheet, 2.2)."""
+        names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)
+        self._book.note(dict.fromkeys(names, 0), Provenance.RESET)
+
+    def adopted(self) -> None:
+        """The module was taken over as it is: what is an output cannot be read.
+
+        Lines that are not configured as outputs count as inputs: the configuration says that something else drives
+        them.
+        """
+        self._book.forget(TAKEN_OVER)
+        inputs = [DIRECTIONS[line] for line in DIRECTIONS if not self._allowed & 1 << line - 1]
+        self._book.assume(dict.fromkeys(inputs, 0), "the configuration does not list the line as an output")
+
+    # -- polling -----------------------------------------------------------------------------------------------------
+
+    @override
+    def next_exchange(self, now_s: float) -> Exchange[IoStatus]:
+        self.due_at_s = next_on_grid(self.due_at_s, self._period_s, now_s)
+        self.deadline_at_s = self.due_at_s + self._period_s
+        return self._exchange
+
+    @override
+    def deliver(self, reply: IoStatus, timing: Timing) -> None:
+        self.status = 0
+        self.observed(self._reading(reply), timing)
+
+    @override
+    def missed(self, error: BusError) -> None:
+        self.status = None
+        self.lost()
+
+    def _reading(self, status: IoStatus) -> IoReading:
+        levels = status.levels or 0
+        directions = [self._book.known(DIRECTIONS[line]) for line in _lines(self._allowed)]
+        outputs = tuple(line for line, out in zip(_lines(self._allowed), directions, strict=True) if out)
+        pwm1, pwm2 = (self._book.known(name) for name in PWM)
+        return IoReading(
+            levels=tuple(bool(levels & 1 << bit) for bit in range(LINES)),
+            outputs=None if None in directions else outputs,
+            adc=(status.adc1 or 0, status.adc2 or 0, status.adc3 or 0),
+            counter=status.counter or 0,
+            pwm=None if pwm1 is None or pwm2 is None else (pwm1 / MOST_PWM, pwm2 / MOST_PWM),
+        )
+
+    # -- commands ----------------------------------------------------------------------------------------------------
+
+    @override
+    async def set_outputs(
+        self, levels: Mapping[int, bool], inputs: frozenset[int], pwm: tuple[float | None, float | None]
+    ) -> IoReading:
+        self._check(levels, inputs)
+        pwm_after = self._pwm_after(pwm)
+        if levels or inputs:
+            directions = dict.fromkeys(levels, 1) | dict.fromkeys(inputs, 0)
+            asked = {DIRECTIONS[line]: out for line, out in directions.items()}
+            turned = None if self._book.holds(asked) else SetDirection(~self._mask_after(asked) & ALL_LINES)
+            latch = await self._levels_after(levels, directions)
+            if turned:
+                with self._book.writing(asked):
+                    await self._bus.execute(send_io_command(self._node, turned))
+            written = {LEVELS[line]: int(level) for line, level in levels.items()}
+            if pwm_after:
+                await self._switch_together(latch, pwm_after, written)
+            else:
+                with self._book.writing(written):
+                    await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
+        elif pwm_after:
+            with self._book.writing(dict(zip(PWM, pwm_after, strict=True))):
+                await self._bus.execute(send_io_command(self._node, SetPwm(*pwm_after)))
+        return self._reading(await self._bus.execute(self._exchange))
+
+    def _mask_after(self, asked: Mapping[str, int]) -> int:
+        """Return which lines are outputs once these directions are written.
+
+        Raises:
+            RegisterUnknown: what another line that may be an output is used as is not known.
+        """
+        outputs = 0
+        for line, name in DIRECTIONS.items():
+            out = asked.get(name, self._book.known(name))
+            if out is None and self._allowed & 1 << line - 1:
+                raise self._unknown(f"whether line {line} is an output", f"name line {line}, too")
+            outputs |= bool(out) << line - 1
+        return outputs
+
+    async def _levels_after(self, levels: Mapping[int, bool], directions: Mapping[int, int]) -> int:
+        """Return the word of Set Output in which every line that is not named keeps the level that its pin has."""
+        kept = [line for line in _lines(self._allowed) if line not in directions]
+        if any(self._book.known(LEVELS[line]) is None for line in kept):
+            shown = (await self._bus.execute(self._exchange)).levels or 0
+            read = {LEVELS[line]: shown >> line - 1 & 1 for line in kept if self._book.known(DIRECTIONS[line])}
+            self._book.note(
+                {name: level for name, level in read.items() if self._book.known(name) is None}, Provenance.READ_BACK
+            )
+        else:
+            shown = 0
+        high = {line for line, level in levels.items() if level}
+        for line in kept:
+            level = self._book.known(LEVELS[line])
+            # an input ignores its bit; if it is an output after all, it keeps what its pin shows
+            if shown >> line - 1 & 1 if level is None else level:
+                high.add(line)
+        return _mask(high)
+
+    def _unknown(self, what: str, remedy: str) -> RegisterUnknown:
+        return RegisterUnknown(f"module {self.name}: {what} is not known", value=self.name, remedy=remedy)
+
+    def _pwm_after(self, pwm: tuple[float | None, float | None]) -> tuple[int, int] | None:
+        """Return the new values of both PWM outputs; None when the request leaves them alone.
+
+        Raises:
+            RegisterUnknown: the one that the request does not name is not known.
+        """
+        if pwm == (None, None):
+            return None
+        values = []
+        for name, new in zip(PWM, pwm, strict=True):
+            value = self._book.known(name) if new is None else round(new * MOST_PWM)
+            if value is None:
+                raise self._unknown(f"what {name} is set to", "name both PWM outputs at once")
+            values.append(value)
+        return values[0], values[1]
+
+    async def _switch_together(self, latch: int, pwm: tuple[int, int], written: Mapping[str, int]) -> None:
+        """Let lines and PWM outputs change in the same cycle of the module.
+
+        Only this module is addressed: in a group with servos Synch Output is Start Motion.
+        """
+        with self._book.writing({**written, **dict(zip(PWM, pwm, strict=True))}):
+            await self._bus.execute(send_io_command(self._node, SetSynchOutput(latch, *pwm)))
+            await self._bus.execute(send_io_command(self._node, SynchOutput()))
+
+    async def captured(self) -> IoStatus:
+        """Return the levels and the count that the latest Synch Input has captured."""
+        return await self._bus.execute(read_io_status(self._node, CAPTURED))
+
+    @override
+    async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:
+        mode = SetTimerMode(enabled, counts_edges, prescale)
+        with self._book.writing({TIMER: timer_control(mode)}):
+            await self._bus.execute(send_io_command(self._node, mode))
+
+    def _check(self, levels: Mapping[int, bool], inputs: frozenset[int]) -> None:
+        for line in (*levels, *inputs):
+            if not 1 <= line <= LINES or (line in levels and not self._allowed & 1 << line - 1):
+                allowed = ", ".join(map(str, _lines(self._allowed))) or "none"
+                raise ValueOutOfRange(
+                    f"module {self.name}: line {line} is not configured as an output; those are {allowed}",
+                    value=line,
+                    limit=allowed,
+                    remedy="configure it in `outputs` of the module, if nothing else drives it",
+                )
+        if both := sorted(inputs & levels.keys()):
+            raise ValueOutOfRange(f"module {self.name}: line {both[0]} cannot be both", value=both[0])
+
+
+def _mask(lines: Iterable[int]) -> int:
+    return sum(1 << line - 1 for line in set(lines))
+
+
+def _lines(mask: int) -> tuple[int, ...]:
+    return tuple(bit + 1 for bit in range(LINES) if mask & 1 << bit)

@@ -1,0 +1,533 @@
+"""One LDCN/NMC line: from whatever state it is in to drives that can be polled, and back when some of them lose power.
+
+Sources: LS-182AP manual, "Addressing", "Changing communications rates"; PIC-SERVO manual, 4.1 "Network initialization".
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from collections.abc import Set as AbstractSet
+from dataclasses import replace
+from typing import Any
+
+from typing_extensions import override
+
+from ldcnd.contract.errors import BusError, NetworkMismatch
+from ldcnd.drives.driver import AxisSpec, Drive, Motion, StopMode
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.addressing import (
+    ANY_DIALECT,
+    EVERYBODY,
+    FASTEST_BAUD,
+    NULLS,
+    NULLS_SETTLE_S,
+    Addressing,
+    Expected,
+    GroupPlan,
+    Identity,
+    LineRate,
+    differences,
+    read_identity,
+)
+from ldcnd.drives.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adoption, Found
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.gathering import Gathering
+from ldcnd.drives.ldcn.groups import Groups
+from ldcnd.drives.ldcn.io_module import IoModule
+from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, Status, StatusItem
+from ldcnd.drives.ldcn.profiles import PIC_IO, PIC_STEP, PROFILES, Support, at_clock
+from ldcnd.drives.ldcn.registers import BaudCodes
+from ldcnd.drives.ldcn.servo import LdcnAxis
+from ldcnd.drives.network import (
+    AdoptFallback,
+    BringUpReport,
+    FoundModule,
+    Instant,
+    IoDriver,
+    LineSpec,
+    Network,
+    StartPolicy,
+)
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange, Timing
+from ldcnd.line.poller import Poller, next_on_grid
+from ldcnd.line.proof import bringing_up
+from ldcnd.line.resync import Resync
+from ldcnd.log import get_logger
+
+PERIOD_S = 1.0
+"""From one question for the status byte of a module that is no axis to the next."""
+
+
+def watch_module(address: int) -> Exchange[Status]:
+    """Return the question for a module's status byte."""
+    return commands.read_status(Node(address, ANY_DIALECT), STATUS_BYTE_ONLY)
+
+
+class ModuleWatch(Poller[Status]):
+    """One module's status byte.
+
+    Attributes:
+        status: the latest, 0 to 255; None while it does not answer.
+    """
+
+    def __init__(self, address: int) -> None:
+        self.node = address
+        self.status: int | None = None
+        self.due_at_s = asyncio.get_running_loop().time()
+        self.deadline_at_s = self.due_at_s + PERIOD_S
+        self._exchange = watch_module(address)
+
+    def next_exchange(self, now_s: float) -> Exchange[Status]:
+        """See `Poller`; a late turn does not shift the next one."""
+        self.due_at_s = next_on_grid(self.due_at_s, PERIOD_S, now_s)
+        self.deadline_at_s = self.due_at_s + PERIOD_S
+        return self._exchange
+
+    @override
+    def deliver(self, reply: Status, timing: Timing) -> None:
+        self.status = int(reply.flags)
+
+    @override
+    def missed(self, error: BusError) -> None:
+        self.status = None
+
+
+log = get_logger("ldcn")
+
+PLACE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY
+RATE_ATTEMPTS = 2
+"""Attempts at Set Baud to the whole line: it is not answered, and one lost packet must not decide on the rate."""
+
+
+class LdcnNetwork(Network):
+    """The chain of modules on one line."""
+
+    def __init__(self, bus: Bus, specs: tuple[AxisSpec, ...], baud: int, line: LineSpec | None = None) -> None:
+        line = line or LineSpec()
+        self._bus = bus
+        self._baud = baud
+        self._line = line
+        self._drives = {
+            spec.address: LdcnAxis(spec, at_clock(PROFILES[spec.model], line.clock_hz), bus) for spec in specs
+        }
+        self._names = {spec.address: spec.name for spec in specs}
+        self._identities: dict[int, Identity] = {}
+        self._watches: dict[int, ModuleWatch | IoModule] = {}
+        self._was_up = False
+        self._restarted: set[int] = set()  # given their addresses again, on a line that has not come up since
+        self._half_reset = False  # an attempt to reset the line has failed: who has received it is not known
+        self._disturbed = False  # an attempt to reset the line has failed on the way
+        self._placed: set[int] = set()
+        self._expected = _expected(specs, line)
+        plan = GroupPlan(line.groups, self._names)
+        self._io = {entry.address: IoModule(bus, entry) for entry in line.modules if entry.name}
+        self._proofs = {
+            each.address: bus.proofs.expect(each.address, each.what, self._names.get(each.address))
+            for each in self._expected
+        }
+        for group in plan.addresses:
+            members = (address for address in self._proofs if group in (EVERYBODY, plan.place(address).address))
+            bus.proofs.expect_group(group, members)
+        self._rate = LineRate(
+            bus,
+            baud,
+            BaudCodes.ALTERNATE if line.alternate_divisors else BaudCodes.MANUAL,
+            plan.addresses,
+            fastest=any(each.profile.top_baud >= FASTEST_BAUD for each in self._expected),
+            clock_hz=line.clock_hz,
+        )
+        self._addressing = Addressing(bus, self._rate, plan)
+        self._adoption = Adoption(bus, self._rate, self._expected)
+        self._gathering = Gathering(bus, self._rate, self._addressing, self._expected)
+        drives = {drive.spec.name: drive for drive in self._drives.values()}
+        self.axes: Mapping[str, Drive] = drives
+        self._groups = Groups(bus, plan, self._addressing, drives, tuple(self._io.values()), snapshots=line.snapshot)
+        self.io: Mapping[str, IoDriver] = {module.name: module for module in self._io.values()}
+        self.resync = Resync(flush=NULLS, quiet_s=0.005, settle_s=NULLS_SETTLE_S, probe=self._probe)
+
+    # -- bring-up ----------------------------------------------------------------------------------------------------
+
+    async def bring_up(self) -> BringUpReport:
+        """See `Network`: take the line over or reset it, as the policy says; every open loop stays open.
+
+        A line that this daemon had up before is taken over if that is possible, whatever the policy.
+        """
+        with bringing_up():
+            return await self._bring_up()
+
+    async def _bring_up(self) -> BringUpReport:
+        self._identities.clear()
+        self._watches.clear()
+        self._rate.working = self._baud
+        remarks: tuple[str, ...] = ()
+        if self._was_up or self._line.start is StartPolicy.ADOPT:
+            try:
+                adopted = await self._adopt()
+            except NetworkMismatch as error:
+                await self._check_may_reset(error)
+                remarks = (error.message,)
+            else:
+                found_open = frozenset() if self._was_up else self._open_loops(adopted)
+                restarted = frozenset(self._names[address] for address in self._restarted & self._drives.keys())
+                report = self._up(adopted.identities, self._take_over(adopted), reset=False)
+                return replace(report, open_loops=found_open, restarted=restarted)
+        for drive in self._drives.values():
+            drive.forget()
+        for module in self._io.values():
+            module.forget()
+        self._half_reset = True
+        modules, found = await self._start_afresh()
+        self._half_reset = False
+        return self._up(modules, remarks + found, reset=True)
+
+    async def _adopt(self) -> Adopted:
+        """Take the line over; where only a part of it answers, make the rest audible if more than reading is allowed.
+
+        Raises:
+            NetworkMismatch: it cannot be taken over.
+        """
+
+        def addressing(address: int) -> None:
+            self._restarted.add(address)
+            if address in self._drives:
+                self._drives[address].forget()
+            elif address in self._io:
+                self._io[address].forget()
+
+        try:
+            return await self._adoption.attempt()
+        except NetworkMismatch:
+            reads_only = not self._was_up and self._line.adopt_fallback is AdoptFallback.REFUSE
+            found = self._adoption.found
+            if reads_only or not found or not self._gathering.possible:
+                raise
+            await self._to_one_rate(found)
+            await self._gathering.search(addressing, lambda _: None, left=len(self._expected) - len(found))
+            await self._addressing.with_leaders()
+        return await self._adoption.attempt()
+
+    async def _to_one_rate(self, found: Mapping[int, Found]) -> None:
+        """Bring modules that a lost host has left at different rates to one; allowed while motors move."""
+        rates = {each.baud for each in found.values()}
+        if len(rates) == 1:
+            (self._rate.working,) = rates
+        for baud in rates - {self._rate.working}:
+            await self._rate.host_to(baud)
+            await self._addressing.without_leaders()
+            await self._rate.everybody_to(self._rate.working)
+        await self._rate.host_to(self._rate.working)
+
+    def _open_loops(self, adopted: Adopted) -> frozenset[str]:
+        return frozenset(
+            self._names[address]
+            for address, status in adopted.states.items()
+            if address in self._drives and not (status.aux is not None and status.aux & AuxFlag.SERVO_ON)
+        )
+
+    def _up(self, modules: Mapping[int, Identity], remarks: tuple[str, ...], *, reset: bool) -> BringUpReport:
+        self._identities = dict(modules)
+        self._gathering.places = self._expected + tuple(
+            Expected(address, "module", found.profile or PIC_STEP, found)
+            for address, found in sorted(modules.items())
+            if address > len(self._expected)
+        )
+        self._watches = {
+            address: self._io.get(address) or ModuleWatch(address) for address in modules if address not in self._drives
+        }
+        self._groups.proven = reset
+        self._groups.servos_only = reset and not self._watches  # an adoption probes only for expected modules
+        known = (identity.profile for identity in modules.values())
+        self._groups.all_capture = reset and all(
+            each is PIC_IO or (each is not None and each.support is Support.FULL) for each in known
+        )
+        for address, drive in self._drives.items():
+            drive.identity = str(modules[address])
+        for proof in self._proofs.values():
+            proof.prove()
+        self._was_up = True
+        self._restarted.clear()
+        log.info("network up", bus=self._bus.settings.name, modules=len(modules), baud=self._bus.baud, reset=reset)
+        return BringUpReport(
+            baud=self._bus.baud,
+            identities={self._names[address]: str(modules[address]) for address in self._drives},
+            reset=reset,
+            remarks=remarks,
+            placed=frozenset(self._names[address] for address in self._placed if address in self._names),
+        )
+
+    def _take_over(self, adopted: Adopted) -> tuple[str, ...]:
+        """Learn what the drives are doing that have not restarted; return remarks."""
+        self._rate.working = adopted.baud
+        known, self._half_reset = self._was_up and not self._half_reset, False
+        for address, drive in self._drives.items():
+            if address not in self._restarted:
+                drive.adopted(adopted.states[address], known=known)
+        for address, module in self._io.items():
+            if address not in self._restarted and not known:
+                module.adopted()
+        remarks = [f"taken over as it was, at {adopted.baud} baud; gains are assumed to be those of the configuration"]
+        remarks += [f"address {address} had lost power and is disabled" for address in sorted(self._restarted)]
+        if adopted.baud != self._baud:
+            remarks.append(f"the configuration asks for {self._baud} baud; the line stays at {adopted.baud}")
+        return tuple(remarks)
+
+    async def _check_may_reset(self, refused: NetworkMismatch) -> None:
+        """Decide what follows a take-over that was not possible: drives that move are never reset after it.
+
+        Raises:
+            NetworkMismatch: nothing: the line stays down.
+        """
+        if self._line.start is StartPolicy.ADOPT and self._line.adopt_fallback is AdoptFallback.REFUSE:
+            raise refused
+        obstacles = await self._adoption.not_standing()
+        if obstacles:
+            raise NetworkMismatch(
+                f"{refused.message}; not reset either: {'; '.join(obstacles)}", remedy="wait, or stop the motion"
+            ) from refused
+
+    async def _start_afresh(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
+        """Reset, address, identify, go to the working rate; return who is where, and remarks.
+
+        Raises:
+            NetworkMismatch: the drives would be lost by a reset, or are not those of the configuration.
+        """
+        if not self._rate.changeable and self._bus.baud != self._rate.at_reset:
+            raise NetworkMismatch(
+                f"bus {self._bus.settings.name}: not reset, as the port stays at {self._bus.baud} baud and the drives"
+                f" would restart at {self._rate.at_reset}",
+                remedy=f'set the far end to {self._rate.at_reset} baud, or use start = "adopt"',
+            )
+        heard = self._bus.statistics.bytes_in
+        first = not (self._was_up or self._disturbed)
+        places_known = self._line.proves_places and first and await self._all_wait()
+        try:
+            if self._disturbed:
+                await self._addressing.reset_all()
+                await self._addressing.let_all_hear(len(self._expected))
+            modules, remarks = await self._reset_and_address()
+        finally:
+            self._disturbed = self._disturbed or self._bus.statistics.bytes_in > heard  # a line without power is not
+        self._placed = await self._places() if places_known else set()
+        return modules, remarks
+
+    async def _reset_and_address(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
+        for _ in range(RATE_ATTEMPTS):
+            modules, remarks = await self._address_afresh()
+            deaf = await self._change_rate(modules)
+            if deaf is None:
+                await self._addressing.with_leaders()
+                return modules, remarks
+        modules, remarks = await self._address_afresh()
+        self._rate.working = self._rate.at_reset
+        await self._addressing.with_leaders()
+        told = f"address {deaf} does not answer at {self._baud} baud; the line stays at {self._rate.at_reset}"
+        return modules, (*remarks, told)
+
+    async def _address_afresh(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
+        """Bring everybody to the rate of power-up and give out addresses; return who is where, and remarks.
+
+        Raises:
+            NetworkMismatch: they are not those of the configuration.
+        """
+        await self._addressing.reset_all()
+        modules = await self._addressing.address_all(len(self._expected))
+        return modules, self._compare(modules)
+
+    async def _all_wait(self) -> bool:
+        """Tell, before a reset, whether all modules wait for an address, and so stand where they were powered on.
+
+        What has an address of an earlier host may have been moved by it. The first module tells: while it waits it
+        keeps the next one from receiving. If only some wait, modules meet at one address, the attempt fails, and the
+        next one is not the first at which a module answered.
+        """
+        if (
+            not await self._rate.host_to(self._rate.at_reset)
+            or await self._rate.who_is(UNADDRESSED, patient=True) is None
+        ):
+            return False
+        for baud in self._rate.candidates if self._rate.changeable else (self._rate.at_reset,):
+            if await self._rate.who_is_at(baud, self._expected[0].address):
+                return False
+        return True
+
+    async def _places(self) -> set[int]:
+        """Return which modules stand at 0 after a reset that found them where they were powered on."""
+        placed = set()
+        for each in self._expected:
+            if each.address not in self._drives or each.address in self._addressing.had_address:
+                continue
+            status = await self._bus.execute(commands.read_status(Node(each.address, each.profile), PLACE_ITEMS))
+            if status.position is not None and abs(status.position) <= STILL_COUNTS and not status.velocity:
+                placed.add(each.address)
+        return placed
+
+    async def _change_rate(self, modules: Mapping[int, Identity]) -> int | None:
+        """Move everybody to the working rate; return the first module that did not follow, None if all did."""
+        if not self._rate.changeable:
+            self._rate.working = self._bus.baud
+            return None
+        await self._rate.everybody_to(self._rate.working)
+        for address, identity in modules.items():
+            if await self._rate.who_is(address, patient=True) != identity:
+                return address
+        return None
+
+    def _compare(self, modules: Mapping[int, Identity]) -> tuple[str, ...]:
+        """Hold what was found against the configuration; return remarks on what does no harm.
+
+        Raises:
+            NetworkMismatch: a configured module is missing or is something else.
+        """
+        different = differences(self._expected, modules)
+        if different:
+            raise NetworkMismatch(
+                f"bus {self._bus.settings.name}: {len(modules)} module(s) found within"
+                f" {self._rate.reset_s:g} s of the reset, {len(self._expected)} configured; " + "; ".join(different),
+                remedy="switch on what has no power, and correct the wiring or the configuration",
+            )
+        known = {each.address for each in self._expected}
+        return tuple(
+            f"address {address}: {found} is not configured; it is kept on the line and never moved"
+            for address, found in sorted(modules.items())
+            if address not in known
+        )
+
+    async def survey(self) -> Mapping[int, Found]:
+        """Find who answers where, by reading only.
+
+        The host is at the rate of the first of them afterwards, or at that of power-up.
+
+        Raises:
+            BusError: the line failed meanwhile.
+        """
+        await self._adoption.search()
+        found = dict(sorted(self._adoption.found.items()))
+        await self._rate.host_to(next(iter(found.values())).baud if found else self._rate.at_reset)
+        return found
+
+    def differences(self, found: Mapping[int, Found]) -> tuple[str, ...]:
+        """Return in words what of that is not as configured."""
+        return differences(self._expected, {address: each.identity for address, each in found.items()})
+
+    # -- while the line is up ----------------------------------------------------------------------------------------
+
+    @property
+    @override
+    def modules(self) -> tuple[FoundModule, ...]:
+        return tuple(self._module(address, identity) for address, identity in sorted(self._identities.items()))
+
+    @property
+    @override
+    def watches(self) -> tuple[Poller[Any], ...]:
+        return tuple(self._watches.values())
+
+    @override
+    def incomplete(self) -> bool:
+        return not self._bus.proofs.all_hold()
+
+    async def rejoin(
+        self, restarted: Callable[[str], None], heard: Callable[[str], None] = lambda _: None
+    ) -> frozenset[str]:
+        """See `Network`: one search of `Gathering`, and what answers again is identified again."""
+
+        def addressing(address: int) -> None:
+            self._proofs[address].lose(f"address {address} has restarted")
+            if address in self._drives:
+                self._drives[address].forget()
+                restarted(self._names[address])
+            elif address in self._io:
+                self._io[address].forget()
+
+        missing = {
+            address: name
+            for address, name in self._names.items()
+            if self._bus.misses(address) or not self._proofs[address].holds
+        }
+        back: set[str] = set()
+
+        def reached(address: int) -> None:
+            if address in missing and missing[address] not in back:
+                back.add(missing[address])
+                heard(missing[address])
+
+        with bringing_up():
+            await self._gathering.search(addressing, reached)
+        for address in await self._identify():
+            reached(address)
+        return frozenset(back)
+
+    @property
+    @override
+    def problem(self) -> str:
+        return self._gathering.problem
+
+    async def _identify(self) -> frozenset[int]:
+        """Prove again who answers and was lost; return the addresses of those that are what is configured."""
+        found = set()
+        for each in self._expected:
+            proof = self._proofs[each.address]
+            if proof.holds or each.address not in self._identities or self._bus.misses(each.address):
+                continue
+            identity = await self._rate.who_is(each.address, patient=True)
+            if identity is None:
+                continue
+            if different := each.differs(identity):
+                proof.lose(different, silent=False)
+                continue
+            self._identities[each.address] = identity
+            proof.prove()
+            found.add(each.address)
+        return frozenset(found)
+
+    @override
+    async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
+        await self._groups.stop(mode, names)
+
+    @override
+    async def start_group(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:
+        await self._groups.start(motions, still_wanted)
+
+    @override
+    async def start_path(self, names: frozenset[str], still_wanted: Callable[[], None]) -> None:
+        await self._groups.start_path(names, still_wanted)
+
+    @override
+    async def snapshot(self, still_free: Callable[[], None]) -> Instant:
+        return await self._groups.snapshot(still_free)
+
+    def _module(self, address: int, identity: Identity) -> FoundModule:
+        profile = next((each.profile for each in self._expected if each.address == address), identity.profile)
+        watch = self._watches.get(address)
+        return FoundModule(
+            address=address,
+            title=str(identity),
+            model=profile.name if profile else None,
+            device_id=identity.device_id,
+            version=identity.version,
+            axis=self._names.get(address),
+            status=watch.status if watch else None,
+            name=self._io[address].name if address in self._io else None,
+        )
+
+    def _probe(self, avoid: AbstractSet[int]) -> Exchange[Any] | None:
+        """See `Resync`: the identity of a module is known beforehand, and no poll has a reply of this length."""
+        candidates = [address for address in self._identities if address not in avoid] or list(self._identities)
+        if not candidates:
+            return None
+        return read_identity(candidates[0], self._identities[candidates[0]])
+
+
+def _expected(specs: tuple[AxisSpec, ...], line: LineSpec) -> tuple[Expected, ...]:
+    """Return what the configuration says is on the line, in the order of the chain."""
+    axes = [
+        Expected(spec.address, f"axis {spec.name}", PROFILES[spec.model], _override(spec.identity)) for spec in specs
+    ]
+    others = [
+        Expected(module.address, "module", PROFILES[module.model], _override(module.identity))
+        for module in line.modules
+    ]
+    return tuple(sorted(axes + others, key=lambda each: each.address))
+
+
+def _override(identity: tuple[int, int] | None) -> Identity | None:
+    return Identity(*identity) if identity else None

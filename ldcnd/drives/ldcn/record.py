@@ -1,0 +1,224 @@
+"""The host's record of one drive: what was sent to it, and what it has shown; its registers are in registers.py.
+
+A drive cannot be asked whether its power driver is enabled or what has switched it off: the host remembers what it has
+sent and what was acknowledged.
+Sources: LS-182AP manual, "Power-up and Reset Conditions", "Set Gain", "Load Trajectory"; PIC-SERVO manual, 4.3 to 4.5.
+"""
+
+from dataclasses import dataclass, replace
+
+from ldcnd.contract.errors import BadReply
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.drives import driver
+from ldcnd.drives.driver import AxisReading
+from ldcnd.drives.ldcn.faults import AFTER_RESET, Fault, FaultCode, Knowledge, diagnose, servo_on
+from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag
+from ldcnd.drives.ldcn.profiles import Profile
+from ldcnd.drives.ldcn.registers import ServoRegisters
+
+BEGUN_COUNTS = 16
+"""A counter that was reset reads 0, and a shaft that its loop has let go settles near it."""
+FOREIGN_CAPTURE = "a capture is armed that this daemon has not armed"
+_MOVE_DONE, _POWER_ON, _LIMIT1, _LIMIT2, _HOMING = map(
+    int,
+    (
+        StatusFlag.MOVE_DONE,
+        StatusFlag.POWER_ON,
+        StatusFlag.LIMIT1,
+        StatusFlag.LIMIT2,
+        StatusFlag.HOME_IN_PROGRESS,
+    ),
+)
+_SERVO_ON, _MOTION_LOCKED, _INDEX = map(int, (AuxFlag.SERVO_ON, AuxFlag.MOTION_LOCKED, AuxFlag.INDEX))
+"""As numbers: arithmetic with flags costs ten times as much, and every reply needs it."""
+
+
+Levels = tuple[bool, bool, bool, bool, bool | None, bool | None, bool | None, bool | None, bool | None]
+"""Armed for homing, motion locked, servo on, profile done, reverse limit, forward limit, index, stop input, Pic_ae."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Shown:
+    """What the flags of a status packet say: worked out again only when they, or what is known, have changed."""
+
+    faults: tuple[driver.Fault, ...]
+    levels: Levels
+
+
+NOTHING_SHOWN = _Shown((), (False, False, False, False, None, None, None, None, None))
+
+
+class DriveState:
+    """The record of one drive: what was sent to it, and what it has shown.
+
+    Attributes:
+        known: what decides on the meaning of its status.
+        homing_armed: a capture was armed and has not been seen to come.
+        loop_may_open: the loop is open on purpose (PWM mode), or will be once home is captured: then the position
+            error flag, which every open loop shows, is no fault.
+        motion_locked: the drive refuses motion since it homed on a limit switch.
+        guard: the limit switch at which the drive stops the present motion by itself; empty without one.
+        guard_hit: it has.
+        offset_counts: what the position counter lacks of the counts since the reset of the drive: Reset Position has
+            set it back by this amount.
+        setting_back: where the counter stood when Reset Position was sent to it last, until a reading shows the effect.
+        counts: the latest position, in counts since the reset of the drive.
+    """
+
+    def __init__(self, name: str, profile: Profile, registers: ServoRegisters) -> None:
+        self._name = name
+        self._profile = profile
+        self._registers = registers
+        self._question: object = ()  # what flags and faults were worked out from last
+        self._shown: _Shown = NOTHING_SHOWN
+        self.restarted()
+
+    # -- what was commanded ------------------------------------------------------------------------------------------
+
+    def restarted(self) -> None:
+        """The drive was reset or lost power: nothing that was sent before holds any more."""
+        self.known = AFTER_RESET
+        self.homing_armed = False
+        self.loop_may_open = False
+        self.motion_locked = False
+        self.guard = ""
+        self.guard_hit = False
+        self.offset_counts = self.setting_back = self.counts = 0
+
+    def taken_over(self, status: Status) -> None:
+        """The drive is adopted as it is, and this host has never known it; the status packet has the auxiliary byte."""
+        self.restarted()
+        self.known = Knowledge(closed=servo_on(status))
+        self.homing_armed = bool(status.flags & StatusFlag.HOME_IN_PROGRESS)
+
+    def unseen(self) -> None:
+        """The drive was out of reach for a while; nothing was sent to it meanwhile, by this host at least."""
+        self.known = replace(self.known, seen=False)
+
+    def switched_unconfirmed(self) -> None:
+        """A Stop Motor was sent, or may have been, that was not acknowledged: it may have opened the loop."""
+        self.known = replace(self.known, pic_ae=None, nothing_latched=False, closed=False)
+
+    def switched(self, *, pic_ae: bool, closed: bool) -> None:
+        """The drive acknowledged a Stop Motor that closes the loop, or opens it."""
+        # spelled out, because `replace` takes three times as long where the answer to a stop waits
+        self.known = Knowledge(
+            pic_ae=pic_ae, nothing_latched=False, latched=self.known.latched, closed=closed, seen=True, absolute=False
+        )
+        self.loop_may_open = False
+
+    def clearing(self) -> None:
+        """Clear Sticky Bits is on its way: a cause that was known may be gone before that is acknowledged."""
+        if self.known.latched and self.known.pic_ae is not True:
+            loses = self.known.latched.loses_position
+            self.known = replace(self.known, latched=Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=loses))
+
+    def cleared(self) -> None:
+        """The drive acknowledged Clear Sticky Bits; it discards the cause of a switch-off only with Pic_ae = 0."""
+        if self.known.pic_ae is False:
+            self.known = replace(self.known, latched=None, nothing_latched=True)
+
+    def loaded(self, *, absolute: bool, opens_loop: bool) -> None:
+        """A motion was loaded: to an analog target or not; one that opens the loop on purpose, at once or at home."""
+        self.known = replace(self.known, absolute=absolute)
+        self.loop_may_open = opens_loop
+
+    # -- what it shows -----------------------------------------------------------------------------------------------
+
+    def reading(self, status: Status, asked: frozenset[TelemetryItem] = frozenset()) -> AxisReading:
+        """Interpret a status packet that was requested for these items.
+
+        Raises:
+            BadReply: position, velocity or the auxiliary byte is missing.
+        """
+        if status.position is None or status.velocity is None or status.aux is None:
+            raise BadReply(f"axis {self._name}: the status packet lacks position, velocity or aux")
+        faults = self.faults(status)
+        homing, locked, enabled, done, reverse, forward, index, stop_input, pic_ae = self._shown.levels
+        counter = status.position
+        if self.setting_back and abs(counter) < abs(self.setting_back) / 2:
+            self.offset_counts += self.setting_back
+            self.setting_back = 0
+        self.counts = counts = counter + self.offset_counts
+        if not homing:
+            self.homing_armed = False
+            self.guard_hit = bool(self.guard)
+        self.motion_locked = locked
+        tick_s, uncertain = self._registers.shown_tick
+        return AxisReading(
+            position_counts=counts,
+            following_error_counts=status.position_error,
+            velocity_counts_per_s=status.velocity / tick_s,
+            velocity_resolution_counts_per_s=1.0 / tick_s,
+            adc_counts=status.adc,
+            enabled=enabled,
+            profile_done=done,
+            homing=homing,
+            faults=faults,
+            reverse_limit=reverse,
+            forward_limit=forward,
+            index=index,
+            stop_input=stop_input,
+            amplifier_enable=pic_ae,
+            asked=asked,
+            cut_short=f"the drive stopped at the {self.guard}" if self.guard_hit else "",
+            begun_anew=-BEGUN_COUNTS <= counter <= BEGUN_COUNTS,
+            altered=FOREIGN_CAPTURE if homing and not self.homing_armed else "",
+            velocity_uncertain=uncertain,
+        )
+
+    def faults(self, status: Status) -> tuple[driver.Fault, ...]:
+        """Return the drive's complaints; recomputed only when something that they depend on has changed."""
+        adc = status.adc if self.known.absolute is not False else None
+        if (status.flags, status.aux, adc, self.known, self.loop_may_open) != self._question:
+            faults = self._diagnose(status)
+            self._shown = _Shown(faults, self._levels(int(status.flags), int(status.aux or 0)))
+            self._question = (status.flags, status.aux, adc, self.known, self.loop_may_open)
+        return self._shown.faults
+
+    def _levels(self, flags: int, aux: int) -> "Levels":
+        """Return what the flags mean now that the faults are known."""
+        profile, known = self._profile, self.known
+        logosol, powered, closed = profile.pic_ae_diagnostics, flags & _POWER_ON, aux & _SERVO_ON
+        shows_limits = not logosol or (bool(known.pic_ae) and bool(powered))
+        stop_input = None
+        if logosol and (closed or (known.pic_ae is False and powered)):
+            stop_input = not (closed or flags & _LIMIT1)
+        reverse, forward = (_LIMIT2, _LIMIT1) if profile.limit1_is_forward else (_LIMIT1, _LIMIT2)
+        return (
+            bool(flags & _HOMING),
+            profile.motion_lock_from is not None and bool(aux & _MOTION_LOCKED),
+            bool(closed),
+            bool(flags & _MOVE_DONE),
+            bool(flags & reverse) if shows_limits else None,
+            bool(flags & forward) if shows_limits else None,
+            None if logosol and not powered else bool(aux & _INDEX) is profile.live_aux,
+            stop_input,
+            known.pic_ae,
+        )
+
+    def _diagnose(self, status: Status) -> tuple[driver.Fault, ...]:
+        self._learn(status)
+        open_on_purpose = self.loop_may_open and not status.flags & StatusFlag.HOME_IN_PROGRESS
+        found = tuple(
+            fault
+            for fault in diagnose(self._profile, status, self.known)
+            if not (open_on_purpose and fault.code is FaultCode.POSITION_ERROR)
+        )
+        cause = next((fault for fault in found if fault.latched and fault.stops), None)
+        if status.aux is not None:
+            self.known = replace(self.known, latched=cause, seen=True)
+        return tuple(
+            driver.Fault(fault.code.value, fault.remedy, stops=fault.stops, loses_position=fault.loses_position)
+            for fault in found
+        )
+
+    def _learn(self, status: Status) -> None:
+        """Take from a status what it proves."""
+        logosol = self._profile.pic_ae_diagnostics
+        if servo_on(status):
+            # PIC-SERVO closes its loop whatever the amplifier (manual, 5.2), a Logosol drive does not
+            pic_ae = True if logosol else self.known.pic_ae
+            self.known = replace(self.known, pic_ae=pic_ae, nothing_latched=False, latched=None, closed=True)
+        elif logosol and self.known.pic_ae is False and status.flags & StatusFlag.POWER_ON:
+            self.known = replace(self.known, nothing_latched=True)

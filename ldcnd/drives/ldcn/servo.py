@@ -1,0 +1,845 @@
+"""One LDCN or NMC servo drive as a `Drive`: which packets a command takes.
+
+What is known of it is in record.py, what its motions are to it in trajectory.py. Versions 1 and 2 of PIC-SERVO do not
+stop on home by themselves: the host stops them.
+
+Positions are counts since the drive was reset, whatever its 32-bit counter says: where a motion would leave the range
+of the counter, Reset Position sets it back beforehand, at standstill, and the host adds what it has set back.
+Sources: LS-182AP manual, "Initializing procedure", "System status", "Absolute positioning mode"; PIC-SERVO manual, 4.1,
+4.5, 5.2.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from types import MappingProxyType
+from typing import Any
+
+from typing_extensions import override
+
+from ldcnd.contract.catalogue import verbs_for
+from ldcnd.contract.commands import Capability, HomeMethod, PinMode, Verb
+from ldcnd.contract.errors import (
+    BadReply,
+    DriveFault,
+    NotSupported,
+    OutcomeUnknown,
+    PacketRejected,
+    RegisterUnknown,
+    Remedy,
+    RequestRefused,
+    ValueOutOfRange,
+    WrongState,
+    step,
+)
+from ldcnd.contract.samples import TelemetryItem
+from ldcnd.drives.driver import (
+    LARGEST_COUNT,
+    NO_CEILING,
+    AnalogMotion,
+    AxisReading,
+    AxisSpec,
+    Ceiling,
+    Evidence,
+    Gains,
+    HasOutputs,
+    HomeCapture,
+    Homes,
+    KeepsMark,
+    Motion,
+    Moves,
+    PathStatus,
+    PwmOutput,
+    Register,
+    RemembersRegisters,
+    StopMode,
+    TakesGains,
+    Tracks,
+    WalksPaths,
+    Warns,
+)
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, StopControl, blocking_pin, pin_bits
+from ldcnd.drives.ldcn.faults import FaultCode, sensor_lost
+from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
+from ldcnd.drives.ldcn.path import MOST_POINTS_PER_PACKET, PathPoint, most_step
+from ldcnd.drives.ldcn.profiles import HomingSource, Profile
+from ldcnd.drives.ldcn.record import DriveState
+from ldcnd.drives.ldcn.registers import FAST_PATH, FRACTION, LIMIT_PINS, TRAJECTORY_CONTROL, ServoRegisters, Unknown
+from ldcnd.drives.ldcn.trajectory import (
+    ProfileMode,
+    Trajectory,
+    TrajectoryControl,
+    quantised,
+    trajectory_of,
+    trajectory_values,
+)
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange
+from ldcnd.line.queue import Lane
+from ldcnd.log import get_logger
+
+SOURCES = MappingProxyType(
+    {
+        HomeMethod.REVERSE_LIMIT: HomingSource.LIMIT1,
+        HomeMethod.FORWARD_LIMIT: HomingSource.LIMIT2,
+        HomeMethod.INDEX: HomingSource.INDEX,
+        HomeMethod.POSITION_ERROR: HomingSource.POSITION_ERROR,
+        HomeMethod.CURRENT: HomingSource.CURRENT,
+    }
+)
+OPPOSITE_LIMITS = MappingProxyType(
+    {HomeMethod.REVERSE_LIMIT: HomeMethod.FORWARD_LIMIT, HomeMethod.FORWARD_LIMIT: HomeMethod.REVERSE_LIMIT}
+)
+STOPS = MappingProxyType(
+    {
+        StopMode.SMOOTH: HomingControl.STOP_SMOOTH,
+        StopMode.ABRUPT: HomingControl.STOP_ABRUPT,
+        StopMode.OFF: HomingControl.MOTOR_OFF,
+    }
+)
+
+
+def homing_source(profile: Profile, method: HomeMethod) -> HomingSource:
+    """Return the input or event that a method watches on this device."""
+    if profile.limit1_is_forward:
+        method = OPPOSITE_LIMITS.get(method, method)
+    return SOURCES[method]
+
+
+def home_methods(profile: Profile) -> frozenset[HomeMethod]:
+    """Return what can capture the home position of this device."""
+    return frozenset(method for method in SOURCES if homing_source(profile, method) & profile.homing_sources)
+
+
+def homing_control(profile: Profile, capture: HomeCapture) -> HomingControl:
+    """Return the control byte that arms a capture.
+
+    An excess position error opens the loop by itself, so no way to stop goes with it.
+    """
+    control = HomingControl(homing_source(profile, capture.method))
+    for method in capture.also:
+        control |= HomingControl(homing_source(profile, method))
+    if profile.stops_on_home and capture.method is not HomeMethod.POSITION_ERROR:
+        control |= STOPS[capture.stop]
+    return control
+
+
+def opens_loop(profile: Profile, capture: HomeCapture) -> bool:
+    """Tell whether the drive opens its loop by itself when it has captured."""
+    if capture.method is HomeMethod.POSITION_ERROR:
+        return True
+    return profile.stops_on_home and capture.stop is StopMode.OFF
+
+
+def _limits_ahead(motion: Motion | AnalogMotion | PwmOutput, here_counts: int) -> tuple[HomeMethod, ...]:
+    """Return the limit switches that a motion may run onto; both where the drive finds the direction itself."""
+    match motion:
+        case AnalogMotion():
+            return (HomeMethod.FORWARD_LIMIT, HomeMethod.REVERSE_LIMIT)
+        case PwmOutput():
+            way = motion.duty
+        case Motion(None):
+            way = motion.velocity_counts_per_s
+        case Motion():
+            way = (motion.target_counts or 0) - here_counts
+    if way == 0:
+        return ()
+    return (HomeMethod.FORWARD_LIMIT if way > 0 else HomeMethod.REVERSE_LIMIT,)
+
+
+ANY_LIMIT = HomingControl.LIMIT1 | HomingControl.LIMIT2
+LEAST_SET_BACK = 1000
+"""A counter so near to 0 is not set back: whether Reset Position was executed must show in it."""
+log = get_logger("ldcn")
+
+
+def _shifted(motion: Motion, offset_counts: int) -> Motion:
+    """Return a motion in terms of a position counter that lacks so many counts."""
+    if motion.target_counts is None or not offset_counts:
+        return motion
+    return replace(motion, target_counts=motion.target_counts - offset_counts)
+
+
+REACHED_COUNTS = 16
+"""So close to its target a finished profile counts as having run."""
+STATE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
+PATH_CYCLES = 64
+"""Servo cycles of a path point: the longer period, which leaves most of the line to others."""
+PATH_MOST_COUNTS = most_step(PATH_CYCLES)
+PATH_ITEMS = StatusItem.POSITION | StatusItem.POSITION_ERROR | StatusItem.AUX | StatusItem.BIT7
+EVIDENCE_ITEMS = STATE_ITEMS | StatusItem.HOME
+
+_AMP_ENABLE, _MOTOR_OFF = map(int, (StopControl.AMP_ENABLE, StopControl.MOTOR_OFF))
+"""As numbers, because arithmetic with flags costs ten times as much."""
+STOP_CONTROLS = {
+    StopMode.SMOOTH: StopControl.AMP_ENABLE | StopControl.SMOOTH,
+    StopMode.ABRUPT: StopControl.AMP_ENABLE | StopControl.ABRUPT,
+    StopMode.OFF: StopControl.MOTOR_OFF,
+}
+
+
+def reading_items(profile: Profile, items: frozenset[TelemetryItem]) -> StatusItem:
+    """Return the status items that a drive must send for these telemetry items."""
+    mask = STATE_ITEMS
+    if TelemetryItem.ADC in items:
+        mask |= StatusItem.ADC
+    if TelemetryItem.POSITION in items and profile.position_error_bytes:
+        mask |= StatusItem.POSITION_ERROR
+    return mask
+
+
+class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, RemembersRegisters, KeepsMark):
+    """A drive at one address, in the dialect of its profile."""
+
+    shows_inputs = True
+
+    def __init__(self, spec: AxisSpec, profile: Profile, bus: Bus) -> None:
+        self.spec = spec
+        self.profile = profile
+        self.identity: str | None = None
+        self.capabilities = _capabilities(profile)
+        self.adc_full_scale = (1 << profile.adc_bits) - 1
+        self.home_methods = home_methods(profile)
+        self.retargets = profile.sc_extensions
+        self._book = ServoRegisters(profile, spec.gains, lambda: asyncio.get_running_loop().time())
+        self.state = DriveState(spec.name, profile, self._book)
+        self._bus = bus
+        self._node = Node(spec.address, profile)
+        self._initialised = False
+        self.path_period_s = PATH_CYCLES * profile.servo_cycle_s
+        self.path_packet = MOST_POINTS_PER_PACKET
+        self.path_most_counts = PATH_MOST_COUNTS
+        self._switching_off = 0
+        self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
+        self._stops: dict[int, Exchange[Status]] = {}
+
+    def forget(self) -> None:
+        """Note that the drive was reset or lost power: nothing that was sent before holds any more."""
+        self.state.restarted()
+        self._book.reset()
+        self._initialised = False
+
+    def adopted(self, status: Status, *, known: bool) -> None:
+        """The drive was taken over as it is, with this status; its gains are assumed to be the configured ones.
+
+        Args:
+            status: flags and auxiliary byte.
+            known: this host had the line before: what it has sent still holds, as a drive that restarted meanwhile
+                would not answer at its address.
+        """
+        if known:
+            self.state.unseen()
+        else:
+            self.state.taken_over(status)
+            self._book.taken_over()
+        self._initialised = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
+
+    @property
+    def capture_s(self) -> float:  # type: ignore[override]
+        """One servo cycle (LS-182AP manual, "Encoder Input")."""
+        return self.profile.servo_cycle_s * (self._book.next_divisor or 1)
+
+    @property
+    def gains(self) -> Gains | None:
+        """See `TakesGains`."""
+        return self._book.gains
+
+    @gains.setter
+    def gains(self, gains: Gains | None) -> None:
+        self._book.gains = gains
+
+    @property
+    def holds_gains(self) -> bool:  # type: ignore[override]
+        """See `TakesGains`."""
+        return self._book.loaded
+
+    @override
+    def registers(self) -> tuple[Register, ...]:
+        return self._book.published()
+
+    # -- reading -----------------------------------------------------------------------------------------------------
+
+    def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
+        """See `Readable`. The loss of the analog sensor shows only in its value."""
+        senses = self.profile.analog_target and self.state.known.absolute is not False
+        prepared = self._readings.get((items, senses))
+        if prepared is None:
+            mask = reading_items(self.profile, items)
+            if senses:
+                mask |= StatusItem.ADC
+            prepared = self._readings[items, senses] = self._prepare_reading(mask, items)
+        return prepared
+
+    def _prepare_reading(self, mask: StatusItem, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
+        exchange = commands.read_status(self._node, mask)
+        status_of = status_decoder(self.profile, mask)
+
+        def decode(data: bytes) -> AxisReading:
+            return self.state.reading(status_of(data), items)
+
+        return Exchange(
+            node=exchange.node,
+            request=exchange.request,
+            reply_bytes=exchange.reply_bytes,
+            check=exchange.check,
+            decode=decode,
+            response_s=exchange.response_s,
+            repeatable=exchange.repeatable,
+            effect=exchange.effect,
+        )
+
+    # -- power -------------------------------------------------------------------------------------------------------
+
+    @override
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+        first: tuple[Exchange[Any], ...] = ()
+        offset = self.state.offset_counts
+        if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
+            first, offset = (commands.reset_position(self._node),), self.state.counts
+        if self.state.known.closed and self._book.gains and not self._book.loaded:
+            first = (commands.set_gain(self._node, self._book.gains), *first)
+        trajectory = trajectory_of(_shifted(motion, offset), self._next_divisor(), self.profile)
+        return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
+
+    async def power(self, *, on: bool) -> None:
+        """See `Moves`. Closing the loop is verified; it takes effect at the present position.
+
+        Raises:
+            DriveFault: the drive did not close its loop, or holds a fault that only a reset clears.
+        """
+        if not on:
+            await self.stop(StopMode.OFF)
+            return
+        if self._book.gains and not (self.state.known.closed and self._book.loaded):  # it may have been reset unseen
+            await self.set_gains(self._book.gains)
+        if self.profile.pic_ae_diagnostics and self.state.known.pic_ae is not False:
+            await self._check_without_power_driver()
+        if self.profile.pic_ae_diagnostics and not self._initialised:
+            await self._initialise_registers()
+        self._initialised = True
+        await self._switch(commands.close_loop(self._node), Lane.COMMAND, pic_ae=True, closed=True)
+        # pos_error is set while the loop is open, and sticky
+        await self._clear_sticky_bits()
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.AUX))
+        faults = self.state.faults(status)
+        if status.aux is None or not status.aux & AuxFlag.SERVO_ON:
+            causes = "; ".join(fault.text for fault in faults) or "it does not say why"
+            raise DriveFault(
+                f"axis {self.spec.name}: the drive did not close its loop: {causes}",
+                axis=self.spec.name,
+                remedy=Remedy("remove the cause, then {}", step("reset")),
+            )
+
+    async def _check_without_power_driver(self) -> None:
+        """Switch the power driver off first where it may be on, so that the drive says what is wrong at present."""
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.AUX))
+        if status.aux is not None and status.aux & AuxFlag.SERVO_ON:
+            return
+        await self.stop(StopMode.OFF)
+        await self._refuse_faults("not switched on, the drive reports")
+
+    async def _refuse_faults(self, refusal: str, again: str = "") -> None:
+        """Read the drive.
+
+        Raises:
+            DriveFault: it has a fault that keeps the motor off.
+        """
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        standing = [fault for fault in self.state.faults(status) if fault.stops]
+        if standing:
+            raise DriveFault(
+                f"axis {self.spec.name}: {refusal} {'; '.join(fault.text for fault in standing)}",
+                axis=self.spec.name,
+                value=standing[0].code,
+                remedy=Remedy(f"remove the cause, then {{}}{again}", step("reset")),
+            )
+
+    async def _stop_motor(self, control: StopControl) -> None:
+        """Stop, before anything else that waits."""
+        bits = int(control)
+        exchange = self._stops.get(bits)
+        if exchange is None:  # made once: a stop, and a command that stops first, wait for it
+            exchange = self._stops[bits] = commands.stop_motor(self._node, control)
+        await self._switch(exchange, Lane.STOP, pic_ae=bool(bits & _AMP_ENABLE), closed=not bits & _MOTOR_OFF)
+
+    async def _switch(self, exchange: Exchange[Status], lane: Lane, *, pic_ae: bool, closed: bool) -> None:
+        """Send Stop Motor, and take note of what became of power driver and loop."""
+        try:
+            await self._bus.execute(exchange, lane)
+        except BaseException:
+            self.state.switched_unconfirmed()
+            raise
+        self.state.switched(pic_ae=pic_ae, closed=closed)
+
+    async def _clear_sticky_bits(self) -> None:
+        self.state.clearing()
+        await self._bus.execute(commands.clear_sticky_bits(self._node))
+        self.state.cleared()
+
+    async def _initialise_registers(self) -> None:
+        """Do what the LS-182AP manual requires once after a reset: amplifier off, no distance to go."""
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.POSITION | StatusItem.AUX))
+        if status.aux is None or status.aux & AuxFlag.SERVO_ON:
+            return  # taken over with its loop closed: initialised long ago
+        trajectory = Trajectory(
+            position=status.position,
+            velocity=0,
+            acceleration=1,
+            pwm_or_target=0,
+            servo=True,
+            mode=ProfileMode.TRAPEZOIDAL,
+            reverse=False,
+            start_now=True,
+        )
+        await self._load(trajectory)
+
+    @property
+    def switched_off(self) -> bool:
+        """Whether its motor was switched off, or is being by a packet that is on its way."""
+        return self._switching_off > 0 or self.state.known.pic_ae is False
+
+    async def stop(self, mode: StopMode) -> StopMode:
+        """See `Moves`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
+        if self.switched_off:
+            mode = StopMode.OFF
+        self._book.forget("some firmware clears it with a stop", ("velocity",))
+        off = mode is StopMode.OFF
+        self._switching_off += off
+        try:
+            await self._stop_motor(STOP_CONTROLS[mode])
+        finally:
+            self._switching_off -= off
+        if self.state.homing_armed:
+            with contextlib.suppress(RequestRefused):  # not known to be this drive: the next motion disarms it
+                await self._bus.execute(commands.set_homing(self._node, HomingControl(0)), Lane.STOP)
+                self.state.homing_armed = False
+        self.state.guard, self.state.guard_hit = "", False
+        return mode
+
+    async def reset(self) -> None:
+        """See `Moves`: power driver off, sticky bits cleared (LS-182AP manual, "To restore the normal operation").
+
+        Raises:
+            DriveFault: the cause still stands.
+        """
+        await self.stop(StopMode.OFF)
+        await self._clear_sticky_bits()
+        await self._refuse_faults("still", " again")
+
+    async def clear_warnings(self) -> None:
+        """See `Warns`: Clear Sticky Bits, nothing else."""
+        await self._clear_sticky_bits()
+
+    # -- motion ------------------------------------------------------------------------------------------------------
+
+    @override
+    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+        return quantised(motion, self._next_divisor(), self.profile, most)
+
+    def _next_divisor(self) -> int:
+        """Return the servo rate divisor in which the next motion will be loaded.
+
+        Raises:
+            RegisterUnknown: it is not known, and no gains are there to be loaded.
+        """
+        divisor = self._book.next_divisor
+        if divisor is None:
+            raise self._unknown("sr", Remedy("{}", step("set_gains", "send set_gains with all gains")))
+        return divisor
+
+    def _unknown(self, register: str, remedy: str) -> RegisterUnknown:
+        holding = self._book[register]
+        why = f": {holding.why}" if isinstance(holding, Unknown) else ""
+        return RegisterUnknown(
+            f"axis {self.spec.name}: what register {register} of the drive holds is not known{why}",
+            axis=self.spec.name,
+            value=register,
+            remedy=remedy,
+        )
+
+    async def _load_gains(self) -> int:
+        """Have the drive hold the gains that it should before a motion; return the servo rate divisor in force.
+
+        "If the servo rate divisor is modified, the time dependent velocity and acceleration parameters will also have
+        to be modified" (LS-182AP manual, "Servo Control"). Set Gain is idempotent and moves nothing at standstill. What
+        is loaded are the gains that were acknowledged last, or the configured ones: a change that was reported as
+        failed does not take effect later by itself.
+
+        Raises:
+            RegisterUnknown: the divisor is not known, and the axis moves or has no gains to be loaded.
+        """
+        book = self._book
+        if book.gains is not None and not book.loaded:
+            if await self._stands():
+                await self.set_gains(book.gains)
+            elif book.divisor is None:
+                raise self._unknown("sr", Remedy("{} and wait: at standstill the gains are loaded again", step("halt")))
+        return self._next_divisor() if book.divisor is None else book.divisor
+
+    async def _stands(self) -> bool:
+        """Read the drive: no profile of a closed loop runs, and it shows no more velocity than a loop that hunts."""
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        if status.aux is not None and not status.aux & AuxFlag.SERVO_ON:
+            return True
+        return bool(status.flags & StatusFlag.MOVE_DONE) and abs(status.velocity or 0) <= 1
+
+    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        """See `Moves`. A motion lock, set by homing on a limit switch, is lifted: the command is to move on.
+
+        Raises:
+            NotSupported: an analog target on a drive without absolute positioning.
+            WrongState: the limit switch pin that would be homed on is an output; or the target is beyond the counter,
+                and the axis does not stand.
+            DriveFault: the analog sensor is out of its range.
+            RegisterUnknown: see `_load_gains`.
+        """
+        divisor = await self._load_gains()
+        if isinstance(motion, Motion):
+            target = motion.target_counts
+            if target is not None and abs(target - self.state.offset_counts) > LARGEST_COUNT:
+                await self._set_counter_back(target)
+            in_counter: Motion | AnalogMotion | PwmOutput = _shifted(motion, self.state.offset_counts)
+        else:
+            in_counter = motion
+        trajectory = trajectory_of(in_counter, divisor, self.profile)
+        if isinstance(motion, AnalogMotion):
+            await self._check_sensor()
+        if isinstance(motion, PwmOutput) and not self.state.loop_may_open:
+            await self._put_acceleration_in_force(trajectory)
+        if self.state.motion_locked:
+            await self._bus.execute(commands.stop_motor(self._node, StopControl.AMP_ENABLE | StopControl.LOCK_DISABLE))
+        await self._arm(motion, home)
+        await self._load(trajectory)
+        self.state.loaded(
+            absolute=isinstance(motion, AnalogMotion),
+            opens_loop=isinstance(motion, PwmOutput) or (home is not None and opens_loop(self.profile, home)),
+        )
+
+    async def _set_counter_back(self, target_counts: int) -> None:
+        """Set the position counter to 0 by Reset Position, which is forbidden during a trapezoidal move (manuals).
+
+        The host adds what the counter has lost. It takes that from the status before, so each time can cost the counts
+        by which the loop hunts at rest. A lost reply is no harm: the next position tells whether it was executed.
+
+        Raises:
+            ValueOutOfRange: the target is farther away than the counter reaches.
+            WrongState: the axis does not stand, or the counter is at 0 already.
+            OutcomeUnknown: the counter is as it was.
+        """
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        before = status.position or 0
+        if not status.flags & StatusFlag.MOVE_DONE or status.velocity:
+            raise WrongState(
+                f"axis {self.spec.name}: the target is beyond the drive's 32-bit counter",
+                axis=self.spec.name,
+                remedy=Remedy("{} first: at standstill the counter is set back", step("halt")),
+            )
+        away = abs(target_counts - self.state.offset_counts - before)
+        if away > LARGEST_COUNT:
+            raise ValueOutOfRange(
+                f"axis {self.spec.name}: {away} counts do not fit the drive's 32-bit counter",
+                axis=self.spec.name,
+                value=away,
+                limit=LARGEST_COUNT,
+                nearest=LARGEST_COUNT,
+            )
+        if abs(before) < LEAST_SET_BACK:
+            raise WrongState(
+                f"axis {self.spec.name}: a motion of more than {LARGEST_COUNT} counts does not fit the drive's counter",
+                axis=self.spec.name,
+                remedy="move in two parts",
+            )
+        await self.about_to_renumber()
+        self.state.setting_back = before
+        self._book.forget("the position counter was set back", ("position",))
+        with contextlib.suppress(OutcomeUnknown):
+            await self._bus.execute(commands.reset_position(self._node))
+        self.state.reading(await self._bus.execute(commands.read_status(self._node, STATE_ITEMS)))
+        if self.state.setting_back:
+            self.state.setting_back = 0
+            raise OutcomeUnknown(
+                f"axis {self.spec.name}: the drive did not set its position counter back",
+                axis=self.spec.name,
+                remedy="send the motion again",
+            )
+        log.info("position counter set back", axis=self.spec.name, counts=before)
+
+    async def _arm(self, motion: Motion | AnalogMotion | PwmOutput, home: HomeCapture | None) -> None:
+        """Arm the requested capture, or the one that stops the motion at the limit switch ahead, or none.
+
+        It "can also be used as a safety shutoff" (PIC-SERVO manual, 5.2, "Set Homing Mode"). Only the drive's home
+        register changes: the reference is the host's.
+        """
+        self.state.guard, self.state.guard_hit = "", False
+        control, guard = HomingControl(0), ""
+        if home is not None:
+            for method in (home.method, *home.also):
+                self._check_pin(method)
+            control = homing_control(self.profile, home)
+            if home.guarded and self.spec.limit_stop is not None:
+                control |= (await self._guard(motion, active=self.spec.limit_stop))[0] & ANY_LIMIT
+        elif self.spec.limit_stop is not None:
+            control, guard = await self._guard(motion, active=self.spec.limit_stop)
+        if control or self.state.homing_armed:
+            self.state.homing_armed = True  # before it is, so that a stop in between disarms it
+            await self._bus.execute(commands.set_homing(self._node, control))
+        self.state.homing_armed = bool(control)
+        self.state.guard = guard
+
+    async def _guard(self, motion: Motion | AnalogMotion | PwmOutput, *, active: bool) -> tuple[HomingControl, str]:
+        """Return what stops a motion at the limit switches that it may run onto, and their name.
+
+        Only switches ahead are armed: a capture comes with every change, also with that of leaving the other one. A
+        drive that turns round in mid-move has the other one ahead until it has.
+
+        Raises:
+            WrongState: the axis stands on the switch ahead, or its pin is an output.
+        """
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        reading = self.state.reading(status)
+        ahead = _limits_ahead(motion, reading.position_counts)
+        onward = _limits_ahead(Motion(None, reading.velocity_counts_per_s, 1.0), reading.position_counts)
+        levels = {HomeMethod.FORWARD_LIMIT: reading.forward_limit, HomeMethod.REVERSE_LIMIT: reading.reverse_limit}
+        control = HomingControl(0)
+        for method in ahead:
+            self._check_pin(method)
+            if levels[method] is active and len(ahead) == 1:
+                raise WrongState(
+                    f"axis {self.spec.name} stands on its {method.value.replace('_', ' ')} switch",
+                    axis=self.spec.name,
+                    value=method.value,
+                    remedy="move the other way",
+                )
+        ahead += tuple(method for method in onward if method not in ahead and levels[method] is not active)
+        stop = StopMode.OFF if isinstance(motion, PwmOutput) else StopMode.SMOOTH
+        for method in ahead:
+            control |= homing_control(self.profile, HomeCapture(method, stop))
+        return control, " or ".join(f"{method.value.replace('_', ' ')} switch" for method in ahead)
+
+    @override
+    def room_counts(self, *, forward: bool) -> int:
+        counter = self.state.counts - self.state.offset_counts
+        return LARGEST_COUNT + (-counter if forward else counter)
+
+    @override
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:
+        level = reading.forward_limit if limit is HomeMethod.FORWARD_LIMIT else reading.reverse_limit
+        return self.spec.limit_stop is not None and level is self.spec.limit_stop
+
+    async def _load(self, trajectory: Trajectory) -> None:
+        exchange = commands.load_trajectory(self._node, trajectory)
+        with self._book.writing(trajectory_values(trajectory)):
+            await self._bus.execute(exchange)
+
+    async def _put_acceleration_in_force(self, trajectory: Trajectory) -> None:
+        """Start a profile from standstill to standstill before a raw duty.
+
+        The manuals let a smooth stop use "the current acceleration rate" and do not say whether loading makes a rate
+        current or only a start does; after a reset the difference is a motor that is never slowed down.
+        """
+        standing = Trajectory(velocity=0, acceleration=trajectory.acceleration, mode=ProfileMode.VELOCITY)
+        await self._load(standing)
+        await self._bus.execute(commands.start_motion(self._node))
+
+    async def _check_sensor(self) -> None:
+        """Refuse an analog motion while the sensor reads like a broken one (manual, "Analog positioning sensor")."""
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.ADC))
+        if sensor_lost(self.profile, status.adc):
+            raise DriveFault(
+                f"axis {self.spec.name}: the analog sensor reads {status.adc}: {FaultCode.SENSOR_FAULT.remedy}",
+                axis=self.spec.name,
+                value=FaultCode.SENSOR_FAULT.value,
+                remedy="check the sensor's cable",
+            )
+
+    def _check_pin(self, method: HomeMethod) -> None:
+        pin = blocking_pin(method)
+        if pin not in LIMIT_PINS:
+            return
+        is_input, holding = LIMIT_PINS[pin][0], self._book[pin]
+        if isinstance(holding, Unknown) and set(holding.among) - {is_input}:
+            remedy = step("set_outputs", 'send set_outputs with "input"', limit1="input", limit2="input")
+            raise self._unknown(pin, Remedy("{}", remedy))
+        if self._book.known(pin) not in (None, is_input):
+            raise WrongState(
+                f"axis {self.spec.name}: the {method} pin is an output",
+                axis=self.spec.name,
+                value=method.value,
+                remedy=Remedy(
+                    "{}", step("set_outputs", 'send set_outputs with "input"', limit1="input", limit2="input")
+                ),
+            )
+
+    async def start(self) -> None:
+        """See `Moves`.
+
+        A drive clears move_done as it starts. An acknowledgement that shows it set is looked into, because a reply to
+        something older that came late looks just like that.
+
+        Raises:
+            OutcomeUnknown: acknowledged, but nothing shows that it has started.
+            PacketRejected: the drive received it damaged, and nothing shows that it has started; it is not sent again.
+        """
+        try:
+            status = await self._bus.execute(commands.start_motion(self._node), once=True)
+        except PacketRejected:
+            if await self._has_started():
+                return  # it was the reply that was damaged
+            raise
+        if status.flags & StatusFlag.MOVE_DONE and not await self._has_started():
+            raise OutcomeUnknown(
+                f"axis {self.spec.name}: the start was acknowledged, but the drive shows no sign of it",
+                axis=self.spec.name,
+                remedy="read the axis state before anything else",
+            )
+
+    async def _has_started(self) -> bool:
+        """Look for a witness: a profile that runs, the target reached, or a velocity."""
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        control, velocity = self._book.known(TRAJECTORY_CONTROL), self._book.known("velocity")
+        if control is None or not control & TrajectoryControl.SERVO or not status.flags & StatusFlag.MOVE_DONE:
+            return True
+        target = None if control & TrajectoryControl.VELOCITY_MODE else self._book.known("position")
+        if target is not None and status.position is not None:
+            return abs(status.position - target) <= REACHED_COUNTS
+        slow = velocity is not None and velocity < FRACTION  # shows in no status
+        return slow or bool(status.velocity)
+
+    async def track(self, position_counts: int) -> None:
+        """See `Tracks`: "stop here", the manuals' way to follow a string of positions.
+
+        Raises:
+            NotSupported: PIC-SERVO version 1.
+            ValueOutOfRange: beyond the drive's 32-bit counter.
+            OutcomeUnknown: the reply was lost.
+        """
+        await self._load_gains()
+        control = StopControl.AMP_ENABLE | StopControl.HERE
+        counter = position_counts - self.state.offset_counts
+        if abs(counter) > LARGEST_COUNT:
+            raise ValueOutOfRange(
+                f"axis {self.spec.name}: set-point {position_counts} is beyond the drive's 32-bit counter",
+                axis=self.spec.name,
+                value=position_counts,
+                limit=LARGEST_COUNT,
+                remedy=Remedy("{}, a small distance: it sets the counter back", step("move_relative")),
+            )
+        exchange = commands.stop_motor(self._node, control, counter)
+        self.state.loaded(absolute=False, opens_loop=False)
+        # harmless to repeat by itself, but a repetition could come after the stop that has overtaken it
+        await self._bus.execute(replace(exchange, repeatable=False))
+
+    # -- path mode ---------------------------------------------------------------------------------------------------
+
+    @override
+    def check_path(self) -> None:
+        if not (self.profile.path_points and self.profile.sc_extensions):
+            raise NotSupported(
+                f"axis {self.spec.name}: {self.profile.title} has no path mode", axis=self.spec.name, value="path"
+            )
+        if self._book.known(FAST_PATH) != 0:  # a fast path, left by another host, would run at twice the speed
+            raise self._unknown(FAST_PATH, 'restart the daemon with start = "reset"')
+
+    @override
+    def path_exchanges(self) -> tuple[Exchange[Any], ...]:
+        points = [PathPoint(0, PATH_CYCLES)] * MOST_POINTS_PER_PACKET
+        return commands.add_path_points(self._node, points), commands.read_status(self._node, PATH_ITEMS)
+
+    @override
+    async def path_status(self) -> PathStatus:
+        status = await self._bus.execute(commands.read_status(self._node, PATH_ITEMS))
+        position, error, aux, points = status.position, status.position_error, status.aux, status.bit7
+        if position is None or error is None or aux is None or points is None:
+            raise BadReply(f"axis {self.spec.name}: the status packet lacks what shows a path")
+        return PathStatus(
+            commanded_counts=position + error + self.state.offset_counts,
+            points=points,
+            running=bool(aux & AuxFlag.PATH_MODE),
+            enabled=bool(aux & AuxFlag.SERVO_ON),
+        )
+
+    @override
+    async def add_points(self, steps: Sequence[int]) -> PathStatus:
+        """See `WalksPaths`. A reply that is lost leaves open whether they were taken: they are never sent again.
+
+        Raises:
+            OutcomeUnknown: the reply was lost.
+        """
+        points = [PathPoint(counts, PATH_CYCLES) for counts in steps]
+        self.state.loaded(absolute=False, opens_loop=False)
+        await self._bus.execute(commands.add_path_points(self._node, points))
+        return await self.path_status()
+
+    @override
+    async def captured_home(self) -> int:
+        status = await self._bus.execute(commands.read_status(self._node, StatusItem.HOME))
+        if status.home is None:
+            raise BadReply(f"axis {self.spec.name}: the status packet lacks the home position")
+        return status.home + self.state.offset_counts
+
+    # -- what proves that its counter goes on ------------------------------------------------------------------------
+
+    @override
+    async def evidence(self) -> Evidence:
+        """See `KeepsMark`: the mark is in the home register."""
+        status = await self._bus.execute(commands.read_status(self._node, EVIDENCE_ITEMS), Lane.BACKGROUND)
+        if status.home is None or status.position is None:
+            raise BadReply(f"axis {self.spec.name}: the status packet lacks position or home")
+        reading = self.state.reading(status)
+        return Evidence(
+            counts=reading.position_counts,
+            counter=status.position,
+            mark=status.home,
+            enabled=reading.enabled,
+            position_lost=any(fault.loses_position for fault in reading.faults),
+        )
+
+    @override
+    async def leave_mark(self) -> None:
+        await self._bus.execute(commands.save_home(self._node), Lane.BACKGROUND)
+
+    # -- registers ---------------------------------------------------------------------------------------------------
+
+    @override
+    async def set_gains(self, gains: Gains) -> None:
+        exchange = commands.set_gain(self._node, gains)
+        if self.profile.divisor_slows_profile and self._book.divisor != gains.sr and not await self._stands():
+            raise WrongState(
+                f"axis {self.spec.name} moves: another servo rate divisor would change its velocity",
+                axis=self.spec.name,
+                value=gains.sr,
+                remedy=Remedy("{} and wait", step("halt")),
+            )
+        with self._book.writing(asdict(gains)):
+            await self._bus.execute(exchange)
+        self._book.gains = gains
+
+    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
+        """See `HasOutputs`; PIC-SERVO version 4 only."""
+        if not self.profile.limit_outputs:
+            raise NotSupported(f"{self.profile.title} has no limit pins that can be outputs", axis=self.spec.name)
+        values = {FAST_PATH: 0}  # of PIC-SERVO CMC, in the same byte
+        for (name, bits), mode in zip(LIMIT_PINS.items(), (limit1, limit2), strict=True):
+            value = self._book.known(name) if mode is None else pin_bits(mode, *bits)
+            if value is None:
+                raise self._unknown(
+                    name, Remedy("{}", step("set_outputs", "send set_outputs with both limit1 and limit2"))
+                )
+            values[name] = int(value)
+        exchange = commands.io_control(self._node, LimitPins(sum(values.values())))
+        with self._book.writing(values):
+            await self._bus.execute(exchange)
+
+
+def _capabilities(profile: Profile) -> frozenset[Verb]:
+    """Return what a device of this profile can do."""
+    lacking = {
+        Verb.MOVE_ANALOG: not profile.analog_target,
+        Verb.TRACK: not profile.stop_here,
+        Verb.SET_OUTPUTS: not profile.limit_outputs,
+    }
+    able = frozenset(capability for capability in Verb if not lacking.get(capability, False))
+    return able - verbs_for(Capability.PARAMETERS)

@@ -1,0 +1,342 @@
+"""The contract between the daemon and all drives of one line: configuration, bring-up, what concerns them together."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+from types import MappingProxyType
+from typing import Any
+
+from ldcnd.contract.errors import NotSupported
+from ldcnd.drives.driver import Drive, Motion, StopMode
+from ldcnd.line.exchange import Timing
+from ldcnd.line.poller import Poller
+from ldcnd.line.proof import Proof
+from ldcnd.line.resync import Resync
+
+
+class StartPolicy(StrEnum):
+    """How a line in an unknown state is started."""
+
+    RESET = "reset"
+    """The drives are reset: what moves loses its torque, positions count from 0."""
+    ADOPT = "adopt"
+    """The drives are taken over as they are, moving or not; nothing is sent that could move, stop or reset one."""
+
+
+class AdoptFallback(StrEnum):
+    """What happens when a line cannot be adopted."""
+
+    REFUSE = "refuse"
+    """It stays down, and the daemon says why and tries again."""
+    RESET = "reset"
+    """It is reset, unless a drive moves or is not known to stand."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModuleEntry:
+    """A module that is expected on the line and is no axis.
+
+    Attributes:
+        address: node address, 1 to 127.
+        model: profile name of the family.
+        identity: see `AxisSpec`.
+        name: of an I/O module that is served; empty for one that is only watched.
+        outputs: its lines that may be driven.
+        rate_hz: polling rate.
+    """
+
+    address: int
+    model: str
+    identity: tuple[int, int] | None = None
+    name: str = ""
+    outputs: tuple[int, ...] = ()
+    rate_hz: float = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class GroupSpec:
+    """Axes that start and stop together.
+
+    Attributes:
+        name: of the group.
+        axes: names of its members.
+        leader: the member that answers for the group; None for a silent one.
+    """
+
+    name: str
+    axes: tuple[str, ...]
+    leader: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class LineSpec:
+    """The configuration of a line as a whole.
+
+    Attributes:
+        start: see `StartPolicy`.
+        adopt_fallback: see `AdoptFallback`.
+        alternate_divisors: use the other family of baud rate divisors.
+        clock_hz: of the modules.
+        snapshot: positions may be frozen at one instant, which overwrites the drives' home registers.
+        proves_places: find out at a reset which drives stand where they were powered on, see `BringUpReport.placed`.
+        modules: what is on the line besides the axes.
+        groups: at most one for each axis.
+    """
+
+    start: StartPolicy = StartPolicy.RESET
+    adopt_fallback: AdoptFallback = AdoptFallback.REFUSE
+    alternate_divisors: bool = False
+    clock_hz: int = 20_000_000
+    snapshot: bool = False
+    proves_places: bool = False
+    modules: tuple[ModuleEntry, ...] = ()
+    groups: tuple[GroupSpec, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class FoundModule:
+    """Something that answers on the line, axis or not.
+
+    Attributes:
+        address: node address.
+        title: what it is, for people.
+        model: profile name; None for an unsupported device: then it is never moved.
+        device_id: as it reports.
+        version: as it reports.
+        name: under which an I/O module is served.
+        axis: the axis it is; None for a module that is only kept on the line.
+        status: its latest status byte; None for an axis, whose state is telemetry.
+    """
+
+    address: int
+    title: str
+    model: str | None
+    device_id: int
+    version: int
+    axis: str | None
+    status: int | None
+    name: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class BringUpReport:
+    """How a line came up.
+
+    Attributes:
+        baud: the rate in use.
+        identities: what was found, by axis name.
+        reset: the drives were reset, so their positions count from 0.
+        remarks: what differs from the configuration or deserves attention.
+        placed: axes whose drives were powered on where they stood at that reset, so that 0 is that place;
+            empty unless the line proves places.
+        open_loops: axes whose drives an earlier host has left with an open loop: nothing in them would end a raw duty.
+        restarted: axes whose drives had lost power, on a line that was not reset.
+    """
+
+    baud: int
+    identities: Mapping[str, str]
+    reset: bool
+    remarks: tuple[str, ...] = ()
+    placed: frozenset[str] = frozenset()
+    open_loops: frozenset[str] = frozenset()
+    restarted: frozenset[str] = frozenset()
+
+
+@dataclass(frozen=True, slots=True)
+class CapturedIo:
+    """Values that an I/O module has captured together with positions.
+
+    Attributes:
+        name: of the module.
+        levels: of its lines, the first is line 1; true is high.
+        counter: raw count.
+        proven: the count has changed since the capture before; at rest it cannot tell.
+    """
+
+    name: str
+    levels: tuple[bool, ...]
+    counter: int
+    proven: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """Positions of several drives, frozen together, and what I/O modules have captured then.
+
+    Attributes:
+        counts: by axis name.
+        from_s: the earliest instant at which any of them can have been frozen, on the bus's clock.
+        until_s: the latest.
+        io: of each I/O module with a name.
+    """
+
+    counts: Mapping[str, int]
+    from_s: float
+    until_s: float
+    io: tuple[CapturedIo, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class IoReading:
+    """The values of one poll of an I/O module, and its outputs.
+
+    Attributes:
+        levels: of its lines, the first is line 1; true is high.
+        outputs: lines that are outputs; None while that is not known.
+        adc: of its analog inputs, 0 to 255 for 0 to 5 V.
+        counter: counter or timer, 32 bits that wrap silently.
+        pwm: shares of time for which its PWM outputs are on; None while they are not known.
+    """
+
+    levels: tuple[bool, ...]
+    outputs: tuple[int, ...] | None
+    adc: tuple[int, ...]
+    counter: int
+    pwm: tuple[float, float] | None
+
+
+class IoDriver(ABC):
+    """An I/O module of a line.
+
+    Attributes:
+        name: as configured.
+        proof: that who answers is this module.
+        observed: called with each reading.
+        lost: called when a poll brought nothing.
+    """
+
+    name: str
+    proof: Proof
+    observed: Callable[[IoReading, Timing], None]
+    lost: Callable[[], None]
+
+    @abstractmethod
+    async def set_outputs(
+        self, levels: Mapping[int, bool], inputs: frozenset[int], pwm: tuple[float | None, float | None]
+    ) -> IoReading:
+        """Drive lines to levels, make others inputs, set PWM outputs; return what the pins show afterwards.
+
+        A line that becomes an output may be low for the time between two packets.
+
+        Raises:
+            ValueOutOfRange: a line is not configured as an output.
+            WrongState: what the others are is not known, and they are not named.
+            BusError: the line failed.
+        """
+
+    @abstractmethod
+    async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:
+        """Run the counter or timer, one count for each `prescale` edges or clocks; the count goes on."""
+
+
+class Network(ABC):
+    """All drives of one line.
+
+    Attributes:
+        axes: by axis name.
+        resync: how the bus gets this line back in step.
+        io: its I/O modules that have a name, by name.
+    """
+
+    axes: Mapping[str, Drive]
+    resync: Resync
+    io: Mapping[str, IoDriver] = MappingProxyType({})
+
+    @property
+    def modules(self) -> tuple[FoundModule, ...]:
+        """The modules found on the line, by address; empty while they are not known."""
+        return ()
+
+    @property
+    def watches(self) -> tuple[Poller[Any], ...]:
+        """Pollers of modules that are no axes; to be added to the bus once the line is up."""
+        return ()
+
+    def incomplete(self) -> bool:
+        """Tell whether something on the line has stopped answering that `rejoin` may bring back."""
+        return False
+
+    async def rejoin(
+        self,
+        restarted: Callable[[str], None],  # noqa: ARG002 - no drive is lost here
+        heard: Callable[[str], None] = lambda _: None,  # noqa: ARG002
+    ) -> frozenset[str]:
+        """Bring back drives that lost power without disturbing the others; moves nothing, resets nothing that moves.
+
+        Args:
+            restarted: called with the axis whose drive had lost power, before that drive can answer again.
+            heard: called with an axis whose drive answers again, as soon as it does.
+
+        Returns:
+            These axes.
+
+        Raises:
+            BusError: the line failed meanwhile.
+        """
+        return frozenset()
+
+    @property
+    def problem(self) -> str:
+        """What keeps drives off the line that is up, and what a person has to do; empty without a problem."""
+        return ""
+
+    async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:  # noqa: B027 - optional
+        """Stop axes with as few packets as the family can, before anything else that waits; not confirmed.
+
+        Args:
+            mode: see `StopMode`.
+            names: axes whose loops are closed: a smooth or abrupt stop would close an open one.
+
+        Raises:
+            BusError: the line failed; each axis must be stopped by itself in any case.
+        """
+
+    async def start_group(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:  # noqa: ARG002
+        """Load motions, and start them all in the same servo cycle; if one cannot be loaded nothing starts.
+
+        Args:
+            motions: by axis name; exactly the members of one group.
+            still_wanted: raises when a stop has overtaken the motion; called before anything starts.
+
+        Raises:
+            NotSupported: these axes are no group.
+            DriveFault: a drive is not ready; nothing started.
+            OutcomeUnknown: a drive did not prove that it started; the group was stopped.
+            BusError: the line failed before the start.
+        """
+        raise NotSupported("this family cannot start several drives together")
+
+    async def start_path(self, names: frozenset[str], still_wanted: Callable[[], None]) -> None:  # noqa: ARG002
+        """Have drives walk through the points that they hold, from the same servo cycle on.
+
+        Args:
+            names: of axes; exactly the members of one group.
+            still_wanted: as for `start_group`.
+
+        Raises:
+            NotSupported, OutcomeUnknown, BusError: as `start_group`.
+        """
+        raise NotSupported("this family has no path mode")
+
+    async def snapshot(self, still_free: Callable[[], None]) -> Instant:  # noqa: ARG002 - part of the contract
+        """Return the positions of all axes at one instant.
+
+        Args:
+            still_free: raises while a command needs the registers; called again just before the packet that freezes.
+
+        Raises:
+            NotSupported: the family cannot, or the configuration forbids it.
+            WrongState: a homing needs the registers.
+            BusError: the line failed, or a drive missed the instant.
+        """
+        raise NotSupported("this family cannot freeze positions")
+
+    @abstractmethod
+    async def bring_up(self) -> BringUpReport:
+        """Make the drives ready to be polled, moving nothing, and prove those that were identified (`Bus.proofs`).
+
+        Raises:
+            NetworkMismatch: what answers is not what the configuration expects; says precisely what differs.
+            BusError: the line failed meanwhile.
+        """

@@ -1,0 +1,60 @@
+"""The common part of simulated lines: a name, a seed, and what may go wrong on the wires; families add the drives."""
+
+from dataclasses import replace
+from typing import Self
+
+from pydantic import Field, model_validator
+
+from ldcnd.contract.frozen import Frozen
+from ldcnd.drives.toml import Name
+from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+
+
+class SimulatedFaultConfig(Frozen):
+    """Something that may go wrong on the wires."""
+
+    kind: FaultKind
+    """The kind of the event."""
+    probability: float = Field(default=1.0, ge=0, le=1)
+    """Of it happening to one request or reply."""
+    from_s: float = Field(default=0.0, ge=0)
+    """Possible from this time on, in seconds after the line was opened first."""
+    until_s: float | None = Field(default=None, gt=0)
+    """Possible before this time."""
+    longest_s: float = Field(default=0.0, ge=0)
+    """For reply_delayed the longest delay, for unplugged the duration."""
+
+    @model_validator(mode="after")
+    def _has_a_length(self) -> Self:
+        if self.kind in {FaultKind.REPLY_DELAYED, FaultKind.UNPLUGGED} and self.longest_s == 0.0:
+            raise ValueError(f"{self.kind} needs longest_s above 0")
+        if self.until_s is not None and self.until_s <= self.from_s:
+            raise ValueError(f"until_s {self.until_s:g} is not after from_s {self.from_s:g}")
+        return self
+
+    def spec(self, starts_at_s: float) -> Fault:
+        """Return what the simulator plays."""
+        fault = Fault(self.kind, self.probability, starts_at_s + self.from_s, longest_s=self.longest_s)
+        return fault if self.until_s is None else replace(fault, until_s=starts_at_s + self.until_s)
+
+
+class FaultPlanConfig(Frozen):
+    """A file of its own for what may go wrong on the wires."""
+
+    fault: tuple[SimulatedFaultConfig, ...] = ()
+    """Added to those of the line."""
+
+
+class SimulatedLineConfig(Frozen):
+    """One simulated line, used by `port = "sim:NAME"`; its family adds the drives."""
+
+    name: Name
+    """The name in `port = "sim:NAME"`."""
+    seed: int = 1
+    """Seed of all random values."""
+    fault: tuple[SimulatedFaultConfig, ...] = ()
+    """Faults of the wires."""
+
+    def faults(self, starts_at_s: float) -> FaultPlan:
+        """Return what may go wrong, counted from an instant of the line's clock."""
+        return FaultPlan(tuple(fault.spec(starts_at_s) for fault in self.fault), self.seed)

@@ -1,0 +1,419 @@
+"""The configuration of SmartStep lines and units, beside what every line and axis has."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Annotated, ClassVar, Literal, Self
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.samples import MonitorName
+from ldcnd.drives.axis_config import AxisConfig, RatesConfig
+from ldcnd.drives.line_config import BusConfig
+from ldcnd.drives.simulated_line import SimulatedLineConfig
+from ldcnd.drives.smartstep.monitors import function_switches
+from ldcnd.drives.smartstep.packet import HIGHEST_UNIT
+from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000, find_parameter, parameter_at
+from ldcnd.drives.smartstep.profiles import (
+    ByteOrder,
+    CommandPulseGear,
+    CountUnit,
+    Echo,
+    EepromWrite,
+    Framing,
+    SmartStepProfile,
+    StringChecksum,
+    TraceWordLayout,
+    TriggerMap,
+    Verification,
+    Wiring,
+)
+from ldcnd.drives.toml import refuse_duplicates
+from ldcnd.sim.smartstep.unit import SimulatedUnit
+from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
+
+WORD = 0xFFFF
+
+
+class TriggerMapConfig(Frozen):
+    """The bits of the trigger condition word, found on a bench; the manual's figure of them is lost."""
+
+    trace1: int = Field(ge=0, le=WORD)
+    """Object code of trace 1's value."""
+    trace2: int = Field(ge=0, le=WORD)
+    """Object code of trace 2's value."""
+    io: int = Field(ge=0, le=WORD)
+    """Object code of the signals."""
+    rising: int = Field(gt=0, le=WORD)
+    """Enable bit of the rising edge."""
+    falling: int = Field(gt=0, le=WORD)
+    """Enable bit of the falling edge."""
+
+
+class SmartStepTraceConfig(Frozen):
+    """How the trace of one unit is taken to work where its manual leaves room."""
+
+    word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
+    """Where the signal's bit and the value sit in a word of the trace memory; raw leaves words as they are."""
+    byte_order: ByteOrder = ByteOrder.BIG
+    """Which half of a word comes first in a string."""
+    string_checksum: StringChecksum = StringChecksum.AUTO
+    """Bytes that the checksum of a string reply covers; auto takes every variant until the drive shows which."""
+    string_count_unit: CountUnit = CountUnit.BYTES
+    """Unit of the count in a string reference."""
+    chunk_bytes: int = Field(default=200, ge=2, le=1000)
+    """How much of the memory is read at once, even; 2 ms of the line for each byte."""
+    verify: bool = True
+    """Read everything until two readings agree: the checksum may not cover it."""
+    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
+    """Which way command pulses are geared to motor speed."""
+    trigger_map: TriggerMapConfig | None = None
+    """The bits of the trigger condition; without them traces have no trigger."""
+
+    @field_validator("chunk_bytes")
+    @classmethod
+    def _whole_words(cls, value: int) -> int:
+        if value % 2:
+            raise ValueError("chunk_bytes is even: a word of the trace memory has two bytes")
+        return value
+
+    def assumed_of(self, profile: SmartStepProfile) -> SmartStepProfile:
+        """Return a drive's profile with these assumptions."""
+        bits = self.trigger_map
+        return replace(
+            profile,
+            trace_word_layout=self.word_layout,
+            trace_byte_order=self.byte_order,
+            string_checksum=self.string_checksum,
+            string_count_unit=self.string_count_unit,
+            trace_chunk_bytes=self.chunk_bytes,
+            trace_verify=self.verify,
+            command_pulse_gear=self.command_pulse_gear,
+            trigger_map=TriggerMap(**bits.model_dump()) if bits else None,
+        )
+
+
+MODEL = "smartstep"
+EARLIER = 1.0
+"""Velocity and acceleration that captures of earlier versions have."""
+MOTION_KEYS = (
+    "velocity",
+    "acceleration",
+    "limits",
+    "gains",
+    "reference",
+    "home",
+    "pwm",
+    "tracking",
+    "settle",
+    "identity",
+)
+"""Keys of an axis that only a drive with commands for motion has."""
+
+
+class SmartStepLineConfig(Frozen):
+    """How a line of SmartSteps is wired."""
+
+    framing: Framing = Framing.SEVEN_EVEN
+    """7e1, or 8n1-soft-parity for adapters that cannot make seven bits and parity."""
+    wiring: Wiring = Wiring.FOUR_WIRE
+    """4-wire as in the manual; 2-wire needs accept_two_wire."""
+    accept_two_wire: bool = False
+    """Two wires are known to be risky: a drive may take its own replies for commands."""
+    echo: Literal["none", "expect"] = "none"
+    """Whether the adapter returns what the host sends; on two wires it may."""
+
+    @model_validator(mode="after")
+    def _wires(self) -> Self:
+        if self.wiring is Wiring.TWO_WIRE and not self.accept_two_wire:
+            raise ValueError("wiring 2-wire is not described in the manual; set accept_two_wire = true to use it")
+        if self.echo == "expect" and self.wiring is Wiring.FOUR_WIRE:
+            raise ValueError("there is no echo on four wires")
+        return self
+
+
+class SmartStepUnitConfig(Frozen):
+    """How one unit is read and written, and how it is taken to behave where its manual leaves room."""
+
+    monitors: Mapping[MonitorName, float] = {}
+    """Monitors to publish, with their rates in Hz."""
+    audit_s: float = Field(default=45.0, ge=0, le=86_400)
+    """In how many seconds each parameter is read once, to find what another program or a reset has changed; 0 never."""
+    eeprom_write: EepromWrite = EepromWrite.ALLOW
+    """deny forbids it; allow: EEPROM is written when a request names it."""
+    eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
+    """Writes of the drive's EEPROM, all parameters together, until further ones are refused; it endures 10,000."""
+    planned_response_s: float = Field(default=0.02, ge=0, le=5)
+    """How long it takes to answer as a rule, for the plan; the manual promises 0.2 s, which would leave no room."""
+    first_character_s: float = Field(default=0.3, gt=0, le=5)
+    """The longest wait for a reply; the manual says 0.2 s."""
+    encoder_counts_per_rev: int = Field(default=8000, gt=0)
+    """Pulses of the feedback counter in one turn."""
+    run_active_low: bool = True
+    """RUN is on while its input bit is 0."""
+    reset_active_low: bool = True
+    """RESET is on while its input bit is 0."""
+    alarm_output_high: bool = True
+    """/ALM is 1 in alarm."""
+    trace: SmartStepTraceConfig = SmartStepTraceConfig()
+    """How its recorder is taken to work."""
+    verified: Mapping[Annotated[str, Field(title="assumption")], Verification] = {}
+    """Results of tests on the drive for the assumptions of its profile, by their keys."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, document: object) -> object:
+        if isinstance(document, dict) and "settled" in document:
+            raise ValueError('settled: the key is called verified now, and its value "bench_verified" is "verified"')
+        if isinstance(document, dict) and document.get("eeprom_write") == "confirm":
+            raise ValueError('eeprom_write: "confirm" never differed from "allow"; use "allow" or "deny"')
+        return document
+
+    @model_validator(mode="after")
+    def _rates(self) -> Self:
+        for name, rate in self.monitors.items():
+            if not 0 <= rate <= 100:  # noqa: PLR2004 - a word takes 29 ms at least
+                raise ValueError(f"monitors.{name}: {rate} Hz is not 0 to 100")
+        return self
+
+
+class SimulatedEventConfig(Frozen):
+    """An event of a simulated drive at an instant."""
+
+    at_s: float = Field(ge=0)
+    """Seconds after the line began."""
+    run: bool | None = None
+    """RUN is switched."""
+    pulse_rate: float | None = None
+    """The pulse input changes, command units a second."""
+    alarm: int | None = Field(default=None, ge=0, le=WORD)
+    """An alarm or a warning comes."""
+    reset: bool = False
+    """RESET is pressed."""
+    power: bool | None = None
+    """It is switched off or on."""
+
+
+class SimulatedVariantConfig(Frozen):
+    """How a simulated drive behaves where the manual leaves room; the defaults are the assumptions of the driver."""
+
+    response_s: float = Field(default=0.01, ge=0, le=5)
+    """From a command to the first character of its reply; the manual allows 0.2."""
+    string_checksum: StringChecksum = StringChecksum.HEADER
+    """Bytes that the checksum of a string reply covers."""
+    string_count_unit: CountUnit = CountUnit.BYTES
+    """Unit of the count in a string reference."""
+    longest_string_bytes: int = Field(default=1000, ge=2, le=1000)
+    """More is an error in number of bytes."""
+    trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
+    """Where the signal's bit and the value sit in a word of the trace memory."""
+    trace_byte_order: ByteOrder = ByteOrder.BIG
+    """Which half of a word comes first in a string."""
+    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
+    """By which way of gearing traced command pulses become the motor's speed."""
+    trigger_map: TriggerMapConfig | None = None
+    """The bits of the trigger condition; invented ones when missing."""
+    full_scale_settable: bool = True
+    """8701H and 8702H take settings."""
+    eeprom_changes_ram: bool = False
+    """A write to EEPROM also changes the value in use."""
+    hears_itself: bool = False
+    """It takes its own replies for commands."""
+    run_active_low: bool = True
+    """RUN is on at level 0."""
+    reset_active_low: bool = True
+    """RESET is on at level 0."""
+    alarm_output_high: bool = True
+    """/ALM is 1 in alarm."""
+
+
+class SimulatedUnitConfig(Frozen):
+    """One simulated SmartStep."""
+
+    number: int = Field(ge=0, le=15)
+    """Its unit number."""
+    run: bool = False
+    """RUN is on."""
+    pulse_rate: float = 0.0
+    """Command units a second that come in from the start."""
+    stored: Mapping[Annotated[str, Field(title="parameter number")], Annotated[int, Field(ge=0, le=WORD)]] = {}
+    """Parameters in EEPROM, by number such as Pn102; the others have factory values."""
+    worn: int = Field(default=0, ge=0, le=10_000)
+    """Writes that its EEPROM has taken already; after 10,000 in all nothing is stored any more."""
+    gain_switch: int = Field(default=4, ge=0, le=15)
+    """Position of the gain rotary switch."""
+    switches: int = Field(default=0x20, ge=0, le=0x3F)
+    """Function selection switches, switch 1 in bit 0."""
+    history: tuple[Annotated[int, Field(ge=0, le=WORD)], ...] = Field(default=(), max_length=10)
+    """Alarm codes of its history, the newest first."""
+    event: tuple[SimulatedEventConfig, ...] = ()
+    """Scheduled events."""
+    variant: SimulatedVariantConfig = SimulatedVariantConfig()
+    """How it behaves where the manual leaves room."""
+
+    @field_validator("stored")
+    @classmethod
+    def _listed(cls, values: Mapping[str, int]) -> Mapping[str, int]:
+        for name in values:
+            found = find_parameter(name)
+            if found not in PARAMETERS or found is PN000:
+                raise ValueError(f"{name} is no parameter that can be stored; the unit number is `number`")
+        return values
+
+
+class SimulatedSmartStepLineConfig(SimulatedLineConfig):
+    """A simulated line of SmartSteps."""
+
+    unit: tuple[SimulatedUnitConfig, ...] = Field(min_length=1, max_length=16)
+    """The drives of the line."""
+
+    @model_validator(mode="after")
+    def _different_units(self) -> Self:
+        refuse_duplicates("unit", [str(unit.number) for unit in self.unit])
+        return self
+
+
+class SimulatedSmartStepsConfig(Frozen):
+    """A file of `ldcnd sim --smartstep`."""
+
+    unit: tuple[SimulatedUnitConfig, ...] = Field(min_length=1, max_length=16)
+    """The drives of the line."""
+    wiring: Wiring = Wiring.FOUR_WIRE
+    """2-wire for its hazards."""
+    framing: Framing = Framing.SEVEN_EVEN
+    """How the host makes characters; a pseudo-terminal carries no parity bit unless the host makes it."""
+
+
+class SlowRatesConfig(RatesConfig):
+    """How often an item is published, in Hz; 0 for never. One word takes about 40 ms."""
+
+    position: float = Field(default=1.0, ge=0, le=2000)
+    """Position."""
+    velocity: float = Field(default=2.0, ge=0, le=2000)
+    """Velocity."""
+    adc: float = Field(default=0.0, ge=0, le=2000)
+    """It has no analog input."""
+    state: float = Field(default=1.0, gt=0, le=2000)
+    """The drive's status and state; cannot be switched off, faults come with it."""
+
+
+def _known_model(model: str) -> str:
+    if model != MODEL:
+        raise ValueError("no such drive model on a line of family smartstep; known is smartstep")
+    return model
+
+
+class SmartStepAxisConfig(AxisConfig):
+    """One SmartStep, which takes no motion over its line."""
+
+    model: Annotated[str, AfterValidator(_known_model)]
+    """The drive model: smartstep."""
+    address: int = Field(ge=0)
+    """The unit number, 0 to 15."""
+    rates: SlowRatesConfig = SlowRatesConfig()
+    """How often each item is published."""
+    smartstep: SmartStepUnitConfig = SmartStepUnitConfig()
+    """Settings of a SmartStep only."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_motion(cls, document: object) -> object:
+        """Refuse keys for motion."""
+        for key in MOTION_KEYS:
+            if isinstance(document, dict) and document.get("model") == MODEL and key in document:
+                if key in {"velocity", "acceleration"} and document[key] in {0.0, EARLIER}:
+                    document = {name: value for name, value in document.items() if name != key}
+                    continue
+                raise ValueError(f"{key}: a SmartStep takes no motion over its line; remove it")
+        return document
+
+    @field_validator("address")
+    @classmethod
+    def _is_a_unit(cls, address: int) -> int:
+        if address > HIGHEST_UNIT:
+            raise ValueError("a SmartStep has a unit number from 0 to 15")
+        return address
+
+
+class SmartStepBusConfig(BusConfig):
+    """One line of SmartSteps; its rate is always 9600."""
+
+    skips_by_default: ClassVar[bool] = True
+
+    family: Literal["smartstep"]
+    """The drive family on it."""
+    smartstep: SmartStepLineConfig = SmartStepLineConfig()
+    """How the line is wired."""
+    axis: tuple[SmartStepAxisConfig, ...] = Field(min_length=1, max_length=31)
+    """The drives that are axes."""
+
+    @model_validator(mode="after")
+    def _released_transmitters(self) -> Self:
+        if len(self.axis) > 1 and any(axis.address == 0 for axis in self.axis):
+            raise ValueError("unit 0 never releases its transmitter: it must be alone on its line")
+        return self
+
+    @model_validator(mode="after")
+    def _known_echo(self) -> Self:
+        echo = self.smartstep.echo == "expect"
+        if self.rs485 and self.smartstep.wiring is Wiring.TWO_WIRE and echo is not self.rs485.receive_own:
+            raise ValueError('rs485: on two wires receive_own = true goes with echo = "expect", false with "none"')
+        return self
+
+    def profile(self, axis: SmartStepAxisConfig) -> SmartStepProfile:
+        """Return how one of its drives is taken to behave."""
+        line, unit = self.smartstep, axis.smartstep
+        profile = SmartStepProfile(
+            framing=line.framing,
+            wiring=line.wiring,
+            echo=Echo(line.echo),
+            first_character_s=unit.first_character_s,
+            eeprom_write=unit.eeprom_write,
+            encoder_counts_per_rev=unit.encoder_counts_per_rev,
+            run_active_low=unit.run_active_low,
+            reset_active_low=unit.reset_active_low,
+            alarm_output_high=unit.alarm_output_high,
+        )
+        profile = unit.trace.assumed_of(profile)
+        for key, verification in unit.verified.items():
+            profile = profile.verified(key, verification)
+        return profile
+
+
+def simulated_units(settings: Sequence[SimulatedUnitConfig], now_s: float) -> list[SimulatedUnit]:
+    """Return the drives that a configuration describes; their events count from now on."""
+    return [_unit(each, now_s) for each in settings]
+
+
+def _unit(settings: SimulatedUnitConfig, now_s: float) -> SimulatedUnit:
+    bits = settings.variant.trigger_map
+    values = settings.variant.model_dump(exclude={"trigger_map"})
+    variant = SimulatedVariant(**values, trigger_map=TriggerMap(**bits.model_dump()) if bits else BENCH_TRIGGER_MAP)
+    stored = {PN000: settings.number << 8}
+    for name, value in settings.stored.items():
+        stored[parameter_at(int(name.lower().removeprefix("pn"), 16))] = value
+    unit = SimulatedUnit(variant, stored)
+    drive = unit.drive
+    drive.memory.worn = settings.worn
+    drive.gain_switch = settings.gain_switch
+    drive.switches = function_switches(settings.switches)
+    drive.alarm_history[: len(settings.history)] = settings.history
+    drive.set_run(now_s, on=settings.run)
+    drive.set_pulse_rate(settings.pulse_rate, now_s)
+    for event in sorted(settings.event, key=lambda each: each.at_s):
+        unit.schedule(now_s + event.at_s, partial(_happen, unit, event))
+    return unit
+
+
+def _happen(unit: SimulatedUnit, event: SimulatedEventConfig, at_s: float) -> None:
+    if event.power is not None:
+        (unit.power_on if event.power else unit.power_off)(at_s)
+    if event.reset:
+        unit.drive.press_reset(at_s)
+    if event.run is not None:
+        unit.drive.set_run(at_s, on=event.run)
+    if event.pulse_rate is not None:
+        unit.drive.set_pulse_rate(event.pulse_rate, at_s)
+    if event.alarm is not None:
+        unit.drive.provoke(event.alarm, at_s)

@@ -1,0 +1,245 @@
+"""One SmartStep line: its port, which units answer on it, their models, whether one receives its own replies.
+
+The port pauses before each packet, so that a drive has time to release its transmitter (the manual gives no time, the
+profile does), and makes parity in software where the adapter cannot. Units have no addressing procedure: their numbers
+are set in Pn000.2. A silent unit does not keep the others from being served; it is probed at increasing intervals.
+Source: manual 2.1, 2.2.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Mapping
+from collections.abc import Set as AbstractSet
+from typing import Any
+
+from typing_extensions import override
+
+from ldcnd.contract.errors import DriveFault, NetworkMismatch, ReplyTimeout, TransportLost, WrongState
+from ldcnd.drives.driver import Drive
+from ldcnd.drives.network import BringUpReport, Network
+from ldcnd.drives.smartstep import commands
+from ldcnd.drives.smartstep.addresses import Register
+from ldcnd.drives.smartstep.drive import SmartStepAxis, UnitSpec
+from ldcnd.drives.smartstep.modes import end_mode
+from ldcnd.drives.smartstep.monitors import DriverType, FunctionSwitch, function_switches
+from ldcnd.drives.smartstep.packet import add_parity, strip_parity
+from ldcnd.drives.smartstep.parameters import PN000, PN100, unit_number
+from ldcnd.drives.smartstep.poller import STRAY_WAIT_S
+from ldcnd.drives.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile
+from ldcnd.drives.smartstep.words import stray_packets
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange
+from ldcnd.line.resync import Resync
+from ldcnd.line.transport import Opener, Receiver, Transport
+from ldcnd.log import get_logger
+
+BAUD = 9600
+"""The only rate (manual 2.1)."""
+
+
+class SmartStepPort(Transport):
+    """An open port with the SmartStep's framing and pauses; also the receiver of the port that it wraps."""
+
+    def __init__(self, port: Transport, framing: Framing, quiet_s: float) -> None:
+        self._port = port
+        self._soft_parity = framing is Framing.SOFT_PARITY
+        self._quiet_s = quiet_s
+        self._loop = asyncio.get_running_loop()
+        self._receiver: Receiver | None = None
+        self._quiet_from_s = 0.0
+        self._held_back: deque[bytes] = deque()
+        self._timer: asyncio.TimerHandle | None = None
+
+    # -- transport ---------------------------------------------------------------------------------------------------
+
+    @override
+    def attach(self, receiver: Receiver) -> None:
+        self._receiver = receiver
+        self._port.attach(self)
+
+    def write(self, data: bytes) -> None:
+        """See `Transport`; what has to wait for silence leaves a few milliseconds later."""
+        self._held_back.append(add_parity(data) if self._soft_parity else data)
+        if self._timer is None:
+            wait_s = self._quiet_from_s + self._quiet_s - self._loop.time()
+            if wait_s > 0:
+                self._timer = self._loop.call_later(wait_s, self._release)
+            else:
+                self._send()
+
+    @override
+    def expect(self, reply_bytes: int) -> None:
+        self._port.expect(reply_bytes)
+
+    @override
+    def collect(self) -> None:
+        self._port.collect()
+
+    @override
+    def discard_input(self) -> None:
+        self._port.discard_input()
+
+    @override
+    def set_baud(self, baud: int) -> None:
+        self._port.set_baud(baud)
+
+    async def close(self) -> None:
+        """See `Transport`; what is held back is dropped."""
+        self._forget()
+        self._receiver = None
+        await self._port.close()
+
+    # -- receiver ----------------------------------------------------------------------------------------------------
+
+    def data_received(self, data: bytes) -> None:
+        """Pass bytes of the line on, without their parity where that is kept in software."""
+        self._quiet_from_s = self._loop.time()
+        if self._receiver:
+            self._receiver.data_received(strip_parity(data) if self._soft_parity else data)
+
+    def transport_lost(self, reason: str) -> None:
+        """Tell the receiver that the line is gone."""
+        self._forget()
+        if self._receiver:
+            self._receiver.transport_lost(reason)
+
+    # -- silence -----------------------------------------------------------------------------------------------------
+
+    def _release(self) -> None:
+        self._timer = None
+        try:
+            self._send()
+        except TransportLost as error:
+            self.transport_lost(error.message)
+
+    def _send(self) -> None:
+        while self._held_back:
+            self._port.write(self._held_back.popleft())
+
+    def _forget(self) -> None:
+        self._held_back.clear()
+        if self._timer:
+            self._timer.cancel()
+            self._timer = None
+
+
+def smartstep_opener(opener: Opener, profile: SmartStepProfile) -> Opener:
+    """Return an opener of the same port for a line of these drives."""
+
+    async def open_port() -> Transport:
+        return SmartStepPort(await opener(), profile.framing, profile.quiet_s)
+
+    return open_port
+
+
+log = get_logger("smartstep")
+
+
+class SmartStepNetwork(Network):
+    """The units of one line."""
+
+    def __init__(self, bus: Bus, specs: tuple[UnitSpec, ...]) -> None:
+        self._bus = bus
+        names = {spec.axis.address: spec.axis.name for spec in specs}
+        self._units = {
+            number: SmartStepAxis(spec, bus, {other: name for other, name in names.items() if other != number})
+            for number, spec in ((spec.axis.address, spec) for spec in specs)
+        }
+        self._answering: list[int] = []
+        self.axes: Mapping[str, Drive] = {unit.spec.name: unit for unit in self._units.values()}
+        self.resync = Resync(flush=commands.FLUSH, quiet_s=SMARTSTEP.gap_s, settle_s=0.005, probe=self._probe)
+
+    async def bring_up(self) -> BringUpReport:
+        """See `Network`: read the identity of every unit; only reads.
+
+        Raises:
+            NetworkMismatch: no unit answers at all, or one takes its own replies for commands.
+            BusError: the line failed meanwhile.
+        """
+        self._answering.clear()
+        remarks: list[str] = []
+        for unit in self._units.values():
+            unit.wires_checked = False
+            unit.words.forget()
+        for number, unit in self._units.items():
+            try:
+                await self._bus.execute(commands.with_response_time(commands.probe(number), unit.profile))
+            except ReplyTimeout:
+                remarks.append(f"unit {number} (axis {unit.spec.name}) does not answer")
+                continue
+            self._answering.append(number)
+            try:
+                await self._check_wires(unit)
+                unit.wires_checked = True
+                remarks += await self._meet(unit)
+            except (ReplyTimeout, DriveFault) as error:
+                remarks.append(f"unit {number} (axis {unit.spec.name}): {error.message}")
+        name = self._bus.settings.name
+        if not self._answering:
+            raise NetworkMismatch(
+                f"bus {name}: none of the {len(self._units)} configured SmartStep units answers",
+                remedy="check wiring, 9600 baud 7E1, and the unit numbers in Pn000.2",
+            )
+        log.info("network up", bus=name, units=list(self._answering))
+        return BringUpReport(
+            baud=self._bus.baud,
+            identities={unit.spec.name: unit.identity for unit in self._units.values() if unit.identity},
+            reset=False,
+            remarks=tuple(remarks),
+        )
+
+    async def _check_wires(self, unit: SmartStepAxis) -> None:
+        """Refuse a line on which a drive receives its own replies, before a word is read that may be zero.
+
+        Raises:
+            NetworkMismatch: it does.
+        """
+        if await hears_itself(self._bus, unit):
+            unit.words.self_hearing = True
+            raise NetworkMismatch(
+                f"bus {self._bus.settings.name}: unit {unit.spec.address} (axis {unit.spec.name}) takes its own replies"
+                " for commands; reading a zero or writing would make it answer itself without end",
+                remedy="use four wires",
+            )
+
+    async def _meet(self, unit: SmartStepAxis) -> list[str]:
+        """Learn what a unit is; return what deserves attention."""
+        words, who = unit.words, f"unit {unit.spec.address} (axis {unit.spec.name})"
+        remarks = []
+        type_word = await words.read(Register.DRIVER_TYPE)
+        unit.identified(type_word, await words.read(Register.SOFTWARE_VERSION))
+        if type_word != DriverType.R7D_AP:
+            remarks.append(f"{who}: driver type {type_word:04X}H is not one that the manual lists")
+        try:
+            ended = await end_mode(words)
+        except WrongState as error:
+            remarks.append(f"{who}: {error.message}")
+        else:
+            if ended:
+                remarks.append(
+                    f"{who}: was left in operating mode {ended:04X}H by another host; it is in its normal mode now"
+                )
+        stored = unit_number(await words.read(PN000.eeprom_address))
+        if stored != unit.spec.address:
+            remarks.append(f"{who}: Pn000.2 makes it unit {stored} at its next power-on")
+        if FunctionSwitch.PARAMETERS_RULE not in function_switches(await words.read(Register.FUNCTION_SWITCHES)):
+            remarks.append(f"{who}: its switches seem to overrule parameters (switch 6 is off)")
+        return remarks
+
+    def _probe(self, avoid: AbstractSet[int]) -> Exchange[Any] | None:
+        """See `Resync`: no other command's reply carries the address of the probe."""
+        candidates = [number for number in self._answering if number not in avoid] or self._answering
+        return commands.probe(candidates[0]) if candidates else None
+
+
+async def hears_itself(bus: Bus, unit: SmartStepAxis) -> bool:
+    """Tell whether a drive takes its own replies for commands.
+
+    A non-zero word makes it answer itself with a data error, which stops by itself: Pn100 is never zero.
+    """
+    unit.words.self_hearing = False
+    await unit.words.read(PN100.ram_address)
+    loop = asyncio.get_running_loop()
+    heard_at_s = loop.time()
+    await asyncio.sleep(STRAY_WAIT_S)
+    return any(commands.is_self_hearing(unit.spec.address, packet) for packet in stray_packets(bus, heard_at_s))

@@ -1,0 +1,144 @@
+"""TOML files: read, validated whole, refused with every complaint at once."""
+
+import difflib
+import tomllib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar, get_args
+
+from pydantic import BaseModel, Field, GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
+from pydantic.json_schema import JsonSchemaValue
+from pydantic_core import CoreSchema, core_schema
+
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.frozen import Frozen
+
+DocumentT = TypeVar("DocumentT", bound=Frozen)
+
+
+@dataclass(frozen=True, slots=True)
+class Variants:
+    """Marks a table that different models read; what they have in common is the annotated model.
+
+    Attributes:
+        choose: returns the model that reads a table; raises ValueError when there is none.
+        models: returns all of them by name.
+    """
+
+    choose: Callable[[Mapping[str, Any]], type[BaseModel]]
+    models: Callable[[], Mapping[str, type[BaseModel]]]
+
+    def __get_pydantic_core_schema__(self, source: type[BaseModel], handler: GetCoreSchemaHandler) -> CoreSchema:
+        """Read a table by its own model before it is taken for the common one."""
+
+        def read(document: object) -> object:
+            return self.choose(document).model_validate(document) if isinstance(document, dict) else document
+
+        return core_schema.no_info_before_validator_function(read, handler(source))
+
+    def __get_pydantic_json_schema__(self, _common: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Describe all of them."""
+        return {"anyOf": [handler(model.__pydantic_core_schema__) for model in self.models().values()]}
+
+
+REMOVED_KEYS = {
+    "idle": "`telemetry.on_demand` is gone; delete this key",
+    "on_demand": "every item is polled at its rate whether it has subscribers or not; delete this key",
+    "pre_empt_polls": "stops wait for the exchange on the wire; delete this key and, on a slow line, raise `baud`",
+}
+"""Keys of earlier versions, and what to do about them."""
+
+
+def read_toml(path: Path, document_type: type[DocumentT]) -> DocumentT:
+    """Read and validate a file.
+
+    Raises:
+        ConfigError: the file cannot be read, is not TOML, or cannot work; names file, keys, what is wrong, what is
+            allowed.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: not UTF-8 at byte {error.start}") from error
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{path}: not valid TOML: {error}") from error
+    try:
+        return document_type.model_validate(document)
+    except ValidationError as error:
+        raise ConfigError("\n".join(f"{path}: {line}" for line in complaints(error, document_type))) from error
+
+
+def complaints(error: ValidationError, document_type: type[BaseModel]) -> list[str]:
+    """Say for each refused key what is wrong with it."""
+    said = []
+    details = error.errors()
+    for detail in details:
+        if detail["type"] == "too_short" and any(
+            len(other["loc"]) > len(detail["loc"]) and other["loc"][: len(detail["loc"])] == detail["loc"]
+            for other in details
+        ):
+            continue  # a list is only short because its items were refused
+        key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in detail["loc"]).lstrip(".")
+        shown = detail["input"] if isinstance(detail["input"], str | int | float | bool) else None
+        given = f" (given: {shown!r})" if shown is not None else ""
+        if detail["type"] == "extra_forbidden":
+            said.append(f"{key}: {_unknown_key(document_type, detail['loc'])}")
+            continue
+        said.append(f"{key or 'whole file'}: {detail['msg'].removeprefix('Value error, ')}{given}")
+    return said
+
+
+def _unknown_key(document_type: type[BaseModel], loc: tuple[int | str, ...]) -> str:
+    """Say that a key does not exist, and which one may have been meant."""
+    name = str(loc[-1])
+    if name in REMOVED_KEYS:
+        return f"no longer supported: {REMOVED_KEYS[name]}"
+    keys = _keys_at(document_type, loc[:-1])
+    if name in keys:
+        return "drives of another family have this key"
+    close = difflib.get_close_matches(name, keys, n=1)
+    return f"there is no such key{f'; did you mean {close[0]!r}?' if close else ''}"
+
+
+def _keys_at(document_type: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
+    """Return the keys of the table at this place; empty where the place is not a single kind of table."""
+    tables: list[type[BaseModel]] = [document_type]
+    for part in loc:
+        if not isinstance(part, int):
+            fields = [table.model_fields[part] for table in tables if part in table.model_fields]
+            tables = [table for field in fields for table in _tables_in(field.annotation)]
+    return [key for table in tables for key in table.model_fields]
+
+
+def _tables_in(annotation: object) -> list[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return [annotation]
+    if isinstance(annotation, Variants):
+        return list(annotation.models().values())
+    inner = (*get_args(annotation), *getattr(annotation, "__metadata__", ()))
+    return [table for each in inner for table in _tables_in(each)]
+
+
+NAME_CHARACTERS = 63
+
+Name = Annotated[str, Field(pattern=rf"^[a-z0-9][a-z0-9_]{{0,{NAME_CHARACTERS - 1}}}$")]
+"""One chunk of a key: lower-case letters, digits, underscores."""
+
+DeviceIdentity = tuple[Annotated[int, Field(ge=0, le=255)], Annotated[int, Field(ge=0, le=255)]]
+"""Id and version, as a module reports them."""
+
+
+def refuse_duplicates(what: str, names: list[str]) -> None:
+    """Refuse a list in which something stands twice.
+
+    Raises:
+        ValueError: names what stands twice.
+    """
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"{what} {name!r} is given more than once")

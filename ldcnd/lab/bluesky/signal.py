@@ -1,0 +1,133 @@
+"""An item of an axis's telemetry as a Bluesky device that is read and monitored."""
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from ldcnd.client.loop_thread import LoopThread
+from ldcnd.client.rig import Rig
+from ldcnd.contract.errors import SessionError
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import (
+    AdcSample,
+    FaultSample,
+    MonitorSample,
+    PositionSample,
+    Quality,
+    Sample,
+    StateSample,
+    VelocitySample,
+)
+from ldcnd.lab.bluesky.status import Status
+from ldcnd.lab.bluesky.values import SILENT_S, instant, number_key, reading, refuse_other_unit, text_key, within
+
+if TYPE_CHECKING:
+    from bluesky.protocols import Callback, Hints, Reading
+    from event_model.documents import DataKey
+
+TEXTS = frozenset({"state", "fault"})
+
+
+class Signal:
+    """One item of one axis; made by `Devices.signal`. Faults are their codes with commas between, empty for none.
+
+    Attributes:
+        name: of the device, and of its reading in documents.
+        parent: None; it is part of no other device.
+    """
+
+    parent = None
+
+    def __init__(self, name: str, rig: Rig, info: AxisInfo, item: str, loop: LoopThread) -> None:
+        self.name = name
+        self._rig = rig
+        self._axis = info.axis
+        self._item = item
+        self._source = f"ldcnd://{rig.name}/{info.axis}/{item}"
+        self._loop = loop
+        self._triggered: Sample | None = None
+        self._unit: str | None = None  # as described last
+        self._followers: dict[Callback[float | str], Status] = {}
+
+    @property
+    def hints(self) -> "Hints":
+        """Plot the value if it is a number."""
+        return {"fields": [] if self._item in TEXTS else [self.name]}
+
+    def trigger(self) -> Status:
+        """Wait for a value that was measured from now on, for the next reading; fails when none comes within 10 s."""
+        return Status(f"trigger of {self.name}", self._loop.start(self._take_next()))
+
+    async def _take_next(self) -> None:
+        self._triggered = None
+        problem = f"axis {self._axis}: no {self._item} was measured within {SILENT_S:g} s after the trigger"
+        async with (
+            within(SILENT_S, problem, f"raise the rate of {self._item} in the daemon's configuration"),
+            self._rig.samples(self._axis, self._item) as samples,
+        ):
+            not_before_ns = await instant(self._rig)
+            async for _, sample in samples:
+                if sample.t > not_before_ns and sample.quality is not Quality.BAD:
+                    self._triggered = sample
+                    return
+
+    async def read(self) -> "dict[str, Reading[float | str]]":
+        """Return the value of the last trigger, once, or else the last value, with the time at which it was true.
+
+        Raises:
+            SessionError: there is none yet, or the daemon does not answer.
+        """
+        sample, self._triggered = self._triggered, None
+        return self._of(sample or await self._latest())
+
+    async def describe(self) -> "dict[str, DataKey]":
+        """Return what the value is."""
+        if self._item in TEXTS:
+            return {self.name: text_key(self._source)}
+        _, self._unit = _value(await self._latest())
+        return {self.name: number_key(self._source, self._unit)}
+
+    def subscribe(self, function: "Callback[float | str]") -> None:
+        """Call `function` with every value that comes, on the devices' own thread."""
+
+        async def follow() -> None:
+            async with self._rig.samples(self._axis, self._item) as samples:
+                async for _, sample in samples:
+                    function(self._of(sample))
+
+        self._followers[function] = Status(f"subscription of {self.name}", self._loop.start(follow()))
+
+    def clear_sub(self, function: "Callback[float | str]") -> None:
+        """End a subscription."""
+        status = self._followers.pop(function, None)
+        if status:
+            status.cancel()
+
+    async def _latest(self) -> Sample:
+        sample = await asyncio.wrap_future(self._loop.start(self._rig.latest(self._axis, self._item)))
+        if sample is None:
+            raise SessionError(
+                f"axis {self._axis}: there is no {self._item} yet", axis=self._axis, remedy="see `ldcnd top`"
+            )
+        return sample
+
+    def _of(self, sample: Sample) -> "dict[str, Reading[float | str]]":
+        value, unit = _value(sample)
+        refuse_other_unit(self._axis, unit if self._unit is None else self._unit, unit)
+        return {self.name: reading(value, sample.t * 1e-9, sample.quality)}
+
+    def __repr__(self) -> str:
+        return f"<signal {self.name}: {self._source}>"
+
+
+def _value(sample: Sample) -> tuple[float | str, str]:
+    """Return the value of a sample, and its unit."""
+    match sample:
+        case PositionSample() | VelocitySample() | MonitorSample():
+            return sample.value, sample.unit
+        case AdcSample():
+            return sample.volts, "V"
+        case StateSample():
+            return sample.state.value, ""
+        case FaultSample():
+            return ",".join(fault.code for fault in sample.active), ""
+    raise TypeError(f"{type(sample).__name__} is no item of an axis")

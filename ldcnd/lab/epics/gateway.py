@@ -1,0 +1,200 @@
+"""The gateway: motor records of a rig, served over Channel Access for as long as it runs."""
+
+import asyncio
+import logging
+import os
+from collections.abc import AsyncIterator, Coroutine
+from contextlib import asynccontextmanager
+
+from caproto.asyncio.server import Context
+
+from ldcnd.client.rig import Rig
+from ldcnd.contract.errors import LdcndError, UnknownAxis
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.lab.epics.fields import Field
+from ldcnd.lab.epics.motor import NO_HOLDER, MotorRecord, database
+from ldcnd.listen_address import ListenAddress
+
+LEASE_S = 1.0
+"""The axes do what their `loss.client` says so soon after this program is gone, in seconds."""
+IDLE_S = 30.0
+"""Control is given back when an axis has not moved and nothing was put to it for so long, seconds."""
+SILENT_S = 5.0
+"""Time without samples after which an axis is shown as unknown, seconds."""
+MOTIONLESS = (1.0, 1.0)
+"""Velocity and acceleration that are shown of what has none."""
+WHO = "epics gateway"
+
+
+class Gateway:
+    """Shows the axes of a rig as motor records; made by `gateway`.
+
+    Attributes:
+        variables: the process variables by name.
+        circuits: the connections of clients at present.
+    """
+
+    def __init__(self, rig: Rig, group: asyncio.TaskGroup) -> None:
+        self.variables: dict[str, Field] = {}
+        self.circuits: set[object] = set()
+        self._rig = rig
+        self._group = group
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._records: dict[str, MotorRecord] = {}
+        self._start(self._follow_descriptions(), "descriptions")
+
+    def add(self, info: AxisInfo, defaults: tuple[float, float], prefix: str, *, moves: bool) -> None:
+        """Show an axis, and begin to follow it."""
+        record = MotorRecord(info, defaults, self._start_motion, self._stop, self.connected, moves=moves)
+        self._records[info.axis] = record
+        self.variables |= database(prefix, {info.axis: record})
+        self._start(self._follow(record), f"values of {info.axis}")
+        for monitor in info.monitors:
+            self._start(self._follow_monitor(record, monitor), f"{monitor} of {info.axis}")
+        if moves:
+            self._start(self._hold(record), f"control of {info.axis}")
+
+    def end(self) -> None:
+        """End all that runs in the background; motions halt when control is released."""
+        for task in self._tasks:
+            task.cancel()
+
+    def connected(self) -> frozenset[object]:
+        """Return who is connected now."""
+        return frozenset(self.circuits)
+
+    async def _follow_descriptions(self) -> None:
+        async for described in self._rig.follow_descriptions():
+            for name, record in self._records.items():
+                if name in described:
+                    await record.describe(described[name], await _defaults(self._rig, name))
+
+    async def _describe(self, record: MotorRecord) -> None:
+        """Have a record say what its axis is by the daemon that is there now."""
+        name = record.info.axis
+        for info in await self._rig.describe():
+            if info.axis == name:
+                await record.describe(info, await _defaults(self._rig, name))
+
+    async def _follow(self, record: MotorRecord) -> None:
+        axis = record.info.axis
+        async with self._rig.samples(axis) as samples:
+            for item in record.info.items:
+                last = await self._rig.latest(axis, item)
+                if last:
+                    await record.take(last)
+            while True:
+                try:
+                    async with asyncio.timeout(SILENT_S):
+                        _, sample = await anext(samples)
+                except TimeoutError:
+                    await record.silent()
+                else:
+                    await record.take(sample)
+
+    async def _follow_monitor(self, record: MotorRecord, monitor: str) -> None:
+        async with self._rig.samples(record.info.axis, f"monitor/{monitor}") as samples:
+            async for _, sample in samples:
+                await record.take(sample, monitor)
+
+    async def _hold(self, record: MotorRecord) -> None:
+        """Control an axis from a put that needs it until it idles; what another program has is never taken by force."""
+        while True:
+            await record.wait_wanted()
+            try:
+                async with self._rig.control(record.info.axis, client=WHO, lease_s=LEASE_S) as axis:
+                    await self._describe(record)  # a lease is of one run of the daemon, and so is what is put under it
+                    await record.controlled(axis, WHO)
+                    await record.wait_idle(IDLE_S)
+                    await record.controlled(None, NO_HOLDER)
+            except LdcndError as error:
+                await record.controlled(None, str(error))
+
+    async def _stop(self, axis: str) -> object:
+        async with self._rig.watch(axis) as watched:
+            return await watched.stop()
+
+    def _start(self, work: Coroutine[object, object, None], name: str) -> asyncio.Task[None]:
+        task = self._group.create_task(work, name=name)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task
+
+    def _start_motion(self, work: Coroutine[object, object, None], name: str) -> asyncio.Future[None]:
+        """Start what may fail without ending the gateway: the client that has put it learns of it."""
+        ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        ended.add_done_callback(lambda future: future.cancelled() or future.exception())  # perhaps without a waiter
+
+        async def motion() -> None:
+            try:
+                await work
+            except LdcndError as error:
+                if not ended.done():
+                    ended.set_exception(error)
+            finally:
+                if not ended.done():
+                    ended.set_result(None)
+
+        self._start(motion(), name)
+        return ended
+
+
+@asynccontextmanager
+async def gateway(
+    rig: Rig, *, prefix: str, axes: tuple[str, ...] = (), moves: tuple[str, ...] = ()
+) -> AsyncIterator[Gateway]:
+    """Show axes of a rig as motor records until the context ends.
+
+    Args:
+        rig: the rig.
+        prefix: of every process variable.
+        axes: which; all of them when none is named.
+        moves: those that puts may move, under a lease of the gateway for each.
+
+    Raises:
+        UnknownAxis: the rig has no such axis.
+    """
+    known = {info.axis: info for info in await rig.describe()}
+    unknown = [name for name in (*axes, *moves) if name not in known]
+    if unknown:
+        raise UnknownAxis(
+            f"rig {rig.name} has no axis {unknown[0]!r}; it has {', '.join(known)}", axis=unknown[0], value=unknown[0]
+        )
+    try:
+        async with asyncio.TaskGroup() as group:
+            made = Gateway(rig, group)
+            for name in axes or known:
+                made.add(known[name], await _defaults(rig, name), prefix, moves=name in moves)
+            try:
+                yield made
+            finally:
+                made.end()
+    except BaseExceptionGroup as errors:
+        if len(errors.exceptions) > 1:
+            raise
+        raise errors.exceptions[0] from None
+
+
+async def serve(records: Gateway, address: ListenAddress) -> None:
+    """Answer Channel Access clients until cancelled.
+
+    Beacons go to the loopback interface when that is where the gateway listens, and otherwise where EPICS_CAS_* says.
+    """
+    os.environ["EPICS_CA_SERVER_PORT"] = str(address.port)
+    if address.host.startswith("127."):
+        os.environ["EPICS_CAS_AUTO_BEACON_ADDR_LIST"] = "NO"
+        os.environ["EPICS_CAS_BEACON_ADDR_LIST"] = address.host
+    logging.getLogger("caproto").setLevel(logging.CRITICAL)  # it logs every refused put with a traceback
+    context = Context(records.variables, [address.host])
+    records.circuits = context.circuits
+    await context.run()
+
+
+async def _defaults(rig: Rig, name: str) -> tuple[float, float]:
+    """Return the velocity and acceleration of a move that names none."""
+    async with rig.watch(name) as axis:
+        try:
+            preview = await axis.preview(distance=0)
+        except LdcndError:
+            return MOTIONLESS
+    return preview.velocity or MOTIONLESS[0], preview.acceleration or MOTIONLESS[1]

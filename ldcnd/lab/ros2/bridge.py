@@ -1,0 +1,142 @@
+"""The bridge: what a rig publishes becomes joint states and diagnostics. Nothing goes the other way."""
+
+import asyncio
+import math
+import secrets
+import time
+from collections.abc import Mapping
+from contextlib import AsyncExitStack
+
+from ldcnd.client.rig import Rig
+from ldcnd.contract.condition import Alarm, Place, assess
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import (
+    FaultSample,
+    PositionSample,
+    Quality,
+    Sample,
+    StateSample,
+    VelocitySample,
+)
+from ldcnd.lab.ros2.cdr import DIAGNOSTIC_ARRAY, JOINT_STATE, DiagnosticArray, DiagnosticStatus, JointState
+from ldcnd.lab.ros2.graph import Node, Publisher, advertise
+from ldcnd.net.session import Session
+
+SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "rev": math.tau}
+"""Metres or radians in a unit; axes in other units have no joint."""
+FRESH_NS = 200_000_000
+"""Maximum age of a velocity relative to the position that it accompanies."""
+PERIOD_S = 1.0
+"""Between two reports on all axes, in seconds."""
+SILENT_NS = 5_000_000_000
+"""An axis whose last state is older is stale."""
+OK, WARN, ERROR, STALE = range(4)
+LEVELS = {Alarm.NONE: OK, Alarm.MINOR: WARN, Alarm.MAJOR: ERROR, Alarm.INVALID: ERROR}
+NOT_REPORTED = "its state is not reported any more"
+
+
+class Bridge:
+    """The axes of a rig, as messages.
+
+    Attributes:
+        axes: what they are, by name.
+    """
+
+    def __init__(self, rig: str, axes: Mapping[str, AxisInfo]) -> None:
+        self._rig = rig
+        self.axes = axes
+        self._velocities: dict[str, VelocitySample] = {}
+        self._states: dict[str, StateSample] = {}
+        self._faults: dict[str, FaultSample] = {}
+
+    def take(self, axis: str, sample: Sample) -> JointState | None:
+        """Take a sample; return the joint state that it makes, if it is a position that was measured."""
+        match sample:
+            case VelocitySample():
+                self._velocities[axis] = sample
+            case StateSample():
+                self._states[axis] = sample
+            case FaultSample():
+                self._faults[axis] = sample
+            case PositionSample() if sample.unit in SI and self._is_known(axis, sample):
+                scale = SI[sample.unit]  # of the daemon that has measured it, which may have another unit than before
+                velocity = self._velocities.get(axis)
+                is_fresh = (
+                    velocity is not None
+                    and velocity.unit == f"{sample.unit}/s"
+                    and abs(sample.t - velocity.t) <= FRESH_NS
+                )
+                velocities = (velocity.value * scale,) if velocity and is_fresh else ()
+                return JointState(sample.t, (axis,), (sample.value * scale,), velocities)
+        return None
+
+    def diagnostics(self, now_ns: int) -> DiagnosticArray:
+        """Return a report on every axis."""
+        return DiagnosticArray(now_ns, tuple(self._status(name, now_ns) for name in self.axes))
+
+    def _is_known(self, axis: str, sample: PositionSample) -> bool:
+        """Tell whether a position says where the axis is: a joint state has no place for a reservation."""
+        state = self._states.get(axis)
+        if sample.quality is Quality.BAD or state is None:
+            return False
+        return assess(state, self._faults.get(axis)).place is Place.KNOWN
+
+    def _status(self, axis: str, now_ns: int) -> DiagnosticStatus:
+        info, state, faults = self.axes[axis], self._states.get(axis), self._faults.get(axis)
+        active = faults.active if faults else ()
+        is_old = state is not None and now_ns - state.t > SILENT_NS
+        condition = assess(state, faults, silence=NOT_REPORTED if is_old else "")
+        values = (
+            ("place", condition.place.value),
+            *((fault.code, fault.text) for fault in active),
+            *((trouble.short, trouble.text) for trouble in condition.troubles),
+        )
+        level = STALE if state is None or is_old else LEVELS[condition.alarm]
+        message = condition.summary
+        return DiagnosticStatus(level, f"{self._rig}: {axis}", message, f"{info.bus}/{info.address}", values)
+
+
+async def run_bridge(rig: Rig, session: Session, axes: tuple[str, ...], domain: int) -> None:
+    """Publish until cancelled.
+
+    Args:
+        rig: the rig.
+        session: with the router of the ROS graph.
+        axes: which axes; all of them when none is named.
+        domain: the ROS domain.
+    """
+    infos = {info.axis: info for info in await rig.describe() if not axes or info.axis in axes}
+    bridge = Bridge(rig.name, infos)
+    node = Node(domain, f"ldcnd_{rig.name}", secrets.token_hex(16))
+    async with AsyncExitStack() as declared:
+        declared.push_async_callback((await session.declare_token(node.token)).close)
+        publishers: list[Publisher] = []
+        for entity, (topic, message) in enumerate(
+            (("/joint_states", JOINT_STATE), ("/diagnostics", DIAGNOSTIC_ARRAY)), 1
+        ):
+            publisher, token = await advertise(session, node, entity, topic, message)
+            declared.push_async_callback(token.close)
+            publishers.append(publisher)
+        async with asyncio.TaskGroup() as group:
+            group.create_task(_joints(rig, bridge, publishers[0]), name="joint states")
+            group.create_task(_descriptions(rig, bridge, axes), name="descriptions")
+            group.create_task(_diagnostics(bridge, publishers[1]), name="diagnostics")
+
+
+async def _descriptions(rig: Rig, bridge: Bridge, axes: tuple[str, ...]) -> None:
+    async for infos in rig.follow_descriptions():
+        bridge.axes = {name: info for name, info in infos.items() if not axes or name in axes}
+
+
+async def _joints(rig: Rig, bridge: Bridge, publisher: Publisher) -> None:
+    async with rig.samples() as samples:
+        async for axis, sample in samples:
+            if axis in bridge.axes and (message := bridge.take(axis, sample)):
+                publisher.publish(message.payload, message.t)
+
+
+async def _diagnostics(bridge: Bridge, publisher: Publisher) -> None:
+    while True:
+        await asyncio.sleep(PERIOD_S)
+        now_ns = time.time_ns()
+        publisher.publish(bridge.diagnostics(now_ns).payload, now_ns)

@@ -1,0 +1,106 @@
+"""A node and its publishers as rmw_zenoh shows them: key expressions, liveliness tokens, attachments.
+
+After the design document of rmw_zenoh for ROS 2 Jazzy and later. Not tested against rmw_zenoh itself.
+"""
+
+import struct
+from dataclasses import dataclass
+from itertools import count
+
+from ldcnd.lab.ros2.cdr import MessageType
+from ldcnd.net.session import Declaration, Qos, Session
+
+DEPTH = 10
+"""Of a publisher's history, as its token says; values are not kept."""
+QOS = f"::,{DEPTH}:,:,:,,"
+"""Reliable, volatile, the last ones kept, no deadline, no lifespan: what is default is left out."""
+GID_BYTES = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Node:
+    """A node in the root namespace.
+
+    Attributes:
+        domain: the ROS domain, 0 to 232.
+        name: of the node.
+        session_id: names its session, in hexadecimal.
+    """
+
+    domain: int
+    name: str
+    session_id: str
+
+    @property
+    def token(self) -> str:
+        """The key of its liveliness token."""
+        return f"@ros2_lv/{self.domain}/{self.session_id}/0/0/NN/%/%/{self.name}"
+
+    def publisher_token(self, entity: int, topic: str, message: MessageType) -> str:
+        """Return the key of the liveliness token of one of its publishers, such as of `/joint_states`."""
+        mangled = topic.replace("/", "%")
+        return (
+            f"@ros2_lv/{self.domain}/{self.session_id}/0/{entity}/MP/%/%/{self.name}/{mangled}"
+            f"/{message.name}/{message.type_hash}/{QOS}"
+        )
+
+    def topic_key(self, topic: str, message: MessageType) -> str:
+        """Return the key on which a topic is published."""
+        return f"{self.domain}/{topic.strip('/')}/{message.name}/{message.type_hash}"
+
+
+class Publisher:
+    """A publisher of one topic; made by `advertise`."""
+
+    def __init__(self, session: Session, key: str, gid: bytes) -> None:
+        self._session = session
+        self._key = key
+        self._gid = gid
+        self._numbers = count(1)
+
+    def publish(self, payload: bytes, t: int) -> None:
+        """Publish a message.
+
+        Args:
+            payload: in CDR.
+            t: when it was made, UTC in ns since 1970.
+        """
+        attachment = attachment_of(next(self._numbers), t, self._gid)
+        self._session.publish(self._key, payload, encoding="", qos=Qos.TELEMETRY, attachment=attachment)
+
+
+async def advertise(
+    session: Session, node: Node, entity: int, topic: str, message: MessageType
+) -> tuple[Publisher, Declaration]:
+    """Show a publisher in the graph; it vanishes with the declaration or the session.
+
+    Args:
+        session: with the router of the ROS graph.
+        node: whose publisher.
+        entity: its number within the node, from 1.
+        topic: such as `/joint_states`.
+        message: what it publishes.
+    """
+    token = await session.declare_token(node.publisher_token(entity, topic, message))
+    gid = bytes.fromhex(node.session_id).rjust(GID_BYTES, b"\0")[: GID_BYTES - 1] + bytes([entity])
+    return Publisher(session, node.topic_key(topic, message), gid), token
+
+
+def attachment_of(number: int, t: int, gid: bytes) -> bytes:
+    """Return what accompanies a message: its number, its time, and who has sent it, in Zenoh's own serialisation."""
+    return b"".join(
+        (
+            _text("sequence_number"),
+            struct.pack("<q", number),
+            _text("source_timestamp"),
+            struct.pack("<q", t),
+            _text("source_gid"),
+            bytes([len(gid)]),
+            gid,
+        )
+    )
+
+
+def _text(text: str) -> bytes:
+    """Return a short text behind its length."""
+    return bytes([len(text)]) + text.encode()

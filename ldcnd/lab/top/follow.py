@@ -1,0 +1,30 @@
+"""Keeping a view up to date with a daemon that may go away and come back."""
+
+import asyncio
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.leases import ListHolders
+from ldcnd.lab.top.rig_view import RigView, described
+
+CHECK_PERIOD_S = 1.0
+"""Period of queries for the daemon's description and the holders of leases; everything else it publishes by itself."""
+
+
+async def follow(client: RigClient, view: RigView) -> None:
+    """Feed a view until cancelled; a daemon that does not answer is queried again."""
+    loop = asyncio.get_running_loop()
+    async with client.published(lambda sample: view.take(sample, loop.time())):
+        instance = None
+        while True:
+            try:
+                daemon = await client.daemon()
+                if daemon.instance != instance:
+                    for sample in await client.last_published():
+                        view.take(sample, loop.time())
+                    instance = daemon.instance
+                holders = await client.ask(ListHolders())
+                view.describe(described(daemon, await client.axes(), holders))
+            except LdcndError:
+                pass  # the view shows how long the daemon has been silent
+            await asyncio.sleep(CHECK_PERIOD_S)

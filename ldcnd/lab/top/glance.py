@@ -1,0 +1,102 @@
+"""A rig at one moment, as `ldcnd top` shows it and prints it with `--json`."""
+
+from ldcnd.contract.condition import Place, Severity
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality
+
+
+class Glance(Frozen):
+    """The common fields of rows."""
+
+    severity: Severity
+    """The severity of the trouble."""
+    trouble: str
+    """The worst trouble, in words; empty when there is none."""
+
+
+class AxisGlance(Glance):
+    """One axis; what is not known is null."""
+
+    axis: str
+    """Its name."""
+    bus: str
+    """The line it is on."""
+    unit: str
+    """Unit of position and target; velocity is a second of it."""
+    state: AxisState | None
+    """PLCopen state."""
+    moving: Moving
+    """Whether it moves."""
+    position: float | None
+    """Where it is, as far as `place` says so."""
+    place: Place
+    """Whether the position says where it is."""
+    condition: tuple[str, ...]
+    """Everything that is to be said of it, in a few words each, the worst first."""
+    cause: str
+    """What several axes have in common that is wrong, such as their line; empty where the trouble is its own."""
+    shown_position: str
+    """The position in words: in brackets and with its mark where it does not say where the axis is."""
+    shown_state: str
+    """The state in words."""
+    velocity: float | None
+    """How fast it moves."""
+    target: float | None
+    """Where its command ends."""
+    adc_volts: float | None
+    """Its analog input."""
+    quality: Quality | None
+    """How much the position is worth."""
+    age_s: float | None
+    """Age of the position, seconds."""
+    rate_hz: float | None
+    """How often the position came in the last second."""
+    rate_wanted_hz: float | None
+    """The configured rate."""
+    link: LinkState | None
+    """Whether the drive answers."""
+    holder: str | None
+    """Who controls it."""
+
+
+class BusGlance(Glance):
+    """One line."""
+
+    bus: str
+    """Its name."""
+    cause: str
+    """As that of the axes that it concerns."""
+    up: bool
+    """Its drives are polled."""
+    utilisation: float
+    """Share of the last second for which bytes were on the wire."""
+    exchanges_per_s: float | None
+    """Requests in a second; null before the second report."""
+    errors: int
+    """Exchanges that brought nothing to be trusted, since the daemon started."""
+    resent: int
+    """Exchanges sent again, since then."""
+    poll_p99_s: float | None
+    """99 % of its polls ended within this time after they were due, seconds."""
+    stop_longest_s: float | None
+    """The longest that a stop has taken."""
+
+
+class RigGlance(Frozen):
+    """A rig; axes and lines with the highest severity come first."""
+
+    rig: str
+    """Its name."""
+    version: str | None
+    """Of its daemon; null when none answers."""
+    trouble: str
+    """Troubles of the rig as a whole; empty when there are none."""
+    axes: tuple[AxisGlance, ...]
+    """All of them."""
+    buses: tuple[BusGlance, ...]
+    """All of them."""
+
+    def count(self, severity: Severity) -> int:
+        """Return how many causes have this severity: what several axes have in common counts once."""
+        causes = {row.cause or f"{row.axis}: {row.trouble}" for row in self.axes if row.severity is severity}
+        return len(causes | {row.cause for row in self.buses if row.severity is severity})

@@ -1,0 +1,203 @@
+"""The latest values that a rig publishes, and their summary; uses no terminal and no clock.
+
+Samples are kept as they come and decoded when they are shown: a rig publishes many more than are read.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+from ldcnd.contract.codec import decode_received
+from ldcnd.contract.condition import SHARED, Kind, Severity, Trouble, assess, line_troubles
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.health import BusHealth, LaneHealth
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.leases import HolderList
+from ldcnd.contract.meta import AxisInfo, DaemonInfo
+from ldcnd.contract.samples import (
+    AdcSample,
+    FaultSample,
+    Moving,
+    PositionSample,
+    StateSample,
+    TelemetryItem,
+    VelocitySample,
+)
+from ldcnd.lab.top.glance import AxisGlance, BusGlance, RigGlance
+from ldcnd.net.session import Sample, SampleKind
+
+SILENT_S = 3.0
+"""Time without a report after which a daemon is shown as silent: three reports."""
+
+ModelT = TypeVar("ModelT", bound=Frozen)
+
+
+@dataclass(frozen=True, slots=True)
+class Description:
+    """The daemon's last answers to queries.
+
+    Attributes:
+        daemon: itself.
+        axes: in the order in which they are shown.
+        holders: who controls which axis; an axis that is not controlled is missing.
+    """
+
+    daemon: DaemonInfo
+    axes: tuple[AxisInfo, ...]
+    holders: Mapping[str, str]
+
+
+def described(daemon: DaemonInfo, axes: list[AxisInfo], holders: HolderList) -> Description:
+    """Return the answers as one description."""
+    held = {holder.axis: holder.client for holder in holders.holders if holder.client is not None}
+    return Description(daemon, tuple(axes), held)
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """A sample and when it came, by the loop's clock."""
+
+    sample: Sample
+    at_s: float
+
+
+class RigView:
+    """The known state of one rig.
+
+    Args:
+        rig: its name.
+        now_s: when the view is made, by the clock whose times `take` and `glance` are given.
+    """
+
+    def __init__(self, rig: str, now_s: float) -> None:
+        self._keys = Keys(rig)
+        self._began_at_s = now_s
+        self._description: Description | None = None
+        self._kept: dict[str, _Kept] = {}
+        self._report_before: dict[str, BusHealth] = {}
+
+    def take(self, sample: Sample, now_s: float) -> None:
+        """Keep a sample in the place of the one before."""
+        if sample.kind is SampleKind.DELETE:
+            self._kept.pop(sample.key, None)
+            return
+        before = self._kept.get(sample.key)
+        if before and sample.key.startswith(f"{self._keys.health}/"):
+            report = self._decoded(before, BusHealth)
+            self._report_before[report.bus] = report
+        self._kept[sample.key] = _Kept(sample, now_s)
+
+    def describe(self, description: Description) -> None:
+        """Take what the daemon says of its rig."""
+        self._description = description
+
+    def glance(self, now_s: float) -> RigGlance:
+        """Return the rig as it is now, the most urgent first."""
+        description = self._description
+        trouble = self._rig_trouble(now_s)
+        axes = description.axes if description else ()
+        names = description.daemon.buses if description else ()
+        reports = {name: report for name in names if (report := self._latest(self._keys.bus_health(name), BusHealth))}
+        rows = [self._axis(axis, reports.get(axis.bus), now_s, trouble if self._description else "") for axis in axes]
+        lines = [self._bus(report) for report in reports.values()]
+        return RigGlance(
+            rig=self._keys.rig,
+            version=description.daemon.version if description else None,
+            trouble=trouble,
+            axes=tuple(sorted(rows, key=lambda row: -row.severity)),
+            buses=tuple(sorted(lines, key=lambda line: -line.severity)),
+        )
+
+    def _rig_trouble(self, now_s: float) -> str:
+        report = self._kept.get(self._keys.health)
+        silent_s = now_s - (report.at_s if report else self._began_at_s)
+        if silent_s > SILENT_S:
+            return f"the daemon has been silent for {silent_s:.0f} s: what is shown is what it said last"
+        return "" if self._description else "waiting for the daemon"
+
+    def _axis(self, info: AxisInfo, line: BusHealth | None, now_s: float, silent: str) -> AxisGlance:
+        position_key = self._keys.telemetry(info.axis, TelemetryItem.POSITION)
+        position = self._latest(position_key, PositionSample)
+        velocity = self._latest(self._keys.telemetry(info.axis, TelemetryItem.VELOCITY), VelocitySample)
+        adc = self._latest(self._keys.telemetry(info.axis, TelemetryItem.ADC), AdcSample)
+        fault = self._latest(self._keys.telemetry(info.axis, TelemetryItem.FAULT), FaultSample)
+        state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
+        health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
+        age_s = now_s - self._kept[position_key].at_s if position else None
+        condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent)
+        worst = next(iter(condition.troubles), None)
+        news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
+        return AxisGlance(
+            axis=info.axis,
+            bus=info.bus,
+            unit=info.unit,
+            state=state.state if state else None,
+            moving=state.moving if state and condition.live else Moving.UNKNOWN,
+            position=position.value if position else None,
+            place=condition.place,
+            condition=condition.notes,
+            cause=cause_of(worst, info.bus),
+            shown_position=condition.position(f"{position.value:.3f}" if position else None, info.unit, age_s),
+            shown_state=condition.summary,
+            velocity=velocity.value if velocity else None,
+            target=state.command.target if state and state.command else None,
+            adc_volts=adc.volts if adc else None,
+            quality=position.quality if position else None,
+            age_s=age_s,
+            rate_hz=health.rate_hz if health else None,
+            rate_wanted_hz=health.rate_wanted_hz if health else None,
+            link=state.link if state else None,
+            holder=self._description.holders.get(info.axis) if self._description else None,
+            severity=worst.severity if worst else Severity.NOTICE if news else Severity.FINE,
+            trouble=worst.text if worst else news,
+        )
+
+    def _bus(self, report: BusHealth) -> BusGlance:
+        before = self._report_before.get(report.bus)
+        period_s = (report.t - before.t) / 1e9 if before else 0.0
+        errors = _errors(report)
+        grown = errors - _errors(before) if before else 0
+        severity, trouble = Severity.FINE, ""
+        if down := line_troubles(up=report.up):
+            severity, trouble = down[0].severity, down[0].text
+        elif grown > 0:
+            severity, trouble = Severity.NOTICE, f"{grown} exchanges brought nothing to be trusted in the last second"
+        poll, stop = _lane(report, "poll"), _lane(report, "stop")
+        return BusGlance(
+            bus=report.bus,
+            cause=f"{Kind.LINE_DOWN}: {report.bus}" if down else f"{report.bus}: {trouble}",
+            up=report.up,
+            utilisation=report.utilisation,
+            exchanges_per_s=(report.exchanges - before.exchanges) / period_s if before and period_s > 0 else None,
+            errors=errors,
+            resent=report.resent,
+            poll_p99_s=poll.p99_s if poll else None,
+            stop_longest_s=stop.longest_s if stop and stop.exchanges else None,
+            severity=severity,
+            trouble=trouble,
+        )
+
+    def _latest(self, key: str, model: type[ModelT]) -> ModelT | None:
+        kept = self._kept.get(key)
+        return self._decoded(kept, model) if kept else None
+
+    @staticmethod
+    def _decoded(kept: _Kept, model: type[ModelT]) -> ModelT:
+        return decode_received(model, kept.sample.payload, kept.sample.encoding)
+
+
+def cause_of(worst: Trouble | None, bus: str) -> str:
+    """Return what an axis has in common with others that is wrong; empty where its trouble is its own."""
+    if worst is None:
+        return ""
+    if worst.kind is Kind.LINE_DOWN:
+        return f"{Kind.LINE_DOWN}: {bus}"
+    return str(worst.kind) if worst.kind in SHARED else ""
+
+
+def _errors(report: BusHealth) -> int:
+    return report.timeouts + report.corrupt_replies + report.rejected_packets
+
+
+def _lane(report: BusHealth, name: str) -> LaneHealth | None:
+    return next((lane for lane in report.lanes if lane.lane == name), None)

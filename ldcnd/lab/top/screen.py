@@ -1,0 +1,151 @@
+"""The screen: follows one rig, shows it a few times a second, and can stop it."""
+
+import asyncio
+from collections.abc import Sequence
+from typing import ClassVar
+
+from rich.text import Text
+from textual.app import App, ComposeResult
+from textual.binding import Binding
+from textual.coordinate import Coordinate
+from textual.widgets import DataTable, Footer, Static
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.commands import Halt, Reset, StopReply
+from ldcnd.contract.condition import Severity
+from ldcnd.contract.errors import LdcndError
+from ldcnd.lab.top.columns import AXIS_TITLES, BUS_TITLES, NARROW, axis_cells, bus_cells, headline
+from ldcnd.lab.top.follow import follow
+from ldcnd.lab.top.rig_view import RigView
+
+REDRAW_S = 0.25
+WIDE = 130
+"""Columns of a terminal that has room for everything."""
+NAME = "ldcnd top"
+STYLES = {Severity.FINE: "", Severity.NOTICE: "yellow", Severity.WRONG: "bold red"}
+
+
+class TopScreen(App[None]):
+    """One rig.
+
+    Args:
+        client: of the rig; its session outlives the screen.
+    """
+
+    TITLE = "ldcnd"
+    ENABLE_COMMAND_PALETTE = False
+    BINDINGS: ClassVar[list[Binding | tuple[str, str] | tuple[str, str, str]]] = [
+        Binding("s,escape", "stop_all", "STOP all (no emergency stop)", priority=True),
+        Binding("h", "halt_axis", "Halt axis"),
+        Binding("r", "reset_axis", "Reset axis"),
+        Binding("q", "quit", "Quit"),
+    ]
+    CSS = """
+    #headline { padding: 0 1; text-style: bold; }
+    #answer { padding: 0 1; display: none; }
+    #answer.said { display: block; }
+    #axes { height: 1fr; }
+    #buses { height: auto; max-height: 40%; border-top: solid $primary; }
+    """
+
+    def __init__(self, client: RigClient) -> None:
+        super().__init__()
+        self._client = client
+        self._view = RigView(client.rig, asyncio.get_running_loop().time())
+        self._shown: list[str] = []
+        self._laid_out: tuple[int, ...] = ()
+
+    def compose(self) -> ComposeResult:
+        """Lay out the screen."""
+        yield Static(id="headline", markup=False)
+        yield Static(id="answer", markup=False)
+        yield DataTable(id="axes", cursor_type="row", zebra_stripes=True)
+        yield DataTable(id="buses", cursor_type="none")
+        yield Footer()
+
+    def on_mount(self) -> None:
+        """Begin to follow the rig."""
+        self.query_one("#buses", DataTable).add_columns(*BUS_TITLES)
+        self.run_worker(follow(self._client, self._view), name="follow")
+        self.set_interval(REDRAW_S, self._redraw)
+        self._redraw()
+
+    def action_stop_all(self) -> None:
+        """Stop every axis; what became of it is shown above the tables."""
+        self.run_worker(self._stop_all(), name="stop")
+
+    def action_halt_axis(self) -> None:
+        """Halt the axis of the row under the cursor."""
+        self.run_worker(self._send(Halt(client=NAME), "halted"), name="halt")
+
+    def action_reset_axis(self) -> None:
+        """Clear stop latch and faults of the axis of the row under the cursor; nothing moves."""
+        self.run_worker(self._send(Reset(client=NAME), "reset"), name="reset")
+
+    async def _send(self, command: Halt | Reset, done: str) -> None:
+        row = self.query_one("#axes", DataTable).cursor_row
+        if row >= len(self._shown):
+            return
+        axis = self._shown[row]
+        try:
+            await self._client.command(axis, command)
+            self._say(f"{axis}: {done}")
+        except LdcndError as error:
+            self._say(f"{axis}: not {done}: {error.message}")
+
+    async def _stop_all(self) -> None:
+        self._say("stopping all axes ...")
+        try:
+            answer = _stopped(await self._client.stop(client=NAME))
+        except LdcndError as error:
+            answer = f"STOP NOT CONFIRMED: {error.message}. Use the machine's emergency stop."
+        self._say(answer)
+
+    def _columns(self) -> tuple[int, ...]:
+        return NARROW if self.size.width < WIDE else tuple(range(len(AXIS_TITLES)))
+
+    def _say(self, what: str) -> None:
+        answer = self.query_one("#answer", Static)
+        answer.update(what)
+        answer.add_class("said")
+
+    def _redraw(self) -> None:
+        if not self.is_running:
+            return  # the timer outlives the widgets while the screen closes
+        glance = self._view.glance(asyncio.get_running_loop().time())
+        urgent = glance.trouble or glance.count(Severity.WRONG)
+        self.query_one("#headline", Static).update(Text(headline(glance), STYLES[Severity.WRONG] if urgent else ""))
+        self._shown = [row.axis for row in glance.axes]
+        axes, columns = self.query_one("#axes", DataTable), self._columns()
+        if columns != self._laid_out:
+            axes.clear(columns=True)
+            axes.add_columns(*(AXIS_TITLES[column] for column in columns))
+            self._laid_out = columns
+        cells = [(axis_cells(row), row.severity) for row in glance.axes]
+        _fill(axes, [(tuple(row[column] for column in columns), severity) for row, severity in cells])
+        _fill(self.query_one("#buses", DataTable), [(bus_cells(row), row.severity) for row in glance.buses])
+
+
+def _fill(table: "DataTable[Text]", rows: Sequence[tuple[tuple[str, ...], Severity]]) -> None:
+    """Put rows into a table; cursor and scroll position stay where they are."""
+    while table.row_count > len(rows):
+        table.remove_row(table.ordered_rows[-1].key)
+    while table.row_count < len(rows):
+        table.add_row(*(Text() for _ in table.columns))
+    for number, (cells, severity) in enumerate(rows):
+        for column, cell in enumerate(cells):
+            text, place = Text(cell, STYLES[severity]), Coordinate(number, column)
+            before = table.get_cell_at(place)
+            if (before.plain, before.style) != (text.plain, text.style):
+                table.update_cell_at(place, text, update_width=True)
+
+
+def _stopped(reply: StopReply) -> str:
+    """Return what became of a stop."""
+    missing = [axis for axis in reply.axes if axis not in reply.confirmed]
+    if missing:
+        return (
+            f"STOP NOT CONFIRMED BY {', '.join(missing)}: nothing else starts, but use the machine's emergency stop."
+            f" Confirmed by {', '.join(reply.confirmed) or 'none'}."
+        )
+    return f"stopped and latched: {', '.join(reply.confirmed)}"

@@ -1,0 +1,97 @@
+"""From settings to Zenoh's own configuration, and what of it is for ldcnd to see to: files and sockets."""
+
+import base64
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+import zenoh
+
+from ldcnd.contract.errors import SessionError
+from ldcnd.net import zenoh_failures
+from ldcnd.net.zenoh_settings import ZenohSettings
+
+TLS = "transport/link/tls"
+FILES = (
+    f"{TLS}/root_ca_certificate",
+    f"{TLS}/listen_certificate",
+    f"{TLS}/listen_private_key",
+    f"{TLS}/connect_certificate",
+    f"{TLS}/connect_private_key",
+    "transport/auth/usrpwd/dictionary_file",
+)
+"""Settings that name files; Zenoh itself searches for relative ones in the working directory."""
+
+UNIX_SOCKET = "unixsock-stream/"
+FOR_THE_GROUP = 0o660
+"""Zenoh makes sockets that only the daemon's own user can connect to; its group may, then folder and group decide."""
+
+
+def zenoh_config(settings: ZenohSettings) -> zenoh.Config:
+    """Return the configuration for settings.
+
+    Raises:
+        ConfigError: Zenoh does not accept a setting or the configuration file.
+    """
+    default = zenoh.Config()
+    config = default
+    if settings.config_file:
+        try:
+            config = zenoh.Config.from_file(settings.config_file)
+        except zenoh.ZError as error:
+            raise zenoh_failures.config_file_refused(str(error), settings.config_file) from error
+        _resolve_files(config, settings.config_file.parent)
+    wanted = settings.required() | {
+        path: value
+        for path, value in settings.optional().items()
+        if value or not settings.config_file or config.get_json(path) == default.get_json(path)
+    }
+    for path, value in wanted.items():
+        text = json.dumps(value)
+        try:
+            config.insert_json5(path, text)
+        except zenoh.ZError as error:
+            raise zenoh_failures.config_refused(str(error), path, text) from error
+    return config
+
+
+def endpoints(config: zenoh.Config, what: Literal["listen", "connect"]) -> tuple[str, ...]:
+    """Return where a configuration listens or connects; for each mode alike, as ldcnd and its examples say it."""
+    configured = json.loads(config.get_json(f"{what}/endpoints"))
+    if not isinstance(configured, list):
+        return ()
+    return tuple(one if isinstance(one, str) else json.dumps(one) for one in configured)
+
+
+def root_certificate(config: zenoh.Config) -> str | None:
+    """Return the certificates that a configuration trusts, in PEM, as far as they can be read."""
+    inline = json.loads(config.get_json(f"{TLS}/root_ca_certificate_base64"))
+    if isinstance(inline, str):
+        return base64.b64decode(inline).decode("ascii", errors="replace")
+    file = json.loads(config.get_json(f"{TLS}/root_ca_certificate"))
+    try:
+        return Path(file).read_text(encoding="ascii") if isinstance(file, str) else None
+    except (OSError, UnicodeError):
+        return None  # Zenoh has complained about it
+
+
+def share_sockets(listen: Sequence[str]) -> None:
+    """Let the group of this program's user connect to the Unix sockets that it listens on.
+
+    Raises:
+        SessionError: a socket is not there, or not this program's.
+    """
+    for endpoint in listen:
+        if endpoint.startswith(UNIX_SOCKET):
+            try:
+                Path(endpoint.removeprefix(UNIX_SOCKET)).chmod(FOR_THE_GROUP)
+            except OSError as error:
+                raise SessionError(f"{endpoint}: cannot be opened to the group: {error.strerror}") from error
+
+
+def _resolve_files(config: zenoh.Config, folder: Path) -> None:
+    for path in FILES:
+        name = json.loads(config.get_json(path))
+        if isinstance(name, str):
+            config.insert_json5(path, json.dumps(str((folder / name).absolute())))

@@ -1,0 +1,1 @@
+"""For those who run ldcnd: certificates and access, and a line's bytes for Wireshark."""
