@@ -77,7 +77,7 @@ def test_the_wheel_has_the_pages_and_no_tests(twice: list[dict[str, Path]]) -> N
         metadata = wheel.read(next(name for name in names if name.endswith("METADATA"))).decode()
         shipped = {Path(name).stem: wheel.read(name).decode() for name in names if name.startswith("ldcnd/schemas/")}
 
-    assert {f"ldcnd/fault_pages/{code}.md" for code in codes()} <= names
+    assert {f"ldcnd/contract/fault_pages/{code}.md" for code in codes()} <= names
     assert shipped == all_schemas()
     assert "ldcnd/py.typed" in names
     assert {name.partition("/")[0].partition("-")[0] for name in names} == {"ldcnd"}
