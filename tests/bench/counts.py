@@ -74,8 +74,8 @@ def rows(root: Path, before: Path | None) -> "list[Row]":
 def _counts_of(root: Path) -> dict[str, float]:
     own = root / "tests" / "bench" / "counts.py"  # it knows where that checkout has its modules
     done = subprocess.run(  # noqa: S603
-        (sys.executable, "-P", str(own if own.exists() else __file__)), cwd=root, env=os.environ | {"PYTHONPATH": str(root)}, capture_output=True,
-        text=True, timeout=600, check=False,
+        (sys.executable, "-P", str(own if own.exists() else __file__)),
+        cwd=root, env=os.environ | {"PYTHONPATH": str(root)}, capture_output=True, text=True, timeout=600, check=False,
     )  # fmt: skip
     if done.returncode:
         print(f"costs of {root} not counted: {done.stderr[-500:]}", flush=True)
