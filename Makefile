@@ -31,6 +31,7 @@ check: .venv/ready
 	.venv/bin/mypy
 	.venv/bin/lint-imports
 	.venv/bin/ldcnd schema check
+	$(PY) -m tests.words
 
 fix: .venv/ready
 	.venv/bin/ldcnd schema client

@@ -109,7 +109,7 @@ class AxisVerbs(ABC):
             position: Target in axis units; on an axis with a modulo any turn of it is meant.
             velocity: Speed in units a second; the axis default when missing.
             acceleration: Acceleration in units a second squared; the axis default when missing.
-            direction: Which way to turn, on an axis with a modulo only; the shortest when missing.
+            direction: Way to turn, on an axis with a modulo only; the shortest when missing.
         """
         return await self._start(
             lambda: MoveAbsolute(
@@ -216,7 +216,7 @@ class AxisVerbs(ABC):
             timeout_s: Longest search, in seconds; moving off a limit switch first counts as a search of its own.
             distance: Longest search, in axis units; a missing one is as far as the velocity goes in that time.
             stop: How the motor stops there.
-            move_to: Where to go afterwards, in axis units; a missing one stays where the motor stopped.
+            move_to: Position to move to afterwards, in axis units; without one the axis stays where the motor stopped.
         """
         return await self._start(
             lambda: Home(
@@ -247,7 +247,7 @@ class AxisVerbs(ABC):
         Args:
             sources: Signals that latch: any change of a limit switch input, an index pulse, the current limit; the
                 first counts.
-            position: Where the move ends at the latest, in axis units; needs a referenced axis.
+            position: Position at which the move ends at the latest, in axis units; needs a referenced axis.
             distance: How far it goes at most, in axis units, signed.
             velocity: Speed in units a second; the axis default when missing. On the index at most 0.75 of an index
                 width in a servo cycle. The latched position is surer the slower it is.
@@ -361,7 +361,7 @@ class AxisVerbs(ABC):
         """Set a pulse counter to 0; command pulses must be stopped, and for the feedback counter the motor must stand.
 
         Args:
-            counter: Which counter.
+            counter: Counter to clear.
         """
         return await self._send(lambda: ClearCounter(counter=counter))
 
@@ -385,7 +385,7 @@ class AxisVerbs(ABC):
         """Read monitors once, published or not.
 
         Args:
-            monitors: Which; none stands for all.
+            monitors: Monitors to read; none stands for all.
         """
         return await self._send(lambda: ReadMonitors(monitors=monitors))
 
@@ -488,7 +488,7 @@ class AxisVerbs(ABC):
 
         Args:
             position: A move to this position, in axis units.
-            direction: With a position on an axis with a modulo: which way to turn.
+            direction: Way to turn to a position on an axis with a modulo.
             distance: A move by this distance, in axis units.
             velocity: Speed of the move; alone: a motion at this velocity, signed. Units a second.
             acceleration: Units a second squared; the axis default when missing.
@@ -505,7 +505,7 @@ class AxisVerbs(ABC):
         """Publish what an observer has found in the motions of an axis, on `tele/<axis>/shadow`; it stops nothing.
 
         Args:
-            t: Of the last position that the observer has seen, UTC in ns since 1970.
+            t: Instant of the last position that the observer has seen, UTC in ns since 1970.
             learning: It still learns what is usual.
             judged: Motions that have taught or were judged since the observer began.
             figures: Those of which enough is known.

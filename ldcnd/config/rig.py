@@ -17,7 +17,7 @@ SimulatedLine = Annotated[SerializeAsAny[SimulatedLineConfig], Variants(known.si
 
 
 class ZenohConfig(Frozen):
-    """Where the daemon meets its clients."""
+    """Zenoh session over which the daemon meets its clients."""
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     """Endpoints to listen on; the default is this machine only, or what `config_file` says."""
@@ -48,7 +48,7 @@ class CapturesConfig(Frozen):
     """The captures of lines on which something has gone wrong: a drive's fault, a loss, a line that acts too late."""
 
     directory: Path | None = None
-    """Where captures are written; `captures` in `state_dir` if that is set, else nothing is written."""
+    """Directory for captures; `captures` in `state_dir` if that is set, else nothing is written."""
     files: int = Field(default=20, ge=1, le=10_000)
     """Maximum number; the oldest are deleted."""
     total_mb: int = Field(default=200, ge=1, le=100_000)
@@ -59,7 +59,7 @@ class TelemetryConfig(Frozen):
     """How telemetry leaves."""
 
     encoding: Literal["msgpack", "json"] = "msgpack"
-    """json can be read by every Zenoh tool; msgpack is smaller."""
+    """Encoding of samples: json can be read by every Zenoh tool; msgpack is smaller."""
 
 
 class HeartbeatConfig(Frozen):
@@ -68,7 +68,7 @@ class HeartbeatConfig(Frozen):
     port: str | None = None
     """A serial port that carries nothing else; best a name below /dev/serial/by-id."""
     signal: Literal["rts", "dtr"] = "rts"
-    """Which output of the port."""
+    """Output of the port that carries the signal."""
     gpio: str | None = Field(default=None, pattern=r"^gpiochip[0-9]+:[0-9]+$")
     """A line of a GPIO chip, as "gpiochip0:17"; needs the extra `gpio`."""
     file: Path | None = None
@@ -93,7 +93,7 @@ class RigConfig(Frozen):
     rig: Name
     """Second chunk of every key; unique on the site."""
     zenoh: ZenohConfig = ZenohConfig()
-    """Where the daemon meets its clients."""
+    """Zenoh session over which the daemon meets its clients."""
     daemon: DaemonConfig = DaemonConfig()
     """How the daemon's process runs."""
     telemetry: TelemetryConfig = TelemetryConfig()
@@ -101,8 +101,8 @@ class RigConfig(Frozen):
     authority: Literal["open", "leased"] = "open"
     """Whether a lease is needed to move anything; readers and stops never need one."""
     state_dir: Path | None = None
-    """Where the daemon keeps what must outlive it: the wear of EEPROMs, faults of axes, and with start = "adopt" \
-their references; without it EEPROM is not written."""
+    """Directory in which the daemon keeps what must outlive it: the wear of EEPROMs, faults of axes, and with \
+start = "adopt" their references; without it EEPROM is not written."""
     captures: CapturesConfig = CapturesConfig()
     """Captures that the daemon writes by itself."""
     heartbeat: HeartbeatConfig | None = None

@@ -28,7 +28,7 @@ class ControlRequest(Frozen):
     """Take control of axes."""
 
     axes: tuple[str, ...] = Field(min_length=1, max_length=MOST_AXES)
-    """Which."""
+    """Axes to take."""
     force: bool = False
     """Take them from their holders, too."""
 

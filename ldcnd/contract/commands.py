@@ -232,7 +232,8 @@ class CommandReply(Frozen):
     duty: float | None = None
     """Duty as the drive's register makes it, -1 to 1."""
     since: int | None = None
-    """When the motion was accepted, as in the command of `state`; null for a command that begins none."""
+    """Instant at which the motion was accepted, the same as in the command of `state`; null for a command that
+    begins none."""
 
 
 class StopReply(Frozen):
@@ -261,21 +262,21 @@ class ReceivedError(Frozen):
     """Why a query was not carried out, as a client reads it: a newer daemon may have more codes."""
 
     code: str = Field(description="what went wrong")
-    message: str = Field(description="one sentence for a person: what, to whom, which value, which limit")
-    retryable: bool = Field(description="the same request may be sent again without harm and may then succeed")
-    axis: str | None = Field(default=None, description="the axis concerned")
-    value: float | str | None = Field(default=None, description="the offending value, in the unit that the caller used")
-    limit: float | str | None = Field(default=None, description="the limit that the value broke")
-    nearest: float | None = Field(default=None, description="the closest value that would be accepted")
-    remedy: str | None = Field(default=None, description="what to do about it")
-    steps: tuple[RemedyStep, ...] = Field(default=(), description="the commands that the remedy names, in their order")
-    page: str | None = Field(default=None, description="where its page is, below a console or the documentation")
+    message: str = Field(description="Sentence for a person: what, to whom, which value, which limit.")
+    retryable: bool = Field(description="Whether the same request may be sent again without harm and may then succeed.")
+    axis: str | None = Field(default=None, description="Axis concerned.")
+    value: float | str | None = Field(default=None, description="Offending value, in the unit that the caller used.")
+    limit: float | str | None = Field(default=None, description="Limit that the value broke.")
+    nearest: float | None = Field(default=None, description="Closest value that would be accepted.")
+    remedy: str | None = Field(default=None, description="Remedy: what to do about it.")
+    steps: tuple[RemedyStep, ...] = Field(default=(), description="Commands that the remedy names, in their order.")
+    page: str | None = Field(default=None, description="Path of its page below a console or the documentation.")
 
 
 class ErrorReply(ReceivedError):
     """Why a query was not carried out; sent as JSON in an error reply, whatever the query's encoding."""
 
-    code: ErrorCode = Field(description="what went wrong, out of a closed list")
+    code: ErrorCode = Field(description="Code of the error, out of a closed list.")
 
 
 # -- motion ----------------------------------------------------------------------------------------------------------
@@ -314,7 +315,7 @@ class Move(AxisCommand[CommandReply]):
 
 
 class Direction(StrEnum):
-    """Which way an axis with a modulo turns to a position; PLCopen's directions."""
+    """Way in which an axis with a modulo turns to a position; PLCopen's directions."""
 
     SHORTEST_WAY = "shortest_way"
     POSITIVE = "positive"
@@ -333,7 +334,7 @@ class MoveAbsolute(Move):
     acceleration: float | None = Field(default=None, gt=0)
     """Acceleration in units a second squared; the axis default when missing."""
     direction: Direction | None = None
-    """Which way to turn, on an axis with a modulo only; the shortest when missing."""
+    """Way to turn, on an axis with a modulo only; the shortest when missing."""
 
 
 class MoveRelative(Move):
@@ -461,7 +462,7 @@ servo cycle: a faster search is refused with the nearest velocity."""
     stop: HomeStop | None = None
     """How the motor stops there."""
     move_to: float | None = None
-    """Where to go afterwards, in axis units; a missing one stays where the motor stopped."""
+    """Position to move to afterwards, in axis units; without one the axis stays where the motor stopped."""
 
 
 class ProbeSource(StrEnum):
@@ -495,7 +496,7 @@ class Probe(AxisCommand[CommandReply]):
     sources: tuple[ProbeSource, ...] = Field(min_length=1, max_length=4)
     """Signals that latch: any change of a limit switch input, an index pulse, the current limit; the first counts."""
     position: float | None = None
-    """Where the move ends at the latest, in axis units; needs a referenced axis."""
+    """Position at which the move ends at the latest, in axis units; needs a referenced axis."""
     distance: float | None = None
     """How far it goes at most, in axis units, signed."""
     velocity: float | None = Field(default=None, gt=0)
@@ -631,7 +632,7 @@ class Cause(Frozen):
     steps: tuple[RemedyStep, ...] = ()
     """The commands that the remedy names, in their order."""
     page: str | None = None
-    """Where its page is, below a console or the documentation."""
+    """Path of its page below a console or the documentation."""
 
 
 class WhyReply(Frozen):
@@ -670,9 +671,10 @@ class PreviewReply(Frozen):
     obstacles: tuple[str, ...]
     """The other obstacles now; see `why`."""
     position: float | None = None
-    """Where it would end, in axis units; null when it has no end."""
+    """Position at the end, in axis units; null when the motion has no end."""
     approach_from: float | None = None
-    """Where it would go first, to come to its end from the configured side; null when one motion will do."""
+    """Position to which the axis would go first, to come to its end from the configured side; null when one motion
+    will do."""
     velocity: float | None = None
     """Velocity that the registers would hold, units a second."""
     velocity_error: float | None = None
@@ -682,11 +684,11 @@ class PreviewReply(Frozen):
     acceleration_error: float | None = None
     """Held minus requested acceleration, units a second squared."""
     duration_s: float | None = None
-    """Of the profile, without settling; null when it has no end."""
+    """Duration of the profile, in seconds, without settling; null when it has no end."""
     packets: tuple[str, ...] = ()
     """The packets that would be sent, in hexadecimal."""
     bus_s: float | None = None
-    """For how long that would occupy the line at most, in seconds."""
+    """Longest time for which the move would occupy the line, in seconds."""
 
 
 class Preview(Command[PreviewReply]):
@@ -699,7 +701,7 @@ class Preview(Command[PreviewReply]):
     position: float | None = None
     """A move to this position, in axis units."""
     direction: Direction | None = None
-    """With a position on an axis with a modulo: which way to turn."""
+    """Way to turn to a position on an axis with a modulo."""
     distance: float | None = None
     """A move by this distance, in axis units."""
     velocity: float | None = None
@@ -723,7 +725,7 @@ class ReportShadow(Command[ShadowReply]):
     effect = Effect.QUESTION
 
     t: int = Field(ge=0, le=LATEST_NS)
-    """Of the last position that the observer has seen, UTC in ns since 1970."""
+    """Instant of the last position that the observer has seen, UTC in ns since 1970."""
     learning: bool
     """It still learns what is usual."""
     judged: int = Field(ge=0, le=LARGEST_INTEGER)

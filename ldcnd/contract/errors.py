@@ -175,7 +175,7 @@ class LdcndError(Exception):
 
     @property
     def page(self) -> str | None:
-        """Where its page is, below a console or the documentation: what to check, how to clear it."""
+        """Path of its page below a console or the documentation: what to check, how to clear it."""
         return page_of(self.code)
 
 

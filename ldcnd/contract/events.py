@@ -51,7 +51,7 @@ class CommandEvent(Frozen):
     """A command got further: published on `tele/<axis>/event`."""
 
     t: int
-    """When, UTC in ns since 1970; published up to 5 ms later."""
+    """Instant of the event, UTC in ns since 1970; published up to 5 ms later."""
     seq: int = Field(ge=0)
     """Grows by one with every event of the axis."""
     run: str
@@ -61,7 +61,7 @@ class CommandEvent(Frozen):
     axis: str
     """The axis."""
     command_id: str
-    """Which command."""
+    """Id of the command."""
     verb: str
     """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
     motion that did not settle, `reference` for what became of a kept reference, `drive_changed` for a drive that was
@@ -78,7 +78,7 @@ class CommandEvent(Frozen):
     code: str | None = None
     """The error code, when there is one."""
     position: float | None = None
-    """Where the axis was at the end of a motion, in axis units, measured after it; null where none was measured."""
+    """Position at the end of a motion, in axis units, measured after it; null where none was measured."""
     following_error: float | None = None
     """Target minus that position, in axis units; without a target what the drive reports, null where it does not."""
     settled: bool | None = None
@@ -89,7 +89,7 @@ class CommandOutcome(Frozen):
     """The outcome of a command: the reply to `@cmd/_/outcome`."""
 
     command_id: str
-    """Which command."""
+    """Id of the command."""
     axis: str
     """The axis."""
     verb: str
@@ -99,11 +99,11 @@ class CommandOutcome(Frozen):
     reason: str | None
     """Why, when it did not end as requested."""
     position: float | None = None
-    """As in the event of its end."""
+    """Position at the end, as in the event of the end."""
     following_error: float | None = None
-    """As in the event of its end."""
+    """Following error at the end."""
     settled: bool | None = None
-    """As in the event of its end."""
+    """Whether the axis settled."""
 
 
 class EventList(Frozen):
@@ -112,7 +112,7 @@ class EventList(Frozen):
     run: str
     """The run of the daemon that they are of."""
     first_number: int = Field(ge=0)
-    """From here on nothing was left out; above the requested number when that was discarded."""
+    """Number from which on nothing was left out; above the requested number when that was discarded."""
     next_number: int = Field(ge=0)
     """First number of the next request."""
     end_number: int = Field(ge=0)
@@ -129,7 +129,7 @@ class ReadOutcome(Command[CommandOutcome]):
     effect = Effect.QUESTION
 
     command_id: str
-    """Which command."""
+    """Id of the command."""
 
 
 class ReadEvents(Command[EventList]):
@@ -140,7 +140,7 @@ class ReadEvents(Command[EventList]):
     effect = Effect.QUESTION
 
     axis: str | None = None
-    """Only this axis."""
+    """Axis whose events are wanted; none means all."""
     count: int = Field(default=100, ge=1, le=1000)
     """Maximum number, and never more than one reply takes."""
     from_number: int | None = Field(default=None, ge=0, le=LARGEST_INTEGER)

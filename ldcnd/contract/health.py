@@ -80,7 +80,7 @@ class BusHealth(Frozen):
     """One line and its axes: published each second on `meta/health/<bus>`."""
 
     t: int
-    """When, UTC in ns since 1970."""
+    """Instant of the sample, UTC in ns since 1970."""
     seq: int = Field(ge=0)
     """Grows by one with every report."""
     bus: str
@@ -128,7 +128,7 @@ class DaemonHealth(Frozen):
     """The daemon's process: published each second on `meta/health`."""
 
     t: int
-    """When, UTC in ns since 1970."""
+    """Instant of the sample, UTC in ns since 1970."""
     seq: int = Field(ge=0)
     """Grows by one with every report."""
     loop_lag_s: float = Field(ge=0)

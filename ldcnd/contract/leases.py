@@ -13,7 +13,7 @@ class LeaseReply(Frozen):
     """A lease that holds."""
 
     lease: str
-    """To be carried by every command."""
+    """Lease that every command has to carry."""
     client: str
     """Who holds it."""
     axes: tuple[str, ...]
@@ -31,9 +31,9 @@ class Acquire(Command[LeaseReply]):
     client: str = Field(min_length=1, max_length=64)
     """The requester: a name for people, shown to others and in the log."""
     axes: tuple[str, ...] = ()
-    """Which axes, or groups of them; none means all."""
+    """Axes, or groups of them, to control; none means all."""
     lease_s: float = Field(default=1.0, ge=SHORTEST_LEASE_S, le=60)
-    """For how long, in seconds; it must be renewed before."""
+    """Duration of the lease, in seconds; it must be renewed before its end."""
     force: bool = False
     """Take control from its present holder; that is logged."""
 
@@ -42,7 +42,7 @@ class LeaseRequest(Frozen):
     """Renew or release a lease."""
 
     lease: str
-    """As the reply to acquire named it."""
+    """Lease that the reply to acquire named."""
 
 
 class Renew(LeaseRequest, Command[LeaseReply]):
@@ -61,7 +61,7 @@ class Release(Command[LeaseReply]):
     about = About.RIG
 
     lease: str
-    """As the reply to acquire named it."""
+    """Lease that the reply to acquire named."""
     leave_running: bool = False
     """Let what moves go on to its own end, without a holder of control."""
 

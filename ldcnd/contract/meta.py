@@ -22,7 +22,7 @@ class DaemonInfo(Frozen):
     instance: str
     """Names this run of the daemon, as in its liveliness token."""
     started: int
-    """When it started, UTC in ns since 1970."""
+    """Instant at which the daemon started, UTC in ns since 1970."""
     encoding: str
     """How telemetry is encoded."""
     axes: tuple[str, ...]
@@ -67,13 +67,13 @@ class ModuleInfo(Frozen):
     model: str | None
     """Model name as in the configuration; null for an unknown device: it is never moved."""
     device_id: int
-    """As it reports."""
+    """Device id reported by the module."""
     version: int
-    """As it reports."""
+    """Firmware version reported by the module."""
     axis: str | None
     """The axis that it is; null for a module that is only kept on the line."""
     name: str | None = None
-    """Under which an I/O module is served; null for others."""
+    """Name under which an I/O module is served; null for others."""
     status: int | None
     """Latest status byte of a module that is no axis; null while it does not answer, and for axes."""
 
@@ -84,7 +84,7 @@ class BusInfo(Frozen):
     bus: str
     """Its name."""
     port: str
-    """Where it is connected."""
+    """Port to which the line is connected."""
     baud: int
     """The rate in use."""
     up: bool
@@ -178,7 +178,7 @@ class PastFault(Frozen):
     text: str
     """Meaning and remedy."""
     since: int
-    """When the daemon first saw it, UTC in ns since 1970."""
+    """Instant at which the daemon first saw the fault, UTC in ns since 1970."""
     source: str
     """Who said so: drive or daemon."""
 
@@ -203,7 +203,7 @@ class AxisInfo(Frozen):
     counts_per_unit: float | None
     """Encoder counts per unit; null when no scale is configured and the axis works in counts."""
     direction: str
-    """forward or reverse: the sign between counts and units."""
+    """Sign between counts and units: forward or reverse."""
     modulo: float | None = None
     """A rotary axis: positions repeat after this distance, in axis units; null for others."""
     limits: AxisLimits

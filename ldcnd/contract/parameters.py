@@ -15,7 +15,7 @@ SLOW_S = 60.0
 
 
 class Memory(StrEnum):
-    """Where a parameter value is kept."""
+    """Memory in which a parameter value is kept."""
 
     RAM = "ram"
     """The value in use; lost at power-off."""
@@ -42,7 +42,7 @@ class DigitInfo(Frozen):
     values: Mapping[str, str]
     """Meanings of its values, by their hexadecimal digit; empty where they are numbers or not known."""
     confidence: str
-    """Where that comes from: S the manual, X a related drive, M recollection."""
+    """Source of the statement: S the manual, X a related drive, M recollection."""
 
 
 class ParameterInfo(Frozen):
@@ -67,7 +67,7 @@ class ParameterInfo(Frozen):
     power_cycle: bool | None
     """A change takes effect at the next power-on only; null where it is not known."""
     confidence: str | None
-    """Where range and unit come from: S the manual, X a related drive, M recollection; null where nothing is known."""
+    """Source of range and unit: S the manual, X a related drive, M recollection; null where nothing is known."""
 
 
 class ParameterList(CommandReply):
@@ -129,7 +129,7 @@ class ParameterDump(CommandReply):
     """All listed parameters of a drive, read one after the other."""
 
     values: tuple[ParameterValue, ...]
-    """In the manual's order; those that the drive does not have are left out."""
+    """Values in the manual's order; parameters that the drive does not have are left out."""
     facts: DriveFacts | None = None
     """Facts about the drive."""
 
@@ -138,17 +138,17 @@ class PlannedWrite(Frozen):
     """One write of a plan."""
 
     parameter: str
-    """Which, such as Pn100."""
+    """Parameter number, such as Pn100."""
     name: str
     """The manual's name."""
     memory: Memory
-    """Where it goes."""
+    """Memory to which the value goes."""
     before: int
     """The present value in the memory."""
     value: int
     """The new value: for Pn000 with the unit number that the drive has."""
     effective: str
-    """When it takes effect, as far as is known."""
+    """Event at which the value takes effect, as far as is known."""
     digits: tuple[str, ...] = ()
     """The digits that change, spelled out."""
 
@@ -157,7 +157,7 @@ class PlannedParameters(Frozen):
     """The writes after which a drive would hold certain values."""
 
     writes: tuple[PlannedWrite, ...]
-    """In the order in which they are to be sent; none when the drive holds the values already."""
+    """Writes in the order in which they are to be sent; none when the drive holds the values already."""
     problems: tuple[str, ...] = ()
     """Why they must not be sent."""
     remarks: tuple[str, ...] = ()
@@ -175,7 +175,7 @@ class CounterReply(CommandReply):
     """A counter after it was cleared."""
 
     counter: CounterName
-    """Which."""
+    """Name of the counter."""
     value: int
     """Its present count, signed; 0 unless pulses have come in since."""
     remarks: tuple[str, ...] = ()
@@ -195,11 +195,11 @@ class AlarmEntry(Frozen):
     """One alarm code."""
 
     code: int = Field(ge=0, le=0xFFFF)
-    """As the drive reports it."""
+    """Code that the drive reports."""
     text: str
     """The manual's words."""
     kind: str
-    """alarm, warning, none or unknown."""
+    """Kind of the entry: alarm, warning, none or unknown."""
 
 
 class AlarmReport(CommandReply):
@@ -219,7 +219,7 @@ class AssumptionInfo(Frozen):
     question: str
     """The assumption, or the open question."""
     confidence: str
-    """Where the assumption comes from, by the marks of the reference page."""
+    """Source of the assumption, by the marks of the reference page."""
     verification: str
     """Result of a test on the drive: assumed, verified or contradicted."""
     setting: str | None
@@ -243,7 +243,7 @@ class MonitorReading(Frozen):
     """One monitor of a drive, read once."""
 
     monitor: MonitorName
-    """Which."""
+    """Name of the counter."""
     title: str
     """The manual's words."""
     value: int
@@ -260,7 +260,7 @@ class MonitorReport(CommandReply):
     """Monitors of a drive, read one after the other."""
 
     readings: tuple[MonitorReading, ...]
-    """In the order of the request; those that the drive does not have are left out."""
+    """Readings in the order of the request; monitors that the drive does not have are left out."""
 
 
 class ParameterCommand(AxisCommand[ReplyT_co], Generic[ReplyT_co]):
@@ -340,7 +340,7 @@ class ClearCounter(ParameterCommand[CounterReply]):
     verb = Verb.CLEAR_COUNTER
 
     counter: CounterName
-    """Which counter."""
+    """Counter to clear."""
 
 
 class RestartEepromCount(ParameterCommand[EepromCount]):
@@ -376,7 +376,7 @@ class ReadMonitors(ParameterCommand[MonitorReport]):
     needs_lease = False
 
     monitors: tuple[MonitorName, ...] = Field(default=(), max_length=len(MonitorName))
-    """Which; none stands for all."""
+    """Monitors to read; none stands for all."""
 
 
 COMMANDS: tuple[type[Command[Frozen]], ...] = (

@@ -18,7 +18,7 @@ class ItemPlan(Frozen):
     rate_hz: float
     """How often it is read."""
     response_s: float | None
-    """From being due to being read, at the latest; null when the line is full and there is no bound."""
+    """Longest time from being due to being read; null when the line is full and there is no bound."""
 
 
 class PollPlan(Frozen):
@@ -37,7 +37,7 @@ class PollPlan(Frozen):
     longest_s: float
     """How long it occupies the line at most."""
     response_s: float | None
-    """From being due to being over, at the latest; null when the line is full and there is no bound."""
+    """Longest time from being due to being over; null when the line is full and there is no bound."""
     holds: bool
     """It is always over before its next turn."""
     items: tuple[ItemPlan, ...]
@@ -68,11 +68,11 @@ class BusPlan(Frozen):
     commands_per_s: float
     """Evenly spaced commands a second that fit in without making a poll miss its turn."""
     stop_wait_s: float
-    """From a stop's arrival to its first bit, at the latest, while no reply is lost."""
+    """Longest time from a stop's arrival to its first bit, while no reply is lost."""
     stop_s: float
-    """From a stop's arrival to the end of the drive's reply."""
+    """Time from a stop's arrival to the end of the drive's reply."""
     stop_after_loss_s: float
-    """To the end of the drive's reply when the exchange before it is lost."""
+    """Time from a stop's arrival to the end of the drive's reply when the exchange before it is lost."""
     stop_probe_hz: float
     """How often the wait of a stop is measured by a stop probe; counted in the load."""
     holds: bool

@@ -70,7 +70,7 @@ class AxisPath(AxisMove):
     model_config = ConfigDict(title="AxisPath")
 
     via: tuple[float, ...] = Field(default=(), max_length=5000)
-    """Where the axis is at each corner before the end, in axis units; equally many for all axes."""
+    """Positions at the corners before the end, in axis units; equally many for all axes."""
 
 
 class PathReply(Frozen):
@@ -79,7 +79,7 @@ class PathReply(Frozen):
     replies: tuple[CommandReply, ...]
     """One for each axis, in the order of the request."""
     duration_s: float
-    """To the last point, without settling."""
+    """Duration to the last point, in seconds, without settling."""
     deviation: float = Field(ge=0)
     """How far from the polyline the axes get at most, by the points; what their servos lag behind comes on top."""
     rate_hz: float
@@ -116,13 +116,13 @@ class AxisShare(Frozen):
     axis: str
     """The axis."""
     position: float
-    """Where it would end, in axis units."""
+    """Position at the end, in axis units."""
     velocity: float
     """Velocity that the registers would hold, units a second."""
     acceleration: float
     """Acceleration that the registers would hold, units a second squared."""
     duration_s: float
-    """Of its profile, without settling."""
+    """Duration of its profile, in seconds, without settling."""
 
 
 class PreviewTogetherReply(Frozen):
@@ -131,9 +131,9 @@ class PreviewTogetherReply(Frozen):
     shares: tuple[AxisShare, ...]
     """One for each axis, in the order of the request."""
     duration_s: float
-    """Of the longest profile, without settling."""
+    """Duration of the longest profile, in seconds, without settling."""
     deviation: float | None = Field(default=None, ge=0)
-    """As the reply to `move_together` would say it."""
+    """Deviation from the straight line that the reply to `move_together` would name."""
 
 
 class PreviewTogether(GroupMoves, Command[PreviewTogetherReply]):
@@ -148,7 +148,7 @@ class SpeedOverrideReply(Frozen):
     """The speed override from now on: the reply to `@cmd/_/set_speed_override`."""
 
     percent: float
-    """Of every velocity."""
+    """Speed override, in percent of each commanded velocity."""
     changed: tuple[str, ...]
     """Axes whose motion under way goes on at another velocity."""
     halted: tuple[str, ...]
@@ -165,7 +165,8 @@ class SetSpeedOverride(Command[SpeedOverrideReply]):
     about = About.RIG
 
     percent: float = Field(ge=0, le=100)
-    """Of every velocity; 100 when the daemon starts. Set-points of `track` and duties of `set_pwm` are not scaled."""
+    """Speed override, in percent of each commanded velocity; 100 when the daemon starts. Set-points of `track` and
+    duties of `set_pwm` are not scaled."""
     client: str | None = Field(default=None, max_length=64)
     """The requester, for the log."""
     leases: tuple[str, ...] = Field(default=(), max_length=64)
@@ -174,12 +175,12 @@ class SetSpeedOverride(Command[SpeedOverrideReply]):
 
 
 class FrozenPosition(Frozen):
-    """Where one axis was at the instant of a snapshot."""
+    """Position of one axis at the instant of a snapshot."""
 
     axis: str
     """The axis."""
     position: float
-    """In axis units."""
+    """Position, in axis units."""
     counts: int
     """Raw encoder counts of the drive."""
     unit: str
@@ -207,7 +208,7 @@ class SnapshotReply(Frozen):
     bus: str
     """The line."""
     t: int
-    """When all of them were true, UTC in ns since 1970."""
+    """Instant at which all of them were true, UTC in ns since 1970."""
     t_error_ns: int = Field(ge=0)
     """Every one of the true instants lies within this many ns of `t`."""
     positions: tuple[FrozenPosition, ...]
@@ -226,7 +227,7 @@ class Snapshot(Command[SnapshotReply]):
     about = About.RIG
 
     bus: str
-    """Which line; it needs `snapshot = true`."""
+    """Line to read; it needs `snapshot = true`."""
 
 
 Line = Annotated[int, Field(ge=1, le=12)]
@@ -253,7 +254,7 @@ class SetIo(Command[IoReply]):
     about = About.RIG
 
     module: str
-    """Which module, by its configured name."""
+    """Configured name of the module."""
     high: tuple[Line, ...] = ()
     """Lines that are driven high. Only those that are configured as outputs can be; one that becomes an output may be
     low for the time between two packets."""
@@ -264,7 +265,7 @@ class SetIo(Command[IoReply]):
     pwm1: float | None = Field(default=None, ge=0, le=1)
     """Share of time for which PWM output 1 is on."""
     pwm2: float | None = Field(default=None, ge=0, le=1)
-    """Likewise output 2."""
+    """Duty of output 2, in the same way."""
     lease: str | None = None
     """The sender's lease: it must cover all axes on the module's line, where a motion of them would need one."""
     leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
@@ -289,15 +290,15 @@ class SetIoTimer(Command[IoReply]):
     about = About.RIG
 
     module: str
-    """Which module, by its configured name."""
+    """Configured name of the module."""
     mode: IoTimer
     """Input of the counter."""
     prescale: Literal[1, 2, 4, 8] = 1
     """Edges or clocks for each count."""
     lease: str | None = None
-    """As for `set_io`,"""
+    """Lease, see `set_io`."""
     leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
-    """and these, too."""
+    """Further leases."""
 
 
 class Rehearsal(StrEnum):
@@ -368,7 +369,7 @@ class ReadWireLog(Command[WireLogReply]):
     effect = Effect.QUESTION
 
     bus: str
-    """Which line."""
+    """Name of the line."""
     seconds: float = Field(default=10.0, gt=0, le=86_400)
     """How far back, in seconds; what is older than the recorder keeps is gone."""
     from_record: int | None = Field(default=None, ge=0, le=LARGEST_INTEGER)

@@ -64,7 +64,7 @@ class Sample(Frozen):
     """Fields of every telemetry payload."""
 
     t: int
-    """When the value was true, UTC in ns since 1970."""
+    """Instant at which the value was true, UTC in ns since 1970."""
     t_error_ns: int = Field(ge=0)
     """The true instant lies within this many ns of `t`, as far as the wire tells."""
     seq: int = Field(ge=0)
@@ -74,7 +74,7 @@ class Sample(Frozen):
 
 
 class PositionSample(Sample):
-    """Where the axis is."""
+    """Position of an axis."""
 
     value: float
     """Position in axis units; on an axis with a modulo from 0 up to it."""
@@ -140,7 +140,7 @@ class LatchSample(Sample):
     sources: tuple[str, ...]
     """The possible sources of the latch."""
     command_id: str
-    """Of the probe."""
+    """Id of the probe command that latched this position."""
 
 
 class IoSample(Sample):
@@ -168,13 +168,13 @@ class FaultEntry(Frozen):
     text: str
     """Meaning and remedy."""
     since: int
-    """When the daemon first saw it, UTC in ns since 1970."""
+    """Instant at which the daemon first saw the fault, UTC in ns since 1970."""
     source: str
     """Who says so: drive or daemon."""
     stops: bool = True
     """The motor is off because of it; false for a warning."""
     page: str | None = None
-    """Where its page is, below a console or the documentation: what to check, how to clear it."""
+    """Path of its page below a console or the documentation: what to check, how to clear it."""
 
 
 class FaultSample(Sample):
@@ -194,7 +194,7 @@ class ShadowFigure(Frozen):
     """One figure of an axis, as an observer finds it in its motions."""
 
     figure: str = Field(pattern="^[a-z_]{1,20}$")
-    """Which one: friction, inertia or misfit of `ldcnd shadow`."""
+    """Name of the figure: friction, inertia or misfit of `ldcnd shadow`."""
     value: float
     """Mean of the last motions."""
     usual: float
@@ -228,19 +228,21 @@ class CurrentCommand(Frozen):
     """The command that the axis carries out."""
 
     command_id: str
-    """As given in the reply that accepted it."""
+    """Id from the command's reply."""
     verb: str
     """The verb of the command."""
     since: int
-    """When it was accepted, UTC in ns since 1970."""
+    """Instant at which it was accepted, UTC in ns since 1970."""
     target: float | None = None
-    """Where it ends, in axis units; the distance left is from the position to here. Null without an end of its own."""
+    """Position at which it ends, in axis units; the distance left is from the position to here. Null without an end
+    of its own."""
     expected_end: int | None = None
-    """When its profile should end, UTC in ns since 1970; settling comes on top. Null without an end of its own."""
+    """Instant at which its profile should end, UTC in ns since 1970; settling comes on top. Null without an end of
+    its own."""
 
 
 class StateSample(Sample):
-    """In which state the axis is; `t` grows even when nothing changes: a sign of life of the line itself."""
+    """State of an axis; `t` grows even when nothing changes: a sign of life of the line itself."""
 
     state: AxisState
     """PLCopen state."""
@@ -266,8 +268,8 @@ class StateSample(Sample):
     reference_lost: bool = False
     """The position was valid and is not any more; false on an axis that was never homed, and again once it is valid."""
     target: float | None = None
-    """Where the axis was sent last, in axis units; once something else has stopped or moved it, where it came to rest.
-    Null while it moves without a target, while its position loop is open, and while it is not known."""
+    """Position to which the axis was sent last, in axis units; once something else has stopped or moved it, where it
+    came to rest. Null while it moves without a target, while its position loop is open, and while it is not known."""
     speed_override: float = Field(default=100.0, ge=0, le=100)
     """Percent of every velocity, for the whole rig; nothing moves at 0."""
 
@@ -304,7 +306,7 @@ class MonitorSample(Sample):
     title: str
     """The manual's words."""
     high: tuple[str, ...] = ()
-    """For signals, those whose level is high, whatever that means; for switches, those that are on."""
+    """Signals whose level is high, whatever that means; of switches, those that are on."""
     active: tuple[str, ...] | None = None
     """Signals that are on, by the active levels of the configuration; null for what has no active level."""
 

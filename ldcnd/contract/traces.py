@@ -25,7 +25,7 @@ ENDING_S = 10.0
 
 
 class TriggerKind(StrEnum):
-    """When a trigger fires."""
+    """Condition at which a trigger fires."""
 
     RISING = "rising"
     """The channel comes from below the level and reaches it; a signal goes from 0 to 1."""
@@ -47,9 +47,9 @@ class TraceTrigger(Frozen):
     channel: str
     """One of the recorded channels."""
     kind: TriggerKind
-    """When it fires."""
+    """Condition at which it fires."""
     level: float | None = None
-    """In the channel's unit; every channel but a signal needs one."""
+    """Level in the channel's unit; every channel but a signal needs one."""
 
 
 class TracePhase(StrEnum):
@@ -86,13 +86,13 @@ class TraceChannel(Frozen):
     """One recorded quantity."""
 
     name: str
-    """As in the request."""
+    """Name of the channel, as requested."""
     unit: str
     """Unit of its values; empty for signals, which are 0 or 1."""
     scale: float | None = None
     """Its value for a raw one of 1; null where the raw value is not simply proportional."""
     raw_column: int | None = None
-    """Which raw column it was made from."""
+    """Raw column from which it was made."""
 
 
 class DriveTraceInfo(Frozen):
@@ -121,19 +121,19 @@ class DriveTraceInfo(Frozen):
     gear_denominator: int | None
     """RATA, Pn203; null likewise."""
     encoder_counts_per_rev: int
-    """As configured."""
+    """Encoder counts per revolution, as configured."""
     word_layout: str
-    """Where the I/O bit and the value were taken to be in a memory word."""
+    """Place that was assumed for the I/O bit and the value in a memory word."""
     byte_order: str
-    """Which half of a word was taken to come first."""
+    """Half of a word that was taken to come first."""
     string_checksum: str
     """The bytes that the checksum of a string was found or taken to cover."""
     string_count_unit: str
     """The unit in which the count of a string was taken."""
     trigger_word_source: str
-    """Where the trigger comes from: none, configured (the drive's, bits of 5004H), or host (polled, then started)."""
+    """Source of the trigger: none, configured (the drive's, bits of 5004H), or host (polled, then started)."""
     command_pulse_gear: str
-    """Which way command pulses were taken to be geared."""
+    """Gearing of command pulses that was assumed."""
     assumptions: tuple[AssumptionInfo, ...]
     """The assumptions of the drive's profile that bear on a trace."""
 
@@ -188,7 +188,7 @@ class TraceChunk(Sample):
     first: int = Field(ge=0)
     """Index of its first sample in the trace."""
     offsets_ns: tuple[int, ...]
-    """When each sample was true, relative to the header's `t`."""
+    """Instants at which the samples were true, relative to the header's `t`."""
     values: tuple[tuple[float | None, ...], ...]
     """One column for each channel, in its unit; null where the drive did not say."""
     raw: tuple[tuple[int | float | None, ...], ...]

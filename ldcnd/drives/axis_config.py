@@ -60,19 +60,19 @@ class HomeConfig(Frozen):
     stop: HomeStop = HomeStop.SMOOTH
     """How the motor stops there."""
     move_to: float | None = None
-    """Where to go afterwards, in axis units."""
+    """Position to move to afterwards, in axis units."""
     switch_active: Literal["high", "low"] = "high"
     """Level of a limit switch input while the switch is actuated."""
 
 
 class SettleConfig(Frozen):
-    """When a motion to a target is done: its profile has ended and the axis has stayed near the target."""
+    """Condition at which a motion to a target is done: its profile has ended and the axis stays near the target."""
 
     window: float | None = Field(default=None, gt=0)
     """How far from the target it may be, in axis units; without it 1/400 of the position error limit `el`, at least 5 \
 counts."""
     time_s: float = Field(default=0.05, ge=0, le=10)
-    """For how long it must have stayed within the window, in seconds."""
+    """Time for which the axis must have stayed within the window, in seconds."""
     timeout_s: float = Field(default=1.0, gt=0, le=60)
     """Longest time for that, from the end of the profile, in seconds."""
     unsettled: Literal["report", "fault"] = "report"
@@ -114,7 +114,7 @@ class TrackingConfig(Frozen):
 
 
 class ApproachConfig(Frozen):
-    """From which side a move comes to its goal, where the mechanics have play."""
+    """Side from which a move comes to its goal, where the mechanics have play."""
 
     direction: Literal["positive", "negative"]
     """The direction of the last motion."""
@@ -192,7 +192,7 @@ class AxisConfig(Frozen):
     """Encoder counts per unit, 1e-9 to 1e12: every count is a finite position then. There is no default: without it
     the axis works in counts and says so."""
     direction: Literal["forward", "reverse"] = "forward"
-    """reverse: forward in axis units is backward in encoder counts."""
+    """Sign between counts and units; with reverse, forward in axis units is backward in encoder counts."""
     modulo: float | None = Field(default=None, gt=0)
     """A rotary axis: positions repeat after this distance in axis units, such as 360. It turns endlessly, and takes no
     position limits."""
@@ -203,7 +203,7 @@ class AxisConfig(Frozen):
     limits: AxisLimits = AxisLimits()
     """Software limits, in axis units."""
     gains: GainsConfig | None = None
-    """Without gains the loop of this drive stays open."""
+    """Gains of the position loop; without them the loop of this drive stays open."""
     reference: Literal["required", "at_reset"] = "required"
     """Whether absolute moves need home or set_position first, or the place where the drive was powered on \
 counts as 0. The latter only for a line that no host has used since: after a restart with powered drives, home again."""
@@ -216,7 +216,7 @@ counts as 0. The latter only for a line that no host has used since: after a res
     tracking: TrackingConfig | None = None
     """Bounds of `track`; without them the axis follows no set-points."""
     settle: SettleConfig = SettleConfig()
-    """When a motion to a target is done."""
+    """Condition at which a motion to a target is done."""
     approach: ApproachConfig | None = None
     """`move_absolute` and `move_relative` come to their goal from one side, by two motions where one would not do; \
 other motions, also those of a group, do not."""
@@ -228,8 +228,9 @@ come now and then."""
     loss: LossConfig = LossConfig()
     """Reaction of the axis to the loss of a client, the line or the daemon in mid-motion."""
     limit_switches: Literal["ignore", "stop"] = "ignore"
-    """stop: the drive itself decelerates when a motion runs onto the limit switch ahead, also if the host is dead; \
-moving off a switch stays possible. Not for `track`, nor on drives that do not stop on their limit inputs."""
+    """Use of the limit switches. With stop, the drive itself decelerates when a motion runs onto the limit switch \
+ahead, also if the host is dead; moving off a switch stays possible. Not for `track`, nor on drives that do not stop \
+on their limit inputs."""
     jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)
     """Time after which the drive itself ends a motion at constant velocity that no software limit ends, seconds."""
     jog_reach_s: float = Field(default=5.0, gt=0, le=3600)

@@ -24,7 +24,7 @@ class GroupConfig(Frozen):
     """Axes that can be started in the same servo cycle and stopped by one packet; an axis is in one group at most."""
 
     name: Name
-    """For people and messages."""
+    """Name of the group, for people and messages."""
     axes: tuple[Name, ...] = Field(min_length=2, max_length=31)
     """The members."""
     leader: Name | None = None
@@ -46,9 +46,9 @@ class Rs485Config(Frozen):
     rts_on_send: bool = True
     """RTS is on while sending and off otherwise; false for ports that are wired the other way round."""
     before_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
-    """From switching the transmitter on to the first bit."""
+    """Time from switching the transmitter on to the first bit, in ms."""
     after_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
-    """From the last bit to switching the transmitter off."""
+    """Time from the last bit to switching the transmitter off, in ms."""
     receive_own: bool = False
     """The receiver stays on while sending: on two wires the host then receives its own bytes, see `echo`."""
     terminate: bool = False
@@ -62,7 +62,7 @@ class BusConfig(Frozen):
     """Whether rates that the line may not be able to keep pass where `overload` is left out."""
 
     name: Name
-    """For people and messages, and its chunk in `meta/buses`."""
+    """Name of the line, for people and messages, and its chunk in `meta/buses`."""
     port: Annotated[str, AfterValidator(_known_port)]
     """A device path, socket://host:port, or sim:NAME."""
     family: str

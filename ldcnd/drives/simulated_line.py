@@ -16,13 +16,13 @@ class SimulatedFaultConfig(Frozen):
     kind: FaultKind
     """The kind of the event."""
     probability: float = Field(default=1.0, ge=0, le=1)
-    """Of it happening to one request or reply."""
+    """Probability that it happens to one request or reply."""
     from_s: float = Field(default=0.0, ge=0)
     """Possible from this time on, in seconds after the line was opened first."""
     until_s: float | None = Field(default=None, gt=0)
     """Possible before this time."""
     longest_s: float = Field(default=0.0, ge=0)
-    """For reply_delayed the longest delay, for unplugged the duration."""
+    """Longest delay of reply_delayed, or the duration of unplugged, in seconds."""
 
     @model_validator(mode="after")
     def _has_a_length(self) -> Self:

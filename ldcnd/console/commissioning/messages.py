@@ -65,7 +65,7 @@ class CurveView(Frozen):
     times_s: tuple[float, ...]
     """Seconds."""
     positions: tuple[float, ...]
-    """In axis units."""
+    """Position, in axis units."""
     following_errors: tuple[float, ...]
     """Likewise."""
 

@@ -72,9 +72,9 @@ class ModuleConfig(Frozen):
     model: Annotated[str, AfterValidator(_known_module)]
     """The module model."""
     identity: DeviceIdentity | None = None
-    """As for an axis."""
+    """Identity of the module, given in the same way as that of an axis."""
     name: Name | None = None
-    """Of a PIC-I/O: its inputs are published and its outputs can be set under this name; unique among the axes."""
+    """Name of a PIC-I/O: its inputs are published and its outputs can be set under it; unique among the axes."""
     outputs: tuple[Annotated[int, Field(ge=1, le=12)], ...] = ()
     """Lines of a PIC-I/O that may be driven; all others stay inputs. None is driven before a request sets it."""
     rate: float = Field(default=5.0, gt=0, le=500)

@@ -55,9 +55,9 @@ class SmartStepTraceConfig(Frozen):
     """How the trace of one unit is taken to work where its manual leaves room."""
 
     word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
-    """Where the signal's bit and the value sit in a word of the trace memory; raw leaves words as they are."""
+    """Place of the signal's bit and the value in a word of the trace memory; raw leaves words as they are."""
     byte_order: ByteOrder = ByteOrder.BIG
-    """Which half of a word comes first in a string."""
+    """Half of a word that comes first in a string."""
     string_checksum: StringChecksum = StringChecksum.AUTO
     """Bytes that the checksum of a string reply covers; auto takes every variant until the drive shows which."""
     string_count_unit: CountUnit = CountUnit.BYTES
@@ -67,7 +67,7 @@ class SmartStepTraceConfig(Frozen):
     verify: bool = True
     """Read everything until two readings agree: the checksum may not cover it."""
     command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
-    """Which way command pulses are geared to motor speed."""
+    """Gearing of command pulses to motor speed."""
     trigger_map: TriggerMapConfig | None = None
     """The bits of the trigger condition; without them traces have no trigger."""
 
@@ -139,9 +139,10 @@ class SmartStepUnitConfig(Frozen):
     monitors: Mapping[MonitorName, float] = {}
     """Monitors to publish, with their rates in Hz."""
     audit_s: float = Field(default=45.0, ge=0, le=86_400)
-    """In how many seconds each parameter is read once, to find what another program or a reset has changed; 0 never."""
+    """Period in which each parameter is read once, in seconds, to find what another program or a reset has changed;
+    0 never."""
     eeprom_write: EepromWrite = EepromWrite.ALLOW
-    """deny forbids it; allow: EEPROM is written when a request names it."""
+    """Permission to write EEPROM: deny forbids it; with allow, EEPROM is written when a request names it."""
     eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
     """Writes of the drive's EEPROM, all parameters together, until further ones are refused; it endures 10,000."""
     planned_response_s: float = Field(default=0.02, ge=0, le=5)
@@ -199,7 +200,7 @@ class SimulatedVariantConfig(Frozen):
     """How a simulated drive behaves where the manual leaves room; the defaults are the assumptions of the driver."""
 
     response_s: float = Field(default=0.01, ge=0, le=5)
-    """From a command to the first character of its reply; the manual allows 0.2."""
+    """Time from a command to the first character of its reply, in seconds; the manual allows 0.2."""
     string_checksum: StringChecksum = StringChecksum.HEADER
     """Bytes that the checksum of a string reply covers."""
     string_count_unit: CountUnit = CountUnit.BYTES
@@ -207,11 +208,11 @@ class SimulatedVariantConfig(Frozen):
     longest_string_bytes: int = Field(default=1000, ge=2, le=1000)
     """More is an error in number of bytes."""
     trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
-    """Where the signal's bit and the value sit in a word of the trace memory."""
+    """Place of the signal's bit and the value in a word of the trace memory."""
     trace_byte_order: ByteOrder = ByteOrder.BIG
-    """Which half of a word comes first in a string."""
+    """Half of a word that comes first in a string."""
     command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
-    """By which way of gearing traced command pulses become the motor's speed."""
+    """Gearing by which traced command pulses become the motor's speed."""
     trigger_map: TriggerMapConfig | None = None
     """The bits of the trigger condition; invented ones when missing."""
     full_scale_settable: bool = True

@@ -45,7 +45,7 @@ class Framing(StrEnum):
 
 
 class Wiring(StrEnum):
-    """Which pairs the line has; the manual describes four wires only (1.1)."""
+    """Pairs of the line; the manual describes four wires only (1.1)."""
 
     FOUR_WIRE = "4-wire"
     TWO_WIRE = "2-wire"
@@ -84,7 +84,7 @@ class CountUnit(StrEnum):
 
 
 class TraceWordLayout(StrEnum):
-    """Where the I/O bit and the value sit in a trace memory word."""
+    """Place of the I/O bit and the value in a trace memory word."""
 
     MSB_IO = "msb-io"
     LSB_IO_SHIFT = "lsb-io-shift"
@@ -93,7 +93,7 @@ class TraceWordLayout(StrEnum):
 
 
 class ByteOrder(StrEnum):
-    """Which half of a word comes first in a string."""
+    """Half of a word that comes first in a string."""
 
     BIG = "big"
     LITTLE = "little"
@@ -109,7 +109,7 @@ class TriggerWordSource(StrEnum):
 
 
 class CommandPulseGear(StrEnum):
-    """Which way command pulses are geared to motor speed; the two printed formulas contradict the table."""
+    """Gearing of command pulses to motor speed; the two printed formulas contradict the table."""
 
     NUM_DEN = "num/den"
     DEN_NUM = "den/num"

@@ -29,7 +29,7 @@ class PositionErrorClearing(StrEnum):
 
 
 class AnalogEnd(StrEnum):
-    """When a motion to an analog target begins to stop."""
+    """Condition at which a motion to an analog target begins to stop."""
 
     EQUAL = "equal"
     """When the A/D value is equal to the target, as the LS-182AP manual says; a value that is skipped ends nothing."""
@@ -88,7 +88,7 @@ class PathWithoutServo(StrEnum):
 
 
 class RelativeTo(StrEnum):
-    """Which command position a relative goal of PIC-SERVO SC is added to, when it is loaded first and started later."""
+    """Command position to which a relative goal of PIC-SERVO SC is added, when it is loaded first and started later."""
 
     START = "start"
     LOAD = "load"

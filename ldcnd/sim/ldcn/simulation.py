@@ -68,11 +68,11 @@ class PlantConfig(Frozen):
     supply_v: float | None = Field(default=None, gt=0, le=100)
     """Voltage at full duty; 24."""
     resistance_ohm: float | None = Field(default=None, gt=0)
-    """Of the winding; 1.2."""
+    """Resistance of the winding, in ohms; 1.2."""
     torque_nm_per_a: float | None = Field(default=None, gt=0)
-    """Also the back EMF constant in V s/rad; 0.0767."""
+    """Torque constant, and back EMF constant in V s/rad; 0.0767."""
     inertia_kg_m2: float | None = Field(default=None, gt=0)
-    """Of motor and load; 5e-5."""
+    """Inertia of motor and load, in kg m2; 5e-5."""
     viscous_nm_s: float | None = Field(default=None, gt=0)
     """Viscous friction per rad/s; 1e-5."""
     friction_nm: float | None = Field(default=None, ge=0)
@@ -80,9 +80,9 @@ class PlantConfig(Frozen):
     stop_margin_counts: int | None = Field(default=None, ge=0)
     """Distance of the hard stops behind the limit switches; 2000."""
     index_at_counts: int | None = None
-    """Where an index pulse begins; 700."""
+    """Position at which an index pulse begins, in counts; 700."""
     index_spacing_counts: int | None = Field(default=None, gt=0)
-    """From one index pulse to the next; a revolution when left out."""
+    """Distance from one index pulse to the next, in counts; a revolution when left out."""
     index_width_counts: int | None = Field(default=None, gt=0)
     """How long a pulse is; 4. Firmware samples it once per servo cycle and may miss it."""
     pot_span_counts: Annotated[CountRange | None, AfterValidator(_rising)] = None
@@ -113,7 +113,7 @@ class Quirks(Frozen):
     clock_hz: int | None = Field(default=None, ge=10_000_000, le=20_000_000)
     """Its clock, PIC-SERVO up to version 5; servo cycle and rates follow it. 20 MHz when left out."""
     phase_s: float | None = Field(default=None, ge=0, lt=SERVO_CYCLE_S)
-    """Where its servo cycles lie; drawn from the seed when left out."""
+    """Phase of its servo cycles, in seconds; drawn from the seed when left out."""
     drift_ppm: float | None = Field(default=None, ge=-MOST_DRIFT_PPM, le=MOST_DRIFT_PPM)
     """How much longer its servo cycles and its bits are than nominal; drawn from the seed when left out."""
     reply_latency_s: float | None = Field(default=None, ge=0, le=10)
@@ -160,7 +160,7 @@ written needs 0: a terminal does not wait for the line."""
     velocity_sign: Literal[-1, 1] | None = None
     """Sign of the velocity item while the motor runs forward; the model's when left out."""
     relative_to: RelativeTo | None = None
-    """Which command position a relative goal is added to, PIC-SERVO SC: that of the load or of the start."""
+    """Command position to which a relative goal is added, PIC-SERVO SC: that of the load or of the start."""
     reset_in_motion: ResetInMotion | None = None
     """Effect of Reset Position on the goal of a move that is under way."""
     home_shifts: bool | None = None
@@ -190,9 +190,9 @@ written needs 0: a terminal does not wait for the line."""
     path_rate_at_load: bool | None = None
     """Whether the fast path option counts when a point is loaded, or when it begins."""
     path_move_done: bool | None = None
-    """Whether MOVE_DONE is set during a path,"""
+    """Whether MOVE_DONE is set during a path."""
     path_slew: bool | None = None
-    """and whether auxiliary bit 4 is."""
+    """Whether auxiliary bit 4 is set during a path."""
     path_ignores_divisor: bool | None = None
     """Whether the servo rate divisor of a CMC leaves its path as it is."""
     path_ended_by_enable: bool | None = None
@@ -246,11 +246,11 @@ class SimulatedModuleConfig(Frozen):
     model: ModuleName
     """Module name as in `ldcnd sim --chain`."""
     travel_counts: Annotated[CountRange | None, AfterValidator(_rising)] = None
-    """Where the limit switches sit, in counts from the power-up position; endless when left out."""
+    """Positions of the limit switches, in counts from the power-up position; endless when left out."""
     plant: PlantConfig = PlantConfig()
     """Constants of the machine."""
     behaviour: Quirks = Quirks()
-    """Where the manuals allow variants."""
+    """Behaviour where the manuals allow variants."""
     conditions: tuple[Condition, ...] = ()
     """Faults around the drive at power-up."""
     start_up: Byte | None = None
@@ -316,19 +316,19 @@ class SimulatedEventConfig(Frozen):
     module: int = Field(ge=1, le=31)
     """Its place in the chain, from 1 on, in the order of addresses."""
     begins: Condition | None = None
-    """A condition that begins,"""
+    """Fault condition that starts."""
     ends: Condition | None = None
-    """or one that ends,"""
+    """Fault condition that ends."""
     power: Literal["on", "off"] | None = None
-    """or the module's own supply; switched on, it starts as after a reset,"""
+    """Supply of the module; switched on, the module starts as after a reset."""
     line: LineNumber | None = None
-    """or a line of a PIC-I/O, which is driven to `level`,"""
+    """Number of a line of a PIC-I/O, which is driven to `level`."""
     adc: int | None = Field(default=None, ge=1, le=3)
-    """or an A/D input of a PIC-I/O, which takes `value`."""
+    """Number of an A/D input of a PIC-I/O, which takes `value`."""
     level: Literal["high", "low"] | None = None
-    """With `line`: the level from outside."""
+    """Level from outside, with `line`."""
     value: Byte | None = None
-    """With `adc`: 0 to 255 for 0 to 5 V."""
+    """Reading of `adc`, 0 to 255 for 0 to 5 V."""
 
     @model_validator(mode="after")
     def _one_thing(self) -> Self:

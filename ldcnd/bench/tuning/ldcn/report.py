@@ -70,7 +70,7 @@ class MoveCurve(Frozen):
     times_s: tuple[float, ...]
     """From the begin of the move, seconds."""
     positions: tuple[float, ...]
-    """In axis units."""
+    """Positions, in axis units."""
     following_errors: tuple[float, ...]
     """What they are behind the command, in axis units."""
 
