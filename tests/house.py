@@ -198,7 +198,8 @@ async def _command(send: Callable[[RunningRig], Awaitable[object]]) -> Way:
 
 async def move() -> Way:
     """Follow one move: from its query to the answer, which comes when the drive has acknowledged it."""
-    return await _command(lambda rig: rig.client.command(AXIS, MoveAbsolute(position=5.0)))
+    command = MoveAbsolute(position=5.0)
+    return await _command(lambda rig: rig.client.command(AXIS, command))
 
 
 async def console_move() -> Way:
@@ -217,7 +218,8 @@ async def console_move() -> Way:
 
 async def trace() -> Way:
     """Follow one trace request: from its query to the answer that the trace is armed."""
-    return await _command(lambda rig: rig.client.command(AXIS, TakeTrace(channels=("position",), samples=10)))
+    command = TakeTrace(channels=("position",), samples=10)
+    return await _command(lambda rig: rig.client.command(AXIS, command))
 
 
 async def smartstep_trace() -> Way:
@@ -228,8 +230,9 @@ async def smartstep_trace() -> Way:
         await rig.until("feed", lambda state: state.link == "up")
         await rig.client.command("feed", ReadAlarms())  # the client knows the axis from now on
         await asyncio.sleep(SETTLED_S)
+        command = TakeTrace(channels=("speed_feedback",), samples=10)
         with followed(way):
-            await rig.client.command("feed", TakeTrace(channels=("speed_feedback",), samples=10))
+            await rig.client.command("feed", command)
     return way
 
 

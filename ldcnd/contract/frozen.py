@@ -8,12 +8,15 @@ import sys
 from collections.abc import Mapping
 from functools import cache
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pydantic import BaseModel, ConfigDict
+from pydantic_core import PydanticKnownError, core_schema
+
+from ldcnd.contract.number_text import is_number
 
 if TYPE_CHECKING:
-    from pydantic import GetJsonSchemaHandler
+    from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
     from pydantic.json_schema import JsonSchemaValue
     from pydantic_core import CoreSchema
 
@@ -23,12 +26,19 @@ DIALECT = "https://json-schema.org/draft/2020-12/schema"
 
 
 class Frozen(BaseModel):
-    """An immutable model that refuses unknown fields, NaN and infinity.
+    """An immutable model that refuses unknown fields, NaN, infinity, and for a number what is none.
 
-    What validates and encodes a model is built when it is needed first: a program seldom needs more than a few of them.
+    Texts and truths are no numbers, in Python and in TOML as in JSON: `position="1_000"` is refused. What validates and
+    encodes a model is built when it is needed first: a program seldom needs more than a few of them.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, defer_build=True)
+
+    @classmethod
+    def __get_pydantic_core_schema__(cls, source: type[BaseModel], handler: "GetCoreSchemaHandler") -> "CoreSchema":
+        """Return what validates the model, with the rule for numbers in each of its fields."""
+        schema: CoreSchema = _with_numbers(handler(source), cls)
+        return schema
 
     @classmethod
     def __get_pydantic_json_schema__(
@@ -41,6 +51,51 @@ class Frozen(BaseModel):
             if name in said:
                 described["description"] = said[name]
         return schema
+
+
+_NOT_FOR_VALUES = frozenset({"default", "metadata", "serialization", "keys_schema", "config"})
+"""Parts of a core schema that validate no values; JSON has texts for the keys of a table."""
+
+
+def _with_numbers(schema: Any, model: type[BaseModel]) -> Any:  # noqa: ANN401 - a core schema is a tree of dicts
+    """Return the core schema of a model with the rule for numbers wherever an int or a float is validated.
+
+    JSON is validated without a call of Python, strictly. A model inside has the rule from its own class.
+    """
+    match schema:
+        case {"type": "model", "cls": other} if other is not model:
+            return schema
+        case {"type": "int" | "float"}:
+            given = core_schema.no_info_before_validator_function(
+                _whole if schema["type"] == "int" else _real, {**schema, "strict": False}
+            )
+            return core_schema.json_or_python_schema({**schema, "strict": True}, given)
+        case {"type": "model-fields", "fields": fields}:  # by their names, which mean nothing here
+            return {**schema, "fields": {name: _with_numbers(each, model) for name, each in fields.items()}}
+        case dict():
+            return {key: each if key in _NOT_FOR_VALUES else _with_numbers(each, model) for key, each in schema.items()}
+        case list() | tuple():
+            return type(schema)(_with_numbers(each, model) for each in schema)
+    return schema
+
+
+def _real(value: object) -> float:
+    try:
+        if is_number(value):
+            return float(value)
+    except (OverflowError, ValueError):  # beyond binary64; a signalling NaN
+        raise PydanticKnownError("finite_number") from None
+    raise PydanticKnownError("float_type")
+
+
+def _whole(value: object) -> int:
+    try:
+        # every number converts, also those of NumPy, whose types do not say so
+        if is_number(value) and value == (whole := int(value)):  # type: ignore[arg-type]
+            return whole
+    except (OverflowError, ValueError):  # infinity, NaN
+        raise PydanticKnownError("finite_number") from None
+    raise PydanticKnownError("int_from_float" if is_number(value) else "int_type")
 
 
 def build_models(model: type[Frozen] = Frozen) -> None:

@@ -1,13 +1,16 @@
 """Numbers that people type, on a command line or in an answer: read by one rule wherever they are typed.
 
 The console's pages read by the same rules in `console/static/parts/number_text.js`; one table of cases tests both.
-Files and payloads of programs hold numbers of their own syntax (TOML, JSON) and are not read by this.
+Files, payloads and programs have numbers of their own syntax (TOML, JSON, Python); a text is none there: `is_number`.
 """
 
 import math
 import re
 import unicodedata
 from dataclasses import dataclass
+from decimal import Decimal
+from numbers import Real
+from typing import TypeGuard
 
 _NUMBER = re.compile(r"([+\-\u2212]?)([0-9]*)(?:([.,])([0-9]*))?(?:[eE]([+\-\u2212]?[0-9]+))?\s*(.*)", re.DOTALL)
 _NOT_FINITE = re.compile(r"[+\-\u2212]?\s*(?:inf|nan|∞)", re.IGNORECASE)
@@ -33,6 +36,14 @@ class _Parts:
     fraction: str
     power: str
     rest: str
+
+
+def is_number(value: object) -> TypeGuard[Real | Decimal]:
+    """Tell whether a program has given a number: Python's, NumPy's scalars, fractions, decimals; no text, no truth.
+
+    A text that Python reads as a number (`"1_000"`, `" 5 "`) can be another one by the rule for what people type.
+    """
+    return isinstance(value, Real | Decimal) and not isinstance(value, bool)
 
 
 def read_number(text: str, unit: str = "") -> float:
