@@ -105,6 +105,7 @@ class Target:
 
         async def within() -> ResultT:
             async with open_rig(self._settings(), self.rig) as client:
+                client.watch_rivals(lambda: click.echo(client.rivals, err=True))
                 return await work(client)
 
         return asyncio.run(within())

@@ -76,7 +76,7 @@ def dated(pattern: Path, start: datetime) -> Path:
 async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
     from ldcnd.lab.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder  # noqa: PLC0415 - needs an optional package
 
-    recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes)
+    recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes, client.descriptions)
     on_end(recorder.end)
     try:
         with recorder:

@@ -123,7 +123,7 @@ async def follow_events(client: RigClient, axis: str | None = None, *, history: 
         if sample.kind is SampleKind.PUT:
             events.take(decode_received(CommandEvent, sample.payload, sample.encoding))
 
-    declaration = await client.session.subscribe(client.keys.telemetry_pattern("*", EVENT), take)
+    declaration = await client.subscribe(client.keys.telemetry_pattern("*", EVENT), take)
     try:
         yield events
     finally:

@@ -32,7 +32,7 @@ async def health_reports(client: RigClient, take: Callable[[DaemonHealth | BusHe
         else:
             take(decode_received(BusHealth, sample.payload, sample.encoding))
 
-    declaration = await client.session.subscribe(f"{client.keys.health}/**", decode)
+    declaration = await client.subscribe(f"{client.keys.health}/**", decode)
     try:
         yield
     finally:

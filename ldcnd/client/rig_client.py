@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from typing import TypeVar
 
+from ldcnd.client.own_samples import Origin
 from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
 from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownCommand
@@ -24,7 +25,15 @@ from ldcnd.contract.samples import (
 )
 from ldcnd.contract.samples import Sample as Measurement
 from ldcnd.net.hand_over import Answer
-from ldcnd.net.session import NO_PARAMETERS, Declaration, Sample, SampleKind, Session
+from ldcnd.net.session import (
+    NO_PARAMETERS,
+    UNDELIVERED_SAMPLES,
+    Declaration,
+    OnSample,
+    Sample,
+    SampleKind,
+    Session,
+)
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
@@ -101,7 +110,7 @@ class RigClient:
         self.session = session
         self.keys = Keys(rig)
         self._instance: str | None = None
-        self._source: str | None = None  # the session of the daemon that was found last
+        self._origin = Origin(self.daemon)
 
     async def read(self, key: str, model: type[ModelT]) -> list[ModelT]:
         """Return the values of the keys of the rig that match `key`."""
@@ -110,14 +119,42 @@ class RigClient:
     async def _values(self, key: str, parameters: Mapping[str, str] = NO_PARAMETERS) -> list[Answer]:
         """Return what the daemon of the rig answers: others, such as a storage with old values, may answer as well."""
         answers = await self.session.query(key, parameters=parameters, everyone=True)
-        if any(answer.source == self._source for answer in answers):
-            return [answer for answer in answers if answer.source == self._source]
+        if any(answer.source == self._origin.source for answer in answers):
+            return [answer for answer in answers if answer.source == self._origin.source]
         if answers:
             try:
                 await self.daemon()
             except SessionError:
                 return []
-        return [answer for answer in answers if answer.source == self._source]
+        return [answer for answer in answers if answer.source == self._origin.source]
+
+    @property
+    def rivals(self) -> str | None:
+        """What was dropped because other programs than the daemon have published it, in words; None if nothing was."""
+        count = self._origin.rivals.total()
+        who = "another program publishes" if len(self._origin.rivals) == 1 else "other programs publish"
+        return f"{who} on the keys of rig {self.rig}; such values are left out, {count} so far" if count else None
+
+    def watch_rivals(self, on_rival: Callable[[], None]) -> None:
+        """Call back whenever another program begins to publish on the keys of the rig."""
+        self._origin.on_rival = on_rival
+
+    async def subscribe(
+        self, key: str, take: OnSample, kept: int = UNDELIVERED_SAMPLES, *, linger_s: float = 0.0
+    ) -> Declaration:
+        """Hand what the daemon publishes on the keys that match to `take`; as `Session.subscribe`."""
+        gate = self._origin.gate(take)
+        try:
+            declaration = await self.session.subscribe(key, gate.admit, kept, linger_s=linger_s)
+        except BaseException:
+            await gate.close()
+            raise
+
+        async def close() -> None:
+            await declaration.close()
+            await gate.close()
+
+        return Declaration(close, lambda: declaration.load)
 
     async def daemon(self) -> DaemonInfo:
         """Return what the daemon says about itself.
@@ -129,7 +166,8 @@ class RigClient:
         found = [(self._decoded(answer, DaemonInfo), answer.source) for answer in answers if not answer.is_error]
         if not found:
             return self._one(answers, DaemonInfo)
-        daemon, self._source = max(found, key=lambda each: each[0].started)
+        daemon, source = max(found, key=lambda each: each[0].started)
+        self._origin.found(source)
         return daemon
 
     async def axes(self) -> list[AxisInfo]:
@@ -249,7 +287,7 @@ class RigClient:
     ) -> AsyncIterator[None]:
         """Hand one item of an axis to `take`, encoded as it came, for the time of the context."""
         key = self.keys.telemetry_pattern(axis, item)
-        declaration = await self.session.subscribe(key, take, KEPT_SAMPLES, linger_s=linger_s)
+        declaration = await self.subscribe(key, take, KEPT_SAMPLES, linger_s=linger_s)
         try:
             yield
         finally:
@@ -259,7 +297,7 @@ class RigClient:
     async def samples(self, axis: str = "*", item: str = "*") -> AsyncIterator[Samples]:
         """Subscribe to telemetry for the time of the context."""
         samples = Samples()
-        declaration = await self.session.subscribe(self.keys.telemetry_pattern(axis, item), samples.take)
+        declaration = await self.subscribe(self.keys.telemetry_pattern(axis, item), samples.take)
         try:
             yield samples
         finally:
@@ -279,7 +317,7 @@ class RigClient:
         async with AsyncExitStack() as declared:
             declarations: list[Declaration] = []
             for key in (self.keys.all_telemetry, f"{self.keys.health}/**"):
-                declaration = await self.session.subscribe(key, take, kept, linger_s=linger_s)
+                declaration = await self.subscribe(key, take, kept, linger_s=linger_s)
                 declared.push_async_callback(declaration.close)
                 declarations.append(declaration)
             yield lambda: sum(declaration.load.lost for declaration in declarations)
@@ -293,7 +331,7 @@ class RigClient:
         )
         answers = [a for key in keys for a in await self._values(key, {"enc": "msgpack"})]
         return [
-            Sample(answer.key, answer.payload, answer.encoding, SampleKind.PUT, answer.measured_at_ns)
+            Sample(answer.key, answer.payload, answer.encoding, SampleKind.PUT, answer.measured_at_ns, answer.source)
             for answer in answers
             if not answer.is_error
         ]
@@ -356,7 +394,7 @@ class RigClient:
                 f"no daemon serves rig {self.rig}, or this login may not query it",
                 remedy="check that the daemon runs and that you connect to it",
             )
-        own = [answer for answer in answers if answer.source == self._source]
+        own = [answer for answer in answers if answer.source == self._origin.source]
         return self._decoded((own or answers)[-1], model)
 
     @staticmethod

@@ -39,6 +39,7 @@ class RigWatch:
         self._conditions = Conditions(client.rig, values.take, asyncio.get_running_loop().time)
         self._instances: set[str] = set()
         self._stirred = asyncio.Event()
+        client.watch_rivals(self._stirred.set)
         self._reply = RigReply(
             name=client.rig, endpoint=endpoint, connected=False, problem="its daemon has not been seen yet"
         )
@@ -122,7 +123,8 @@ class RigWatch:
             self._show(problem=error.message)
             return False
         several = len(self._instances) > 1
-        self._show(problem="two daemons serve it; motion is refused until one of them goes" if several else None)
+        two = "two daemons serve it; motion is refused until one of them goes"
+        self._show(problem=two if several else self.client.rivals, connected=True)
         return True
 
     async def _describe(self) -> None:
@@ -148,8 +150,8 @@ class RigWatch:
         except TimeoutError:
             return
 
-    def _show(self, *, problem: str | None) -> None:
-        connected = bool(self._instances) and (problem is None or len(self._instances) > 1)
+    def _show(self, *, problem: str | None, connected: bool = False) -> None:
+        connected = bool(self._instances) and connected
         self._reply = self._reply.model_copy(update={"connected": connected, "problem": problem})
         self._conditions.silence = "" if connected else problem or "its daemon has not been seen yet"
         told = {"connected": connected, "problem": problem, "instance": self.instance}

@@ -153,7 +153,7 @@ class MemorySession(Session):
         """Offer the sample to every subscription that matches; quality of service makes no difference here."""
         del qos, attachment
         if self._closed or self._broker.subscriptions or self._overhear:
-            self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
+            self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns, self._name))
 
     def publisher(self, key: str, *, encoding: str, qos: Qos) -> PublishValue:
         """Return what publishes the values of one key."""
@@ -162,13 +162,13 @@ class MemorySession(Session):
 
         def publish(payload: bytes, measured_at_ns: int) -> None:
             if self._closed or broker.subscriptions or self._overhear:
-                self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns))
+                self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns, self._name))
 
         return publish
 
     def delete(self, key: str) -> None:
         """Offer the deletion to every subscription that matches."""
-        self._offer(Sample(key, b"", "", SampleKind.DELETE, None))
+        self._offer(Sample(key, b"", "", SampleKind.DELETE, None, self._name))
 
     async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
         """Answer queries; nothing is in the way of an answer here, so urgent only means not to be refused."""

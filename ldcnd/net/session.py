@@ -48,6 +48,8 @@ class Sample(NamedTuple):
     kind: SampleKind
     measured_at_ns: int | None
     """When the value was true, UTC in ns since 1970; when it was sent if not given; None without a time stamp."""
+    source: str = ""
+    """The session that has published it, as in the `source` of an `Answer`; empty when it does not say."""
 
 
 OnSample = Callable[[Sample], None]

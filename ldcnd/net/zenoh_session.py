@@ -149,6 +149,7 @@ class ZenohSession(Session):
         self._logins: dict[str, str | None] = {}
         self._link_changes: object = None  # the listener, once a login was asked for
         self._stamps = Stamps(session.new_timestamp().get_id())
+        self._source_info = zenoh.SourceInfo(session.id, 0)
         self._closed = False
 
     def publish(
@@ -166,19 +167,16 @@ class ZenohSession(Session):
         timestamp = self._stamps.of(measured_at_ns)
         outlet = self._outlets.get(key) or self._new_outlet(key, qos)
         try:
-            if outlet.publisher and outlet.qos is qos:
-                outlet.publisher.put(payload, encoding=encoding, timestamp=timestamp, attachment=attachment)
-            else:
-                self._session.put(
-                    key, payload, encoding=encoding, timestamp=timestamp, attachment=attachment, **TRAVEL[qos]
-                )
+            declared = outlet.publisher if outlet.qos is qos else None
+            put = declared.put if declared else partial(self._session.put, key, **TRAVEL[qos])
+            put(payload, encoding=encoding, timestamp=timestamp, attachment=attachment, source_info=self._source_info)
         except zenoh.ZError as error:
             raise SessionError(f"{key}: cannot publish: {error}") from error
 
     def publisher(self, key: str, *, encoding: str, qos: Qos) -> PublishValue:
         """Return what publishes the values of one key; one call for each, as five belong to every poll."""
         outlet = _Outlet(qos, encoding)
-        stamps, session, travel = self._stamps, self._session, TRAVEL[qos]
+        stamps, session, travel, source_info = self._stamps, self._session, TRAVEL[qos], self._source_info
 
         def publish(payload: bytes, measured_at_ns: int) -> None:
             if self._closed:
@@ -186,9 +184,9 @@ class ZenohSession(Session):
             timestamp = stamps.latest if measured_at_ns == stamps.at_ns else stamps.of(measured_at_ns)
             try:
                 if outlet.publisher is not None:
-                    outlet.publisher.put(payload, timestamp=timestamp)
+                    outlet.publisher.put(payload, timestamp=timestamp, source_info=source_info)
                     return
-                session.put(key, payload, encoding=encoding, timestamp=timestamp, **travel)
+                session.put(key, payload, encoding=encoding, timestamp=timestamp, source_info=source_info, **travel)
             except zenoh.ZError as error:
                 raise SessionError(f"{key}: cannot publish: {error}") from error
             if key not in self._outlets:
@@ -201,7 +199,7 @@ class ZenohSession(Session):
         self._must_be_open()
         outlet = self._outlets.get(key)
         try:
-            self._session.delete(key, **TRAVEL[outlet.qos if outlet else Qos.EVENT])
+            self._session.delete(key, source_info=self._source_info, **TRAVEL[outlet.qos if outlet else Qos.EVENT])
         except zenoh.ZError as error:
             raise SessionError(f"{key}: cannot delete: {error}") from error
 
@@ -311,7 +309,7 @@ class ZenohSession(Session):
                 payload=payload if payload or encoding else None,
                 encoding=encoding or None,
                 cancellation_token=token,
-                source_info=zenoh.SourceInfo(self._session.id, 0),
+                source_info=self._source_info,
             )
 
         try:

@@ -34,9 +34,12 @@ _PUT, _PUT_OF_OURS = zenoh.SampleKind.PUT, SampleKind.PUT
 def to_sample(sample: zenoh.Sample) -> Sample:
     """Return a sample as the session's users expect it."""
     key, payload, at_ns = str(sample.key_expr), sample.payload.to_bytes(), _stamped_ns(sample.timestamp)
+    # not the id in the time stamp: who passes on a sample without one puts in its own
+    info = sample.source_info
+    source = "" if info is None else str(info.source_id.zid)
     if sample.kind == _PUT:
-        return Sample(key, payload, str(sample.encoding), _PUT_OF_OURS, at_ns)
-    return Sample(key, payload, "", SampleKind.DELETE, at_ns)
+        return Sample(key, payload, str(sample.encoding), _PUT_OF_OURS, at_ns, source)
+    return Sample(key, payload, "", SampleKind.DELETE, at_ns, source)
 
 
 def to_answers(key: str, replies: Sequence[zenoh.Reply], timeout_s: float) -> list[Answer]:

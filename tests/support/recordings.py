@@ -51,7 +51,9 @@ async def recorded_rig(
         loop = asyncio.get_running_loop()
         counts: Counter[str] = Counter()
         descriptions = await rig.client.descriptions()
-        with Recorder(path, descriptions, lambda: EPOCH_NS + round(loop.time() * 1e9), rotate_bytes) as recorder:
+        with Recorder(
+            path, descriptions, lambda: EPOCH_NS + round(loop.time() * 1e9), rotate_bytes, rig.client.descriptions
+        ) as recorder:
 
             def take(sample: Sample) -> None:
                 counts[sample.key] += 1

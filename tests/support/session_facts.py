@@ -6,7 +6,7 @@ import pytest
 
 from ldcnd.contract.errors import SessionError
 from ldcnd.net.session import UNDELIVERED_SAMPLES, Qos, Sample, SampleKind
-from tests.support.session_pair import JSON, KEYS, POSITION, Pair, subscribed
+from tests.support.session_pair import HALT, JSON, KEYS, POSITION, Pair, echo, served, subscribed
 
 
 class SampleFacts:
@@ -20,7 +20,25 @@ class SampleFacts:
 
         async with asyncio.timeout(2):
             sample = await samples.get()
-        assert sample == Sample(POSITION, b"\x81", encoding, SampleKind.PUT, at_ns)
+        assert sample[:5] == Sample(POSITION, b"\x81", encoding, SampleKind.PUT, at_ns)[:5]
+
+    async def test_a_sample_names_the_session_that_an_answer_names(self, pair: Pair) -> None:
+        """The only proof of origin: a program on the way puts its own name into a time stamp that is missing."""
+        await pair.server.serve(HALT, echo, complete=True)
+        await served(pair.client, HALT)
+        samples = await subscribed(pair.server, pair.client)
+
+        (answer,) = await pair.client.query(HALT)
+        pair.server.publish(POSITION, b"1", encoding=JSON, qos=Qos.TELEMETRY)
+        pair.server.publisher(POSITION, encoding=JSON, qos=Qos.TELEMETRY)(b"2", 1)
+        pair.server.delete(POSITION)
+        pair.client.publish(POSITION, b"3", encoding=JSON, qos=Qos.TELEMETRY)
+
+        async with asyncio.timeout(2):
+            found = {(sample := await samples.get()).payload: sample.source for _ in range(4)}
+        other = found.pop(b"3")
+        assert set(found.values()) == {answer.source}
+        assert other not in ("", answer.source)
 
     async def test_samples_of_a_key_arrive_in_order_and_the_deletion_last(self, pair: Pair) -> None:
         samples = await subscribed(pair.server, pair.client)

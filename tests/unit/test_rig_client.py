@@ -91,6 +91,7 @@ async def test_a_storage_with_older_values_is_not_taken_for_the_daemon(
 
 
 async def test_a_sample_with_fields_that_are_news_is_understood(newer: Newer) -> None:
+    await newer.answers(KEYS.daemon, present)
     async with newer.client.samples() as samples:
         newer.session.publish(POSITION, text(SAMPLE), encoding=JSON, qos=Qos.TELEMETRY)
         axis, sample = await anext(samples)
@@ -104,6 +105,7 @@ async def test_samples_that_the_network_dropped_are_counted_for_each_key(newer: 
     def publish(key: str, seq: int) -> None:
         newer.session.publish(key, text(SAMPLE | {"seq": seq}), encoding=JSON, qos=Qos.TELEMETRY)
 
+    await newer.answers(KEYS.daemon, present)
     async with newer.client.samples() as samples:
         for seq in (7, 8, 11, 12, 0, 1, 3):  # two are missing, the daemon was started anew, one is missing
             publish(POSITION, seq)

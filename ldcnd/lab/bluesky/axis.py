@@ -212,7 +212,7 @@ class Axis(ReadableAxis):
 
     def set(self, value: float) -> Status:
         """Move to a position in axis units; the status is done when the axis stands there, or where it was stopped."""
-        return self._begin(f"move to {value:g}", lambda: self._move(float(value), self.velocity))
+        return self._begin(f"move to {value}", lambda: self._move(value, self.velocity))
 
     def home(self) -> Status:
         """Find the reference position, as the axis's configuration says."""
@@ -248,7 +248,7 @@ class Axis(ReadableAxis):
         Raises:
             RequestRefused: as the daemon would refuse it, with the nearest position that it would accept.
         """
-        await self._there(self._check(float(value), self.velocity))
+        await self._there(self._check(value, self.velocity))
 
     async def read(self) -> "dict[str, Reading[float]]":
         """Return the position and the setpoint, as `locate` does.

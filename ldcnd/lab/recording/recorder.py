@@ -1,7 +1,12 @@
-"""Writes what a rig publishes into one MCAP file after the other."""
+"""Writes what a rig publishes into one MCAP file after the other.
+
+A file has one description of the rig. The values of a daemon that was restarted wait until it has described itself;
+with another configuration they go into the next file, because the same counts can be other millimetres then.
+"""
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -19,12 +24,17 @@ KEPT_SAMPLES = 16_384
 """Maximum number of samples that wait for a slow disk, about 8 s of a line of 31 axes."""
 
 
+CONFIGURATION = "configuration"
+"""Name of the description from which units, scales and limits follow."""
+
+
 class Recorder:
     """A recording under way; leaving the context completes its last file.
 
     Args:
         path: the first file; those that follow have a number before the suffix.
         descriptions: of the rig, in JSON, attached to every file, by name.
+        describe: returns them as they are now.
         now_ns: the wall clock, UTC in ns since 1970.
         rotate_bytes: size of a file at which the next one follows, after at most `FLUSH_PERIOD_S`.
 
@@ -40,7 +50,12 @@ class Recorder:
     """
 
     def __init__(
-        self, path: Path, descriptions: Mapping[str, bytes], now_ns: Callable[[], int], rotate_bytes: int
+        self,
+        path: Path,
+        descriptions: Mapping[str, bytes],
+        now_ns: Callable[[], int],
+        rotate_bytes: int,
+        describe: Callable[[], Awaitable[Mapping[str, bytes]]] | None = None,
     ) -> None:
         self.messages = 0
         self.not_understood = 0
@@ -50,7 +65,11 @@ class Recorder:
         self._descriptions = descriptions
         self._now_ns = now_ns
         self._rotate_bytes = rotate_bytes
-        self._over = asyncio.Event()
+        self._describe = describe
+        self._source = ""  # the session of the daemon that the descriptions are of
+        self._undescribed: deque[Sample] = deque(maxlen=KEPT_SAMPLES)
+        self._stirred = asyncio.Event()
+        self._over = False
         self._problem: OSError | None = None
         self._files = 0
         self._file = self._open()
@@ -76,7 +95,8 @@ class Recorder:
 
     def end(self) -> None:
         """Make `run` return."""
-        self._over.set()
+        self._over = True
+        self._stirred.set()
 
     async def run(self, gave_way: Callable[[], int]) -> None:
         """Put on the disk what has come, each `FLUSH_PERIOD_S`, until `end`.
@@ -88,13 +108,15 @@ class Recorder:
             ConfigError: the next file exists already.
             OSError: a file cannot be written.
         """
-        while not self._over.is_set():
+        while not self._over:
+            self._stirred.clear()
             try:
                 async with asyncio.timeout(FLUSH_PERIOD_S):
-                    await self._over.wait()
+                    await self._stirred.wait()
             except TimeoutError:
                 self._file.flush()
                 self._rotate()
+            await self._follow_daemon()
             self.too_slow = gave_way()
         if self._problem:
             raise self._problem
@@ -102,6 +124,10 @@ class Recorder:
     def take(self, sample: Sample) -> None:
         """Record one value; deletions of keys are left out. An error ends `run`."""
         if sample.kind is SampleKind.DELETE or self._problem:
+            return
+        if self._describe and sample.source != self._source:
+            self._undescribed.append(sample)
+            self._stirred.set()
             return
         try:
             entry = entry_of(sample)
@@ -119,11 +145,30 @@ class Recorder:
         self.messages += 1
         self.losses.saw(f"/{sample.key}", entry.seq)
 
+    async def _follow_daemon(self) -> None:
+        """Describe a daemon, and record what it has published; in the next file if it is configured anew."""
+        while self._describe and self._undescribed:
+            try:
+                descriptions = await self._describe()
+            except LdcndError:
+                return  # asked again with the next sample, and each `FLUSH_PERIOD_S`
+            source, changed = self._undescribed[-1].source, _is_another(descriptions, self._descriptions)
+            waiting = tuple(each for each in self._undescribed if each.source == source)
+            self._undescribed.clear()
+            self._source, self._descriptions = source, descriptions
+            if changed:
+                self._begin_next()
+            for sample in waiting:
+                self.take(sample)
+
     def _rotate(self) -> None:
         """Begin the next file if this one is full."""
         if self._file.size_bytes >= self._rotate_bytes:
-            full, self._file = self._file, self._open()
-            full.complete(self._facts())
+            self._begin_next()
+
+    def _begin_next(self) -> None:
+        full, self._file = self._file, self._open()
+        full.complete(self._facts())
 
     def _open(self) -> McapFile:
         number = self._files + 1
@@ -137,3 +182,7 @@ class Recorder:
         """Return the facts of the recording until now, for a file."""
         counts = {"messages": self.messages, "too_slow": self.too_slow, "not_understood": self.not_understood}
         return {name: str(count) for name, count in counts.items()} | self.losses.facts()
+
+
+def _is_another(descriptions: Mapping[str, bytes], before: Mapping[str, bytes]) -> bool:
+    return descriptions.get(CONFIGURATION) != before.get(CONFIGURATION)
