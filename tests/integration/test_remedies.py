@@ -1,16 +1,28 @@
 """What a refusal tells people to type is typed in the state that refused, and then the command works."""
 
+import ast
 import asyncio
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeAlias
 
 import pytest
 
+import ldcnd
+from ldcnd.cli.output import typed
 from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.contract.commands import AxisCommand, Command, CommandReply, Jog, MoveVelocity
+from ldcnd.contract.errors import LdcndError, Remedy, step
+from ldcnd.contract.events import ReadOutcome
+from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import LinkState
 from ldcnd.contract.traces import TakeTrace
-from tests.support.command_line import VirtualRig, virtual_rig
+from ldcnd.drives.smartstep.ledger import EEPROM_LIFE
+from tests.support.command_line import Ran, VirtualRig, virtual_rig
 from tests.support.rig import SIMULATED
+
+AnyCommand: TypeAlias = AxisCommand[CommandReply] | Command[Frozen]
 
 FILLED = {
     "POSITION": "5",
@@ -28,6 +40,7 @@ class Case:
     """A refusal, and what it tells people to type.
 
     Attributes:
+        says: the remedy, as typed.
         before: commands that lead to its state.
         refused: the command that is refused in it.
         typed: what the remedy names.
@@ -35,6 +48,7 @@ class Case:
         then: what works afterwards; the refused command when empty.
     """
 
+    says: str
     before: tuple[str, ...]
     refused: str
     typed: str
@@ -43,26 +57,93 @@ class Case:
 
 
 LONG = "axis move x 60 --velocity 5"
+HALT = "ldcnd axis halt AXIS and wait"
+GAINS = "ldcnd axis gains AXIS --kp KP --el EL"
+OUTPUTS = "ldcnd axis outputs AXIS --limit1 input --limit2 input"
+RESTART = (
+    "write RAM, raise eeprom_budget (the memory endures {life} writes), or, if the drive was replaced,"
+    " ldcnd params restart-count AXIS"
+)
+CLOSE = "configure gains or ldcnd axis gains AXIS --kp KP --el EL"
+AXES = ("x", "n", "z", "g", "feed")
+HELD = "wait until it is released, or ldcnd lease hold --axis AXIS --force -- COMMAND"
+LEASE = "ldcnd lease hold --axis AXIS -- COMMAND"
+DAMAGED = (
+    "restore the file from a backup and start the daemon again, or ldcnd params restart-count AXIS with the writes that"
+    " you know of"
+)
 CASES = {
-    "disabled": Case((), "axis move x 1 --relative --wait", "axis power x on"),
-    "not homed": Case(("axis power n on",), "axis move n 1", "axis home n", waits_s=30.0),
-    "not homed, place known": Case(("axis power z on",), "axis move z 6", "axis set-position z POSITION"),
-    "moving": Case((LONG,), "axis move x 1 --wait", "axis halt x", waits_s=2.0),
-    "moving, unreferenced": Case((LONG,), "axis set-position x 1", "axis halt x", waits_s=2.0),
-    "resetting in motion": Case((LONG,), "axis reset x", "axis halt x", waits_s=2.0),
-    "latched": Case(("axis stop x",), "axis power x on", "axis reset x"),
-    "speed override": Case(("axis power x on", "speed 0"), "axis move x 1 --wait", "speed PERCENT"),
-    "without gains": Case((), "axis power g on", "axis gains g --kp KP --el EL"),
+    "disabled": Case("ldcnd axis power AXIS on", (), "axis move x 1 --relative --wait", "axis power x on"),
+    "not homed": Case(
+        "ldcnd axis home AXIS or ldcnd axis set-position AXIS POSITION",
+        ("axis power n on",),
+        "axis move n 1",
+        "axis home n",
+        waits_s=30.0,
+    ),
+    "not homed, place known": Case(
+        "ldcnd axis home AXIS or ldcnd axis set-position AXIS POSITION",
+        ("axis power z on",),
+        "axis move z 6",
+        "axis set-position z POSITION",
+    ),
+    "moving": Case(HALT, (LONG,), "axis move x 1 --wait", "axis halt x", waits_s=2.0),
+    "moving, unreferenced": Case(HALT, (LONG,), "axis set-position x 1", "axis halt x", waits_s=2.0),
+    "resetting in motion": Case(HALT, (LONG,), "axis reset x", "axis halt x", waits_s=2.0),
+    "latched": Case("ldcnd axis reset AXIS", ("axis stop x",), "axis power x on", "axis reset x"),
+    "speed override": Case(
+        "ldcnd speed PERCENT above 0 %", ("axis power x on", "speed 0"), "axis move x 1 --wait", "speed PERCENT"
+    ),
+    "faulted": Case(
+        "remove the cause, then ldcnd axis reset AXIS",
+        (
+            "axis power x on",
+            "axis gains x --el 1",
+            "axis move x 3 --relative --velocity 60",
+            "WAIT 3",
+            "axis gains x --el 4000",
+        ),
+        "axis power x on",
+        "axis reset x",
+    ),
+    "velocity of nothing": Case(
+        "ldcnd axis halt AXIS", ("axis power x on",), "VELOCITY x 0", "axis halt x", then="axis halt x"
+    ),
+    "few gains": Case(GAINS, (), "axis gains g --kd 5", "axis gains g --kp KP --el EL"),
     "pin is an output": Case(
+        OUTPUTS,
         ("axis outputs z --limit2 low",),
         "axis home z --method forward_limit --velocity 5",
         "axis outputs z --limit1 input --limit2 input",
     ),
-    "traced": Case(("TRACE x",), "trace take x --channel position --samples 5", "trace abort x"),
-    "unlisted parameter": Case((), "params get feed Pn999", "params list feed", then="params get feed Pn100"),
-    "budget spent": Case(
-        (), "params set feed Pn102 57 --eeprom", "params restart-count feed", then="params set feed Pn102 57 --eeprom"
+    "traced": Case(
+        "wait for its end, or ldcnd trace abort AXIS",
+        ("TRACE x",),
+        "trace take x --channel position --samples 5",
+        "trace abort x",
     ),
+    "unlisted parameter": Case(
+        "ldcnd params list AXIS, or allow unlisted ones",
+        (),
+        "params get feed Pn999",
+        "params list feed",
+        then="params get feed Pn100",
+    ),
+    "budget spent": Case(
+        RESTART.format(life=EEPROM_LIFE),
+        (),
+        "params set feed Pn102 57 --eeprom",
+        "params restart-count feed",
+        then="params set feed Pn102 57 --eeprom",
+    ),
+    "renewal of no jog": Case(
+        "let go, then ldcnd axis jog AXIS VELOCITY again",
+        ("axis power x on",),
+        "RENEW x",
+        "axis jog x 1 --for 0.2",
+        then="axis halt x",
+    ),
+    "unknown command": Case("ldcnd events", (), "OUTCOME x", "events", then="events"),
 }
 
 
@@ -91,13 +172,33 @@ def rig(tmp_path_factory):
             yield here
 
 
-def type_line(here: VirtualRig, line: str):
-    if line.startswith("TRACE"):
-        request = TakeTrace(channels=("position",), samples=5000, interval_s=0.1)
-        return here.wait(here.rig.client.command(line.split()[1], request))
+def type_line(here: VirtualRig, line: str) -> Ran:
+    """Type a line, or do what cannot be typed: begin a trace, ask for the outcome of a command of long ago."""
+    match line.split():
+        case ["WAIT", seconds]:
+            here.wait(asyncio.sleep(float(seconds)))
+            return Ran(0, "", "")
+        case ["TRACE", axis]:
+            return send(here, axis, TakeTrace(channels=("position",), samples=5000, interval_s=0.1))
+        case ["VELOCITY", axis, value]:
+            return send(here, axis, MoveVelocity(velocity=float(value)))
+        case ["RENEW", axis]:
+            return send(here, axis, Jog(velocity=1.0, renews="of-long-ago"))
+        case ["OUTCOME", axis]:
+            return send(here, axis, ReadOutcome(command_id="of-long-ago"))
     for word, filled in FILLED.items():
         line = line.replace(word, filled)
     return here.run(line, typed="y\n")
+
+
+def send(here: VirtualRig, axis: str, command: AnyCommand) -> Ran:
+    """Send what no command line sends; what is refused is put as the command line puts it."""
+    try:
+        client = here.rig.client
+        here.wait(client.command(axis, command) if isinstance(command, AxisCommand) else client.ask(command))
+    except LdcndError as error:
+        return Ran(1, "", error.remedy.phrased(lambda each: typed(each, axis)))
+    return Ran(0, "", "")
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
@@ -107,13 +208,36 @@ def test_what_a_refusal_names_is_a_way_out_of_the_state_that_refused(rig, case):
     rig.wait(asyncio.sleep(0.5))
 
     refused = type_line(rig, case.refused)
+    axis = next(word for word in case.refused.split() if word in AXES)
     assert refused.code != 0
-    assert f"ldcnd {case.typed}" in refused.errors
+    assert case.says.replace("AXIS", axis) in refused.errors
+    assert " ".join(case.typed.split()[:2]) in case.says.replace("AXIS", axis)
     way_out = type_line(rig, case.typed)
     assert way_out.code == 0, way_out.errors
     rig.wait(asyncio.sleep(case.waits_s))
     now = type_line(rig, case.then or case.refused)
     assert now.code == 0, now.errors
+
+
+def test_gains_that_were_never_given_are_given_as_the_refusal_says(monkeypatch):
+    with virtual_rig(monkeypatch, rig_config()) as here:
+        here.wait(here.rig.until("g", lambda state: state.link is LinkState.UP))
+
+        refused = here.run("axis power g on")
+        assert CLOSE.replace("AXIS", "g") in refused.errors
+        assert type_line(here, "axis gains g --kp KP --el EL").code == 0
+        assert here.run("axis power g on").code == 0
+
+
+def test_a_count_of_writes_that_was_lost_is_begun_again_as_the_refusal_says(monkeypatch, tmp_path):
+    (tmp_path / "eeprom-writes.json").write_text("{")
+    with virtual_rig(monkeypatch, rig_config().model_copy(update={"state_dir": tmp_path})) as here:
+        here.wait(here.rig.until("feed", lambda state: state.link is LinkState.UP))
+
+        refused = here.run("params set feed Pn102 57 --eeprom", typed="y\n")
+        assert DAMAGED.replace("AXIS", "feed") in refused.errors
+        assert here.run("params restart-count feed --writes 40", typed="y\n").code == 0
+        assert here.run("params set feed Pn102 57 --eeprom", typed="y\n").code == 0
 
 
 def test_control_that_a_refusal_tells_people_to_take_is_enough(rig, monkeypatch):
@@ -122,9 +246,68 @@ def test_control_that_a_refusal_tells_people_to_take_is_enough(rig, monkeypatch)
     here.run("axis power x on")
     here.wait(client.ask(Acquire(client="ann", axes=("x",), lease_s=60.0)))
     refused = here.run("axis move x 1 --relative")
-    assert "ldcnd lease hold --axis x --force -- COMMAND" in refused.errors
+    assert HELD.replace("AXIS", "x") in refused.errors
     held = here.wait(client.ask(Acquire(client="ldcnd", axes=("x",), lease_s=60.0, force=True)))
     monkeypatch.setenv("LDCND_LEASE", held.lease)
 
     assert here.run("axis move x 1 --relative --wait").code == 0
     assert here.run("axis jog x 1 --for 0.2").code == 0
+
+
+def test_a_lease_that_is_missing_is_taken_as_the_refusal_says(monkeypatch):
+    with virtual_rig(monkeypatch, rig_config().model_copy(update={"authority": "leased"})) as here:
+        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
+        take = here.rig.client.ask
+        other = here.wait(take(Acquire(client="ann", axes=("z",), lease_s=60.0)))
+        brief = here.wait(take(Acquire(client="ann", axes=("x",), lease_s=0.2)))
+        here.wait(asyncio.sleep(1.0))
+        for lease in ("", "no-such-lease", other.lease, brief.lease):
+            monkeypatch.setenv("LDCND_LEASE", lease)
+            refused = here.run("axis power x on")
+            assert refused.code != 0
+            assert LEASE.replace("AXIS", "x") in refused.errors.replace("AXIS", "x"), lease
+        taken = here.wait(take(Acquire(client="ldcnd", axes=("x",), lease_s=60.0)))
+        monkeypatch.setenv("LDCND_LEASE", taken.lease)
+        assert here.run("axis power x on").code == 0
+
+
+BY_OTHER_TESTS = {CLOSE, DAMAGED, HELD, LEASE}
+NOT_RUN = {
+    "ldcnd axis halt AXIS, wait until it stands, then ldcnd axis reset AXIS": "a shaft that turns without its drive",
+    "wait until it stands, then ldcnd axis power AXIS on": "a shaft that turns without its drive",
+    "ldcnd axis reset AXIS first": "an encoder that is unplugged and plugged in by hand",
+    "ldcnd axis home AXIS, then power it off": "a tuning, which the tests of tuning run",
+    "secure the load, then ldcnd axis reset AXIS": "a load that is secured by hand",
+    "wait for the end of the trace, or ldcnd trace abort AXIS": "a drive that a dead program has left in its trace",
+    "ldcnd trace abort AXIS": "a daemon that is lost during a trace",
+    "ldcnd trace abort AXIS again": "a drive that does not leave its trace",
+    "ldcnd axis clear-counter AXIS COUNTER again": "a drive that does not leave its counter mode",
+    "ldcnd events; give every command an id of its own": "thousands of commands",
+    "ldcnd axis halt AXIS first: at standstill the counter is set back": "hours of motion",
+    "ldcnd axis move AXIS DISTANCE --relative, a small distance: it sets the counter back": "hours of motion",
+    "ldcnd axis halt AXIS and wait: at standstill the gains are loaded again": "a drive taken over in motion",
+}
+"""Remedies whose state takes hands, hours or a broken drive, with what that is."""
+
+
+def test_every_remedy_that_names_a_command_is_run_or_takes_hands():
+    run = {case.says for case in CASES.values()} | BY_OTHER_TESTS
+    known = remedies()
+    print(f"{len(known)} remedies name commands, {len(run & known)} were run from the state that says them")
+
+    assert run <= known
+    assert not run & set(NOT_RUN)
+    assert known - run == set(NOT_RUN)
+
+
+def remedies() -> set[str]:
+    """Return what each remedy of the package that names commands says, as it is typed."""
+    words = {"Remedy": Remedy, "step": step, "EEPROM_LIFE": EEPROM_LIFE, "again": ""}
+    words["remedy"] = step("set_outputs", limit1="input", limit2="input")
+    found = set()
+    for file in Path(ldcnd.__file__).parent.rglob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "Remedy":
+                remedy = eval(ast.unparse(node), words)  # noqa: S307 - our own code
+                found.add(remedy.phrased(lambda each: typed(each, None)))
+    return found
