@@ -368,15 +368,16 @@ class AxisService:
         if not self._proof.holds:
             self._nothing_came()  # from its drive: who answers was not identified
             return False
-        standing = tracker.command is None and tracker.at_rest and self._queue.free
+        # a command that waits has sent nothing yet
+        standing = tracker.command is None and tracker.at_rest and not self._queue.at_work.locked()
         judged = self._plausibility.judge(reading, timing, standing=standing)
         if judged.verdict is Verdict.BELIEVED:
             if judged.step:
                 self._stepped(judged.step, reading)
             if judged.confirmed:  # items that only the first of two readings has are valid as well
                 first, first_timing = judged.confirmed
-                self.observed(first, first.asked - asked, first_timing)
-            self.observed(reading, asked, timing)
+                self._observe(first, first.asked - asked, first_timing)
+            self._observe(reading, asked, timing)
         elif judged.verdict is Verdict.CONTRADICTS:
             now_ns = self._clock.now_ns()
             if tracker.contradicted(now_ns):
@@ -408,13 +409,16 @@ class AxisService:
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         """Process an accepted reading; that of a drive which was not identified says nothing about the axis."""
-        if not self._proof.holds:
+        if self._proof.holds:
+            self._observe(reading, asked, timing)
+        else:
             self._nothing_came()  # from its drive: who answers was not identified
-            return
+
+    def _observe(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         tracker, arrivals = self.tracker, self._arrivals
         was_away = self._seen and tracker.link is LinkState.DOWN
         self._seen = True
-        was_referenced = tracker.referenced
+        had_lost_reference = tracker.reference_lost
         if tracker.command:
             arrivals.reading = reading
         if reading.altered != self._altered or not reading.profile_done:  # a call less for each poll of what stands
@@ -423,7 +427,7 @@ class AxisService:
         tracker.observed(reading, timing, t)
         if was_away and self.returned:
             self.returned()
-        if was_referenced and not tracker.referenced:
+        if tracker.reference_lost and not had_lost_reference:
             log.warning("reference lost", axis=self.config.name, faults=[fault.code for fault in reading.faults])
         self._changed.set()
         self._motion.reading = reading

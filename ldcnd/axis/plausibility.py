@@ -78,10 +78,27 @@ class _Fit(IntEnum):
     """How a reading fits to an earlier one."""
 
     FOLLOWS = 0
-    NEAR = 1
-    """A second reading must agree: another status, or a little farther than the motion explains."""
-    FAR = 2
+    CHANGED = 1
+    """It shows another status or speed, or an axis that should not have moved: a second reading must agree."""
+    BEYOND = 2
+    """It is a little farther than the motion explains: a second reading must agree."""
+    FAR = 3
     """No motion of the axis leads there: `ROUNDS` readings must agree."""
+
+
+class _Record(Enum):
+    """What the last accepted reading is worth."""
+
+    FIRST = "first"
+    """There was none before, or they contradicted each other: nothing jumps away from it."""
+    SURE = "sure"
+    AWAY = "away"
+    """The drive was out of reach since."""
+    CONTRADICTED = "contradicted"
+    """What came then contradicts it: what follows is compared with the latest reading."""
+
+
+_FIRST, _SURE, _AWAY, _CONTRADICTED = _Record  # `_Record.SURE` is looked up slowly, and every poll needs it
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,13 +134,12 @@ class PlausibilityGate:
     def __init__(self, config: AxisConfig) -> None:
         self.withheld = 0
         self._known: _Seen | None = None
+        self._record = _FIRST
         self._unconfirmed: _Seen | None = None
         self._rounds = self._agreeing = 0
-        self._expected: tuple[
-            _Expected, ...
-        ] = ()  # may run, or have run, since the accepted reading; the latest is last
-        # nothing jumps away from the very first reading, which is accepted as it is
-        self._sure = self._was_away = self._far = self._contradicts = False
+        self._far = False  # of those rounds, one at least
+        # may run, or have run, since the accepted reading; the latest is last
+        self._expected: tuple[_Expected, ...] = ()
         self.reconfigure(config)
 
     def reconfigure(self, config: AxisConfig) -> None:
@@ -157,8 +173,7 @@ class PlausibilityGate:
 
         Until two readings agree again, another place than before is not believed at once, and no jump is called one.
         """
-        self._unconfirmed, self._rounds, self._sure, self._was_away = None, 0, False, True
-        self._contradicts = False
+        self._unconfirmed, self._rounds, self._record = None, 0, _AWAY
 
     def judge(self, reading: AxisReading, timing: Timing, *, standing: bool) -> Judgement:
         """Judge a reading.
@@ -168,124 +183,120 @@ class PlausibilityGate:
             timing: of that reading.
             standing: the axis was at rest, and nothing was commanded since.
         """
-        known, unconfirmed = self._known, self._unconfirmed
+        known = self._known
         if standing:
             self._expected = ()
         if known is None:
-            return self._believe(reading, timing)
-        fit = self._fit(known, reading, timing, still=standing or self._was_away)
-        if self._contradicts:
+            return self._believe(reading, timing, record=_FIRST)
+        fit = self._fit(known, reading, timing.true_until_s, still=standing or self._record is _AWAY)
+        if fit or self._unconfirmed or self._record is _CONTRADICTED:
+            return self._weigh(known, reading, timing, fit)
+        self._known, self._expected, self._record = (reading, timing), self._expected[-1:], _SURE
+        return _BELIEVED
+
+    def _weigh(self, known: _Seen, reading: AxisReading, timing: Timing, fit: _Fit) -> Judgement:
+        """Judge a reading that does not follow, or that comes after one that did not."""
+        record, unconfirmed = self._record, self._unconfirmed
+        if record is _CONTRADICTED:
             return self._contradict(reading, timing, fit)
-        agrees = unconfirmed is not None and self._agrees(unconfirmed, reading, timing)
+        agreed = unconfirmed if unconfirmed and self._agrees(unconfirmed, reading, timing) else None
         # a counter that was set back in mid-motion soon passes where it was: it fits better to what it showed meanwhile
-        fits_better = (
-            unconfirmed is not None
-            and agrees
-            and self._far
-            and _misfit(unconfirmed, reading, timing) < _misfit(known, reading, timing)
-        )
-        if fit is _Fit.FOLLOWS and not fits_better:
+        back = agreed and self._far and _misfit(agreed, reading, timing) < _misfit(known, reading, timing)
+        if fit is _Fit.FOLLOWS and not back:
             self.withheld += self._rounds
-            self._sure = True
             return self._believe(reading, timing)
-        if agrees:
-            # a false velocity in the reading before explains any way; the true one in this reading does not
-            self._agreeing, self._far = self._agreeing + 1, self._far or fit is _Fit.FAR
-        else:
-            self._agreeing, self._far = 1, fit is _Fit.FAR
+        self._agreeing = self._agreeing + 1 if agreed else 1
+        # a false velocity in the reading before explains any way; the true one in this reading does not
+        self._far = fit is _Fit.FAR or (agreed is not None and self._far)
         # late replies of another drive agree as well
         if self._agreeing >= (ROUNDS if self._far else 2):
-            step = self._step(known, reading, timing) if self._sure else None
-            self._sure = True
+            step = None
+            if record is _SURE:
+                # a shaft that happens to come to rest at its 0 was led there
+                zeroed = reading.begun_anew and not known[0].begun_anew and fit >= _Fit.BEYOND
+                step = Step.ZEROED if zeroed else Step.JUMPED if self._far else None
             return self._believe(reading, timing, unconfirmed, step)
         self._unconfirmed = reading, timing
         self._rounds += 1
-        foreign = self._far or (self._was_away and abs(_way(known[0], reading)) > NOISE_COUNTS)
+        foreign = self._far or (record is _AWAY and abs(_way(known[0], reading)) > NOISE_COUNTS)
         if self._rounds < ROUNDS:
             return Judgement(Verdict.ASK_AGAIN, foreign=foreign)
         self.withheld += self._rounds
         # what follows is compared with the latest: what was believed before may never be true again
         self._known, self._unconfirmed, self._rounds, self._agreeing = (reading, timing), None, 0, 0
-        self._sure, self._contradicts = False, True
+        self._record = _CONTRADICTED
         return Judgement(Verdict.CONTRADICTS, foreign=foreign)
 
     def _contradict(self, reading: AxisReading, timing: Timing, fit: _Fit) -> Judgement:
         """Go on until as many polls in a row make sense as have not; a loop that hunts takes no more of the line."""
         self._agreeing = 0 if fit is _Fit.FAR else self._agreeing + 1
         if self._agreeing >= ROUNDS:
-            self._contradicts = False
-            return self._believe(reading, timing)
+            return self._believe(reading, timing, record=_FIRST)
         self.withheld += 1
         self._known = reading, timing
         return _STILL_CONTRADICTS
 
     def _believe(
-        self, reading: AxisReading, timing: Timing, confirmed: _Seen | None = None, step: Step | None = None
+        self,
+        reading: AxisReading,
+        timing: Timing,
+        confirmed: _Seen | None = None,
+        step: Step | None = None,
+        record: _Record = _SURE,
     ) -> Judgement:
-        self._known, self._expected = (reading, timing), self._expected[-1:]
-        self._unconfirmed, self._rounds, self._was_away, self._far = None, 0, False, False
-        return Judgement(Verdict.BELIEVED, confirmed, step) if confirmed else _BELIEVED
+        self._known, self._expected, self._record = (reading, timing), self._expected[-1:], record
+        self._unconfirmed, self._rounds = None, 0
+        return Judgement(Verdict.BELIEVED, confirmed, step)
 
-    def _step(self, known: _Seen, reading: AxisReading, timing: Timing) -> Step | None:
-        beyond = self._unexplained(known, reading, timing.true_until_s, by_shown=True)
-        # a shaft that happens to come to rest at its 0 was led there
-        if reading.begun_anew and not known[0].begun_anew and beyond > 0:
-            return Step.ZEROED
-        return Step.JUMPED if self._far else None
-
-    def _fit(self, seen: _Seen, reading: AxisReading, timing: Timing, *, still: bool) -> _Fit:
-        """Tell how a reading fits to an earlier one, of an axis that should not have moved when `still`."""
-        before, by_s = seen[0], timing.true_until_s
-        beyond = self._unexplained(seen, reading, by_s, by_shown=True)
-        if beyond > 0 and self.is_out_of_reach(reading, by_s):
-            return _Fit.FAR
-        if beyond > 0 or not _same_status(before, reading) or (still and abs(_way(before, reading)) > NOISE_COUNTS):
-            return _Fit.NEAR
-        fastest = max(abs(before.velocity_counts_per_s), 0.0 if still else self._speed)
-        for expected in self._expected:
-            fastest = max(fastest, -expected.low, expected.high)
-        odd = abs(reading.velocity_counts_per_s) > fastest + 2 * reading.velocity_resolution_counts_per_s
-        return _Fit.NEAR if odd else _Fit.FOLLOWS
+    def _fit(self, known: _Seen, reading: AxisReading, by_s: float, *, still: bool) -> _Fit:
+        """Tell how a reading fits to the accepted one, of an axis that should not have moved when `still`."""
+        before = known[0]
+        way, low, high, tolerance = _shown_way(known, reading, by_s)
+        if not low - tolerance <= way <= high + tolerance:
+            return _Fit.FAR if self.is_out_of_reach(reading, by_s) else _Fit.BEYOND
+        if (still and not -NOISE_COUNTS <= way <= NOISE_COUNTS) or not _same_status(before, reading):
+            return _Fit.CHANGED
+        speed = abs(reading.velocity_counts_per_s) - 2 * reading.velocity_resolution_counts_per_s
+        if speed <= abs(before.velocity_counts_per_s) or (speed <= self._speed and not still):
+            return _Fit.FOLLOWS
+        explained = any(speed <= max(-expected.low, expected.high) for expected in self._expected)
+        return _Fit.FOLLOWS if explained else _Fit.CHANGED
 
     def _agrees(self, unconfirmed: _Seen, reading: AxisReading, timing: Timing) -> bool:
-        by_s = timing.true_until_s
-        allowed = 0.0 if self._far else self._allowed(unconfirmed, reading, by_s)
-        return _same_status(unconfirmed[0], reading) and self._unexplained(unconfirmed, reading, by_s) <= allowed
+        led = self._is_led(unconfirmed, reading, timing.true_until_s, exactly=self._far)
+        return led and _same_status(unconfirmed[0], reading)
 
     def is_out_of_reach(self, reading: AxisReading, by_s: float) -> bool:
         """Tell whether no motion can have led to a reading by then, in loop time, from the last one believed."""
-        known = self._known
-        return known is not None and self._unexplained(known, reading, by_s) > self._allowed(known, reading, by_s)
+        return self._known is not None and not self._is_led(self._known, reading, by_s)
 
-    def _allowed(self, seen: _Seen, reading: AxisReading, by_s: float) -> float:
-        """Return how much farther than explained an axis may have gone, in counts."""
-        if seen[0].enabled and reading.enabled:
-            return self._step_counts
-        return self._step_counts + self._turned_by_hand * (by_s - seen[1].true_from_s)
+    def _is_led(self, seen: _Seen, reading: AxisReading, by_s: float, *, exactly: bool = False) -> bool:
+        """Tell whether an axis may have come from the one reading to the other; `exactly`, by what is explained."""
+        way, low, high, spare = _shown_way(seen, reading, by_s)
+        before, passed_s = seen[0], by_s - seen[1].true_from_s
+        for expected in self._expected:
+            least, most = expected.ways(before.position_counts, passed_s)
+            low, high = min(low, least), max(high, most)
+        if not exactly:
+            spare += self._step_counts
+            spare += 0.0 if before.enabled and reading.enabled else self._turned_by_hand * passed_s
+        return min(low, 0.0) - spare <= way <= max(high, 0.0) + spare
 
-    def _unexplained(self, seen: _Seen, reading: AxisReading, by_s: float, *, by_shown: bool = False) -> float:
-        """Return how much farther the axis went from the one reading to the other than explained, in counts.
 
-        Args:
-            seen: the one.
-            reading: the other.
-            by_s: when it was true, in loop time.
-            by_shown: explained by the velocities that they show, and by nothing else.
-        """
-        before, seen_at = seen
-        passed_s = by_s - seen_at.true_from_s
-        shown = before.velocity_counts_per_s * passed_s, reading.velocity_counts_per_s * passed_s
-        low, high = min(shown), max(shown)
-        if not by_shown:
-            ways = [expected.ways(before.position_counts, passed_s) for expected in self._expected]
-            low = min(low, 0.0, *(least for least, _ in ways))
-            high = max(high, 0.0, *(most for _, most in ways))
-        # a velocity is that of the last servo tick, which takes up to 130 ms, in whole counts: it shows what was
-        resolution = max(before.velocity_resolution_counts_per_s, reading.velocity_resolution_counts_per_s)
-        late = abs(reading.velocity_counts_per_s - before.velocity_counts_per_s) / resolution
-        blurred = NOISE_COUNTS + late + resolution * passed_s
-        way = _way(before, reading)
-        return max(0.0, low - blurred - way, way - high - blurred)
+def _shown_way(seen: _Seen, reading: AxisReading, by_s: float) -> tuple[int, float, float, float]:
+    """Return the way from the one reading to the other, true by then in loop time, and what their velocities explain.
+
+    That is from the least to the most, and a tolerance for either; all in counts.
+    """
+    before, seen_at = seen
+    passed_s = by_s - seen_at.true_from_s
+    earlier, velocity = before.velocity_counts_per_s, reading.velocity_counts_per_s
+    # a velocity is that of the last servo tick, which takes up to 130 ms, in whole counts: it shows what was
+    resolution = max(before.velocity_resolution_counts_per_s, reading.velocity_resolution_counts_per_s)
+    tolerance = NOISE_COUNTS + abs(velocity - earlier) / resolution + resolution * passed_s
+    if earlier > velocity:
+        earlier, velocity = velocity, earlier
+    return _way(before, reading), earlier * passed_s, velocity * passed_s, tolerance
 
 
 def _same_status(before: AxisReading, reading: AxisReading) -> bool:
@@ -301,9 +312,8 @@ def _same_status(before: AxisReading, reading: AxisReading) -> bool:
 
 def _misfit(seen: _Seen, reading: AxisReading, timing: Timing) -> float:
     """Return how far a reading is from where the mean of both velocities leads, in counts."""
-    before, seen_at = seen
-    velocity = (before.velocity_counts_per_s + reading.velocity_counts_per_s) / 2
-    return abs(_way(before, reading) - velocity * (timing.true_until_s - seen_at.true_from_s))
+    way, low, high, _ = _shown_way(seen, reading, timing.true_until_s)
+    return abs(way - (low + high) / 2)
 
 
 def agree(one: AxisReading, other: AxisReading) -> bool:

@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import Enum
+from typing import Any
 
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -208,9 +209,6 @@ def _ignore(_fault: PastFault) -> None:
     pass
 
 
-StateShown = tuple[
-    Quality, AxisState, bool, bool, Moving, LinkState, bool, bool, ActiveCommand | None, str | None, float | None, float
-]
 QUALITIES = {LinkState.UP: Quality.GOOD, LinkState.DEGRADED: Quality.UNCERTAIN, LinkState.DOWN: Quality.BAD}
 """Quality of a value read just now, by the drive's link."""
 
@@ -319,22 +317,24 @@ class AxisTracker:
 
     # -- for other modules -------------------------------------------------------------------------------------------
 
-    def shown(self) -> "StateShown":
-        """Return what a state sample says besides when; compared after every poll, so no model is built for it."""
-        return (
-            self.quality,
-            self.state,
-            self.enabled,
-            self._referenced,
-            self.moving,
-            self.link,
-            self.stop_latched,
-            self.stop_pending,
-            self.command,
-            self.last_error,
-            self.target,
-            self.speed_share,
-        )
+    def shown(self) -> dict[str, Any]:
+        """Return the fields of a state sample besides when, in its order; compared after every poll, so no model."""
+        return {
+            "quality": self.quality,
+            "state": self.state,
+            "enabled": self.enabled,
+            "referenced": self._referenced,
+            "moving": self.moving,
+            "link": self.link,
+            "stop_latched": self.stop_latched,
+            "stop_pending": self.stop_pending,
+            "command": self.command,
+            "last_error": self.last_error,
+            "has_reference": self.has_reference,
+            "reference_lost": self.reference_lost,
+            "target": self.target,
+            "speed_override": 100.0 * self.speed_share,
+        }
 
     @property
     def referenced(self) -> bool:
@@ -383,11 +383,9 @@ class AxisTracker:
         return self.enabled or (self.command is not None and self.command.opens_loop)
 
     @property
-    def holds_unnamed(self) -> bool:
-        """Whether the axis stands in a closed loop at a place to which no command has sent it."""
-        if self.target is not None or not self.enabled or self.command or self.position_lost:
-            return False
-        return self.moving is Moving.NO
+    def came_to_rest(self) -> bool:
+        """Whether a closed loop without a target stands at a place to which no command has sent it."""
+        return not self.command and not self.position_lost and self.moving is Moving.NO
 
     def concerns(self, timing: Timing) -> bool:
         """Tell whether a reading was requested after the latest command took effect."""
@@ -684,7 +682,7 @@ class ObservedTracker(AxisTracker):
     Others send such an axis: it has no target that is known here.
     """
 
-    holds_unnamed = False
+    came_to_rest = False
 
     has_reference = False
 

@@ -2,8 +2,9 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
-from ldcnd.axis.state import NOT_SETTLED, ActiveCommand, AxisTracker, StateShown
+from ldcnd.axis.state import NOT_SETTLED, ActiveCommand, AxisTracker
 from ldcnd.contract.commands import ReportShadow
 from ldcnd.contract.events import UNSETTLED, CommandStatus
 from ldcnd.contract.samples import CurrentCommand, FaultEntry, LatchSample, Quality, ShadowSample, TelemetryItem
@@ -54,7 +55,7 @@ class AxisTelemetry:
                 TelemetryItem.FAULT,
             )
         )
-        self._last_state: StateShown | None = None
+        self._last_state: dict[str, Any] = {}
         self._last_faults: FaultKey | None = None
         self._shows_inputs = shows_inputs
         self._modulo = modulo
@@ -77,7 +78,11 @@ class AxisTelemetry:
 
     def reading(self, reading: AxisReading, asked: frozenset[TelemetryItem], t: int, t_error_ns: int) -> None:
         """Publish the requested items, and the state and the inputs if they changed."""
-        quality, counts_per_unit = self._tracker.quality, self._counts_per_unit
+        tracker, counts_per_unit = self._tracker, self._counts_per_unit
+        if tracker.enabled and tracker.target is None and tracker.came_to_rest:
+            tracker.target = self.within_turn(self.position(reading.position_counts))[0]
+        shown = tracker.shown()
+        quality = shown["quality"]
         if TelemetryItem.POSITION in asked:
             counts, lag, turns = reading.position_counts, reading.following_error_counts, None
             value = (counts - self.origin_counts) / counts_per_unit
@@ -147,51 +152,19 @@ class AxisTelemetry:
                         "amplifier_enable": amplifier_enable,
                     }
                 )
-        if self._tracker.holds_unnamed:
-            self._tracker.target = self.within_turn(self.position(reading.position_counts))[0]
-        self.state(t, t_error_ns, due=TelemetryItem.STATE in asked)
+        self._publish(shown, t, t_error_ns, due=TelemetryItem.STATE in asked)
 
-    def state(self, t: int, t_error_ns: int = 0, *, due: bool = False) -> None:
-        """Publish state and faults if they changed, or if they are due anyway."""
-        tracker = self._tracker
-        shown = tracker.shown()
-        (
-            quality,
-            state,
-            enabled,
-            referenced,
-            moving,
-            link,
-            stop_latched,
-            stop_pending,
-            command,
-            last_error,
-            target,
-            share,
-        ) = shown
+    def state(self, t: int) -> None:
+        """Publish state and faults if they changed."""
+        self._publish(self._tracker.shown(), t, 0)
+
+    def _publish(self, shown: dict[str, Any], t: int, t_error_ns: int, *, due: bool = False) -> None:
         if due or shown != self._last_state:
-            self._last_state = shown
+            self._last_state, command = shown, shown["command"]
             self._state.publish(
-                {
-                    "t": t,
-                    "t_error_ns": t_error_ns,
-                    "seq": 0,
-                    "quality": quality,
-                    "state": state,
-                    "enabled": enabled,
-                    "referenced": referenced,
-                    "moving": moving,
-                    "link": link,
-                    "stop_latched": stop_latched,
-                    "stop_pending": stop_pending,
-                    "command": command and _current(command),
-                    "last_error": last_error,
-                    "has_reference": tracker.has_reference,
-                    "reference_lost": tracker.reference_lost,
-                    "target": target,
-                    "speed_override": 100.0 * share,
-                }
+                {"t": t, "t_error_ns": t_error_ns, "seq": 0, **shown, "command": command and _current(command)}
             )
+        tracker = self._tracker
         faults = (tracker.active_faults, tracker.first_fault)
         if due or faults != self._last_faults:
             self._last_faults = faults
@@ -200,9 +173,9 @@ class AxisTelemetry:
                     "t": t,
                     "t_error_ns": t_error_ns,
                     "seq": 0,
-                    "quality": quality,
-                    "active": tracker.active_faults,
-                    "first": tracker.first_fault,
+                    "quality": shown["quality"],
+                    "active": faults[0],
+                    "first": faults[1],
                 }
             )
 
