@@ -372,13 +372,15 @@ class AxisService:
         standing = tracker.command is None and tracker.at_rest and not self._queue.at_work.locked()
         judged = self._plausibility.judge(reading, timing, standing=standing)
         if judged.verdict is Verdict.BELIEVED:
-            if judged.step:
-                self._stepped(judged.step, reading)
-            if judged.confirmed:  # items that only the first of two readings has are valid as well
+            if judged.confirmed:
+                if judged.step:
+                    self._stepped(judged.step, reading)
+                # items that only the first of two readings has are valid as well
                 first, first_timing = judged.confirmed
                 self._observe(first, first.asked - asked, first_timing)
             self._observe(reading, asked, timing)
-        elif judged.verdict is Verdict.CONTRADICTS:
+            return False
+        if judged.verdict is Verdict.CONTRADICTS:
             now_ns = self._clock.now_ns()
             if tracker.contradicted(now_ns):
                 log.error("readings contradict each other", axis=self.config.name, counts=reading.position_counts)

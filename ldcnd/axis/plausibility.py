@@ -188,11 +188,27 @@ class PlausibilityGate:
             self._expected = ()
         if known is None:
             return self._believe(reading, timing, record=_FIRST)
-        fit = self._fit(known, reading, timing.true_until_s, still=standing or self._record is _AWAY)
-        if fit or self._unconfirmed or self._record is _CONTRADICTED:
-            return self._weigh(known, reading, timing, fit)
-        self._known, self._expected, self._record = (reading, timing), self._expected[-1:], _SURE
-        return _BELIEVED
+        before, still = known[0], standing or self._record is _AWAY
+        way, middle, half, tolerance = _shown_way(known, reading, timing.true_until_s)
+        if abs(way - middle) > half + tolerance:
+            fit = _Fit.FAR if self.is_out_of_reach(reading, timing.true_until_s) else _Fit.BEYOND
+        elif (
+            not _same_status(before, reading)
+            or (still and abs(way) > NOISE_COUNTS)
+            or (
+                abs(reading.velocity_counts_per_s) > abs(before.velocity_counts_per_s)
+                and self._is_too_fast(before, reading, still=still)
+            )
+        ):
+            fit = _Fit.CHANGED
+        elif self._unconfirmed or self._record is _CONTRADICTED:
+            fit = _Fit.FOLLOWS
+        else:
+            self._known, self._record = (reading, timing), _SURE
+            if self._expected:
+                self._expected = self._expected[-1:]
+            return _BELIEVED
+        return self._weigh(known, reading, timing, fit)
 
     def _weigh(self, known: _Seen, reading: AxisReading, timing: Timing, fit: _Fit) -> Judgement:
         """Judge a reading that does not follow, or that comes after one that did not."""
@@ -218,7 +234,8 @@ class PlausibilityGate:
             return self._believe(reading, timing, unconfirmed, step)
         self._unconfirmed = reading, timing
         self._rounds += 1
-        foreign = self._far or (record is _AWAY and abs(_way(known[0], reading)) > NOISE_COUNTS)
+        way, *_ = _shown_way(known, reading, timing.true_until_s)
+        foreign = self._far or (record is _AWAY and abs(way) > NOISE_COUNTS)
         if self._rounds < ROUNDS:
             return Judgement(Verdict.ASK_AGAIN, foreign=foreign)
         self.withheld += self._rounds
@@ -248,19 +265,12 @@ class PlausibilityGate:
         self._unconfirmed, self._rounds = None, 0
         return Judgement(Verdict.BELIEVED, confirmed, step)
 
-    def _fit(self, known: _Seen, reading: AxisReading, by_s: float, *, still: bool) -> _Fit:
-        """Tell how a reading fits to the accepted one, of an axis that should not have moved when `still`."""
-        before = known[0]
-        way, low, high, tolerance = _shown_way(known, reading, by_s)
-        if not low - tolerance <= way <= high + tolerance:
-            return _Fit.FAR if self.is_out_of_reach(reading, by_s) else _Fit.BEYOND
-        if (still and not -NOISE_COUNTS <= way <= NOISE_COUNTS) or not _same_status(before, reading):
-            return _Fit.CHANGED
-        speed = abs(reading.velocity_counts_per_s) - 2 * reading.velocity_resolution_counts_per_s
-        if speed <= abs(before.velocity_counts_per_s) or (speed <= self._speed and not still):
-            return _Fit.FOLLOWS
-        explained = any(speed <= max(-expected.low, expected.high) for expected in self._expected)
-        return _Fit.FOLLOWS if explained else _Fit.CHANGED
+    def _is_too_fast(self, before: AxisReading, reading: AxisReading, *, still: bool) -> bool:
+        """Tell whether an axis that did not turn as fast before cannot do so by now."""
+        fastest = max(abs(before.velocity_counts_per_s), 0.0 if still else self._speed)
+        for expected in self._expected:
+            fastest = max(fastest, -expected.low, expected.high)
+        return abs(reading.velocity_counts_per_s) > fastest + 2 * reading.velocity_resolution_counts_per_s
 
     def _agrees(self, unconfirmed: _Seen, reading: AxisReading, timing: Timing) -> bool:
         led = self._is_led(unconfirmed, reading, timing.true_until_s, exactly=self._far)
@@ -272,7 +282,8 @@ class PlausibilityGate:
 
     def _is_led(self, seen: _Seen, reading: AxisReading, by_s: float, *, exactly: bool = False) -> bool:
         """Tell whether an axis may have come from the one reading to the other; `exactly`, by what is explained."""
-        way, low, high, spare = _shown_way(seen, reading, by_s)
+        way, middle, half, spare = _shown_way(seen, reading, by_s)
+        low, high = min(0.0, middle - half), max(0.0, middle + half)
         before, passed_s = seen[0], by_s - seen[1].true_from_s
         for expected in self._expected:
             least, most = expected.ways(before.position_counts, passed_s)
@@ -280,23 +291,24 @@ class PlausibilityGate:
         if not exactly:
             spare += self._step_counts
             spare += 0.0 if before.enabled and reading.enabled else self._turned_by_hand * passed_s
-        return min(low, 0.0) - spare <= way <= max(high, 0.0) + spare
+        return low - spare <= way <= high + spare
 
 
 def _shown_way(seen: _Seen, reading: AxisReading, by_s: float) -> tuple[int, float, float, float]:
-    """Return the way from the one reading to the other, true by then in loop time, and what their velocities explain.
+    """Return the way from the one reading to the other, and what explains it: the velocities that they show.
 
-    That is from the least to the most, and a tolerance for either; all in counts.
+    These lead to the second number, give or take the third; the fourth is a tolerance. All are counts, the other
+    reading was true by then, in loop time.
     """
     before, seen_at = seen
     passed_s = by_s - seen_at.true_from_s
     earlier, velocity = before.velocity_counts_per_s, reading.velocity_counts_per_s
+    way = (reading.position_counts - before.position_counts + _HALF) % _COUNTER - _HALF  # the shortest: counts wrap
     # a velocity is that of the last servo tick, which takes up to 130 ms, in whole counts: it shows what was
     resolution = max(before.velocity_resolution_counts_per_s, reading.velocity_resolution_counts_per_s)
-    tolerance = NOISE_COUNTS + abs(velocity - earlier) / resolution + resolution * passed_s
-    if earlier > velocity:
-        earlier, velocity = velocity, earlier
-    return _way(before, reading), earlier * passed_s, velocity * passed_s, tolerance
+    change = abs(velocity - earlier)
+    tolerance = NOISE_COUNTS + change / resolution + resolution * passed_s
+    return way, (earlier + velocity) / 2 * passed_s, change / 2 * passed_s, tolerance
 
 
 def _same_status(before: AxisReading, reading: AxisReading) -> bool:
@@ -312,8 +324,8 @@ def _same_status(before: AxisReading, reading: AxisReading) -> bool:
 
 def _misfit(seen: _Seen, reading: AxisReading, timing: Timing) -> float:
     """Return how far a reading is from where the mean of both velocities leads, in counts."""
-    way, low, high, _ = _shown_way(seen, reading, timing.true_until_s)
-    return abs(way - (low + high) / 2)
+    way, middle, *_ = _shown_way(seen, reading, timing.true_until_s)
+    return abs(way - middle)
 
 
 def agree(one: AxisReading, other: AxisReading) -> bool:
@@ -321,9 +333,5 @@ def agree(one: AxisReading, other: AxisReading) -> bool:
     resolution = other.velocity_resolution_counts_per_s
     speed = max(abs(one.velocity_counts_per_s), abs(other.velocity_counts_per_s))
     moving_counts = (speed + resolution) * APART_S if speed > resolution else 0.0
-    return abs(_way(one, other)) <= NOISE_COUNTS + moving_counts and one.faults == other.faults
-
-
-def _way(before: AxisReading, after: AxisReading) -> int:
-    """Return the shortest way between two counts, which wrap."""
-    return (after.position_counts - before.position_counts + _HALF) % _COUNTER - _HALF
+    way = (other.position_counts - one.position_counts + _HALF) % _COUNTER - _HALF
+    return abs(way) <= NOISE_COUNTS + moving_counts and one.faults == other.faults

@@ -402,9 +402,9 @@ class AxisTracker:
         self.link = LinkState.UP
         if faults or self.active_faults:
             self._faults(faults, now_ns)
-        self.position_lost = bool(faults) and any(fault.loses_position for fault in faults)
-        if self.position_lost:
-            self.referenced, self.target = False, None
+            self.position_lost = any(fault.loses_position for fault in faults)
+            if self.position_lost:
+                self.referenced, self.target = False, None
         if timing.sent_at_s < self._effective_from_s:
             return  # requested before the latest command took effect: says nothing about it
         self._rest.observed(reading, timing.sent_at_s)

@@ -174,8 +174,8 @@ class AxisTelemetry:
                     "t_error_ns": t_error_ns,
                     "seq": 0,
                     "quality": shown["quality"],
-                    "active": faults[0],
-                    "first": faults[1],
+                    "active": tracker.active_faults,
+                    "first": tracker.first_fault,
                 }
             )
 
