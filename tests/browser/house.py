@@ -49,19 +49,20 @@ class DaemonUnderTest:
     """A daemon that can be ended and started again on the same endpoint.
 
     Attributes:
+        config: its configuration, read at each start.
         endpoint: where it listens.
         rig: a client of it, of a session of its own.
     """
 
     def __init__(self, config: Path) -> None:
+        self.config = config
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.rig: RigClient
-        self._config = config
         self._running = AsyncExitStack()
 
     async def start(self) -> None:
         """Return when every axis answers."""
-        run = process("run", "--config", str(self._config), "--listen", self.endpoint)
+        run = process("run", "--config", str(self.config), "--listen", self.endpoint)
         daemon = await self._running.enter_async_context(run)
         await answering(daemon, self.endpoint)
         self.rig = await self._running.enter_async_context(client(self.endpoint))
@@ -136,10 +137,12 @@ class Desk:
         return self.page.get_by_role("region", name=title, exact=True)
 
     def strangers(self) -> list[str]:
-        """Return the addresses asked for that are not the console's."""
-        home = urlsplit(self.url).netloc
+        """Return the addresses asked for that are on another machine."""
+        here = {"127.0.0.1", "localhost"}
         return [
-            url for url in self.asked if urlsplit(url).scheme not in {"blob", "data"} and urlsplit(url).netloc != home
+            url
+            for url in self.asked
+            if urlsplit(url).scheme not in {"blob", "data"} and urlsplit(url).hostname not in here
         ]
 
 
@@ -151,6 +154,7 @@ class House:
         browser: without any context.
         sim: the daemon of the simulated rig.
         mixed: the daemon of the rig of two families.
+        alpha: a daemon that is not running, of the same rig under a name that comes before the others.
         link: the console's one-time link.
         url: of the console, without a path.
     """
@@ -158,6 +162,7 @@ class House:
     browser: Browser
     sim: DaemonUnderTest
     mixed: DaemonUnderTest
+    alpha: DaemonUnderTest
     link: str
     _cookies: list[dict[str, object]] = field(default_factory=list)
 
@@ -239,14 +244,19 @@ async def open_house(folder: Path) -> AsyncIterator[House]:
     )
     text = text.replace('{ model = "pic-servo-v4" },\n]', '{ model = "pic-servo-v4" },\n    { model = "pic-io" },\n]')
     sim_config.write_text(text, encoding="utf-8")
-    sim, mixed = DaemonUnderTest(sim_config), DaemonUnderTest(mixed_config)
+    alpha_config = folder / "alpha.toml"
+    alpha_config.write_text(
+        mixed_config.read_text(encoding="utf-8").replace('rig = "mixed"', 'rig = "alpha"'), encoding="utf-8"
+    )
+    sim, mixed, alpha = map(DaemonUnderTest, (sim_config, mixed_config, alpha_config))
     async with AsyncExitStack() as stack:
         browser = await stack.enter_async_context(open_browser())
-        for daemon in (sim, mixed):
+        for daemon in (sim, mixed, alpha):
             stack.push_async_callback(daemon.end)
         async with asyncio.TaskGroup() as group:
             for daemon in (sim, mixed):
                 group.create_task(daemon.start(), name=daemon.endpoint)
-        link = await stack.enter_async_context(console(sim.endpoint, mixed.endpoint, commission=sim_config))
+        endpoints = [daemon.endpoint for daemon in (sim, mixed, alpha)]
+        link = await stack.enter_async_context(console(*endpoints, commission=sim_config))
         expect.set_options(timeout=PATIENCE_S * 1e3)
-        yield House(browser, sim, mixed, link)
+        yield House(browser, sim, mixed, alpha, link)

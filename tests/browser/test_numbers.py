@@ -1,22 +1,19 @@
 """Numbers typed key by key into every field of every page, in two engines, while axes move and values come in."""
 
-import asyncio
-import itertools
 import json
 import time
-from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
-import pytest_asyncio
 
 from ldcnd.client.lease import control
-from ldcnd.contract.commands import MoveVelocity, Power, SetPosition
-from ldcnd.contract.number_text import NotANumber, read_number
-from tests.support.marionette import CONTROL, DELETE, ENTER, Firefox, firefox, open_firefox
+from ldcnd.model.commands import MoveVelocity, Power, SetPosition
+from ldcnd.number_text import NotANumber, read_number
+from tests.support.marionette import CONTROL, DELETE, ENTER
 
-playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
+windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
+until = windows.until
 
 pytestmark = [
     pytest.mark.system,
@@ -39,7 +36,6 @@ TEXTS = [
 MOVED = ("1.5", "1,5", "1.05", "0.05", "12.25", "-1.5", "−1,25", "1e1", ".5", "5.", "+2", "2.5 mm")  # noqa: RUF001
 REFUSED = ("1,234", "1.234,5", "1 2", "1.5 um", "0x10", "NaN", "--5")
 KEY_PAUSE_MS = 8
-PATIENCE_S = 45.0
 FIELDS = "input[inputmode=decimal]"
 FOUND = f"""[...document.querySelectorAll("{FIELDS}")].filter(
   (field) => !panel || field.closest(".panel").querySelector("h2").textContent === panel)"""
@@ -90,66 +86,6 @@ PLACES = [
 
 LEAST = {"tuning/mixed/feed": 8}
 """Fields of a page that come one by one, as they are read from a drive."""
-
-
-class Chromium:
-    """A page of Chromium, driven as `Firefox` is."""
-
-    def __init__(self, page):
-        self._page = page
-
-    async def open(self, url):
-        await self._page.goto(url)
-
-    async def evaluate(self, script, *arguments):
-        return await self._page.evaluate(f"(given) => ({script})(...given)", list(arguments))
-
-    async def keys(self, *strokes, pause_ms=0):
-        named = {CONTROL: "Control", DELETE: "Delete", ENTER: "Enter"}
-        for special, group in itertools.groupby(strokes, lambda each: len(each) > 1 or each in named):
-            if not special:
-                await self._page.keyboard.type("".join(group), delay=pause_ms)
-                continue
-            for stroke in group:
-                await self._page.keyboard.press("+".join(named.get(key, key) for key in stroke))
-
-
-@asynccontextmanager
-async def open_chromium(house, _folder) -> AsyncIterator[Chromium]:
-    async with house.desk() as desk:
-        yield Chromium(desk.page)
-
-
-@asynccontextmanager
-async def open_gecko(house, folder) -> AsyncIterator[Firefox]:
-    program = firefox()
-    if program is None:
-        pytest.skip("no firefox-esr: install it, or say where one is in LDCND_FIREFOX")
-    async with house.desk() as desk:
-        await desk.open("rig")
-        cookies = await desk.page.context.cookies()
-    async with open_firefox(program, folder) as window:
-        await window.open(f"{house.url}/")
-        for cookie in cookies:
-            given = {"name": cookie["name"], "value": cookie["value"], "path": "/", "httpOnly": cookie["httpOnly"]}
-            await window.command("WebDriver:AddCookie", cookie=given)
-        yield window
-
-
-@pytest_asyncio.fixture(
-    scope="module", loop_scope="package", params=[open_chromium, open_gecko], ids=["chromium", "firefox"]
-)
-async def window(request, house, tmp_path_factory):
-    """A page of one engine."""
-    async with request.param(house, tmp_path_factory.mktemp("profile")) as page:
-        yield page
-
-
-async def until(window, script, *arguments, wanted=bool):
-    async with asyncio.timeout(PATIENCE_S):
-        while not wanted(found := await window.evaluate(script, *arguments)):
-            await asyncio.sleep(0.05)
-    return found
 
 
 async def type_over(window, text):

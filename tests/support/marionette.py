@@ -18,6 +18,24 @@ COMMAND_TIME_S = 60.0
 CONTROL = "\ue009"
 DELETE = "\ue017"
 ENTER = "\ue007"
+ESCAPE = "\ue00c"
+SHIFT = "\ue008"
+TAB = "\ue004"
+NARROWEST = 640
+"""Width of the narrowest window, in pixels of the screen."""
+COMPOSE = """
+const method = Cc["@mozilla.org/text-input-processor;1"].createInstance(Ci.nsITextInputProcessor);
+if (!method.beginInputTransactionForTests(window)) throw new Error("no input method");
+for (const text of arguments[0]) {
+  method.setPendingCompositionString(text);
+  method.appendClauseToPendingComposition(text.length, method.ATTR_RAW_CLAUSE);
+  method.setCaretInPendingComposition(text.length);
+  method.flushPendingComposition();
+}
+const enter = new KeyboardEvent("keydown", { key: "Enter", code: "Enter", keyCode: KeyboardEvent.DOM_VK_RETURN });
+method.commitComposition(enter);
+method.keyup(enter);
+"""
 PREFERENCES = {
     "marionette.port": "{port}",
     "app.update.enabled": "false",
@@ -40,6 +58,14 @@ class Firefox:
         self._reader = reader
         self._writer = writer
         self._numbers = itertools.count(1)
+
+    async def reload(self) -> None:
+        """Load the page again."""
+        await self.command("WebDriver:Refresh")
+
+    async def back(self) -> None:
+        """Go back to the page before."""
+        await self.command("WebDriver:Back")
 
     # Any: what JSON holds
     async def command(self, name: str, **parameters: object) -> Any:
@@ -73,7 +99,56 @@ class Firefox:
             actions += [{"type": "keyDown", "value": key} for key in stroke]
             actions += [{"type": "keyUp", "value": key} for key in reversed(stroke)]
             actions += [{"type": "pause", "duration": pause_ms}] if pause_ms else []
-        await self.command("WebDriver:PerformActions", actions=[{"type": "key", "id": "keys", "actions": actions}])
+        await self._perform("key", actions)
+
+    async def hold(self, key: str, times: int, pause_ms: int) -> None:
+        """Keep a key down while it repeats so many times: to press one that is down is a repetition."""
+        down: list[dict[str, object]] = [{"type": "keyDown", "value": key}, {"type": "pause", "duration": pause_ms}]
+        await self._perform("key", [*down * times, {"type": "keyUp", "value": key}])
+
+    async def click(self, x: float, y: float, count: int = 1) -> None:
+        """Click at a point of the window, as often as a hand does in one go."""
+        press = [{"type": "pointerDown", "button": 0}, {"type": "pointerUp", "button": 0}]
+        await self._perform("pointer", [_move(x, y), *press * count])
+
+    async def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Press the button at one point and let it go at another."""
+        steps = [[a + (b - a) * step / 10 for a, b in zip(start, end, strict=True)] for step in range(1, 11)]
+        held = [{**_move(*step), "duration": 20} for step in steps]
+        down, up = ({"type": f"pointer{way}", "button": 0} for way in ("Down", "Up"))
+        await self._perform("pointer", [_move(*start), down, *held, up])
+
+    async def wheel(self, x: float, y: float, by: int) -> None:
+        """Turn the wheel over a point."""
+        turn = {"type": "scroll", "x": round(x), "y": round(y), "deltaX": 0, "deltaY": by, "origin": "viewport"}
+        await self._perform("wheel", [turn])
+
+    async def compose(self, *texts: str) -> None:
+        """Let an input method show each of these texts in the focused field, and take over the last."""
+        await self.command("Marionette:SetContext", value="chrome")
+        try:
+            await self.command("WebDriver:ExecuteScript", script=COMPOSE, args=[list(texts)])
+        finally:
+            await self.command("Marionette:SetContext", value="content")
+
+    async def resize(self, width: int, height: int) -> None:
+        """Give the page a size, in its own pixels: a window cannot be narrow, so its page is zoomed instead."""
+        await self.command("Marionette:SetContext", value="chrome")
+        try:
+            zoom = "ZoomManager.setZoomForBrowser(gBrowser.selectedBrowser, arguments[0])"
+            factor = NARROWEST / width if width < NARROWEST else 1.0
+            await self.command("WebDriver:ExecuteScript", script=zoom, args=[factor])
+        finally:
+            await self.command("Marionette:SetContext", value="content")
+        for _ in range(2):  # what is round the page shows when it has a size
+            rect = await self.command("WebDriver:GetWindowRect")
+            has = await self.evaluate("() => [innerWidth, innerHeight]")
+            around = [rect[side] - have * factor for side, have in zip(("width", "height"), has, strict=True)]
+            wanted = [round(size * factor + more) for size, more in zip((width, height), around, strict=True)]
+            await self.command("WebDriver:SetWindowRect", width=wanted[0], height=wanted[1])
+
+    async def _perform(self, kind: str, actions: list[dict[str, object]]) -> None:
+        await self.command("WebDriver:PerformActions", actions=[{"type": kind, "id": kind, "actions": actions}])
 
 
 @asynccontextmanager
@@ -83,7 +158,7 @@ async def open_firefox(program: str, folder: Path) -> AsyncIterator[Firefox]:
     lines = [f'user_pref("{name}", {value.format(port=port)});' for name, value in PREFERENCES.items()]
     (folder / "user.js").write_text("\n".join(lines), encoding="utf-8")
     process = await asyncio.create_subprocess_exec(
-        program, "--headless", "--marionette", "--no-remote", "--profile", str(folder),
+        program, "--headless", "--marionette", "--remote-allow-system-access", "--no-remote", "--profile", str(folder),
         stdout=asyncio.subprocess.DEVNULL, stderr=asyncio.subprocess.DEVNULL,
         env={**os.environ, "HOME": str(folder), "MOZ_HEADLESS": "1"},
     )  # fmt: skip
@@ -103,3 +178,7 @@ async def open_firefox(program: str, folder: Path) -> AsyncIterator[Firefox]:
         with contextlib.suppress(ProcessLookupError):
             process.terminate()
         await process.wait()
+
+
+def _move(x: float, y: float) -> dict[str, object]:
+    return {"type": "pointerMove", "x": round(x), "y": round(y), "origin": "viewport"}

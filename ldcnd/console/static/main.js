@@ -112,6 +112,13 @@ function Console() {
     </main>`;
 }
 
+/** A text, link or file that is dropped changes no field and opens no page: a hand that slips must move nothing. */
+for (const kind of ["dragover", "drop"]) {
+  addEventListener(kind, (event) => {
+    if (event.target.type !== "file") event.preventDefault();
+  });
+}
+
 watch();
 keepControl();
 render(html`<${Console} />`, document.getElementById("console"));

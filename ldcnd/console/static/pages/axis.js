@@ -1,7 +1,8 @@
 /** The page of one axis: what it does now, and what can be asked of it. */
 
 import { html } from "../html.js";
-import { useRigs } from "../session/rigs.js";
+import { NotThere } from "../parts/one_axis.js";
+import { axisNamed, useRigs } from "../session/rigs.js";
 import { AuthorityPanel } from "./axis_authority.js";
 import { FaultPanel, WhyPanel } from "./axis_faults.js";
 import { GainsPanel } from "./axis_gains.js";
@@ -16,8 +17,9 @@ import { ShadowPanel } from "./axis_shadow.js";
 const MOTIONS = ["move_absolute", "move_relative", "move_velocity", "set_pwm", "move_analog", "probe"];
 
 export function AxisPage({ at }) {
-  const axis = useRigs().get(at.rig)?.axes.get(at.axis);
-  if (!axis?.info) return html`<h1>Axis ${at.axis}</h1><p>This axis is not known, or not known yet.</p>`;
+  useRigs();
+  const axis = axisNamed(at);
+  if (!axis) return html`<h1>Axis ${at.axis}</h1><${NotThere} at=${at} />`;
   const { info } = axis;
   return html`
     <header class="title">

@@ -9,18 +9,20 @@ import { HolderWord } from "./rig.js";
 
 export function AuthorityPanel({ axis }) {
   const mine = controls(axis);
-  const [force, setForce] = useState(false);
+  const [from, setFrom] = useState(null); // consent to take it from one client is none to take it from the next
   const others = !mine && axis.holder;
+  const force = Boolean(others) && from === axis.holder;
   return html`<${Panel} title="Control">
     <p>${mine || axis.holder ? "Held by " : "This axis is "}<${HolderWord} axis=${axis} />${mine ? ". When this page closes, the console halts what it moved and ends control." : "."}</p>
     <p class="row">
       ${
         mine
-          ? html`<${Action} act=${() => release([axis])} title="An axis that moves is halted first">Release control<//>`
-          : html`<${Action} act=${() => take([axis], force)} kind="main"
+          ? html`<${Action} key="release" act=${() => release([axis])} title="An axis that moves is halted first">Release control<//>`
+          : html`<${Action} key="take" act=${() => take([axis], force)} kind="main"
             obstacle=${obstacle(axis, "none") ?? (others && !force ? `Control is held by ${axis.holder}: tick to take it from there.` : null)}>Take control<//>`
       }
-      ${others && html`<${Tick} label=${`Take it from ${axis.holder}`} checked=${force} onChange=${setForce} />`}
+      ${others && html`<${Tick} label=${`Take it from ${axis.holder}`} checked=${force}
+        onChange=${(on) => setFrom(on ? axis.holder : null)} />`}
     </p>
     ${axis.can("power") && html`<${Power} axis=${axis} />`}
     ${axis.can("stop") && html`<${Endings} axis=${axis} />`}
@@ -34,7 +36,7 @@ function Power({ axis }) {
   const toReset = obstacle(axis, "reset");
   return html`<h3>Power</h3>
     <p class="row">
-      <${Action} act=${() => command(axis, "power", { on: !on })} obstacle=${way} reason=${`${reasons}-power`}
+      <${Action} key=${on} act=${() => command(axis, "power", { on: !on })} obstacle=${way} reason=${`${reasons}-power`}
         title=${on ? "Open the loop: the motor coasts, a hanging load falls" : "Close the loop at the present position; nothing moves"}
       >${on ? "Disable" : "Enable"}<//>
       <${Action} act=${() => command(axis, "reset")} obstacle=${toReset} reason=${`${reasons}-reset`}

@@ -73,10 +73,7 @@ export function MovePanel({ axis }) {
   const body = bodyOf(verb, values);
   const missing = unread(usedBy(verb, values)) ?? (body === null ? `${label} is missing.` : null);
   const way = obstacle(axis, verb, body?.buffer_mode !== undefined && body.buffer_mode !== "refuse") ?? missing ?? once.obstacle(body, moves(axis));
-  const move = () => {
-    once.note(body);
-    return command(axis, verb, body);
-  };
+  const move = () => once.send(body, moves(axis), () => command(axis, verb, body));
 
   return html`<${Panel} title="Move">
     <div class="fields" onKeyDown=${enterSends}>

@@ -4,31 +4,23 @@ import { html, useEffect, useState } from "../html.js";
 import { save } from "../parts/chart_view.js";
 import { Action, Choice, Panel, RefusalText, Table, Tick } from "../parts/controls.js";
 import { NumberField, TextField, unread } from "../parts/number_field.js";
+import { OneAxis } from "../parts/one_axis.js";
 import { Mark } from "../parts/state.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { asToml, driverTypeOf, fromToml } from "../session/parameter_file.js";
-import { useRigs } from "../session/rigs.js";
+import { axesOf } from "../session/rigs.js";
 import { AuthorityPanel } from "./axis_authority.js";
 import { AlarmPanel } from "./parameters_alarms.js";
-import { AxisChoice } from "./trace.js";
 
 /** All parameters of a slow drive on a bad line. */
 const PATIENCE_MS = 65_000;
 const LARGEST = 0xffff;
 
 export function ParametersPage({ at }) {
-  const axes = [...useRigs().values()]
-    .flatMap((rig) => [...rig.axes.values()])
-    .filter((axis) => axis.can("list_parameters"));
-  const axis = axes.find((each) => each.rig.name === at.rig && each.name === at.axis) ?? axes[0];
-  if (!axis) {
-    return html`<h1>Parameters</h1><p>No drive with readable parameters is known. LDCN and NMC drives have write-only
-      registers: they stand on the page of each axis.</p>`;
-  }
-  return html`<h1>Parameters</h1>
-    <${AxisChoice} axes=${axes} axis=${axis} page="parameters" />
-    <${Memories} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} />`;
+  return html`<${OneAxis} at=${at} page="parameters" title="Parameters" can=${(axis) => axis.can("list_parameters")}
+    none="No drive with readable parameters is known. LDCN and NMC drives have write-only registers: they are on each axis's page."
+    show=${(axis) => html`<${Memories} axis=${axis} />`} />`;
 }
 
 function Memories({ axis }) {
@@ -232,9 +224,7 @@ function Wear({ axis, values, onCounted }) {
 
 /** Where values can come from: a file, another drive, or what this drive has in use. */
 function sourcesOf(axis, file, values) {
-  const others = [...useRigs().values()]
-    .flatMap((rig) => [...rig.axes.values()])
-    .filter((each) => each !== axis && each.can("list_parameters"));
+  const others = axesOf().filter((each) => each !== axis && each.can("list_parameters"));
   return [
     file && {
       title: `the file ${file.name}`,
@@ -265,11 +255,11 @@ function words(values, memory) {
 /** The daemon plans; this page shows the plan, sends its writes one by one, and plans again to prove them. */
 function Transfer({ axis, file, values, onWritten }) {
   const sources = sourcesOf(axis, file, values);
-  const [chosen, setChosen] = useState(null);
+  const [chosen, setChosen] = useState(sources[0].title);
   const [wanted, setWanted] = useState(null);
   const [plan, setPlan] = useState(null);
   const [report, setReport] = useState([]);
-  const source = sources.find((each) => each.title === chosen) ?? sources[0];
+  const source = sources.find((each) => each.title === chosen); // one that has gone is not replaced
   const planned = async (request) => (await command(axis, "plan_parameters", request, PATIENCE_MS)).plan;
   const ask = async () => {
     const request = await source.ask();
@@ -301,9 +291,9 @@ function Transfer({ axis, file, values, onWritten }) {
     ]);
   }
   return html`<${Panel} title="Restore, save or clone" note="The unit number in Pn000 stays as it is in the drive.">
-    <${Choice} label="Values of" options=${sources.map(({ title }) => [title, title])} value=${source.title}
+    <${Choice} label="Values of" options=${sources.map(({ title }) => [title, title])} value=${chosen} missing=${chosen}
       onChange=${(title) => (setChosen(title), setPlan(null))} />
-    <p class="row"><${Action} act=${ask} obstacle=${obstacle(axis, "parameters")}
+    <p class="row"><${Action} act=${ask} obstacle=${source ? obstacle(axis, "parameters") : "These values are not there any more."}
       onDone=${({ request, plan }) => (setWanted(request), setPlan(plan))}>Plan<//></p>
     ${plan?.problems.map((each) => html`<p><${Mark} level="bad">cannot be done<//> ${each}</p>`)}
     ${

@@ -175,11 +175,13 @@ function refused(axis, verb, { message, nearest }) {
 /** What can be asked of all axes of a rig at once; each one that cannot do it now is passed over. */
 function RigCommands({ rig }) {
   const axes = [...rig.axes.values()].filter((axis) => axis.can("power"));
-  const [force, setForce] = useState(false);
+  const [from, setFrom] = useState(null); // consent to take them from these holders is none to take them from others
   const [told, setTold] = useState("");
   if (!axes.length) return null;
   const mine = axes.filter(controls);
   const others = axes.filter((axis) => !controls(axis) && axis.holder);
+  const held = others.map(({ name, holder }) => `${name} is controlled by ${holder}`).join(", ");
+  const force = others.length > 0 && from === held;
   const ready = (act) => axes.filter((axis) => obstacle(axis, act) === null);
   const each = (act, verb, body) => async () => {
     const asked = ready(act);
@@ -199,11 +201,12 @@ function RigCommands({ rig }) {
     obstacle=${ready(act).length ? null : (obstacle(axes[0], act) ?? "No axis can do that now.")} />`;
   return html`<div class="rig-commands" role="group" aria-label=${`Commands for all axes of ${rig.name}`}>
     <p class="row">
-      ${mine.length < axes.length && html`<${Action} kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)}
-        obstacle=${obstacle(axes[0], "none") ?? (others.length && !force ? `${others.map(({ name, holder }) => `${name} is controlled by ${holder}`).join(", ")}: tick to take it from there.` : null)}
+      ${mine.length < axes.length && html`<${Action} key="take" kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)}
+        obstacle=${obstacle(axes[0], "none") ?? (others.length && !force ? `${held}: tick to take it from there.` : null)}
         >Take control of all<//>`}
-      ${mine.length > 0 && html`<${Action} act=${() => release(mine)} title="Axes that move are halted first">Release control<//>`}
-      ${others.length > 0 && html`<${Tick} label="Take it from the others" checked=${force} onChange=${setForce} />`}
+      ${mine.length > 0 && html`<${Action} key="release" act=${() => release(mine)} title="Axes that move are halted first">Release control<//>`}
+      ${others.length > 0 && html`<${Tick} label="Take it from the others" checked=${force}
+        onChange=${(on) => setFrom(on ? held : null)} />`}
       ${button("Enable", "enable", "power", { on: true })}
       ${button("Disable", "disable", "power", { on: false })}
       ${button("Reset", "reset", "reset", {})}

@@ -31,10 +31,7 @@ function GroupMove({ group, axes }) {
     ? `${hindered.name}: ${obstacle(hindered, "move_absolute")}`
     : (unread({ ...targets, Velocity: speed }) ??
       (missing ? `The position of ${missing.name} is missing.` : once.obstacle(body, axes.some(moves))));
-  const move = () => {
-    once.note(body);
-    return moveTogether(axes, targets, speed, straight);
-  };
+  const move = () => once.send(body, axes.some(moves), () => moveTogether(axes, targets, speed, straight));
   return html`<${Panel} title=${`Group ${group}`} note="All start in the same servo cycle, or none; on a straight line they ramp alike and arrive together.">
     <div class="fields" onKeyDown=${enterSends}>
       ${axes.map(

@@ -3,10 +3,11 @@
 import { html, useEffect, useState } from "../html.js";
 import { ChartView } from "../parts/chart_view.js";
 import { Choice, Panel, Tick } from "../parts/controls.js";
+import { NotThere } from "../parts/one_axis.js";
 import { channelsOf, Recording } from "../session/channels.js";
 import { MOST_CHANNELS } from "../session/contract.js";
 import { feed } from "../session/feed.js";
-import { useRigs } from "../session/rigs.js";
+import { axesOf, axisNamed, useRigs } from "../session/rigs.js";
 
 const WINDOWS = [5, 10, 30, 60, 300];
 const AT_FIRST = 2;
@@ -14,12 +15,17 @@ const AT_FIRST = 2;
 let remembered = null;
 
 export function ScopePage({ at }) {
-  const axes = [...useRigs().values()].flatMap((rig) => [...rig.axes.values()]).filter((axis) => axis.info);
-  const [chosen, setChosen] = useState(remembered);
+  useRigs();
+  const axes = axesOf().filter((axis) => axis.info);
+  const [, setChosen] = useState(remembered);
   const [windowS, setWindowS] = useState(10);
   const [paused, setPaused] = useState(false);
-  const keys = ofAxis(axes, at) ?? chosen ?? atFirst(axes);
+  if (!at.axis && axes.length) remembered ??= atFirst(axes); // once: rigs that join change no choice
+  const named = at.axis ? ofAxis(at) : null;
+  const keys = named ?? (at.axis ? [] : (remembered ?? []));
   const recording = useRecording(axes, keys);
+  const there = new Set(axes.flatMap(channelsOf).map(({ key }) => key));
+  const gone = keys.filter((key) => !there.has(key));
 
   function toggle(key, on) {
     remembered = on ? [...keys, key] : keys.filter((each) => each !== key);
@@ -27,8 +33,10 @@ export function ScopePage({ at }) {
     if (at.axis) location.hash = "#/scope"; // from now on it is the choice that is shown
   }
 
+  if (at.axis && !named) return html`<h1>Scope</h1><${NotThere} at=${at} /><p><a href="#/scope">All channels</a></p>`;
   if (!recording) return html`<h1>Scope</h1><p>No axis is known yet.</p>`;
   return html`<h1>Scope</h1>
+    ${gone.length > 0 && html`<p class="notice mark" role="status" data-level="warn">Not there any more: ${gone.join(", ")}</p>`}
     <div class="bench">
       <${Panel} title="Channels" note=${`Up to ${MOST_CHANNELS} at once; each sample is drawn at the instant at which it was true.`}>
         <div class="fields">
@@ -36,7 +44,7 @@ export function ScopePage({ at }) {
             onChange=${(value) => setWindowS(Number(value))} />
         </div>
         <div class="channels" tabindex="0" role="region" aria-label="Channels of all axes">
-          ${axes.map((axis) => html`<${AxisChannels} key=${axis.name} axis=${axis} keys=${keys} onToggle=${toggle} />`)}
+          ${axes.map((axis) => html`<${AxisChannels} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} keys=${keys} onToggle=${toggle} />`)}
         </div>
       <//>
       <${Panel} title="Live" class="panel bench-picture">
@@ -62,8 +70,8 @@ function AxisChannels({ axis, keys, onToggle }) {
 }
 
 /** The keys of the axis that the address names: all that tells its motion. */
-function ofAxis(axes, at) {
-  const axis = axes.find((each) => each.rig.name === at.rig && each.name === at.axis);
+function ofAxis(at) {
+  const axis = axisNamed(at);
   return axis ? channelsOf(axis).filter(({ item }) => item === "position" || item === "velocity").map(({ key }) => key) : null;
 }
 
@@ -76,12 +84,13 @@ function atFirst(axes) {
 /** Record these channels. */
 function useRecording(axes, keys) {
   const [recording, setRecording] = useState(null);
+  const all = axes.flatMap(channelsOf);
+  const channels = keys.map((key) => all.find((channel) => channel.key === key)).filter(Boolean);
   useEffect(() => {
-    if (!keys.length && !axes.length) return undefined;
-    const all = axes.flatMap(channelsOf);
-    const begun = new Recording(keys.map((key) => all.find((channel) => channel.key === key)).filter(Boolean));
+    if (!axes.length) return undefined;
+    const begun = new Recording(channels);
     setRecording(begun);
     return () => begun.close();
-  }, [axes.length, keys.join()]);
+  }, [axes.length > 0, channels.map(({ key }) => key).join()]);
   return recording;
 }

@@ -5,6 +5,7 @@ import { ChartView } from "../parts/chart_view.js";
 import { Action, Choice, Panel, Reason, Tick } from "../parts/controls.js";
 import { Curve } from "../parts/curve.js";
 import { NumberField, unread } from "../parts/number_field.js";
+import { OneAxis } from "../parts/one_axis.js";
 import { TraceProgress } from "../parts/trace_progress.js";
 import { clock, dateAndClock, duration, words } from "../parts/format.js";
 import { axisPath } from "../session/api.js";
@@ -13,29 +14,16 @@ import { look } from "../session/channels.js";
 import { MOST_CHANNELS, MOST_SAMPLES, TRACE_UNDER_WAY, TRIGGER_KINDS } from "../session/contract.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
-import { useRigs } from "../session/rigs.js";
 
 const FIRST = { samples: 500, timeout_s: 30, pre_trigger: 0, kind: "rising", level: 0 };
 
 export function TracePage({ at }) {
-  const axes = [...useRigs().values()].flatMap((rig) => [...rig.axes.values()]).filter((axis) => axis.can("trace"));
-  const axis = axes.find((each) => each.rig.name === at.rig && each.name === at.axis) ?? axes[0];
-  if (!axis) return html`<h1>Trace</h1><p>No axis that can be traced is known yet.</p>`;
-  return html`<h1>Trace</h1>
-    <${AxisChoice} axes=${axes} axis=${axis} page="trace" />
-    <div class="bench">
-      <div><${TraceForm} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} /></div>
-      <div class="bench-picture"><${Captured} /></div>
-    </div>`;
-}
-
-/** Choose the axis that a page is about. */
-export function AxisChoice({ axes, axis, page }) {
-  const names = axes.map((each) => [`${each.rig.name}/${each.name}`, `${each.rig.name} · ${each.name}`]);
-  return html`<div class="fields"><${Choice} label="Axis" options=${names} value=${`${axis.rig.name}/${axis.name}`}
-    onChange=${(value) => {
-      location.hash = `#/${page}/${value}`;
-    }} /></div>`;
+  const show = (axis) => html`<div class="bench">
+    <div><${TraceForm} axis=${axis} /></div>
+    <div class="bench-picture"><${Captured} /></div>
+  </div>`;
+  return html`<${OneAxis} at=${at} page="trace" title="Trace" can=${(axis) => axis.can("trace")}
+    none="No axis that can be traced is known yet." show=${show} />`;
 }
 
 function TraceForm({ axis }) {
@@ -53,6 +41,7 @@ function TraceForm({ axis }) {
   const way =
     obstacle(axis, "trace") ??
     (chosen.length ? null : "Choose a channel.") ??
+    (!set.trigger || chosen.includes(set.trigger) ? null : `The trigger looks at ${words(set.trigger)}, which is not recorded.`) ??
     (under ? "A trace is under way." : null) ??
     unread(used) ??
     (set.samples ? null : "How many samples?");
@@ -77,7 +66,8 @@ function TraceForm({ axis }) {
     <div class="fields">
       <${NumberField} label="Samples" ...${field("samples")} whole min=${2} max=${MOST_SAMPLES} />
       <${NumberField} label="Interval" min=${0} unit="ms" ...${field("interval_ms")} hint="empty: as fast as can be" />
-      <${Choice} label="Trigger" options=${[["", "none: at once"], ...chosen.map((name) => [name, words(name)])]} ...${field("trigger")} />
+      <${Choice} label="Trigger" options=${[["", "none: at once"], ...chosen.map((name) => [name, words(name)])]}
+        missing=${set.trigger && `${words(set.trigger)}: not recorded`} ...${field("trigger")} />
       ${
         set.trigger &&
         html`<${Choice} label="When it is" options=${TRIGGER_KINDS.map((each) => [each, each])} ...${field("kind")} />

@@ -6,29 +6,19 @@ import { Action, Choice, Panel, Reason, Table, Tick } from "../parts/controls.js
 import { Curve } from "../parts/curve.js";
 import { decimalsOf, duration, number, percent } from "../parts/format.js";
 import { NumberField, unread } from "../parts/number_field.js";
+import { OneAxis } from "../parts/one_axis.js";
 import { TraceProgress } from "../parts/trace_progress.js";
 import { look } from "../session/channels.js";
-import { useRigs } from "../session/rigs.js";
 import { obstacle } from "../session/obstacles.js";
 import { MOVES, runs, runTest } from "../session/test_moves.js";
 import { AuthorityPanel } from "./axis_authority.js";
 import { gainsOf, GainsTable } from "./axis_gains.js";
-import { AxisChoice } from "./trace.js";
 import { hasGainParameters, ParameterBench } from "./tuning_parameters.js";
 
 export function TuningPage({ at }) {
-  const axes = [...useRigs().values()]
-    .flatMap((rig) => [...rig.axes.values()])
-    .filter((axis) => axis.can("set_gains") || hasGainParameters(axis));
-  const axis = axes.find((each) => each.rig.name === at.rig && each.name === at.axis) ?? axes[0];
-  if (!axis) return html`<h1>Tuning</h1><p>No axis with a position loop of its own is known yet.</p>`;
-  return html`<h1>Tuning</h1>
-    <${AxisChoice} axes=${axes} axis=${axis} page="tuning" />
-    ${
-      hasGainParameters(axis)
-        ? html`<${ParameterBench} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} />`
-        : html`<${Bench} key=${`${axis.rig.name}/${axis.name}`} axis=${axis} />`
-    }`;
+  const show = (axis) => (hasGainParameters(axis) ? html`<${ParameterBench} axis=${axis} />` : html`<${Bench} axis=${axis} />`);
+  return html`<${OneAxis} at=${at} page="tuning" title="Tuning" can=${(axis) => axis.can("set_gains") || hasGainParameters(axis)}
+    none="No axis with a position loop of its own is known yet." show=${show} />`;
 }
 
 function Bench({ axis }) {

@@ -1,12 +1,13 @@
 /** Controls: a button says in visible text why it cannot act now; a choice and a tick have labels. */
 
-import { html, useId, useRef, useState } from "../html.js";
+import { html, useId, useLayoutEffect, useRef, useState } from "../html.js";
 import { inPageTerms } from "./remedies.js";
 import { faultPage } from "./state.js";
 
 /** A button that carries out `act`, shows what came of it, and cannot act while `obstacle` is a text.
 
- * It stays in the tab order then, so that everybody can reach the reason.
+ * It stays in the tab order then, so that everybody can reach the reason. A double click and a key that repeats are one
+ * press: what is sent may move something, and the button may be another one by the second.
  * With `reason` the id of an element that shows the obstacle already. `outcome` says what a reply means.
  */
 export function Action({ act, obstacle = null, reason = null, kind = "", onDone, onRefused, title, outcome, children }) {
@@ -16,8 +17,8 @@ export function Action({ act, obstacle = null, reason = null, kind = "", onDone,
   const [refusal, setRefusal] = useState(null);
   const [said, setSaid] = useState("");
 
-  async function press() {
-    if (obstacle || pressed.current) return;
+  async function press(event) {
+    if (obstacle || pressed.current || event.detail > 1) return;
     pressed.current = true;
     setUnderWay(true);
     setRefusal(null);
@@ -39,6 +40,7 @@ export function Action({ act, obstacle = null, reason = null, kind = "", onDone,
     <button
       type="button" class=${kind} aria-disabled=${obstacle ? "true" : null} aria-busy=${underWay ? "true" : null}
       aria-describedby=${obstacle ? (reason ?? own) : null} title=${title} onClick=${press}
+      onKeyDown=${(event) => event.repeat && event.key === "Enter" && event.preventDefault()}
     >${children}</button>
     ${obstacle && !reason && html`<small class="reason" id=${own}>${obstacle}</small>`}
     ${outcome && html`<small role="status">${said}</small>`}
@@ -50,20 +52,23 @@ const ONCE_MS = 1_000;
 
 /** Keep typed motions from being sent twice by a second Enter or a double click.
 
- * Returns what notes a motion that is sent, and what returns why the same one cannot be sent now.
+ * Returns what says why a motion cannot be sent now, and what sends one unless there is such a reason: it looks again,
+ * because the second press comes before the first is drawn.
  */
 export function useOnce() {
   const last = useRef({ text: null, atMs: 0 });
-  return {
-    note: (body) => {
-      last.current = { text: JSON.stringify(body), atMs: performance.now() };
-    },
-    obstacle: (body, moving) => {
-      if (!body || last.current.text !== JSON.stringify(body)) return null;
-      const recent = performance.now() - last.current.atMs < ONCE_MS;
-      return recent || moving ? "This motion was sent just now: change a value, or wait until the axis stands." : null;
-    },
+  const obstacle = (body, moving) => {
+    if (!body || last.current.text !== JSON.stringify(body)) return null;
+    const recent = performance.now() - last.current.atMs < ONCE_MS;
+    return recent || moving ? "This motion was sent just now: change a value, or wait until the axis stands." : null;
   };
+  const send = (body, moving, act) => {
+    const again = obstacle(body, moving);
+    if (again) throw new Error(again);
+    last.current = { text: JSON.stringify(body), atMs: performance.now() };
+    return act();
+  };
+  return { obstacle, send };
 }
 
 /** The one line under a group of controls that says why they cannot act. */
@@ -90,23 +95,42 @@ export function enterSends(event) {
   event.currentTarget.closest(".panel").querySelector("button.main").click();
 }
 
-/** A labelled choice; `options` are pairs of value and text. */
-export function Choice({ label, options, value, onChange, hint }) {
+/** A labelled choice; `options` are pairs of value and text.
+
+ * It shows what `value` is: one that is not among the options, or not any more, stands there as `missing`. While the list
+ * has the focus, and so may be open, its options stay as they are.
+ */
+export function Choice({ label, options, value, onChange, hint, missing }) {
   const id = useId();
+  const list = useRef();
+  const shown = useRef(options);
+  if (document.activeElement !== list.current || !list.current) shown.current = options;
+  const wanted = `${value ?? ""}`;
+  const known = shown.current.some(([each]) => `${each}` === wanted);
+  const [, redraw] = useState(0);
+  useLayoutEffect(() => {
+    list.current.value = wanted;
+  }, [wanted, shown.current]);
   return html`<div class="field">
     <label for=${id}>${label}</label>
-    <select id=${id} aria-describedby=${hint ? `${id}-hint` : null} onChange=${(event) => onChange(event.target.value)}>
-      ${options.map(([each, text]) => html`<option value=${each} selected=${each === (value ?? "")}>${text}</option>`)}
+    <select id=${id} ref=${list} autocomplete="off" aria-describedby=${hint ? `${id}-hint` : null}
+      onChange=${(event) => onChange(event.target.value)} onBlur=${() => redraw((count) => count + 1)}>
+      ${!known && html`<option key=" missing" value=${wanted} disabled>${missing ?? (wanted ? `${wanted}: not there any more` : "")}</option>`}
+      ${shown.current.map(([each, text]) => html`<option key=${each} value=${each}>${text}</option>`)}
     </select>
     ${hint && html`<small id=${`${id}-hint`}>${hint}</small>`}
   </div>`;
 }
 
-/** A labelled tick. */
+/** A labelled tick; it shows `checked` also where a click has not changed that. */
 export function Tick({ label, checked, onChange }) {
   const id = useId();
+  const box = useRef();
+  useLayoutEffect(() => {
+    box.current.checked = checked;
+  });
   return html`<div class="tick">
-    <input id=${id} type="checkbox" checked=${checked} onChange=${(event) => onChange(event.target.checked)} />
+    <input id=${id} ref=${box} type="checkbox" autocomplete="off" onChange=${(event) => onChange(event.target.checked)} />
     <label for=${id}>${label}</label>
   </div>`;
 }

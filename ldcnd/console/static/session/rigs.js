@@ -206,6 +206,9 @@ export class Rig {
     this.problem = told.problem;
     this.daemon = told.daemon ?? this.daemon;
     this.plan = told.plan ?? this.plan;
+    const described = Boolean(told.daemon);
+    if (described) for (const axis of this.axes.values()) axis.info = null; // those that it has not any more keep none
+    for (const bus of this.buses.keys()) if (described && !told.buses.some((each) => each.bus === bus)) this.buses.delete(bus);
     for (const info of told.buses) this.bus(info.bus).info = info;
     for (const info of told.axes) this.axis(info.axis).info = info;
     const place = ({ info }) => (info ? [info.bus, info.address] : ["", 0]);
@@ -242,6 +245,25 @@ export class Rig {
 
 /** All rigs by name. */
 export const rigs = new Map();
+
+/** The axes of all rigs, those too that are not described. */
+export function axesOf() {
+  return [...rigs.values()].flatMap((rig) => [...rig.axes.values()]);
+}
+
+/** The axis that an address names; null while, or because, there is none. */
+export function axisNamed(at) {
+  const axis = rigs.get(at.rig)?.axes.get(at.axis);
+  return axis?.info ? axis : null;
+}
+
+/** Return in words that the axis of an address is not there. */
+export function absence(at) {
+  const rig = rigs.get(at.rig);
+  if (!rig) return `Rig ${at.rig} is not known, or not known yet.`;
+  if (!rig.daemon) return `Axis ${at.axis} of rig ${at.rig} is not known yet.`;
+  return `Rig ${at.rig} has no axis ${at.axis}, or has it no more: choose another one.`;
+}
 
 /** Where rigs are looked for, and what is wrong there. */
 export let endpoints = [];

@@ -1,0 +1,132 @@
+"""One page of either engine, driven alike: by keys, by the mouse, by an input method."""
+
+import asyncio
+import itertools
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from playwright.async_api import Page
+
+from tests.browser.house import House, console
+from tests.support.marionette import CONTROL, DELETE, ENTER, ESCAPE, SHIFT, TAB, Firefox, firefox, open_firefox
+
+__all__ = ["Chromium", "Window", "console", "open_chromium", "open_gecko", "until"]
+PATIENCE_S = 45.0
+NAMED = {CONTROL: "Control", DELETE: "Delete", ENTER: "Enter", TAB: "Tab", ESCAPE: "Escape", SHIFT: "Shift"}
+
+
+class Chromium:
+    """A page of Chromium, driven as `Firefox` is."""
+
+    def __init__(self, page: Page) -> None:
+        self._page = page
+
+    async def open(self, url: str) -> None:
+        """Open a page."""
+        await self._page.goto(url)
+
+    async def reload(self) -> None:
+        """Load the page again."""
+        await self._page.reload()
+
+    async def back(self) -> None:
+        """Go back to the page before."""
+        await self._page.go_back()
+
+    # Any: what JSON holds
+    async def evaluate(self, script: str, *arguments: object) -> Any:
+        """Return what a function of JavaScript returns."""
+        return await self._page.evaluate(f"(given) => ({script})(...given)", list(arguments))
+
+    async def keys(self, *strokes: str, pause_ms: int = 0) -> None:
+        """Press keys one after another; several characters in one stroke are held together."""
+        for special, group in itertools.groupby(strokes, lambda each: len(each) > 1 or each in NAMED):
+            if not special:
+                await self._page.keyboard.type("".join(group), delay=pause_ms)
+                continue
+            for stroke in group:
+                await self._page.keyboard.press("+".join(NAMED.get(key, key) for key in stroke))
+
+    async def hold(self, key: str, times: int, pause_ms: int) -> None:
+        """Keep a key down while it repeats so many times."""
+        for _ in range(times):
+            await self._page.keyboard.down(NAMED[key])
+            await asyncio.sleep(pause_ms / 1e3)
+        await self._page.keyboard.up(NAMED[key])
+
+    async def click(self, x: float, y: float, count: int = 1) -> None:
+        """Click at a point of the window, as often as a hand does in one go."""
+        await self._page.mouse.click(x, y, click_count=count)
+
+    async def drag(self, start: tuple[float, float], end: tuple[float, float]) -> None:
+        """Press the button at one point and let it go at another."""
+        await self._page.mouse.move(*start)
+        await self._page.mouse.down()
+        for step in range(1, 11):
+            await self._page.mouse.move(*(a + (b - a) * step / 10 for a, b in zip(start, end, strict=True)))
+        await self._page.mouse.up()
+
+    async def wheel(self, x: float, y: float, by: int) -> None:
+        """Turn the wheel over a point."""
+        await self._page.mouse.move(x, y)
+        await self._page.mouse.wheel(0, by)
+
+    async def compose(self, *texts: str) -> None:
+        """Let an input method show each of these texts in the focused field, and take over the last."""
+        tools = await self._page.context.new_cdp_session(self._page)
+        enter = {"key": "Enter", "code": "Enter", "windowsVirtualKeyCode": 229}  # so an input method hides its keys
+        for text in texts:
+            await tools.send(
+                "Input.imeSetComposition", {"text": text, "selectionStart": len(text), "selectionEnd": len(text)}
+            )
+        await tools.send("Input.dispatchKeyEvent", {"type": "rawKeyDown", **enter})
+        await tools.send("Input.insertText", {"text": texts[-1]})
+        await tools.send("Input.dispatchKeyEvent", {"type": "keyUp", **enter})
+        await tools.detach()
+
+    async def resize(self, width: int, height: int) -> None:
+        """Give the page a size, in its own pixels."""
+        await self._page.set_viewport_size({"width": width, "height": height})
+
+
+Window = Chromium | Firefox
+
+
+@asynccontextmanager
+async def open_chromium(house: House, _folder: Path) -> AsyncIterator[Window]:
+    """Open a page of Chromium that the console has let in."""
+    async with house.desk() as desk:
+        yield Chromium(desk.page)
+
+
+@asynccontextmanager
+async def open_gecko(house: House, folder: Path) -> AsyncIterator[Window]:
+    """Open a page of Firefox with the cookies of a page that the console has let in."""
+    program = firefox()
+    if program is None:
+        pytest.skip("no firefox-esr: install it, or say where one is in LDCND_FIREFOX")
+    async with house.desk() as desk:
+        await desk.open("rig")
+        cookies = await desk.page.context.cookies()
+    async with open_firefox(program, folder) as window:
+        await window.open(f"{house.url}/")
+        for cookie in cookies:
+            given = {"name": cookie["name"], "value": cookie["value"], "path": "/", "httpOnly": cookie["httpOnly"]}
+            await window.command("WebDriver:AddCookie", cookie=given)
+        yield window
+
+
+# Any: what JSON holds
+async def until(window: Window, script: str, *arguments: object, wanted: Callable[[Any], Any] = bool) -> Any:
+    """Wait until a function of JavaScript returns what is wanted, and return that."""
+    found = None
+    try:
+        async with asyncio.timeout(PATIENCE_S):
+            while not wanted(found := await window.evaluate(script, *arguments)):
+                await asyncio.sleep(0.05)
+    except TimeoutError:
+        raise AssertionError(f"{script} gave {found!r} to the end") from None
+    return found
