@@ -2,7 +2,9 @@
 
 import asyncio
 from collections.abc import Mapping
+from contextlib import suppress
 
+from ldcnd.client.overview import holders_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.console.latest_values import LatestValues
@@ -17,6 +19,8 @@ log = get_logger("console")
 
 ASK_AGAIN_S = 0.5
 """Pause before the next query of a daemon that did not answer, seconds; behind a router it may be late at first."""
+HOLDERS_EACH_S = 1.0
+"""Period of queries for who controls what, seconds; the daemon publishes everything else by itself."""
 LINGER_S = 0.016
 """Period in which samples are taken together, seconds; less than a frame at the highest rate."""
 DESCRIPTION_AGE_S = 1.0
@@ -40,6 +44,7 @@ class RigWatch:
         self._instances: set[str] = set()
         self._stirred = asyncio.Event()
         client.watch_rivals(self._stirred.set)
+        self._control_changed = asyncio.Event()
         self._reply = RigReply(
             name=client.rig, endpoint=endpoint, connected=False, problem="its daemon has not been seen yet"
         )
@@ -71,7 +76,22 @@ class RigWatch:
         """Watch until cancelled."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._conditions.run(), name=f"conditions of {self.client.rig}")
+            group.create_task(self._follow_holders(), name=f"holders of {self.client.rig}")
             await self._watch()
+
+    def control_changed(self) -> None:
+        """Query at once who controls what: a page has taken control, given it up or lost it."""
+        self._control_changed.set()
+
+    async def _follow_holders(self) -> None:
+        """Query who controls what, for all pages at once."""
+        while True:
+            self._control_changed.clear()
+            self._conditions.holders = await holders_of(self.client) if self.connected else {}
+            self._conditions.show()
+            with suppress(TimeoutError):
+                async with asyncio.timeout(HOLDERS_EACH_S):
+                    await self._control_changed.wait()
 
     def _take(self, sample: Sample) -> None:
         self._values.take(sample)

@@ -3,6 +3,8 @@
 import asyncio
 import json
 import os
+import signal
+from asyncio.subprocess import Process
 from collections.abc import AsyncIterator, Callable
 from contextlib import AsyncExitStack, asynccontextmanager
 from dataclasses import dataclass, field
@@ -59,13 +61,18 @@ class DaemonUnderTest:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.rig: RigClient
         self._running = AsyncExitStack()
+        self._process: Process
 
     async def start(self) -> None:
         """Return when every axis answers."""
         run = process("run", "--config", str(self.config), "--listen", self.endpoint)
-        daemon = await self._running.enter_async_context(run)
+        daemon = self._process = await self._running.enter_async_context(run)
         await answering(daemon, self.endpoint)
         self.rig = await self._running.enter_async_context(client(self.endpoint))
+
+    def pause(self, *, on: bool) -> None:
+        """Stop the process where it is, so that it falls silent, or let it go on."""
+        self._process.send_signal(signal.SIGSTOP if on else signal.SIGCONT)
 
     async def end(self) -> None:
         """Return when it has ended."""

@@ -23,7 +23,8 @@ READ = f"""() => {{
   const field = {FIND};
   if (!field) return null;
   const text = (kind) => field.parentElement.querySelector(kind)?.textContent ?? "";
-  return {{ text: field.value, read: text(".read"), refused: text(".unread"), focused: document.activeElement === field }};
+  const focused = document.activeElement === field;
+  return {{ text: field.value, read: text(".read"), refused: text(".unread"), focused }};
 }}"""
 FOCUS = f"() => {FIND}.focus()"
 PLACE = """(text) => {

@@ -223,7 +223,7 @@ async def test_whoever_loses_control_is_told_and_can_move_nothing(house):
 
         await expect(desk.page.get_by_text("another operator took control of c.")).to_be_visible()
         await expect(desk.page).to_have_title(re.compile("^Control lost . Axis c"))
-        await expect(desk.panel("Control")).to_contain_text("Held by another operator")
+        await expect(desk.panel("Control")).to_contain_text("controlled by another operator")
         await expect(desk.button("Enable")).to_be_disabled()
         await expect(desk.panel("Control")).to_contain_text("Control is held by another operator")
 

@@ -19,7 +19,7 @@ from ldcnd.client.overview import AxisNow
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.contract.codec import Encoding, encode
-from ldcnd.contract.condition import Place, assess
+from ldcnd.contract.condition import UNKNOWN_HOLDER, Place, assess
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth, StopWaitHealth
 from ldcnd.contract.keys import Keys
@@ -64,6 +64,7 @@ class Case:
     Attributes:
         name: as the reference has it.
         state: what differs from an axis that stands, enabled and homed.
+        holder: who controls the axis.
         says: what stands on faces; `without` is said by those that know neither faults, nor the line, nor ages.
         place: whether the position is known.
     """
@@ -76,6 +77,7 @@ class Case:
     age_s: float = 0.0
     line_up: bool = True
     without: str | None = None
+    holder: str | None = UNKNOWN_HOLDER
 
 
 DOWN = {"link": LinkState.DOWN, "moving": Moving.UNKNOWN, "referenced": False, "quality": Quality.BAD}
@@ -107,6 +109,10 @@ CASES = (
          without="error stop"),
     Case("missed polls", {"link": LinkState.DEGRADED, "quality": Quality.UNCERTAIN, "moving": Moving.UNKNOWN},
          "missed polls", Place.KNOWN),
+    Case("moved by another", {"state": AxisState.DISCRETE_MOTION, "moving": Moving.YES}, "moved by ada", Place.KNOWN,
+         without="", holder="ada"),
+    Case("controlled by another", {}, "controlled by ada", Place.KNOWN, without="", holder="ada"),
+    Case("not controlled", {}, "not controlled", Place.KNOWN, without="", holder=None),
 )  # fmt: skip
 
 
@@ -162,7 +168,7 @@ def published(at: Known) -> list[Sample]:
 
 def axis_now(at: Known) -> AxisNow:
     health = at.line.axes[0]
-    condition = assess(at.state, at.faults, health, age_s=at.case.age_s, line_up=at.case.line_up)
+    condition = assess(at.state, at.faults, health, age_s=at.case.age_s, line_up=at.case.line_up, holder=at.case.holder)
     return AxisNow(INFO, at.state, at.position, at.case.age_s, health, condition)
 
 
@@ -188,15 +194,26 @@ def top(at: Known) -> str:
     for sample in published(at):
         view.take(sample, 100.0 - (at.case.age_s if sample.key.endswith("position") else 0.0))
     view.take(put(KEYS.health, DaemonHealth(t=NOW_NS, seq=0, loop_lag_s=0, published=0, missed_reports=0)), 100.0)
-    view.describe(Description(DAEMON, (INFO,), {"x": "scan"}))
+    view.describe(Description(DAEMON, (INFO,), holders(at)))
     return "\n".join(as_text(view.glance(100.0))[2:4])
+
+
+def holders(at: Known) -> dict[str, str | None]:
+    return {} if at.case.holder == UNKNOWN_HOLDER else {"x": at.case.holder}
 
 
 DAEMON = DaemonInfo.model_construct(rig="sim", version="1", instance="a", buses=("line0",))
 
 
 def fleet_table(at: Known) -> str:
-    report = AxisReport(info=INFO, state=at.state, fault=at.faults, health=at.line.axes[0], line_up=at.case.line_up)
+    report = AxisReport(
+        info=INFO,
+        state=at.state,
+        fault=at.faults,
+        health=at.line.axes[0],
+        line_up=at.case.line_up,
+        holder=at.case.holder,
+    )
     return "\n".join(fleet.table(RigReport(rig="sim", instance="a", daemon=None, health=None, axes=(report,))))
 
 
@@ -259,6 +276,7 @@ def epics(at: Known) -> str:
 def console(at: Known) -> str:
     sent: list[Sample] = []
     conditions = Conditions("sim", sent.append, lambda: 100.0)
+    conditions.holders = holders(at)
     for sample in published(at):
         conditions.take(sample)
     conditions.show()
@@ -283,6 +301,8 @@ def wanted(case: Case, face: object) -> str:
         return ""  # a reading has a message where it has an alarm
     if case.without is None or face in ALL_KNOWN:
         return case.says
+    if case.holder != UNKNOWN_HOLDER:
+        return case.says if face is fleet_table else ""  # the others are not told who controls an axis
     knows = case.name != "old" and (face in NO_AGE or (face in FAULTS_ONLY and case.name != "line down"))
     return case.says if knows else case.without
 
@@ -335,7 +355,7 @@ def test_alarm_systems_get_no_ok_of_an_axis_whose_place_is_not_known(case):
     bridge.take("x", at.faults)
 
     assert condition.place is case.place
-    assert (condition.alarm == 0) is (case.name in ("well", "speed override 30 %"))
+    assert (condition.alarm == 0) is (case.name in ("well", "speed override 30 %") or case.holder != UNKNOWN_HOLDER)
     if case.place is not Place.KNOWN and case.name != "old":
         assert bridge.diagnostics(NOW_NS).statuses[0].level in {WARN, ERROR}
         assert not epics(at).startswith("NO_ALARM")

@@ -52,7 +52,7 @@ function Summary() {
     ${feed.live ? "" : html`<${Mark} level="bad">No data from the console process<//> `}
     <${Mark} level=${worst}>
       ${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : "Nothing needs attention"}<//>
-    ${[...rigs.values()].filter(slowed).map((rig) => html`<${Mark} level="warn"
+    ${[...rigs.values()].filter((rig) => !rig.worth && slowed(rig)).map((rig) => html`<${Mark} level="warn"
       >${rigs.size > 1 ? `${rig.name}: ` : ""}speed override ${number(overrideOf(rig), 0)} %${overrideOf(rig) === 0 ? ": nothing moves" : ""}<//> `)}
     ${mine.length > 0 && html` <span class="mine">You control ${mine.map((axis) => axis.name).join(", ")}</span>`}
   </p>`;

@@ -28,7 +28,7 @@ def axis_cells(row: AxisGlance) -> tuple[str, ...]:
         UNKNOWN if row.adc_volts is None else f"{row.adc_volts:.2f} V",
         UNKNOWN if row.age_s is None else f"{row.age_s:.1f} s",
         rate,
-        row.holder or UNKNOWN,
+        row.control or UNKNOWN,
         row.trouble,
     )
 

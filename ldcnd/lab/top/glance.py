@@ -55,8 +55,8 @@ class AxisGlance(Glance):
     """The configured rate."""
     link: LinkState | None
     """Whether the drive answers."""
-    holder: str | None
-    """Who controls it."""
+    control: str | None
+    """Who controls or moves it, in words; null where that is not known."""
 
 
 class BusGlance(Glance):

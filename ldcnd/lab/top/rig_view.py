@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from ldcnd.contract.codec import decode_received
-from ldcnd.contract.condition import SHARED, Kind, Severity, Trouble, assess, line_troubles
+from ldcnd.contract.condition import SHARED, UNKNOWN_HOLDER, Kind, Severity, Trouble, assess, line_troubles
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import BusHealth, LaneHealth
 from ldcnd.contract.keys import Keys
@@ -39,17 +39,17 @@ class Description:
     Attributes:
         daemon: itself.
         axes: in the order in which they are shown.
-        holders: who controls which axis; an axis that is not controlled is missing.
+        holders: who controls which axis; None where no client does.
     """
 
     daemon: DaemonInfo
     axes: tuple[AxisInfo, ...]
-    holders: Mapping[str, str]
+    holders: Mapping[str, str | None]
 
 
 def described(daemon: DaemonInfo, axes: list[AxisInfo], holders: HolderList) -> Description:
     """Return the answers as one description."""
-    held = {holder.axis: holder.client for holder in holders.holders if holder.client is not None}
+    held = {holder.axis: holder.client for holder in holders.holders}
     return Description(daemon, tuple(axes), held)
 
 
@@ -124,8 +124,12 @@ class RigView:
         state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
         health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
         age_s = now_s - self._kept[position_key].at_s if position else None
-        condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent)
-        worst = next(iter(condition.troubles), None)
+        condition = assess(
+            state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent,
+            holder=self._description.holders.get(info.axis, UNKNOWN_HOLDER) if self._description else UNKNOWN_HOLDER,
+        )  # fmt: skip
+        control = next((each.short for each in condition.troubles if each.kind is Kind.CONTROL), None)
+        worst = next((each for each in condition.troubles if each.kind is not Kind.CONTROL), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(
             axis=info.axis,
@@ -147,7 +151,7 @@ class RigView:
             rate_hz=health.rate_hz if health else None,
             rate_wanted_hz=health.rate_wanted_hz if health else None,
             link=state.link if state else None,
-            holder=self._description.holders.get(info.axis) if self._description else None,
+            control=control,
             severity=worst.severity if worst else Severity.NOTICE if news else Severity.FINE,
             trouble=worst.text if worst else news,
         )

@@ -14,8 +14,6 @@ import { NowPanel } from "./axis_now.js";
 import { OutputsPanel } from "./axis_outputs.js";
 import { ShadowPanel } from "./axis_shadow.js";
 
-const MOTIONS = ["move_absolute", "move_relative", "move_velocity", "set_pwm", "move_analog", "probe"];
-
 export function AxisPage({ at }) {
   useRigs();
   const axis = axisNamed(at);
@@ -43,7 +41,7 @@ export function AxisPage({ at }) {
       <div class="column">
         <${AuthorityPanel} axis=${axis} />
         ${axis.can("jog") && html`<${JogPanel} key=${axis.name} axis=${axis} />`}
-        ${MOTIONS.some((verb) => axis.can(verb)) && html`<${MovePanel} axis=${axis} />`}
+        <${MovePanel} axis=${axis} />
         ${axis.can("home") && html`<${HomePanel} axis=${axis} />`}
         ${axis.can("set_outputs") && html`<${OutputsPanel} key=${axis.name} axis=${axis} />`}
         ${info.registers.length > 0 && html`<${RegistersPanel} axis=${axis} />`}

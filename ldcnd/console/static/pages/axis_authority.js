@@ -13,7 +13,7 @@ export function AuthorityPanel({ axis }) {
   const others = !mine && axis.holder;
   const force = Boolean(others) && from === axis.holder;
   return html`<${Panel} title="Control">
-    <p>${mine || axis.holder ? "Held by " : "This axis is "}<${HolderWord} axis=${axis} />${mine ? ". When this page closes, the console halts what it moved and ends control." : "."}</p>
+    <p>${mine ? "Held by " : ""}<${HolderWord} axis=${axis} />${mine ? ". When this page closes, the console halts what it moved and ends control." : "."}</p>
     <p class="row">
       ${
         mine

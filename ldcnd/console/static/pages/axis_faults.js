@@ -60,6 +60,7 @@ export function WhyPanel({ axis }) {
     axis.holder,
     mine,
     axis.rig.connected,
+    axis.rig.worth?.word,
   ]);
   useEffect(() => {
     let wanted = true;
@@ -75,7 +76,9 @@ export function WhyPanel({ axis }) {
   return html`<${Panel} title="Can it move?">
     <div aria-live="polite">
       ${
-        why &&
+        axis.rig.worth
+          ? html`<p><${Mark} level="bad">not known<//> ${axis.rig.worth.why}</p>`
+          : why &&
         !refusal &&
         (why.can_move
           ? html`<p>Ready to move: a motion within the limits would be accepted.</p>`
@@ -85,7 +88,7 @@ export function WhyPanel({ axis }) {
             ${cause.remedy && html`<p class="quiet">To clear it: ${inPageTerms(cause)}.</p>`}</li>`,
             )}</ol>`)
       }
-      ${why?.first_fault && html`<p class="quiet">First fault since the last reset: ${why.first_fault}.</p>`}
+      ${!axis.rig.worth && why?.first_fault && html`<p class="quiet">First fault since the last reset: ${why.first_fault}.</p>`}
     </div>
     <${RefusalText} refusal=${refusal} />
   <//>`;

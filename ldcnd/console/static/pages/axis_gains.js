@@ -23,7 +23,7 @@ export function ProvenanceWord({ provenance }) {
 }
 
 export function GainsPanel({ axis }) {
-  return html`<${Panel} title="Gains" note="Register values as in the drive's manual. Nothing is written without a click.">
+  return html`<${Panel} title="Gains" of=${axis.rig} note="Register values as in the drive's manual. Nothing is written without a click.">
     <${GainsTable} axis=${axis} />
   <//>`;
 }

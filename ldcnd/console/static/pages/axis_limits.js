@@ -9,7 +9,7 @@ import { ProvenanceWord } from "./axis_gains.js";
 export function LimitsPanel({ axis }) {
   const { limits, unit, counts_per_unit: scale, direction, adc_full_scale: full } = axis.info;
   const limit = (value, of) => (value === null ? "none" : html`${number(value, 3)} <span class="unit">${of}</span>`);
-  return html`<${Panel} title="Limits" note="From the configuration of the daemon.">
+  return html`<${Panel} title="Limits" of=${axis.rig} note="From the configuration of the daemon.">
     <${Facts} of=${[
       ["lowest position", limit(limits.position_min, unit)],
       ["highest position", limit(limits.position_max, unit)],
@@ -28,7 +28,7 @@ export function RegistersPanel({ axis }) {
       ({ name, value, provenance }) => html`<tr>
     <th scope="row">${name}</th><td class="number">${number(value, 0)}</td><td><${ProvenanceWord} provenance=${provenance} /></td></tr>`,
     );
-  return html`<${Panel} title="Registers"
+  return html`<${Panel} title="Registers" of=${axis.rig}
     note="These drives cannot be read back: this is what the daemon knows of the rest of their registers.">
     <${Table} label=${`Registers of ${axis.name}`} head=${["Register", "#Raw value", "Known by"]} rows=${rows} />
   <//>`;

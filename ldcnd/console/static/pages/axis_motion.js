@@ -62,8 +62,13 @@ const BUFFERING = [
   ["buffered", "wait for its end"],
 ];
 
+/** The panel, of an axis that takes any of these motions. */
 export function MovePanel({ axis }) {
   const kinds = Object.keys(KINDS).filter((verb) => axis.can(verb));
+  return kinds.length > 0 && html`<${Move} axis=${axis} kinds=${kinds} />`;
+}
+
+function Move({ axis, kinds }) {
   const [verb, setVerb] = useState(kinds[0]);
   const [values, setValues] = useState({});
   const reason = useId();

@@ -15,7 +15,7 @@ export function NowPanel({ axis }) {
   const { known, live, mark } = axis.condition;
   const target = live ? state?.command?.target : null;
   const left = target == null || !position ? null : target - position.value;
-  return html`<${Panel} title="Now" data-stale=${live ? "no" : "yes"}>
+  return html`<${Panel} title="Now" of=${axis.rig} data-stale=${live ? "no" : "yes"}>
     <div class="now">
       <p class="big" data-known=${known ? "yes" : "no"}><output aria-label="Position"
         >${known ? number(position?.value, decimals) : `(${number(position?.value, decimals)})`}</output>

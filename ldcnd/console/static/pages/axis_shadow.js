@@ -22,7 +22,7 @@ export function ShadowPanel({ axis }) {
       <td>${allowed(each)} <span class="unit">${each.unit}</span></td>
       <td><${Trend} axis=${axis} figure=${each} /></td></tr>`,
   );
-  return html`<${Panel} title="Shadow" note=${note}>
+  return html`<${Panel} title="Shadow" of=${axis.rig} note=${note}>
     ${old && html`<p class="notice mark" data-level="warn">The observer has said nothing for a minute: these values are old.</p>`}
     ${rows.length > 0 &&
     html`<${Table} label=${`Shadow of ${axis.name}`} head=${["Figure", "#Now", "#Usual", "Allowed", "Trend"]} rows=${rows} />`}

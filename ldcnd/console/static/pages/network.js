@@ -30,13 +30,13 @@ function Line({ rig, bus }) {
   const { info } = bus;
   const plan = rig.plan?.buses.find((each) => each.bus === bus.name);
   if (!info) return null;
-  return html`<${Panel} title=${`${rig.name} · ${bus.name}`}>
+  return html`<${Panel} title=${`${rig.name} · ${bus.name}`} of=${rig}>
     ${info.up ? null : html`<p class="notice mark" data-level="bad">Down: ${info.problem}</p>`}
     ${info.remarks.map((remark) => html`<p class="mark" data-level="warn">${remark}</p>`)}
     <${Facts} of=${[
       ["port", info.port],
       ["rate", `${info.baud} baud`],
-      ["state", info.up ? "up" : "down"],
+      ["state", rig.worth ? `unknown, was ${info.up ? "up" : "down"}` : info.up ? "up" : "down"],
       ["drives were", { reset: "reset: positions count from 0", adoption: "taken over as they were" }[info.started_by]],
       ["in use", percent(bus.health?.utilisation)],
       ["99 % of polls within", duration(info.poll_p99_s)],

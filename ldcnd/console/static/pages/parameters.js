@@ -48,7 +48,7 @@ function Memories({ axis }) {
   const rows = merged(listed, values, file).filter((row) => matches(row, only));
 
   return html`
-    <${Panel} title=${`Memories of ${axis.name}`}
+    <${Panel} title=${`Memories of ${axis.name}`} of=${axis.rig}
       note="RAM is in use and forgotten at power-off. EEPROM endures 10,000 writes.">
       <p class="row">
         <${Action} act=${readAll} onDone=${setDump} obstacle=${obstacle(axis, "parameters")}

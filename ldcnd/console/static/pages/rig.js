@@ -220,5 +220,5 @@ function RigCommands({ rig }) {
 /** Who controls an axis. */
 export function HolderWord({ axis }) {
   if (controls(axis)) return html`<span class="mine">this page</span>`;
-  return axis.holder ? html`<span>${axis.holder}</span>` : html`<span class="quiet">not controlled</span>`;
+  return html`<span class=${axis.holder ? "" : "quiet"}>${axis.control}</span>`;
 }

@@ -27,7 +27,7 @@ function Bench({ axis }) {
     <div>
       <${TestMove} axis=${axis} />
       <${AuthorityPanel} axis=${axis} />
-      <${Panel} title="Gains" note="Nothing is written without a click.">
+      <${Panel} title="Gains" of=${axis.rig} note="Nothing is written without a click.">
         <${GainsTable} axis=${axis} wanted=${wanted} onWanted=${setWanted} />
       <//>
     </div>

@@ -33,7 +33,7 @@ export function ParameterBench({ axis }) {
   const renew = (value) => setGains((last) => last.map((each) => (each.parameter === value.parameter ? value : each)));
   const keep = (run) => setRuns((last) => [{ ...run, number: (last[0]?.number ?? 0) + 1 }, ...last].slice(0, MOST_RUNS));
   return html`<${AuthorityPanel} axis=${axis} />
-    <${Panel} title="Gains" note="Written to RAM: in use at once, lost at power-off. Save them on the parameters page.">
+    <${Panel} title="Gains" of=${axis.rig} note="Written to RAM: in use at once, lost at power-off. Save them on the parameters page.">
       <${RefusalText} refusal=${refusal} />
       ${gains.map((value) => html`<${Gain} key=${value.parameter} axis=${axis} value=${value} onWritten=${renew} />`)}
     <//>

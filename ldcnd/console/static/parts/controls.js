@@ -135,11 +135,16 @@ export function Tick({ label, checked, onChange }) {
   </div>`;
 }
 
-/** A part of a page with a heading of its own. */
-export function Panel({ title, note, children, ...more }) {
+/** A part of a page with a heading of its own.
+ *
+ * With `of` it has values of that rig; while nothing comes from there, it says that they are the last known ones.
+ */
+export function Panel({ title, note, of, children, ...more }) {
   const id = useId();
-  return html`<section class="panel" aria-labelledby=${id} ...${more}>
-    <header><h2 id=${id}>${title}</h2>${note && html`<p class="quiet">${note}</p>`}</header>
+  const stale = of && { "data-stale": of.worth ? "yes" : "no" };
+  return html`<section class="panel" aria-labelledby=${id} ...${stale} ...${more}>
+    <header><h2 id=${id}>${title}</h2>${note && html`<p class="quiet">${note}</p>`}
+      ${of?.worth && html`<p class="mark" data-level="bad">last known values</p>`}</header>
     ${children}
   </section>`;
 }

@@ -2,25 +2,13 @@
 
 import { ask, asJson, axisPath, nameThisPage, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
-import { askHolders, changed, rigs } from "./rigs.js";
+import { changed, rigs } from "./rigs.js";
 
 const OPEN_AGAIN_MS = 1_000;
 /** As the console's `HELD_S` wants it, several times over. */
 const HELD_EACH_MS = 100;
-const MOTIONS = new Set([
-  "move_absolute",
-  "move_relative",
-  "move_velocity",
-  "jog",
-  "move_analog",
-  "set_pwm",
-  "track",
-  "home",
-  "probe",
-]);
-
-/** The axes that this page controls, by key; true once it has moved them. */
-const held = new Map();
+/** The axes that this page controls. */
+const held = new Set();
 
 /** The name under which this page controls axes; null while it is not connected. */
 export let client = null;
@@ -47,16 +35,15 @@ export function controls(axis) {
 
 /** The axes that this page controls. */
 export function controlled() {
-  return [...held.keys()];
+  return [...held];
 }
 
 /** Take control of axes of one rig; `force` takes them from their holders. */
 export async function take(axes, force = false) {
   const body = { axes: axes.map((axis) => axis.name), force };
   await ask(`${rigPath(axes[0].rig.name)}/control`, body);
-  for (const axis of axes) held.set(axis, false);
+  for (const axis of axes) held.add(axis);
   lost.clear();
-  askHolders();
   changed();
 }
 
@@ -64,13 +51,11 @@ export async function take(axes, force = false) {
 export async function release(axes) {
   await ask(`${rigPath(axes[0].rig.name)}/release`, { axes: axes.map((axis) => axis.name) });
   for (const axis of axes) held.delete(axis);
-  askHolders();
   changed();
 }
 
 /** Send a command once, under this page's control if it has it, meant for this run of the daemon. */
 export function command(axis, verb, body = {}, patienceMs = undefined) {
-  if (MOTIONS.has(verb)) noteMoved(axis);
   const instance = rigs.get(axis.rig.name)?.daemon?.instance;
   const envelope = { ...(instance && { instance }), command_id: crypto.randomUUID() };
   return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, { ...given(body), ...envelope }, patienceMs);
@@ -78,7 +63,6 @@ export function command(axis, verb, body = {}, patienceMs = undefined) {
 
 /** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
 export function moveTogether(axes, targets, velocity, straight = false) {
-  for (const axis of axes) noteMoved(axis);
   const moves = shares(axes, targets, velocity).map((move) => ({ ...move, command_id: crypto.randomUUID() }));
   return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves, ...(straight && { path: "linear" }) });
 }
@@ -112,7 +96,6 @@ export function question(axis, verb, body = {}) {
 export function beginJog(axis, velocity) {
   endJog();
   jogRefusal = null;
-  noteMoved(axis);
   say({ jog: { rig: axis.rig.name, axis: axis.name, velocity } });
   holding = setInterval(() => say({ held: true }), HELD_EACH_MS);
   changed();
@@ -130,16 +113,11 @@ function say(message) {
   if (socket?.readyState === WebSocket.OPEN) socket.send(asJson(message));
 }
 
-/** Note that this page has set an axis in motion. */
-export function noteMoved(axis) {
-  if (held.has(axis)) held.set(axis, true);
-}
-
 /** Connect, again whenever the connection is lost; warn before a page goes whose axes move. */
 export function keepControl() {
   open();
   addEventListener("beforeunload", (event) => {
-    if ([...held].some(([axis, moved]) => moved && moves(axis))) event.preventDefault();
+    if ([...held].some(moves)) event.preventDefault();
   });
 }
 
@@ -161,7 +139,7 @@ function open() {
     endJog();
     client = null;
     nameThisPage(null);
-    for (const axis of held.keys()) noteLost(axis, "this page has lost its connection to the console. What it moved is halted.");
+    for (const axis of held) noteLost(axis, "this page has lost its connection to the console. What it moved is halted.");
     held.clear();
     changed();
     setTimeout(open, OPEN_AGAIN_MS);

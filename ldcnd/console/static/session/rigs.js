@@ -1,12 +1,12 @@
 /** What is known of every rig: descriptions by GET, latest values by the feed, and how old they are. */
 
 import { useEffect, useState } from "../html.js";
-import { ask, read, rigPath } from "./api.js";
+import { read } from "./api.js";
 import { feed } from "./feed.js";
 
 const DESCRIBED_EACH_MS = 5_000;
 const DESCRIBED_ANEW_MS = 1_050;
-const HOLDERS_EACH_MS = 1_000;
+const AGES_EACH_MS = 1_000;
 const DRAWN_EACH_MS = 100;
 const SILENT_AFTER_S = 3;
 /** What is shown of an axis of which no condition came yet. */
@@ -25,7 +25,6 @@ export class Axis {
   samples = {};
   monitors = {};
   trace = null;
-  holder = null;
   /** What a command for all axes was refused with here, in words; null when it was not. */
   refusal = null;
   shadows = [];
@@ -49,6 +48,16 @@ export class Axis {
 
   get faults() {
     return this.samples.fault?.active ?? [];
+  }
+
+  /** Who controls it, as the console process has learned: null where no client does, empty where that is not known. */
+  get holder() {
+    return this.rig.worth ? "" : (this.samples.condition?.holder ?? "");
+  }
+
+  /** The same in words. */
+  get control() {
+    return this.rig.worth ? "unknown" : (this.condition.troubles.find(({ kind }) => kind === "control")?.short ?? (this.holder || "unknown"));
   }
 
   can(capability) {
@@ -345,24 +354,7 @@ export function watch() {
   feed.open();
   describe();
   setInterval(describe, DESCRIBED_EACH_MS);
-  setInterval(changed, HOLDERS_EACH_MS); // ages grow by themselves
-  setInterval(askHolders, HOLDERS_EACH_MS);
-}
-
-/** Ask every rig who controls what. */
-export const askHolders = unlessUnderWay(async () => {
-  if (document.hidden) return;
-  await Promise.all([...rigs.values()].filter((rig) => rig.connected).map(holdersOf));
-  changed();
-});
-
-async function holdersOf(rig) {
-  try {
-    const { holders } = await ask(`${rigPath(rig.name)}/rig/holders`);
-    for (const { axis, client } of holders) rig.axis(axis).holder = client;
-  } catch {
-    for (const axis of rig.axes.values()) axis.holder = null; // the page says already that nothing comes in
-  }
+  setInterval(changed, AGES_EACH_MS); // ages grow by themselves
 }
 
 function rigNamed(name) {

@@ -1,0 +1,110 @@
+"""A daemon that is gone, or silent: the page says so wherever one looks, and no value of it passes for a present one."""
+
+from contextlib import asynccontextmanager
+
+import pytest
+
+from tests.support.marionette import ESCAPE
+
+windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
+until = windows.until
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.real_time,
+    pytest.mark.asyncio(loop_scope="package"),
+    pytest.mark.timeout(240),
+]
+
+SIZES = ((320, 568), (640, 400), (1400, 900))
+PAGES = {
+    "rig": 'section[aria-label="Rig alpha"]',
+    "axis/alpha/x": "main",
+    "axis/alpha/feed": "main",
+    "network": "section:has(> header > h2)",
+    "trace/alpha/x": "main",
+    "tuning/alpha/x": "main",
+    "parameters/alpha/feed": "main",
+    "events": "main",
+    "scope": "main",
+    "commissioning": "main",
+}
+"""Pages, and the part of each that is about the rig."""
+SEEN = """() => {
+  scrollTo(0, document.body.scrollHeight);
+  const notice = [...document.querySelectorAll(".notices .notice")].find((each) => each.textContent.includes("alpha"));
+  if (!notice) return "there is no notice";
+  const range = document.createRange();
+  range.selectNodeContents(notice);
+  for (const box of range.getClientRects()) {
+    const [x, y] = [box.left + 4, box.top + box.height / 2];
+    if (box.top < 0 || box.bottom > innerHeight || box.left < 0 || box.right > innerWidth + 1) return "it is off the screen";
+    const over = document.elementFromPoint(x, y);
+    if (!notice.contains(over)) return `${over?.className || over?.tagName} is over it`;
+  }
+  const room = innerHeight - document.querySelector("header.frame").getBoundingClientRect().bottom;
+  return room < innerHeight / 3 ? "it leaves no room for the page" : "";
+}"""
+UNMARKED = """(within) => {
+  const parts = [...document.querySelectorAll(within)].filter(
+    (each) => within !== "section:has(> header > h2)" || each.querySelector("h2").textContent.startsWith("alpha"));
+  const values = "td.number, td.main, .facts dd, .lamps li b, .counters b, .meter b, .big";
+  return parts.flatMap((part) => [...part.querySelectorAll(values)])
+    .filter((each) => /\\d|yes|no|up|open|closed|low|high/.test(each.textContent))
+    .filter((each) => each.checkVisibility() && getComputedStyle(each).fontStyle !== "italic")
+    .map((each) => `${each.closest("tr, div, li")?.textContent.trim().slice(0, 60)}`);
+}"""
+CALM = """() => {
+  const text = document.body.innerText;
+  return ["Nothing needs attention", "Ready to move"].filter((each) => text.includes(each));
+}"""
+NAMED = (
+    """() => [...document.querySelectorAll(".notices .notice")].some((each) => each.textContent.includes("alpha"))"""
+)
+
+
+@asynccontextmanager
+async def lost_alpha(house, window, page, way):
+    """Look at a page of a rig, then lose its daemon."""
+    await house.alpha.start()
+    try:
+        await window.open("about:blank")
+        await window.open(f"{house.url}/#/rig")
+        await until(window, "() => document.querySelector('[aria-label=\"Rig alpha\"]')?.dataset.stale === 'no'")
+        await window.evaluate("(page) => { location.hash = `#/${page}`; }", page)
+        await until(window, "() => document.querySelector('h1') !== null")
+        if way == "gone":
+            await house.alpha.end()
+        else:
+            house.alpha.pause(on=True)
+        await until(window, NAMED)
+        yield
+    finally:
+        if way == "silent":
+            house.alpha.pause(on=False)
+        await house.alpha.end()
+
+
+@pytest.mark.parametrize("way", ["gone", "silent"])
+@pytest.mark.parametrize("page", ["axis/alpha/x", "network", "rig"])
+async def test_the_notice_is_seen_on_a_scrolled_page_of_any_size(house, window, page, way):
+    async with lost_alpha(house, window, page, way):
+        wrong = []
+        try:
+            for size in SIZES:
+                await window.resize(*size)
+                wrong += [(size, found) for found in [await window.evaluate(SEEN)] if found]
+                await window.keys(ESCAPE)  # what a stop reports lies over the page
+                await until(window, "() => document.querySelector('.stop-report').dataset.shown === 'yes'")
+                wrong += [(size, "stop", found) for found in [await window.evaluate(SEEN)] if found]
+        finally:
+            await window.resize(1400, 900)
+        assert not wrong
+
+
+async def test_no_value_of_a_daemon_that_is_gone_passes_for_a_present_one(house, window):
+    async with lost_alpha(house, window, "rig", "gone"):
+        for page, part in PAGES.items():
+            await window.evaluate("(page) => { location.hash = `#/${page}`; }", page)
+            await until(window, UNMARKED, part, wanted=lambda found: not found)
+            await until(window, CALM, wanted=lambda found: not found)
