@@ -1,4 +1,4 @@
-"""A daemon that is gone, or silent: the page says so wherever one looks, and no value of it passes for a present one."""
+"""A daemon that is gone, or silent: the page says so wherever one looks, and none of its values passes for a new one."""
 
 from contextlib import asynccontextmanager
 
@@ -38,7 +38,7 @@ SEEN = """() => {
   range.selectNodeContents(notice);
   for (const box of range.getClientRects()) {
     const [x, y] = [box.left + 4, box.top + box.height / 2];
-    if (box.top < 0 || box.bottom > innerHeight || box.left < 0 || box.right > innerWidth + 1) return "it is off the screen";
+    if (box.top < 0 || box.bottom > innerHeight || x < 0 || box.right > innerWidth + 1) return "it is off the screen";
     const over = document.elementFromPoint(x, y);
     if (!notice.contains(over)) return `${over?.className || over?.tagName} is over it`;
   }

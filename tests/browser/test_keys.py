@@ -4,7 +4,7 @@ import asyncio
 
 import pytest
 
-from ldcnd.model.commands import SetPosition
+from ldcnd.contract.commands import SetPosition
 from tests.support.marionette import CONTROL, ENTER, ESCAPE, SHIFT
 
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from ldcnd.client.lease import control
-from ldcnd.model.commands import MoveVelocity, Power, SetPosition
-from ldcnd.number_text import NotANumber, read_number
+from ldcnd.contract.commands import MoveVelocity, Power, SetPosition
+from ldcnd.contract.number_text import NotANumber, read_number
 from tests.support.marionette import CONTROL, DELETE, ENTER
 
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")

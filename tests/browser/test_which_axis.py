@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from ldcnd.model.leases import Acquire, Release
+from ldcnd.contract.leases import Acquire, Release
 from tests.support.marionette import ENTER, ESCAPE, TAB
 
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
