@@ -18,6 +18,7 @@ from ldcnd.axis.commands import AxisCommands
 from ldcnd.axis.guards import UNCONDITIONAL, Gate, Permit, Right, Unmoved
 from ldcnd.axis.host_tracer import HostTracer, host_channels
 from ldcnd.axis.kept import KeptFiles
+from ldcnd.axis.latches import LatchKeeper
 from ldcnd.axis.motion import AxisMotion, MotionPlan, preview
 from ldcnd.axis.parameters import Parameters
 from ldcnd.axis.plausibility import ROUNDS, PlausibilityGate, Step, Verdict, agree
@@ -208,8 +209,6 @@ SETTLES_WITHIN_S = 0.25
 """Time within which a shaft follows its finished profile, seconds."""
 GAINS_BACK_S = 10.0
 """Longest wait for rest before the loop of an axis with gains of a trial is opened, seconds."""
-STRENGTH = {StopMode.SMOOTH: 0, StopMode.ABRUPT: 1, StopMode.OFF: 2}
-"""Of two stops that no drive has confirmed, the stronger one is sent again."""
 
 
 class AxisService:
@@ -220,6 +219,7 @@ class AxisService:
         line_up: its line is ready for stops; while it is not, they wait for it.
         returned: called when the drive replies again after it was out of reach, once its state is known.
         ask_at: has the drive read at an instant of the loop's clock, besides its ordinary polls.
+        latches: keeps what forbids the axis to move; a stop is answered when that is kept.
     """
 
     def __init__(
@@ -272,7 +272,7 @@ class AxisService:
         self.stop_wanted = asyncio.Event()
         self.returned: Callable[[], None] | None = None
         self.ask_at: Callable[[float], None] | None = None
-        self._pending: StopMode | None = None
+        self.latches: LatchKeeper | None = None
         self.line_up = False
         self._inherited = False
         self._altered = ""
@@ -363,7 +363,7 @@ class AxisService:
     def judged(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
         """Take a reading if the drive can have got there; true when it has to be read again first."""
         tracker = self.tracker
-        if self._pending is not None and tracker.stop_pending:
+        if tracker.stop_pending:
             self.stop_wanted.set()  # it replies again, whatever it says
         if not self._proof.holds:
             self._nothing_came()  # from its drive: who answers was not identified
@@ -405,9 +405,7 @@ class AxisService:
         if not self.tracker.energised or not self.stoppable:
             return
         self._overtake(None, "the stop of a motion that is not understood")
-        if self._pending is None:
-            self._pending = UNDERSTOOD_NO_MORE.get(self.config.loss.bus, StopMode.SMOOTH)
-        self._not_confirmed()
+        self._not_confirmed(UNDERSTOOD_NO_MORE.get(self.config.loss.bus, StopMode.SMOOTH))
 
     def observed(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         """Process an accepted reading; that of a drive which was not identified says nothing about the axis."""
@@ -722,7 +720,15 @@ class AxisService:
             return False
         self.tracker.latch_stop()
         log.info("stop", axis=self.config.name, mode=mode.value)
-        return await self.bring_to_rest(mode, Verb.STOP)
+        confirmed = await self.bring_to_rest(mode, Verb.STOP)
+        if self.latches:
+            await self.latches.settled()
+        return confirmed
+
+    @property
+    def latch_is_kept(self) -> bool:
+        """Whether the stop that is latched is on the disk, so that it outlasts the daemon."""
+        return self.latches is not None and self.latches.holds(self.config.name)
 
     async def bring_to_rest(
         self, mode: StopMode, verb: Verb = Verb.HALT, by: Permit | None = None, command_id: str | None = None
@@ -738,16 +744,15 @@ class AxisService:
         if not self.stoppable:
             return False
         overtaken = self._overtake(by, by.verb if by else OVERTAKES.get(verb, verb))
-        if self._pending is None or STRENGTH[mode] > STRENGTH[self._pending]:
-            self._pending = mode
+        mode = self.tracker.stop_sent(mode)
         try:
             if not self.line_up:
                 return False  # its line is being brought up, or is down: it is the first thing that is sent then
             self._bus.withdraw(self.driver.spec.address, overtaken)
-            return await self._confirmed_stop(self._pending, verb, STOP_ROUNDS, command_id)
+            return await self._confirmed_stop(mode, verb, STOP_ROUNDS, command_id)
         finally:
-            if self._pending is not None:
-                self._not_confirmed()
+            if self.tracker.unconfirmed is not None:
+                self._not_confirmed(self.tracker.unconfirmed)
             self.telemetry.state(self._clock.now_ns())
 
     def _overtake(self, by: Permit | None, cause: str) -> StopLatched | CommandAborted:
@@ -758,14 +763,9 @@ class AxisService:
         self._queue.refuse(overtaken)
         return overtaken
 
-    @property
-    def stop_is_pending(self) -> bool:
-        """Whether a stop waits to be sent again; not while it is being sent."""
-        return self._pending is not None and self.tracker.stop_pending
-
     async def send_pending_stop(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
-        if self._unconfirmed() is None:
+        if not self.tracker.stop_pending:
             return
         try:
             if not self._seen:  # a stop would close the loop of a disabled axis: see how the drive was left
@@ -779,7 +779,7 @@ class AxisService:
         except LdcndError as error:  # a stop that comes now withdraws the reading, and is sent itself
             log.warning("stop not sent again", axis=self.config.name, reason=error.message)
             return
-        mode = self._unconfirmed()
+        mode = self.tracker.unconfirmed
         if mode is None:
             return  # such a stop was confirmed while the axis was read
         if await self._confirmed_stop(mode, Verb.STOP, rounds=1):
@@ -789,15 +789,10 @@ class AxisService:
             )
         self.telemetry.state(self._clock.now_ns())
 
-    def _unconfirmed(self) -> StopMode | None:
-        """Return the mode of the stop that the drive has not confirmed yet; None without one."""
-        return self._pending
-
     def switch_off(self) -> None:
         """Have the motor switched off by the first packet to its drive."""
         if self.stoppable:
-            self._pending = StopMode.OFF
-            self.tracker.stop_unconfirmed(self._clock.now_ns())
+            self.tracker.stop_unconfirmed(self._clock.now_ns(), StopMode.OFF)
 
     def taken_over(self) -> None:
         """Its drive is as another host has left it: what moves in it without an end is to be brought to rest.
@@ -829,13 +824,11 @@ class AxisService:
                 return
             self._inherited, self._done = False, None
             log.warning("motion without an end found", axis=self.config.name)
-            self._pending = self._pending or StopMode.SMOOTH
-            self._not_confirmed()
+            self._not_confirmed(StopMode.SMOOTH)
 
     def cannot_move(self) -> None:
         """Note that the drive was reset or had no power: the motion to be stopped has ended."""
         self._inherited = False
-        self._pending = None
         self.tracker.stop_confirmed()
 
     async def _confirmed_stop(self, mode: StopMode, verb: Verb, rounds: int, command_id: str | None = None) -> bool:
@@ -855,15 +848,13 @@ class AxisService:
                 self.tracker.powered(on=False, now_s=self._clock.now_s())
             elif not stands:  # what was proven to stand is not watched coming to rest, and keeps its target
                 self._commands.brought_to_rest(command_id or self._next_command_id(), verb)
-            if self._pending is None or STRENGTH[mode] >= STRENGTH[self._pending]:
-                self._pending = None
-                self.tracker.stop_confirmed()
+            self.tracker.stop_confirmed(mode)
             return True
         return False
 
-    def _not_confirmed(self) -> None:
+    def _not_confirmed(self, mode: StopMode) -> None:
         """A stop stays to be sent: its line sends it again, before anything else to this drive."""
-        self.tracker.stop_unconfirmed(self._clock.now_ns())
+        self.tracker.stop_unconfirmed(self._clock.now_ns(), mode)
         self.stop_wanted.set()
 
     async def _obey(self, permit: Permit, command: AxisCommand[CommandReply]) -> CommandReply:

@@ -231,7 +231,8 @@ def _faulted(axis: AxisTracker) -> WrongState:
 
 
 def _said(axis: AxisTracker) -> str:
-    return "; ".join(fault.text for fault in axis.active_faults)
+    first = (axis.first_fault,) if axis.first_fault else ()
+    return "; ".join(fault.text for fault in axis.active_faults or first)
 
 
 def always() -> None:

@@ -1,4 +1,6 @@
-"""Data of an axis on disk: its reference, with the values that prove it, and its past faults. One file each.
+"""Data of axes on disk: reference, with the values that prove it, and past faults, one file each; and all latches.
+
+What forbids axes to move is in one file, because one stop may concern them all.
 
 A reference is removed from the disk before anything may change it, and written again afterwards: a crash in between
 costs the reference, and a file never says more than was true when it was written.
@@ -8,11 +10,12 @@ import asyncio
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import TypeVar
+from typing import Literal, TypeVar
 
 from ldcnd import durable
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import PastFault
+from ldcnd.drives.driver import StopMode
 
 FORMAT = 1
 DISK_TIME_S = 2.0
@@ -54,15 +57,62 @@ class FaultFile(Frozen):
     """Oldest first."""
 
 
+class KeptLatch(Frozen):
+    """What forbids an axis to move until it is reset."""
+
+    stopped: bool = False
+    """A stop is latched."""
+    again: StopMode | None = None
+    """How it is to be stopped again, because no drive has confirmed that."""
+    in_error: bool = False
+    """It is in error_stop."""
+    first_fault: PastFault | None = None
+    """What brought it there."""
+
+
+class LatchFile(Frozen):
+    """The latches of the axes of one rig, by name; an axis that may move is not among them."""
+
+    format: Literal[1] = 1
+    """Format of this file; another one is refused."""
+    axes: dict[str, KeptLatch]
+    """By the names of the axes."""
+
+
 class KeptFiles:
     """The files of one rig.
 
-    One thread writes them, so that they change in the order of the requests.
+    One thread writes them, so that they change in the order of the requests; the latches have one of their own, because
+    the answer of a stop waits for them.
     """
 
     def __init__(self, directory: Path) -> None:
         self._directory = directory
         self._worker = ThreadPoolExecutor(1, "kept files")
+        self._latches = directory / "latches.json"
+        self._latch_worker = ThreadPoolExecutor(1, "kept latches")
+
+    def latches(self) -> dict[str, KeptLatch]:
+        """Return the latches that are kept, by axis; the caller waits for the disk, since nothing may move before.
+
+        Raises:
+            DamagedFile: they cannot be read, or make no sense.
+        """
+        kept = _read(self._latches, LatchFile)()
+        return kept.axes if kept else {}
+
+    async def keep_latches(self, latches: dict[str, KeptLatch]) -> None:
+        """Write the latches of all axes; they are on the disk when this returns.
+
+        Raises:
+            OSError: they cannot be written; what was kept before still is.
+        """
+        text = LatchFile(axes=latches).model_dump_json(exclude_defaults=True)
+        future = asyncio.get_running_loop().run_in_executor(
+            self._latch_worker, lambda: durable.replace(self._latches, text)
+        )
+        async with asyncio.timeout(DISK_TIME_S):
+            await asyncio.shield(future)
 
     async def reference(self, axis: str) -> KeptReference | None:
         """Return the reference that is kept of an axis; None without one.

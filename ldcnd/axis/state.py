@@ -12,7 +12,7 @@ from ldcnd.contract.fault_pages import page_of
 from ldcnd.contract.meta import PastFault
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Quality
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import AxisReading, Fault
+from ldcnd.drives.driver import AxisReading, Fault, StopMode
 from ldcnd.line.exchange import Timing
 from ldcnd.line.proof import Proof
 
@@ -97,6 +97,8 @@ OF_DAEMON = (
 )
 """Faults that the daemon finds; the drive tells all others."""
 OF_DAEMON_CODES = frozenset(fault.code for fault in OF_DAEMON)
+STRENGTH = {StopMode.SMOOTH: 0, StopMode.ABRUPT: 1, StopMode.OFF: 2}
+"""Of two stops that no drive has confirmed, the stronger one is sent again."""
 
 
 MOTION_STATES = frozenset(
@@ -209,6 +211,10 @@ def _ignore(_fault: PastFault) -> None:
     pass
 
 
+def _ignore_latch() -> None:
+    pass
+
+
 QUALITIES = {LinkState.UP: Quality.GOOD, LinkState.DEGRADED: Quality.UNCERTAIN, LinkState.DOWN: Quality.BAD}
 """Quality of a value read just now, by the drive's link."""
 
@@ -268,6 +274,10 @@ class AxisTracker:
     Attributes:
         has_reference: the drive can be homed, or its position be set.
         found: takes every fault as it comes up.
+        latch_changed: called when a stop is latched or not confirmed, when the axis falls into error_stop, and when
+            either is over.
+        unconfirmed: the strongest stop that the drive has not confirmed, from when it is sent; None without one.
+        stop_pending: that one was sent in vain, or is yet to be sent: nothing moves until it is confirmed.
         refused: why the reference that an earlier daemon has kept was refused; empty when none was, and once there is
             another one.
         reference_lost: the place was known and is not any more, until it is known again; a reset does not clear it.
@@ -297,6 +307,7 @@ class AxisTracker:
         self._referenced = self.reference_lost = False
         self.position_lost = False
         self.stop_latched = False
+        self.unconfirmed: StopMode | None = None
         self.stop_pending = False
         self.link = LinkState.DOWN
         self.command: ActiveCommand | None = None
@@ -307,6 +318,7 @@ class AxisTracker:
         self.speed_share = 1.0
         self._failure: str | None = None
         self.found: Callable[[PastFault], None] = _ignore
+        self.latch_changed: Callable[[], None] = _ignore_latch
         self.refused = ""
         self._own: tuple[Fault, ...] = ()  # faults that this daemon has found, until reset
         self.settle: SettleJudge | None = None
@@ -562,7 +574,9 @@ class AxisTracker:
         return entry
 
     def _fail(self, reason: str, *, settled: bool | None = None) -> None:
-        self.state = AxisState.ERROR_STOP
+        if self.state is not AxisState.ERROR_STOP:
+            self.state = AxisState.ERROR_STOP
+            self.latch_changed()
         self._end(CommandStatus.FAILED, reason, settled=settled)
 
     def _end(self, status: CommandStatus, reason: str | None = None, *, settled: bool | None = None) -> None:
@@ -626,17 +640,52 @@ class AxisTracker:
     def latch_stop(self) -> None:
         """Latch a stop: nothing moves again before reset."""
         self.stop_latched = True
+        self.latch_changed()
 
-    def stop_unconfirmed(self, now_ns: int) -> None:
+    def stop_sent(self, mode: StopMode) -> StopMode:
+        """Note that a stop is about to be sent; return how: as the strongest of those that are not confirmed."""
+        self.unconfirmed = max(mode, self.unconfirmed or mode, key=STRENGTH.__getitem__)
+        return self.unconfirmed
+
+    def stop_unconfirmed(self, now_ns: int, mode: StopMode = StopMode.SMOOTH) -> None:
         """Note a stop that no drive has confirmed yet."""
+        self.stop_sent(mode)
         if not self.stop_pending:
             self.stop_pending = True
             self.active_faults = (*self.active_faults, _entry(STOP_UNCONFIRMED, now_ns))
+            self.latch_changed()
 
-    def stop_confirmed(self) -> None:
-        """Note that the drive has confirmed the stop, or cannot be moving: it was reset, or had no power."""
-        self.stop_pending = False
+    def stop_confirmed(self, mode: StopMode = StopMode.OFF) -> None:
+        """Note that the drive has confirmed a stop, unless a stronger one is not confirmed yet.
+
+        One that cannot be moving, because it was reset or had no power, has confirmed every stop.
+        """
+        if self.unconfirmed is not None and STRENGTH[self.unconfirmed] > STRENGTH[mode]:
+            return
+        self.unconfirmed = None
         self.active_faults = tuple(fault for fault in self.active_faults if fault.code != STOP_UNCONFIRMED.code)
+        if self.stop_pending:
+            self.stop_pending = False
+            self.latch_changed()
+
+    def recall(
+        self, *, stopped: bool, again: StopMode | None, in_error: bool, first: PastFault | None, now_ns: int
+    ) -> None:
+        """Begin with the latch that an earlier daemon has kept; what it stopped is to be stopped again.
+
+        Args:
+            stopped: a stop is latched.
+            again: how it is to be stopped, if it was not confirmed, or may not have been sent; None when it stood.
+            in_error: it is in error_stop.
+            first: what brought it there.
+            now_ns: when, UTC.
+        """
+        self.stop_latched = stopped
+        if again is not None:
+            self.stop_unconfirmed(now_ns, again)
+        if in_error:
+            self.state = AxisState.ERROR_STOP
+            self.first_fault = FaultEntry(**first.model_dump(), page=page_of(first.code)) if first else None
 
     def powered(self, *, on: bool, now_s: float) -> None:
         """The drive acknowledged a change of power."""
@@ -663,6 +712,7 @@ class AxisTracker:
         self.first_fault = None
         self.last_error = None
         self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
+        self.latch_changed()
 
 
 def _entry(fault: Fault, now_ns: int) -> FaultEntry:

@@ -101,8 +101,8 @@ class RigConfig(Frozen):
     authority: Literal["open", "leased"] = "open"
     """Whether a lease is needed to move anything; readers and stops never need one."""
     state_dir: Path | None = None
-    """Directory in which the daemon keeps what must outlive it: the wear of EEPROMs, faults of axes, and with \
-start = "adopt" their references; without it EEPROM is not written."""
+    """Directory in which the daemon keeps what must outlive it: latched stops, the wear of EEPROMs, faults of axes, and
+    with start = "adopt" their references; without it a latched stop ends with the daemon, and EEPROM is not written."""
     captures: CapturesConfig = CapturesConfig()
     """Captures that the daemon writes by itself."""
     heartbeat: HeartbeatConfig | None = None

@@ -245,6 +245,9 @@ class StopReply(Frozen):
     """The axes concerned."""
     confirmed: tuple[str, ...]
     """The axes whose drives acknowledged the stop."""
+    kept: tuple[str, ...] = ()
+    """The axes whose latch is on the disk of the daemon: it outlasts a restart. The others lose it when the daemon
+    ends: none is kept without a `state_dir`."""
 
 
 class RemedyStep(Frozen):

@@ -10,6 +10,7 @@ from typing import Any
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.kept import KeptFiles
+from ldcnd.axis.latches import LatchKeeper
 from ldcnd.config.plan import demand_of
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.codec import Encoding
@@ -113,11 +114,16 @@ def build_daemon(
         for driver in bus.network.io.values()
     )
     rig = Rig(config.rig, buses, groups, modules)
+    latches = LatchKeeper(kept, {name: axis.tracker for name, axis in rig.axes.items() if axis.stoppable}, clock.now_ns)
+    for each in rig.axes.values():
+        each.latches = latches
     authority = Authority(rig.axes, required=config.authority == "leased", next_token=next_token)
     dispatcher = Dispatcher(rig, authority, ledger, events, clock, instance)
 
     heartbeat = Heartbeat(config.heartbeat, rig) if config.heartbeat else None
-    return Daemon(config, session, rig, dispatcher, publisher, clock, instance, stops=stops, heartbeat=heartbeat)
+    return Daemon(
+        config, session, rig, dispatcher, publisher, clock, instance, latches, stops=stops, heartbeat=heartbeat
+    )
 
 
 def _build_bus(

@@ -8,6 +8,7 @@ from typing import Any
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
+from ldcnd.axis.latches import LatchKeeper
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.keys import Keys
@@ -56,12 +57,14 @@ class Daemon:
         publisher: Publisher,
         clock: Clock,
         instance: str,
+        latches: LatchKeeper,
         *,
         stops: EarlyStops | None = None,
         heartbeat: Heartbeat | None = None,
     ) -> None:
         self.rig = rig
         self._stops = stops
+        self._latches = latches
         self._dispatcher = dispatcher
         self._config = config
         self._session = session
@@ -145,6 +148,7 @@ class Daemon:
                 ]
                 await self._declare(declared, requests)
                 serving.append(group.create_task(self._guarded(self._watch_axes()), name="liveliness"))
+                serving.append(group.create_task(self._guarded(self._latches.run()), name="latches"))
                 serving.append(group.create_task(self._guarded(leases.run()), name="leases"))
                 serving.append(group.create_task(self._guarded(self._health.run()), name="health"))
                 if self._heartbeat:
@@ -159,6 +163,7 @@ class Daemon:
                     axis.close()  # first: what waits now would begin behind the stop that its policy sends
                 await self._come_to_rest()
                 await self._keep_references()
+                await self._latches.settled()
                 if self._failure:
                     raise self._failure
             finally:
@@ -222,12 +227,12 @@ class Daemon:
         except TimeoutError:
             log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
         for name, axis in self.rig.axes.items():
-            if axis.stop_is_pending:
+            if axis.tracker.stop_pending:
                 log.error("stop not confirmed at the end of the daemon, the axis may move", axis=name)
 
     async def _bring_to_rest(self, axis: AxisService) -> None:
         await apply_policy(axis, axis.config.loss.daemon, "the daemon ends")
-        while axis.stop_is_pending:  # as long as there is time for it: after that nothing sends it again
+        while axis.tracker.stop_pending:  # as long as there is time for it: after that nothing sends it again
             await axis.send_pending_stop()
             await asyncio.sleep(STOP_AGAIN_S)
         await axis.take_gains_back()

@@ -216,7 +216,9 @@ class Requests:
             self._journal.stopped(name)
         except Exception:
             log.exception("stop not recorded", key=query.key)  # it is carried out all the same
-        return StopReply(axes=names, confirmed=await self._stop_once(names, query))
+        confirmed = await self._stop_once(names, query)
+        kept = tuple(each for each in names if self._rig.axes[each].latch_is_kept)
+        return StopReply(axes=names, confirmed=confirmed, kept=kept)
 
     async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
         """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.

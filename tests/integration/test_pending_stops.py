@@ -15,7 +15,6 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.drives.axis_config import LossConfig, LossPolicy
-from ldcnd.drives.driver import StopMode
 from ldcnd.drives.ldcn.packet import Command, PacketReader
 from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.net.memory_session import MemoryBroker
@@ -174,7 +173,6 @@ async def test_a_drive_that_had_no_power_meanwhile_has_nothing_to_confirm():
     async with jogging(chain) as rig:
         axis = rig.daemon.rig.axes["x"]
         axis.tracker.stop_unconfirmed(0)
-        axis._pending = StopMode.SMOOTH
         axis.cannot_move()
         assert not axis.tracker.stop_pending
 

@@ -91,7 +91,8 @@ async def put(axis: AxisService, name: str) -> None:
     commands._drop_procedure()
     tracker.command = None
     tracker.link, tracker.referenced, tracker.enabled = LinkState.UP, True, True
-    tracker.stop_latched = tracker.stop_pending = tracker.position_lost = False
+    tracker.stop_latched = tracker.position_lost = False
+    tracker.stop_confirmed()
     tracker.active_faults, tracker.first_fault = (), None
     tracker.state = AxisState.STANDSTILL
     axis._motion.target_counts = None

@@ -148,7 +148,7 @@ async def test_a_stop_is_sent_a_few_times_and_then_stays_pending_until_the_drive
         stop, bench.drive.stop = bench.drive.stop, lost
         assert not await bench.axis.stop(StopMode.ABRUPT)
         assert sent == [StopMode.ABRUPT] * STOP_ROUNDS
-        assert bench.axis.stop_is_pending
+        assert bench.tracker.stop_pending
         assert bench.axis.stop_wanted.is_set()
         assert [fault.code for fault in bench.tracker.active_faults] == ["stop_unconfirmed"]
 
@@ -156,12 +156,12 @@ async def test_a_stop_is_sent_a_few_times_and_then_stays_pending_until_the_drive
         await bench.axis.send_pending_stop()
         assert sent[-1] is StopMode.ABRUPT  # the stronger one is still owed
         assert len(sent) == 2 * STOP_ROUNDS + 1
-        assert bench.axis.stop_is_pending
+        assert bench.tracker.stop_pending
 
         bench.drive.stop = stop
         await bench.axis.send_pending_stop()
         assert bench.drive.told == [("stop", StopMode.ABRUPT)]
-        assert not bench.axis.stop_is_pending
+        assert not bench.tracker.stop_pending
         assert bench.tracker.active_faults == ()
         assert bench.notes == [(Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again")]
 
@@ -182,7 +182,7 @@ async def test_of_two_stops_the_stronger_one_is_sent_while_it_is_owed():
 
         assert bench.drive.told[-1] == ("stop", StopMode.OFF)
         assert bench.tracker.state is AxisState.DISABLED
-        assert not bench.axis.stop_is_pending
+        assert not bench.tracker.stop_pending
 
 
 async def test_a_drive_that_was_switched_off_instead_is_disabled():
@@ -197,7 +197,7 @@ async def test_a_drive_that_was_switched_off_instead_is_disabled():
         assert await bench.axis.stop(StopMode.SMOOTH)
 
         assert (bench.tracker.state, bench.tracker.enabled) == (AxisState.DISABLED, False)
-        assert not bench.axis.stop_is_pending
+        assert not bench.tracker.stop_pending
 
 
 async def test_a_stop_while_the_line_is_down_is_not_sent_and_waits_for_it():
@@ -209,9 +209,9 @@ async def test_a_stop_while_the_line_is_down_is_not_sent_and_waits_for_it():
 
         assert bench.drive.calls == []
         assert bench.bus.withdrawn == []
-        assert bench.axis.stop_is_pending
+        assert bench.tracker.stop_pending
         bench.axis.cannot_move()  # it had no power
-        assert not bench.axis.stop_is_pending
+        assert not bench.tracker.stop_pending
         assert not bench.tracker.stop_pending
 
 
@@ -224,11 +224,11 @@ async def test_an_axis_that_was_never_seen_is_read_before_a_pending_stop_is_sent
 
         await bench.axis.send_pending_stop()
         assert bench.drive.calls == []  # how it was left is not known: a smooth stop would close an open loop
-        assert bench.axis.stop_is_pending
+        assert bench.tracker.stop_pending
 
         await bench.axis.send_pending_stop()
         assert bench.drive.told == [("stop", StopMode.OFF)]
-        assert not bench.axis.stop_is_pending
+        assert not bench.tracker.stop_pending
 
 
 async def test_a_motor_that_was_taken_over_with_a_closed_loop_is_not_switched_off_by_a_stop_before_its_first_reading():
@@ -253,7 +253,7 @@ async def test_a_line_that_is_taken_over_again_changes_nothing_that_was_seen():
 async def test_a_motor_that_must_be_off_first_is_switched_off():
     async with axis_bench() as bench:
         bench.axis.switch_off()
-        assert bench.axis.stop_is_pending
+        assert bench.tracker.stop_pending
 
         await bench.axis.send_pending_stop()
 
@@ -487,7 +487,7 @@ async def test_a_jump_during_a_command_ends_it_costs_the_reference_and_has_the_m
         assert bench.tracker.state is AxisState.ERROR_STOP
         assert not bench.tracker.referenced
         assert bench.tracker.quality is Quality.UNCERTAIN
-        assert bench.axis.stop_is_pending
+        assert bench.tracker.stop_pending
 
 
 @pytest.mark.parametrize("gap", ["disconnected", "missed"])
@@ -521,7 +521,7 @@ async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_t
         assert [fault.code for fault in bench.tracker.active_faults] == ["readings_contradict", "stop_unconfirmed"]
         assert bench.tracker.moving is not Moving.NO
         assert not bench.tracker.referenced
-        assert bench.axis.stop_is_pending
+        assert bench.tracker.stop_pending
         await bench.axis.send_pending_stop()
         assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
         await bench.send(Power(on=False))
@@ -578,7 +578,7 @@ async def test_a_drive_that_replies_with_nothing_that_can_be_used_is_not_silent_
         await moving(bench)
         for _ in range(2):
             bench.axis.missed(error)
-        assert (bench.tracker.link, bench.axis.stop_is_pending) == (LinkState.DEGRADED, False)
+        assert (bench.tracker.link, bench.tracker.stop_pending) == (LinkState.DEGRADED, False)
 
         for _ in range(8):
             bench.axis.missed(error)
@@ -587,7 +587,7 @@ async def test_a_drive_that_replies_with_nothing_that_can_be_used_is_not_silent_
         assert bench.tracker.quality is Quality.UNCERTAIN
         assert "replies_unusable" in [fault.code for fault in bench.tracker.active_faults]
         assert bench.tracker.state is AxisState.ERROR_STOP
-        assert bench.axis.stop_is_pending
+        assert bench.tracker.stop_pending
         await bench.axis.send_pending_stop()
         assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
         bench.show()
@@ -692,7 +692,7 @@ async def test_what_a_silent_drive_has_not_confirmed_is_said_to_be_so_and_waits_
 
         assert set(bench.drive.calls) == {"stop"}
         assert bench.tracker.stop_pending
-        assert bench.axis.stop_is_pending
+        assert bench.tracker.stop_pending
 
 
 async def test_a_fault_during_a_motion_ends_it_and_nothing_follows():

@@ -1,0 +1,115 @@
+"""What forbids an axis to move until it is reset, beyond the life of the daemon: a latched stop, and error_stop.
+
+Both are kept from when they come, and a stop is answered once its latch is on the disk, or after `WITHIN_S`. The
+next daemon begins with them, and has what was stopped stopped again: its drive may not have been sent the stop before
+the daemon was killed. Where the file cannot be read, every axis is latched.
+"""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Mapping
+
+from ldcnd.axis.kept import KeptFiles, KeptLatch
+from ldcnd.axis.state import AxisTracker
+from ldcnd.contract.meta import PastFault
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.driver import StopMode
+from ldcnd.durable import DamagedFile
+from ldcnd.log import get_logger
+
+WITHIN_S = 0.5
+"""Longest delay of the answer of a stop, and of the end of the daemon, for the disk, seconds."""
+RETRY_S = 5.0
+"""Delay before latches are written again that could not be, seconds."""
+log = get_logger("latches")
+
+
+class LatchKeeper:
+    """Keeps the latches of one rig."""
+
+    def __init__(self, files: KeptFiles | None, trackers: Mapping[str, AxisTracker], now_ns: Callable[[], int]) -> None:
+        """Take up what an earlier daemon has kept.
+
+        Args:
+            files: where it is kept; None where nothing is.
+            trackers: of the axes that can be stopped, by name.
+            now_ns: returns the time, UTC in ns since 1970.
+        """
+        self._files = files
+        self._trackers = trackers
+        self._changed = asyncio.Event()
+        self._writing = asyncio.Lock()
+        self._on_disk: Mapping[str, KeptLatch] | None = {}  # None: not known
+        self._others: dict[str, KeptLatch] = {}  # of axes that are not configured now
+        self._trouble = ""
+        if files is None:
+            return
+        for tracker in trackers.values():
+            tracker.latch_changed = self._changed.set
+        try:
+            kept = files.latches()
+        except DamagedFile as error:
+            log.error("kept latches cannot be read: every axis is latched, send reset", reason=str(error))
+            kept, self._on_disk = dict.fromkeys(trackers, KeptLatch(stopped=True)), None
+        else:
+            self._on_disk = kept
+        self._others = {name: latch for name, latch in kept.items() if name not in trackers}
+        for name in kept.keys() & trackers.keys():
+            latch = kept[name]
+            again = latch.again or (StopMode.SMOOTH if latch.stopped else None)
+            trackers[name].recall(
+                stopped=latch.stopped, again=again, in_error=latch.in_error, first=latch.first_fault, now_ns=now_ns()
+            )
+            log.warning("latched since an earlier daemon", axis=name, stopped=latch.stopped, in_error=latch.in_error)
+
+    async def run(self) -> None:
+        """Keep what comes and goes until cancelled; without a place for it there is nothing to do."""
+        while self._files is not None:
+            kept = await self._keep(self._files)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(None if kept else RETRY_S):
+                    await self._changed.wait()
+
+    async def settled(self) -> None:
+        """Return once what is latched is on the disk, or is not in time."""
+        if self._files is None:
+            return
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(WITHIN_S):
+                await self._keep(self._files)
+
+    def holds(self, axis: str) -> bool:
+        """Tell whether the stop of an axis is on the disk."""
+        latch = (self._on_disk or {}).get(axis)
+        return latch is not None and latch.stopped
+
+    async def _keep(self, files: KeptFiles) -> bool:
+        """Write the latches unless they are on the disk as they are; tell whether they are."""
+        async with self._writing:  # those who wait find that it was done for all
+            self._changed.clear()
+            now = self._others | {name: latch for name, each in self._trackers.items() if (latch := _latch_of(each))}
+            if now == self._on_disk:
+                return True
+            self._on_disk = None
+            try:
+                await files.keep_latches(now)
+            except OSError as error:
+                trouble = "the disk does not answer" if isinstance(error, TimeoutError) else str(error)
+                if trouble != self._trouble:
+                    log.error("latches not kept: a restart of the daemon would lose them", reason=trouble)
+                self._trouble = trouble
+                return False
+            self._on_disk, self._trouble = now, ""
+            return True
+
+
+def _latch_of(tracker: AxisTracker) -> KeptLatch | None:
+    """Return what is to be kept of an axis; None while nothing forbids it to move."""
+    again = tracker.unconfirmed if tracker.stop_pending else None
+    in_error, first = tracker.state is AxisState.ERROR_STOP, tracker.first_fault
+    if not (tracker.stop_latched or again or in_error):
+        return None
+    fault = PastFault(code=first.code, text=first.text, since=first.since, source=first.source) if first else None
+    return KeptLatch(
+        stopped=tracker.stop_latched, again=again, in_error=in_error, first_fault=fault if in_error else None
+    )

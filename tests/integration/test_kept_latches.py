@@ -1,0 +1,280 @@
+"""What forbids an axis to move until it is reset outlasts the daemon, however that ends, on drives that outlive it."""
+
+import asyncio
+import os
+from pathlib import Path
+
+import pytest
+from structlog.testing import capture_logs
+
+from ldcnd import durable
+from ldcnd.axis import kept as kept_files
+from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, QuickStop, Reset
+from ldcnd.contract.errors import OutcomeUnknown, RequestRefused, WrongState
+from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
+from ldcnd.sim.ldcn.power import Condition
+from tests.integration.test_kept_references import chain_of, keeping
+from tests.support.chain_rig import ChainRig, drive, rig_on
+
+pytestmark = pytest.mark.promise("latch-outlasts-daemon")
+AXES = ("x", "y", "z", "c")
+HUNTS = 20
+"""Counts that a closed loop at rest goes; the motions here are of 5000 counts/s."""
+
+
+async def up(rig: ChainRig, axis: str = "x") -> None:
+    await rig.until(axis, lambda state: state.link is LinkState.UP and state.moving != "unknown")
+
+
+async def jogging(rig: ChainRig, axis: str = "x") -> None:
+    await up(rig, axis)
+    await rig.client.command(axis, Power(on=True))
+    await rig.client.command(axis, MoveVelocity(velocity=5.0))
+    await asyncio.sleep(0.3)
+
+
+async def end(rig: ChainRig, how: str) -> None:
+    if how == "SIGKILL":
+        await rig.kill()
+    else:
+        rig.daemon.end()
+        await asyncio.wait([rig.running])
+
+
+async def refused_motion(rig: ChainRig, axis: str = "x") -> list[str]:
+    """Return with what everything that could begin a motion is refused; the axis stays where it is."""
+    before = shown(rig, axis)
+    codes = []
+    for command in (Power(on=True), MoveRelative(distance=1.0), MoveVelocity(velocity=1.0)):
+        with pytest.raises(RequestRefused) as refused:
+            await rig.client.command(axis, command)
+        codes.append(refused.value.code.value)
+    await asyncio.sleep(0.5)
+    assert abs(shown(rig, axis) - before) < HUNTS
+    return codes
+
+
+def shown(rig: ChainRig, axis: str) -> float:
+    reading = rig.daemon.rig.axes[axis]._motion.reading
+    assert reading
+    return reading.position_counts
+
+
+async def settled(rig: ChainRig, axis: str = "x") -> None:
+    await rig.until(axis, lambda state: state.moving == "no" and not state.stop_pending)
+
+
+@pytest.mark.parametrize("start", ["adopt", "reset"])
+@pytest.mark.parametrize("how", ["SIGKILL", "SIGTERM"])
+@pytest.mark.parametrize("scope", ["axis", "rig", "quick_stop"])
+async def test_a_latched_stop_forbids_motion_in_the_next_daemon_until_reset(tmp_path, how, scope, start):
+    chain, config = chain_of(), keeping(tmp_path, start=start)
+    async with rig_on(chain, config) as rig:
+        await jogging(rig)
+        if scope == "quick_stop":
+            await rig.client.command("x", QuickStop())
+        else:
+            reply = await rig.client.stop("x" if scope == "axis" else None)
+            assert set(reply.kept) == set(reply.axes) == set(reply.confirmed)
+        await end(rig, how)
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        await settled(rig)
+        latched = [axis for axis in AXES if (await rig.client.state(axis)).stop_latched]
+        codes = await refused_motion(rig)
+        await rig.client.command("x", Reset())
+        await rig.client.command("x", Power(on=True))
+        await end(rig, how)
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        state = await rig.client.state("x")
+
+    assert latched == (list(AXES) if scope == "rig" else ["x"])
+    assert codes == ["stop_latched"] * 3
+    assert not state.stop_latched
+
+
+async def test_a_daemon_killed_before_the_drive_was_sent_the_stop_is_followed_by_one_that_stops_it(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await jogging(rig)
+        chain._injector = FaultInjector(FaultPlan((Fault(FaultKind.REQUEST_LOST, 1.0),)))
+        reply = await rig.client.stop("x")
+        assert (reply.confirmed, reply.kept) == ((), ("x",))
+        await rig.kill()
+    chain._injector = FaultInjector(FaultPlan())
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        await settled(rig)
+        before = drive(chain, 1).shaft.position_counts
+        await asyncio.sleep(1.0)
+        state = await rig.client.state("x")
+
+    assert drive(chain, 1).shaft.position_counts == pytest.approx(before, abs=HUNTS)
+    assert state.stop_latched
+
+
+async def test_a_halt_that_no_drive_has_confirmed_is_sent_by_the_next_daemon(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await jogging(rig)
+        chain._injector = FaultInjector(FaultPlan((Fault(FaultKind.REQUEST_LOST, 1.0),)))
+        with pytest.raises(OutcomeUnknown):
+            await rig.client.command("x", Halt())
+        await asyncio.sleep(0.2)
+        await rig.kill()
+    chain._injector = FaultInjector(FaultPlan())
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        await settled(rig)
+        before = drive(chain, 1).shaft.position_counts
+        await asyncio.sleep(1.0)
+        state = await rig.client.state("x")
+
+    assert drive(chain, 1).shaft.position_counts == pytest.approx(before, abs=HUNTS)
+    assert (state.stop_latched, state.stop_pending) == (False, False)
+
+
+@pytest.mark.parametrize("start", ["adopt", "reset"])
+@pytest.mark.parametrize("how", ["SIGKILL", "SIGTERM"])
+async def test_an_axis_in_error_stop_is_in_error_stop_in_the_next_daemon_with_its_cause(tmp_path, how, start):
+    chain, config = chain_of(), keeping(tmp_path, start=start)
+    async with rig_on(chain, config) as rig:
+        await jogging(rig)
+        now_s = asyncio.get_running_loop().time()
+        drive(chain, 1).set_condition(Condition.STALLED, present=True, at_s=now_s)
+        await rig.until("x", lambda state: state.state is AxisState.ERROR_STOP)
+        first = rig.daemon.rig.axes["x"].tracker.first_fault
+        await asyncio.sleep(0.2)
+        await end(rig, how)
+    drive(chain, 1).set_condition(Condition.STALLED, present=False, at_s=asyncio.get_running_loop().time())
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        state, fault = await rig.client.state("x"), await rig.client.last("x", "fault")
+        with pytest.raises(WrongState, match="error_stop"):
+            await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", Reset())
+        await rig.client.command("x", Power(on=True))
+        await end(rig, how)
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        after = await rig.client.state("x")
+
+    assert state.state is AxisState.ERROR_STOP
+    assert first
+    assert fault.first == first
+    assert after.state is not AxisState.ERROR_STOP
+
+
+@pytest.mark.parametrize("content", [b"", b"\0" * 40, b"{", b'{"format": 2, "axes": {}}', b"\xff", "folder"])
+async def test_a_file_that_cannot_be_read_latches_every_axis_and_says_so_in_one_line(tmp_path, content):
+    path = tmp_path / "latches.json"
+    path.mkdir() if content == "folder" else path.write_bytes(content)
+    chain, config = chain_of(), keeping(tmp_path)
+    with capture_logs() as logs:
+        async with rig_on(chain, config) as rig:
+            await up(rig)
+            await settled(rig)
+            latched = [axis for axis in AXES if (await rig.client.state(axis)).stop_latched]
+            codes = await refused_motion(rig)
+
+    said = [line for line in logs if "kept latches" in line["event"]]
+    assert latched == list(AXES)
+    assert codes == ["stop_latched"] * 3
+    assert [line["log_level"] for line in said] == ["error"]
+    assert str(path) in said[0]["reason"]
+    assert "\n" not in said[0]["reason"]
+
+
+async def test_what_was_latched_because_of_a_damaged_file_is_over_once_it_was_reset(tmp_path):
+    (tmp_path / "latches.json").write_text("?")
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        await settled(rig)
+        await rig.client.command("x", Reset())
+        await asyncio.sleep(0.5)
+        await rig.kill()
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        latched = [axis for axis in AXES if (await rig.client.state(axis)).stop_latched]
+
+    assert latched == ["y", "z", "c"]
+
+
+async def test_without_a_place_for_it_the_answer_says_that_the_latch_ends_with_the_daemon(tmp_path):
+    chain = chain_of()
+    config = keeping(tmp_path).model_copy(update={"state_dir": None})
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        reply = await rig.client.stop()
+        await rig.kill()
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        state = await rig.client.state("x")
+
+    assert (set(reply.confirmed), reply.kept) == (set(AXES), ())
+    assert not state.stop_latched
+
+
+async def test_a_disk_that_fails_delays_no_stop_and_the_answer_says_so(tmp_path, monkeypatch):
+    def fails(path: Path, text: str) -> None:
+        raise OSError(28, os.strerror(28))
+
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await jogging(rig)
+        monkeypatch.setattr(durable, "replace", fails)
+        with capture_logs() as logs:
+            reply = await rig.client.stop("x")
+            await rig.client.stop("x")
+        monkeypatch.undo()
+        await asyncio.sleep(20.0)  # virtual: it is tried again
+        await rig.kill()
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        state = await rig.client.state("x")
+
+    assert (reply.confirmed, reply.kept) == (("x",), ())
+    assert len([line for line in logs if line["event"].startswith("latches not kept")]) == 1
+    assert state.stop_latched
+
+
+async def test_a_disk_that_hangs_delays_the_answer_by_a_bounded_time_and_the_packet_by_none(tmp_path, monkeypatch):
+    hangs = asyncio.Event()
+
+    async def keep(*_args: object) -> None:
+        await hangs.wait()
+
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await jogging(rig)
+        monkeypatch.setattr(kept_files.KeptFiles, "keep_latches", keep)
+        stop = asyncio.create_task(rig.client.stop("x"))
+        await asyncio.sleep(0.1)
+        confirmed = not rig.daemon.rig.axes["x"].tracker.unconfirmed
+        async with asyncio.timeout(1.0):
+            reply = await stop
+        hangs.set()
+
+    assert confirmed
+    assert (reply.confirmed, reply.kept) == (("x",), ())
+
+
+async def test_an_axis_that_is_not_configured_for_a_while_is_latched_when_it_is_back(tmp_path):
+    chain, config = chain_of(), keeping(tmp_path)
+    (bus,) = config.bus
+    fewer = config.model_copy(update={"bus": (bus.model_copy(update={"axis": bus.axis[:3], "group": ()}),)})
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        await rig.client.stop("c")
+    async with rig_on(chain_of(), fewer) as rig:
+        await up(rig)
+        await rig.client.stop("x")
+        await rig.client.command("x", Reset())
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        latched = [axis for axis in AXES if (await rig.client.state(axis)).stop_latched]
+
+    assert latched == ["c"]
