@@ -16,7 +16,7 @@ from ldcnd.cli.quantities import number, outcome, values_of
 from ldcnd.cli.typed import axis_of
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.commands import AxisCommand, CommandReply, Effect, Halt, Power, Verb
+from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Verb
 from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.meta import AxisInfo
@@ -60,7 +60,7 @@ class Sender:
         """
         if wait:
             end_as_interrupted()
-        elif takes_energy_out(command):
+        elif command.takes_energy_out:
             self.send_to_all((axis,), command, "accepted")
             return
 
@@ -108,7 +108,7 @@ class Sender:
                 tasks = [group.create_task(self._outcome(client, axis, command), name=axis) for axis in wanted]
             return [task.result() for task in tasks]
 
-        if not takes_energy_out(command):
+        if not command.takes_energy_out:
             reached = {"": self.target.run(work)}
         else:
             on_each = self.target.run_on_each(work)
@@ -137,11 +137,6 @@ class Sender:
             return await self.command(client, axis, command)
         except LdcndError as error:
             return error
-
-
-def takes_energy_out(command: Sent) -> bool:
-    """Tell whether a command only ever brings an axis to rest, or switches it off."""
-    return command.effect is Effect.REST or (isinstance(command, Power) and not command.on)
 
 
 @asynccontextmanager

@@ -223,8 +223,8 @@ class Axis(AxisVerbs, Watched):
         return await self._client.ask(ReadOutcome(command_id=command_id))
 
     async def halt_now(self) -> None:
-        """Halt, in a bounded time and without raising; nothing is sent once control was lost."""
-        if self.control is None or self.control.lost:
+        """Halt, in a bounded time and without raising; nothing is sent once control was lost: another may have it."""
+        if self.control and self.control.lost:
             return
         with contextlib.suppress(LdcndError, TimeoutError):
             async with asyncio.timeout(HALT_S):

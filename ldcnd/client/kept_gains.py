@@ -132,6 +132,8 @@ async def open_loop(axis: Axis) -> None:
         WrongState: it does not come to rest.
     """
     state = (await seen(axis)).state
+    if axis.control and axis.control.lost:
+        raise axis.control.lost  # the daemon sees to it, and another client may move the axis
     if state.state is AxisState.ERROR_STOP and not state.stop_latched:
         await at_rest(axis)
         with suppress(StopLatched):  # a stop has come meanwhile: only a person clears its latch

@@ -68,10 +68,14 @@ class Control:
     def stamped(self, request: RequestT, axis: str) -> RequestT:
         """Return a request for an axis under the lease, with the next sequence number unless others count as well.
 
+        What takes energy out needs no lease, and is returned without one when that was lost.
+
         Raises:
             LeaseExpired: the lease was lost.
         """
         if self.lost:
+            if isinstance(request, AxisCommand) and request.takes_energy_out:
+                return request
             raise LeaseExpired(
                 f"control was lost: {self.lost.message}",
                 axis=axis,

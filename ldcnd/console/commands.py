@@ -3,6 +3,7 @@
 import asyncio
 import json
 from dataclasses import dataclass
+from functools import partial
 
 from starlette.requests import Request
 from starlette.responses import Response
@@ -10,13 +11,13 @@ from starlette.routing import Route
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.control import PAGE_HEADER, page_of
-from ldcnd.console.errors import answering_errors
+from ldcnd.console.errors import Answer, answering_errors
 from ldcnd.console.pages import Pages, control_needed, refuse_unwatched
 from ldcnd.console.replies import StopsReply
 from ldcnd.console.requests import body_of, json_reply
 from ldcnd.console.rigs import Rigs
 from ldcnd.contract.catalogue import BY_VERB
-from ldcnd.contract.codec import Encoding, decode, error_reply
+from ldcnd.contract.codec import Encoding, decode, error_reply, understand
 from ldcnd.contract.commands import About, AxisCommand, Command, ErrorReply, StopReply, Why
 from ldcnd.contract.errors import LdcndError, UnknownVerb
 from ldcnd.contract.frozen import Frozen
@@ -65,26 +66,55 @@ class Envelope:
         return {name: value for name, value in written.items() if name in request or name in model.model_fields}
 
 
+async def _axis_command(rigs: Rigs, pages: Pages, request: Request) -> Response:
+    """Send a command of an axis; what takes energy out whatever is wrong with the request, or with its page."""
+    rig, axis, verb = (request.path_params[name] for name in ("rig", "axis", "verb"))
+    client = rigs.client(rig)
+    kind = _class_of(About.AXIS, verb)
+    body, unread = await _body_of(request)
+    try:
+        page, gone = page_of(request, pages) if PAGE_HEADER in request.headers else None, None
+    except LdcndError as error:
+        page, gone = None, error
+    envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
+    try:
+        command, wrong = understand(kind, envelope.around(body, kind), Encoding.JSON)
+    except LdcndError as error:
+        raise unread or error from None
+    if command.takes_energy_out and isinstance(command, AxisCommand):
+        named = command.model_copy(update={"client": envelope.client})
+        reply = await client.command(axis, named)
+        if complaint := unread or wrong:
+            raise complaint.although(f"axis {axis[:64]}: {verb} was carried out, but")
+        return json_reply(reply)
+    if refusal := unread or gone:
+        raise refusal
+    if not isinstance(command, AxisCommand):
+        if isinstance(command, Why) and page:
+            command = command.model_copy(update={"lease": page.lease(rig, axis)})
+        return json_reply(await client.ask(command, axis))
+    if page:
+        return json_reply(await page.command(rig, axis, command))
+    refuse_unwatched(axis, command)
+    return json_reply(await client.command(axis, command))
+
+
+async def _stop(rigs: Rigs, request: Request) -> Response:
+    """Stop an axis, or the rig where it cannot be read which axis is meant."""
+    client = rigs.client(request.path_params["rig"])
+    body, complaint = await _body_of(request)
+    try:
+        scope = decode(StopScope, body, Encoding.JSON)
+    except LdcndError as error:
+        scope, complaint = StopScope(), complaint or error
+    reply = await client.stop(scope.axis, STOP_TIME_S, request.state.visitor.client)
+    if complaint:
+        raise complaint.although("the whole rig was stopped, but which axis was meant cannot be read:")
+    return json_reply(reply)
+
+
 def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
     """Return what pages may POST."""
-
-    async def axis_command(request: Request) -> Response:
-        rig, axis, verb = (request.path_params[name] for name in ("rig", "axis", "verb"))
-        client = rigs.client(rig)
-        body = await body_of(request)
-        page = page_of(request, pages) if PAGE_HEADER in request.headers else None
-        kind = _class_of(About.AXIS, verb)
-        if not issubclass(kind, AxisCommand):
-            asked = decode(kind, body, Encoding.JSON)
-            if isinstance(asked, Why) and page:
-                asked = asked.model_copy(update={"lease": page.lease(rig, axis)})
-            return json_reply(await client.ask(asked, axis))
-        envelope = Envelope(page.client if page else request.state.visitor.client, rigs.instance(rig))
-        meant = decode(kind, envelope.around(body, kind), Encoding.JSON)
-        if page:
-            return json_reply(await page.command(rig, axis, meant))
-        refuse_unwatched(axis, meant)
-        return json_reply(await client.command(axis, meant))
 
     async def rig_command(request: Request) -> Response:
         rig, verb = (request.path_params[name] for name in ("rig", "verb"))
@@ -103,21 +133,24 @@ def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
             asked = asked.model_copy(update={"leases": page.leases(rig)})
         return json_reply(await client.ask(asked))
 
-    async def stop(request: Request) -> Response:
-        client = rigs.client(request.path_params["rig"])
-        scope = decode(StopScope, await body_of(request), Encoding.JSON)
-        return json_reply(await client.stop(scope.axis, STOP_TIME_S, request.state.visitor.client))
-
     async def stop_all(request: Request) -> Response:
         return json_reply(StopsReply(rigs=await _all_stopped(rigs, request.state.visitor.client)))
 
-    routes = {
+    routes: dict[str, Answer] = {
         "/api/stop": stop_all,
-        "/api/rigs/{rig}/stop": stop,
+        "/api/rigs/{rig}/stop": partial(_stop, rigs),
         "/api/rigs/{rig}/rig/{verb}": rig_command,
-        "/api/rigs/{rig}/axes/{axis}/{verb}": axis_command,
+        "/api/rigs/{rig}/axes/{axis}/{verb}": partial(_axis_command, rigs, pages),
     }
     return [Route(path, answering_errors(answer), methods=["POST"]) for path, answer in routes.items()]
+
+
+async def _body_of(request: Request) -> tuple[bytes, LdcndError | None]:
+    """Return what a page has sent, or nothing and why: what takes energy out is sent all the same."""
+    try:
+        return await body_of(request), None
+    except LdcndError as error:
+        return b"", error
 
 
 async def _all_stopped(rigs: Rigs, who: str) -> dict[str, StopReply | ErrorReply]:

@@ -17,7 +17,7 @@ import msgpack
 import pydantic
 import pydantic_core
 
-from ldcnd.contract.commands import Cause, ErrorReply, ReceivedError, RemedyStep
+from ldcnd.contract.commands import Cause, Command, Effect, ErrorReply, Power, ReceivedError, RemedyStep
 from ldcnd.contract.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge, Remedy, Step
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.printable import is_printable, printable
@@ -34,6 +34,7 @@ ECHO_CHARACTERS = 80
 _WHITE_SPACE = b" \t\r\n"
 
 ModelT = TypeVar("ModelT", bound=Frozen)
+CommandT = TypeVar("CommandT", bound=Command[Frozen])
 
 
 class Encoding(StrEnum):
@@ -88,6 +89,37 @@ def decode(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:
     if _is_suspicious(text):
         _refuse_unprintable(request)
     return request
+
+
+def understand(model: type[CommandT], payload: bytes, encoding: str) -> tuple[CommandT, LdcndError | None]:
+    """Return the command that a request stands for, and what is wrong with the request all the same.
+
+    As `decode`, but for what takes energy out. That is understood by its verb, and `power` off by an `on` that means
+    false, whatever else the payload says: the complaint is for the answer, once the command was sent.
+
+    Raises:
+        PayloadTooLarge, MalformedRequest: as `decode`, of any other command.
+    """
+    try:
+        return decode(model, payload, encoding), None
+    except LdcndError as error:
+        fields = {"on": False} if issubclass(model, Power) and _says_off(payload, encoding) else {}
+        if not (fields or model.effect is Effect.REST):
+            raise
+        return model.model_validate(fields), error
+
+
+def _says_off(payload: bytes, encoding: str) -> bool:
+    """Tell whether a payload, as far as it can be read, says that a loop is to be opened."""
+    try:
+        value = pydantic_core.from_json(as_json(payload, encoding), allow_partial=True)
+        return isinstance(value, dict) and not _BOOLEAN.validate_python(value.get("on"))
+    except (LdcndError, ValueError):
+        return False
+
+
+_BOOLEAN = pydantic.TypeAdapter(bool)
+"""Reads 0, "off" and "false" as well, as people and stock clients write them."""
 
 
 def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:

@@ -152,6 +152,11 @@ class Command(Frozen, Generic[ReplyT_co]):
             """Return the class with the type of its reply."""
             return GenericAlias(cls, reply)
 
+    @property
+    def takes_energy_out(self) -> bool:
+        """Whether it does nothing but bring an axis to rest or switch it off: nothing refuses such a command."""
+        return self.effect is Effect.REST
+
     @classmethod
     def reply_model(cls) -> type[ReplyT_co]:
         """Return the type of the command's reply."""
@@ -292,6 +297,11 @@ class Power(AxisCommand[CommandReply]):
 
     on: bool
     """True closes the loop at the present position, false opens it and disables the amplifier."""
+
+    @property
+    def takes_energy_out(self) -> bool:
+        """See `Command`."""
+        return not self.on
 
 
 class BufferMode(StrEnum):

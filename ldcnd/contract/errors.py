@@ -173,6 +173,17 @@ class LdcndError(Exception):
             else:
                 self.remedy = Remedy.of(text, ())
 
+    def although(self, done: str) -> Self:
+        """Return this error about a request that was carried out all the same; `done` begins its message."""
+        return type(self)(
+            f"{done} {self.message}",
+            axis=self.axis,
+            value=self.value,
+            limit=self.limit,
+            nearest=self.nearest,
+            remedy=self.remedy,
+        )
+
     @property
     def page(self) -> str | None:
         """Path of its page below a console or the documentation: what to check, how to clear it."""

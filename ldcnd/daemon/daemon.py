@@ -201,7 +201,11 @@ class Daemon:
 
         await until_end(await session.serve_reads(keys.all_telemetry, describing.on_telemetry, complete=False))
         await until_end(await session.serve_reads(keys.all_meta, describing.on_meta, complete=True))
-        await until_end(await session.serve(keys.all_commands, requests.on_command, complete=True))
+        await until_end(
+            await session.serve(
+                keys.all_commands, requests.on_command, complete=True, spared=requests.may_take_energy_out
+            )
+        )
         await until_end(await session.watch_tokens(keys.all_alive, self._on_daemon))
         await until_end(await session.declare_token(keys.alive(self._run.instance)))
 

@@ -14,7 +14,7 @@ from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.guards import UNCONDITIONAL, Permit, Right
 from ldcnd.contract.catalogue import BY_VERB, RENAMED
-from ldcnd.contract.codec import decode, encode, reply_encoding, to_json
+from ldcnd.contract.codec import decode, encode, reply_encoding, to_json, understand
 from ldcnd.contract.commands import (
     About,
     AxisCommand,
@@ -25,6 +25,7 @@ from ldcnd.contract.commands import (
     Ends,
     Jog,
     Move,
+    Power,
     Stop,
     StopReply,
 )
@@ -150,7 +151,7 @@ class Requests:
     def on_command(self, query: Query) -> None:
         """Take a query on `@cmd/**`."""
         self._dispatcher.leases.expire()  # before anything that waited while this process or its client was frozen
-        if self._pending >= PENDING_REQUESTS and not self._brings_to_rest(query):
+        if self._pending >= PENDING_REQUESTS and not self._takes_energy_out(query):
             self._refuse(
                 query,
                 TooManyRequests(
@@ -164,12 +165,28 @@ class Requests:
         task = self._group.create_task(self._answer(query, self._command), name=f"command {query.key}")
         task.add_done_callback(self._done)
 
-    def _brings_to_rest(self, query: Query) -> bool:
-        """Tell whether a query is to bring an axis to rest, which no flood of others may keep from being sent."""
+    def may_take_energy_out(self, key: str) -> bool:
+        """Tell whether a query with a key may be to bring an axis to rest; any thread may ask."""
         try:
-            return _command_class(self._keys.parse_command(query.key)).effect is Effect.REST
+            kind = _command_class(self._keys.parse_command(key))
         except LdcndError:
             return False
+        return kind.effect is Effect.REST or kind is Power
+
+    def _takes_energy_out(self, query: Query) -> bool:
+        """Tell whether a query is to bring an axis to rest, which no flood of others may keep from being sent."""
+        try:
+            return self._understood(query)[1].takes_energy_out
+        except LdcndError:
+            return False
+
+    def _understood(self, query: Query) -> tuple[CommandAddress, Command[Frozen], LdcndError | None]:
+        """Return whom a query is for, what it asks for, and what is wrong with it all the same; see `understand`."""
+        address = self._keys.parse_command(query.key)
+        if address.axis != RIG_ITSELF:
+            _ = self._rig.axes[address.axis]  # an unknown axis is refused before an unknown verb
+        command, complaint = understand(_command_class(address), query.payload, query.encoding)
+        return address, command, complaint
 
     def on_stop(self, query: Query) -> None:
         """Take a query on `@stop` or `@stop/<axis>`."""
@@ -199,14 +216,13 @@ class Requests:
             query.reply(*encode(reply, reply_encoding(query.encoding)))
 
     async def _command(self, query: Query) -> Frozen:
-        address = self._keys.parse_command(query.key)
-        if self._closing:
+        address, command, complaint = self._understood(query)
+        if self._closing and not command.takes_energy_out:
             raise ShuttingDown("the daemon is stopping", axis=address.axis)
-        if address.axis != RIG_ITSELF:
-            _ = self._rig.axes[address.axis]  # an unknown axis is refused before an unknown verb
-        kind = _command_class(address)
-        command = decode(kind, query.payload, query.encoding)
-        return await self._dispatcher.answer(address.axis, command, query.login, partial(self._reply, query))
+        reply = await self._dispatcher.answer(address.axis, command, query.login, partial(self._reply, query))
+        if complaint is not None:
+            raise complaint.although(f"axis {address.axis}: {command.verb} was carried out, but")
+        return reply
 
     async def _stop(self, query: Query) -> Frozen:
         """Stop even if the payload is nonsense: a stop is always accepted."""
@@ -342,7 +358,12 @@ class Dispatcher:
         if isinstance(command, AxisCommand) or (
             command.effect is not Effect.QUESTION and not isinstance(command, Acquire)
         ):
-            self._journal.asked(axis, command)
+            try:
+                self._journal.asked(axis, command)
+            except Exception:
+                if not command.takes_energy_out:
+                    raise
+                log.exception("request not recorded", axis=axis, verb=command.verb)  # it is carried out all the same
         match command:
             case AxisCommand():
                 return await self.carry_out(axis, command, login, accept)
@@ -362,6 +383,8 @@ class Dispatcher:
     ) -> CommandReply:
         """Carry out a command of an axis, or answer as the first time when its id is known.
 
+        What takes energy out passes no gate: neither its lease, run, deadline and id nor another daemon are asked.
+
         Raises:
             LdcndError: as the axis refused it, or because it is not admitted.
         """
@@ -372,13 +395,15 @@ class Dispatcher:
             self._admit(axis_name, command)
             return axis.renew_jog(command, command.renews)
         command_id = command.command_id or self.events.next_command_id()
-        if entry := self._ledger.repeated(command_id, axis_name, command):
-            if command.effect is not Effect.REST:
+        client, right, accepted = command.client, UNCONDITIONAL, asyncio.Event()
+        if command.takes_energy_out:
+            if self._ledger.is_taken(command_id):
+                command_id = self.events.next_command_id()
+        else:
+            if entry := self._ledger.repeated(command_id, axis_name, command):
                 return await self._answer_again(entry)
-            command_id = self.events.next_command_id()
-        client = self._admit(axis_name, command) or command.client
-        accepted = asyncio.Event()
-        right = UNCONDITIONAL if command.effect is Effect.REST else self._right(axis_name, command, accepted)
+            client = self._admit(axis_name, command) or client
+            right = self._right(axis_name, command, accepted)
         hold = axis.begin_hold(command_id, command) if isinstance(command, Jog) else None
         if hold:
             right = right.also(lambda: hold.check(self._clock.now_s()))
@@ -449,8 +474,6 @@ class Dispatcher:
 
     def _admit(self, axis: str, command: AxisCommand[CommandReply]) -> str | None:
         """Refuse a command that is stale, late or sent by another client; return its sender, if it names one."""
-        if command.effect is Effect.REST:
-            return None
         self._refuse_rival(axis)
         if command.instance not in (None, self._instance):
             raise CommandExpired(

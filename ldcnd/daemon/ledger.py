@@ -18,7 +18,7 @@ from ldcnd.axis.clock import Clock
 from ldcnd.axis.state import ActiveCommand
 from ldcnd.axis.telemetry import Arrival
 from ldcnd.contract.codec import to_json
-from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Effect, Verb
+from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Verb
 from ldcnd.contract.errors import (
     CommandIdReused,
     LdcndError,
@@ -88,6 +88,10 @@ class Ledger:
         self._changed = changed
         self._now_s = now_s
 
+    def is_taken(self, command_id: str) -> bool:
+        """Tell whether an id names another command already, or has."""
+        return command_id in self._entries or self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s()
+
     def repeated(self, command_id: str, axis: str, command: AxisCommand[CommandReply]) -> Entry | None:
         """Return the entry that this id has already, or None when it is new.
 
@@ -134,7 +138,7 @@ class Ledger:
         """
         self._remember(entry)
         self._entries[entry.command_id] = entry
-        sender = RESTING if entry.command.effect is Effect.REST else entry.login or entry.client or ""
+        sender = RESTING if entry.command.takes_energy_out else entry.login or entry.client or ""
         entries = self._of_senders.setdefault(sender, OrderedDict())
         self._of_senders.move_to_end(sender)
         entries[entry.command_id] = None
@@ -193,7 +197,7 @@ class Ledger:
 
     def _remember(self, entry: Entry) -> None:
         command = entry.command
-        if command.command_id is None or command.effect is Effect.REST:
+        if command.command_id is None or command.takes_energy_out:
             return
         if command.lease is not None and command.sequence is not None:
             return

@@ -52,6 +52,11 @@ def _no_login() -> str | None:
     return None
 
 
+def no_key(_key: str) -> bool:
+    """Spare no query."""
+    return False
+
+
 Send = Callable[[tuple[Answer, ...]], None]
 """Takes all answers to one query, once, from any thread, without blocking."""
 
@@ -269,8 +274,8 @@ class Admission(Protocol):
 class QueryIntake(Protocol):
     """The admission to one queryable; no method blocks, and any thread may call all but `close`."""
 
-    def admit(self, source: str) -> Admission | None:
-        """Count a query in, None if there is no room; `source` is the session that it names, empty if it names none."""
+    def admit(self, source: str, key: str = "") -> Admission | None:
+        """Count a query with a key in, None if there is no room; `source` is the session that it names, or empty."""
 
     def refusal(self, key: str, source: str) -> TooManyRequests:
         """Return the error for a query that was not admitted."""
@@ -288,21 +293,32 @@ class Intake:
     A query counts from its arrival until its answer has left.
     """
 
-    def __init__(self, loop: asyncio.AbstractEventLoop, on_query: OnQuery, *, urgent: bool = False) -> None:
+    def __init__(
+        self,
+        loop: asyncio.AbstractEventLoop,
+        on_query: OnQuery,
+        *,
+        urgent: bool = False,
+        spared: Callable[[str], bool] = no_key,
+    ) -> None:
         self._on_query = on_query
+        self._spared = spared
         self._capacity = PENDING_URGENT_QUERIES if urgent else PENDING_QUERIES
         self._pending = 0
         self._refused = 0
         # re-entrant: an abandoned query may be collected, and so leave, while this very thread counts
         self._lock = threading.RLock()
         # admission bounds it, so nothing ever gives way
-        self._queries = HandOver(loop, self._deliver, self._capacity, None if urgent else COMMANDS_PER_TURN)
+        self._queries = HandOver(loop, self._deliver, PENDING_URGENT_QUERIES, None if urgent else COMMANDS_PER_TURN)
 
-    def admit(self, source: str) -> Admission | None:
+    def admit(self, source: str, key: str = "") -> Admission | None:
         """Count a query in."""
         del source
         with self._lock:
-            if self._pending >= self._capacity:
+            capacity = self._capacity
+            if self._pending >= capacity and self._spared(key):
+                capacity = PENDING_URGENT_QUERIES
+            if self._pending >= capacity:
                 self._refused += 1
                 return None
             self._pending += 1

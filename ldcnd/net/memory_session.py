@@ -24,6 +24,7 @@ from ldcnd.net.hand_over import (
     Query,
     QueryIntake,
     TokenChanges,
+    no_key,
 )
 from ldcnd.net.reads import ReadIntake, Reads
 from ldcnd.net.session import (
@@ -170,9 +171,17 @@ class MemorySession(Session):
         """Offer the deletion to every subscription that matches."""
         self._offer(Sample(key, b"", "", SampleKind.DELETE, None, self._name))
 
-    async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
+    async def serve(
+        self,
+        key: str,
+        on_query: OnQuery,
+        *,
+        complete: bool,
+        urgent: bool = False,
+        spared: Callable[[str], bool] = no_key,
+    ) -> Declaration:
         """Answer queries; nothing is in the way of an answer here, so urgent only means not to be refused."""
-        return self._serve(key, Intake(self._loop, on_query, urgent=urgent), complete=complete)
+        return self._serve(key, Intake(self._loop, on_query, urgent=urgent, spared=spared), complete=complete)
 
     async def serve_reads(self, key: str, on_read: OnRead, *, complete: bool) -> Declaration:
         """Answer queries in steps."""
@@ -224,7 +233,7 @@ class MemorySession(Session):
             return []
         pending = _Pending(len(asked), self._loop.create_future())
         for queryable in asked:
-            if admission := queryable.intake.admit(self._name):
+            if admission := queryable.intake.admit(self._name, key):
                 send = partial(_answer, pending, admission, queryable.source)
                 admission.offer(Query(key, parameters, payload, encoding, send, lambda: self._login))
             else:

@@ -166,7 +166,7 @@ class ReadIntake:
         self._pending: set[_Read] = set()
         self._refused = 0
 
-    def admit(self, source: str) -> Admission | None:
+    def admit(self, source: str, key: str = "") -> Admission | None:  # noqa: ARG002 - of the protocol
         """Count a read in."""
         if not self.reads.admit(source):
             self._refused += 1

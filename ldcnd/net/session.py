@@ -10,7 +10,7 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import NamedTuple
 
-from ldcnd.net.hand_over import Answer, Load, OnQuery, OnRead, OnToken
+from ldcnd.net.hand_over import Answer, Load, OnQuery, OnRead, OnToken, no_key
 
 UNDELIVERED_SAMPLES = 64
 """Maximum number of samples that a subscription keeps for its callback; the oldest is dropped."""
@@ -120,7 +120,15 @@ class Session(ABC):
         """Say, without waiting, that a key has no value any more."""
 
     @abstractmethod
-    async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
+    async def serve(
+        self,
+        key: str,
+        on_query: OnQuery,
+        *,
+        complete: bool,
+        urgent: bool = False,
+        spared: Callable[[str], bool] = no_key,
+    ) -> Declaration:
         """Answer the queries that match a key expression.
 
         Args:
@@ -129,6 +137,7 @@ class Session(ABC):
             complete: this session alone can answer everything below the key, so only one such session is queried.
             urgent: answers do not queue behind the answers of other declarations, and the number of queries that may be
                 unanswered is so large that none is refused in practice.
+            spared: tells of a query's key, on any thread, whether it is refused as late as an urgent one.
         """
 
     @abstractmethod

@@ -35,6 +35,7 @@ from ldcnd.net.hand_over import (
     Query,
     QueryIntake,
     TokenChanges,
+    no_key,
 )
 from ldcnd.net.login_probe import refusals
 from ldcnd.net.reads import ReadIntake, Reads
@@ -203,10 +204,19 @@ class ZenohSession(Session):
         except zenoh.ZError as error:
             raise SessionError(f"{key}: cannot delete: {error}") from error
 
-    async def serve(self, key: str, on_query: OnQuery, *, complete: bool, urgent: bool = False) -> Declaration:
+    async def serve(
+        self,
+        key: str,
+        on_query: OnQuery,
+        *,
+        complete: bool,
+        urgent: bool = False,
+        spared: Callable[[str], bool] = no_key,
+    ) -> Declaration:
         """Answer queries."""
         workers = self._urgent_workers if urgent else self._command_workers
-        return await self._serve(key, Intake(self._loop, on_query, urgent=urgent), workers, complete=complete)
+        intake = Intake(self._loop, on_query, urgent=urgent, spared=spared)
+        return await self._serve(key, intake, workers, complete=complete)
 
     async def serve_reads(self, key: str, on_read: OnRead, *, complete: bool) -> Declaration:
         """Answer queries in steps."""
@@ -216,7 +226,8 @@ class ZenohSession(Session):
         def take(asked: zenoh.Query) -> None:
             source = asked.source_info
             named = "" if source is None else str(source.source_id.zid)
-            admission = intake.admit(named)
+            key = str(asked.key_expr)
+            admission = intake.admit(named, key)
             if admission is None:
                 # beyond the bound the query ends here, which may hold up the links that share this thread
                 if self._refusals.waiting < REFUSALS_WAITING:
@@ -225,7 +236,7 @@ class ZenohSession(Session):
             path = _AnswerPath(asked, workers, self._stamps.stamp_id, admission.leave)
             admission.offer(
                 Query(
-                    key=str(asked.key_expr),
+                    key=key,
                     parameters=dict(asked.parameters),  # type: ignore[call-overload] # its stub has no true iterator
                     payload=b"" if asked.payload is None else asked.payload.to_bytes(),
                     encoding="" if asked.encoding is None else str(asked.encoding),

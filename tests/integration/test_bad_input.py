@@ -101,7 +101,7 @@ async def ask(rig: RunningRig, key: str, payload: bytes, encoding: str) -> dict[
         ("ldcn/*/@cmd/x/halt", b"{}", "application/json", "wildcard_refused", ["*"]),
         ("ldcn/sim/@cmd/**", b"{}", "application/json", "wildcard_refused", ["*"]),
         ("ldcn/sim/@cmd/x", b"{}", "application/json", "malformed_request", ["@cmd"]),
-        (f"{X}/halt", b" " * (MAX_PAYLOAD_BYTES + 1), "application/json", "payload_too_large", ["16384"]),
+        (f"{X}/reset", b" " * (MAX_PAYLOAD_BYTES + 1), "application/json", "payload_too_large", ["16384"]),
     ],
 )
 async def test_bad_input_gets_one_typed_error_and_nothing_reaches_the_wire(key, payload, encoding, code, words):

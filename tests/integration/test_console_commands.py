@@ -180,3 +180,36 @@ def test_what_looks_like_html_in_a_page_stays_text():
     assert "<h1>Too much</h1>" in html
     assert "<script>" not in html
     assert "<table>" in html
+
+
+@pytest.mark.promise("energy-out-always-sent")
+@pytest.mark.parametrize(
+    ("verb", "body"),
+    [
+        ("halt", {"speed": 3}),
+        ("quick_stop", b"now!"),
+        ("stop", b"a" * 20_000),
+        ("power", {"on": False, "client": 7, "speed": 3}),
+        ("power", {"on": "off"}),
+    ],
+)
+async def test_what_takes_energy_out_is_sent_whatever_else_is_wrong_with_it_or_its_page(console, verb, body):
+    async with open_page(console.app, console.browser) as page:
+        await page.take("sim", "x")
+        await page.post(f"{X}/power", {"on": True})
+        await page.post(f"{X}/move_velocity", {"velocity": 5.0})
+        await console.rig.until("x", lambda state: state.moving == "yes")
+        answer = await console.browser.forging(x_ldcnd_page="gone").post(f"{X}/{verb}", body)
+        off = verb == "power"
+        await console.rig.until("x", lambda state: not state.enabled if off else state.moving == "no")
+
+    assert answer.status == 400
+    assert "was carried out, but" in answer.document["message"]
+
+
+@pytest.mark.promise("energy-out-always-sent")
+async def test_a_stop_of_which_cannot_be_read_what_it_is_for_stops_the_rig(console):
+    answer = await console.browser.post("/api/rigs/sim/stop", {"axes": ["x"]})
+
+    assert (answer.status, "the whole rig was stopped" in answer.document["message"]) == (400, True)
+    assert all([(await console.rig.client.state(axis)).stop_latched for axis in "xyzc"])

@@ -186,6 +186,17 @@ async def test_a_move_that_follows_a_jog_is_not_halted_by_its_end():
         assert (made.variables["T:x.JOGF"].value, made.variables["T:x.DMOV"].value) == (0, 1)
 
 
+@pytest.mark.promise("energy-out-always-sent")
+async def test_an_axis_that_another_program_controls_is_switched_off_by_a_put():
+    async with records() as (running, made):
+        await running.client.ask(Acquire(client="ann", axes=("x",), force=True, lease_s=60))
+        while made.variables["T:x:control"].value == "epics gateway":
+            await asyncio.sleep(0.01)
+        await put(made, "T:x.CNEN", "Disable")
+
+        await running.until("x", lambda state: not state.enabled)
+
+
 @pytest.mark.parametrize("direction", ["forward", "reverse"])
 async def test_a_limit_switch_shows_at_the_end_of_the_axis_where_it_is(direction: str):
     async with dialect_rig(LS_182AP, limit_switches="stop", direction=direction) as drive:

@@ -45,7 +45,7 @@ class Gateway:
 
     def add(self, info: AxisInfo, defaults: tuple[float, float], prefix: str, *, moves: bool) -> None:
         """Show an axis, and begin to follow it."""
-        record = MotorRecord(info, defaults, self._start_motion, self._stop, self.connected, moves=moves)
+        record = MotorRecord(info, defaults, self._start_motion, self._rig.watch, self.connected, moves=moves)
         self._records[info.axis] = record
         self.variables |= database(prefix, {info.axis: record})
         self._start(self._follow(record), f"values of {info.axis}")
@@ -109,10 +109,6 @@ class Gateway:
                     await record.controlled(None, NO_HOLDER)
             except LdcndError as error:
                 await record.controlled(None, str(error))
-
-    async def _stop(self, axis: str) -> object:
-        async with self._rig.watch(axis) as watched:
-            return await watched.stop()
 
     def _start(self, work: Coroutine[object, object, None], name: str) -> asyncio.Task[None]:
         task = self._group.create_task(work, name=name)

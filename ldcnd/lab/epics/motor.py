@@ -5,7 +5,7 @@ Fields follow the motor record of the EPICS collaboration. What the gateway cann
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine, Mapping
-from contextlib import suppress
+from contextlib import AbstractAsyncContextManager, suppress
 from functools import partial
 
 from caproto import AlarmSeverity, AlarmStatus
@@ -77,7 +77,7 @@ class MotorRecord:
         info: what the axis is.
         defaults: its velocity and acceleration, in units a second and a second squared, when a client names no others.
         start: keeps a task until its end.
-        stop: stops the axis and latches, without control.
+        watch: gives the axis without control of it, for what takes energy out.
         clients: returns who is connected: a jog ends when one of them is gone.
         moves: whether puts move it at all.
     """
@@ -87,7 +87,7 @@ class MotorRecord:
         info: AxisInfo,
         defaults: tuple[float, float],
         start: Callable[[Coroutine[object, object, None], str], asyncio.Future[None]],
-        stop: Callable[[str], Awaitable[object]],
+        watch: Callable[[str], AbstractAsyncContextManager[Axis]],
         clients: Callable[[], frozenset[object]],
         *,
         moves: bool,
@@ -99,7 +99,7 @@ class MotorRecord:
         self._control_changed = asyncio.Event()
         self._used_s = 0.0  # when a put needed control last, in loop time
         self._start = start
-        self._stop = stop
+        self._watch = watch
         self._clients = clients
         self._pending = 0
         self._jog_puts = 0
@@ -549,7 +549,11 @@ class MotorRecord:
         return Put()
 
     async def _put_cnen(self, asked: Value) -> Put:
-        await (await self._controlled()).power(on=asked == "Enable")
+        if asked == "Enable":
+            await (await self._controlled()).power(on=True)
+            return Put()
+        async with self._watch(self.info.axis) as axis:  # to switch off needs no control
+            await axis.power(on=False)
         return Put()
 
     async def _put_reset(self, asked: Value) -> Put:
@@ -649,7 +653,8 @@ class MotorRecord:
         self._released.set()
         if self._axis is None:
             if self._is_refused or self._moving is not Moving.NO:
-                await self._stop(self.info.axis)
+                async with self._watch(self.info.axis) as axis:
+                    await axis.stop()
             return
         if self._moving is not Moving.NO or self._pending:
             await self._axis.halt()

@@ -1,0 +1,183 @@
+"""Stop, halt and power off pass every gate: a table of gates, for each of these verbs, judged by the shaft."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from ldcnd.client.lease import control
+from ldcnd.contract.commands import MoveVelocity, Power, Reset, SetGains
+from ldcnd.contract.errors import LeaseExpired
+from ldcnd.contract.keys import Keys
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.samples import LinkState
+from ldcnd.daemon.dispatch import PENDING_REQUESTS
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
+from tests.integration.test_kept_references import chain_of
+from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
+
+pytestmark = pytest.mark.promise("energy-out-always-sent")
+KEYS = Keys("sim")
+VERBS = ("halt", "stop", "quick_stop", "power", "@stop")
+CRAWL = 40
+"""Counts that a closed loop at rest goes in 0.2 s; the motions here are of 5000 counts/s."""
+
+
+@asynccontextmanager
+async def leased_rig(**axes: object) -> AsyncIterator[tuple[ChainRig, Chain, str]]:
+    """Run a rig whose x is under the lease of ann."""
+    chain = chain_of()
+    settings = simulated_config(axes).model_copy(update={"authority": "leased"})
+    async with rig_on(chain, settings) as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        lease = await rig.client.ask(Acquire(client="ann", axes=("x",), lease_s=60.0))
+        yield rig, chain, lease.lease
+
+
+async def run(rig: ChainRig, lease: str) -> None:
+    """Let x run, whatever was done to it before."""
+    await rig.until("x", lambda state: state.moving == "no" and not state.stop_pending)
+    for command in (Reset(lease=lease), Power(on=True, lease=lease), MoveVelocity(velocity=5.0, lease=lease)):
+        await rig.client.command("x", command)
+    await asyncio.sleep(0.3)
+
+
+async def ask(rig: ChainRig, verb: str, payload: bytes | dict[str, object]) -> tuple[str | None, str]:
+    """Send bytes to a verb of x; return the code and the message of the error, None and nothing without one."""
+    key = KEYS.stop("x") if verb == "@stop" else KEYS.command("x", verb)
+    data = payload if isinstance(payload, bytes) else json.dumps(payload).encode()
+    (answer,) = await rig.session.query(key, data, encoding="application/json", timeout_s=5.0)
+    error = json.loads(answer.payload) if answer.is_error else {}
+    return error.get("code"), error.get("message", "")
+
+
+async def rests(chain: Chain, verb: str) -> bool:
+    """Tell whether the shaft does what a verb means soon: stands, or has no voltage."""
+    await asyncio.sleep(0.5)
+    one = drive(chain, 1)
+    if verb == "power":
+        return not one.loop.servo_on
+    before = one.shaft.position_counts
+    await asyncio.sleep(0.2)
+    return abs(drive(chain, 1).shaft.position_counts - before) < CRAWL
+
+
+NO_GATE = {
+    "no lease": {},
+    "a lease that never was": {"lease": "none"},
+    "another's client name": {"client": "ann"},
+    "an old sequence": {"lease": "LEASE", "sequence": 0},
+    "another run of the daemon": {"instance": "another"},
+    "a deadline that has passed": {"not_after": 1},
+    "the id of another command": {"command_id": "taken"},
+}
+"""Fields that would have another command refused; what takes energy out is carried out and says nothing about them."""
+FLAWS: dict[str, object] = {
+    "another field": {"speed": 3},
+    "a number for a text": {"client": 7},
+    "an empty id": {"command_id": ""},
+    "a negative deadline": {"not_after": -5},
+    "a control character": {"client": "a\u0007b"},
+    "a long name": {"client": "a" * 65},
+    "a long payload": {"client": "a" * 20_000},
+    "a payload that is cut short": b'{"on": false, "client": "an',
+    "a number that no field takes": b'{"on": false, "sequence": NaN}',
+}
+NONSENSE = {"no object": b"[1]", "no text": b"\xff\xfe", "words": b"now!", "null": b"null"}
+
+
+@pytest.mark.parametrize("verb", VERBS)
+async def test_what_would_have_another_command_refused_has_no_say(verb):
+    async with leased_rig() as (rig, chain, lease):
+        await rig.client.command("x", SetGains(kp=300, lease=lease, sequence=5, command_id="taken"))
+        for name, fields in NO_GATE.items():
+            await run(rig, lease)
+            payload = {key: lease if value == "LEASE" else value for key, value in fields.items()}
+            answer = await ask(rig, verb, payload | ({"on": False} if verb == "power" else {}))
+            assert await rests(chain, verb), name
+            assert answer == (None, ""), name
+
+
+@pytest.mark.parametrize("verb", VERBS)
+async def test_what_is_wrong_with_a_request_is_told_after_it_was_carried_out(verb):
+    async with leased_rig() as (rig, chain, lease):
+        flaws = FLAWS | (NONSENSE if verb != "power" else {"a word": {"on": "off"}, "a number": {"on": 0}})
+        for name, fields in flaws.items():
+            await run(rig, lease)
+            answer = await ask(
+                rig, verb, {"on": False} | fields if isinstance(fields, dict) and verb == "power" else fields
+            )
+            assert await rests(chain, verb), name
+            if verb == "@stop":
+                assert answer == (None, ""), name
+            else:
+                assert answer[0] in ("malformed_request", "payload_too_large"), name
+                assert f"axis x: {verb} was carried out, but" in answer[1], name
+
+
+@pytest.mark.parametrize("on", [True, 1, "on", "yes", None, "?", [], {}])
+async def test_power_that_does_not_mean_off_switches_nothing(on):
+    async with leased_rig() as (rig, chain, lease):
+        await run(rig, lease)
+        code, message = await ask(rig, "power", {"on": on, "speed": 3})
+        await asyncio.sleep(0.5)
+
+        assert drive(chain, 1).loop.servo_on
+        assert (code, "was carried out" in message) == ("malformed_request", False)
+
+
+@pytest.mark.parametrize("verb", VERBS)
+async def test_neither_another_daemon_nor_a_flood_nor_a_line_that_is_busy_is_in_the_way(verb):
+    off = {"on": False} if verb == "power" else {}
+    async with leased_rig() as (rig, chain, lease):
+        await run(rig, lease)
+        rival = await rig.session.declare_token(KEYS.alive("rival"))
+        await asyncio.sleep(0.1)
+        answer = await ask(rig, verb, off)
+        assert (await rests(chain, verb), answer) == (True, (None, ""))
+        await rival.close()
+        await asyncio.sleep(0.1)
+
+        await run(rig, lease)
+        key, gains = KEYS.command("x", "set_gains"), json.dumps({"kp": 300, "lease": lease}).encode()
+        flood = [
+            asyncio.create_task(rig.session.query(key, gains, encoding="application/json", timeout_s=5.0))
+            for _ in range(4 * PENDING_REQUESTS)
+        ]
+        await asyncio.sleep(0)
+        answer = await ask(rig, verb, off)
+        assert (await rests(chain, verb), answer) == (True, (None, ""))
+        refused = [json.loads(each.result()[0].payload).get("code") for each in flood if each.done()]
+        assert "too_many_requests" in refused
+        await asyncio.gather(*flood)
+
+
+@pytest.mark.parametrize("verb", ["halt", "power"])
+async def test_what_comes_while_the_daemon_ends_is_sent_as_long_as_it_serves(verb):
+    async with leased_rig(loss={"daemon": "halt"}) as (rig, chain, lease):
+        await run(rig, lease)
+        now_s = asyncio.get_running_loop().time()
+        lost = Fault(FaultKind.REQUEST_LOST, 1.0, now_s, until_s=now_s + 1.0)
+        chain._injector = FaultInjector(FaultPlan((lost,)))
+        rig.daemon.end()
+        await asyncio.sleep(0.2)
+        await ask(rig, verb, {"on": False} if verb == "power" else {})
+        await asyncio.wait([rig.running])
+
+        assert await rests(chain, verb)
+
+
+async def test_a_client_that_has_lost_control_still_halts_and_switches_off():
+    async with leased_rig() as (rig, chain, lease):
+        await run(rig, lease)
+        async with control(rig.client, "bob", "x", force=True) as held:
+            await rig.client.ask(Acquire(client="ann", axes=("x",), lease_s=60.0, force=True))
+            held.lost = LeaseExpired("taken by force by ann")
+            await held.command("x", Power(on=False))
+            with pytest.raises(LeaseExpired):
+                await held.command("x", Power(on=True))
+
+        assert await rests(chain, "power")
