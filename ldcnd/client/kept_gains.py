@@ -12,7 +12,7 @@ from ldcnd import durable
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.client.standstill import at_rest, seen
-from ldcnd.contract.errors import BusyTracing, ConfigError, StopLatched, WrongState
+from ldcnd.contract.errors import ConfigError, StopLatched, WrongState
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import AxisState
@@ -25,8 +25,6 @@ LEASE_S = 5.0
 
 PUT_BACK_S = 15.0
 """Longest time that the gains may take to come back, seconds."""
-LOOK_S = 0.5
-"""Interval at which a drive that still records is asked again to take a parameter, seconds."""
 
 
 class KeptGains(Frozen):
@@ -37,14 +35,9 @@ class KeptGains(Frozen):
     axis: str
     """The axis."""
     gains: dict[str, int]
-    """Registers of Set Gain, by the names of `set_gains`; or parameters of a drive, by their numbers."""
+    """Registers of Set Gain, by the names of `set_gains`."""
     model: str = ""
     """The drive model; empty in a file of an earlier version."""
-
-    @property
-    def are_registers(self) -> bool:
-        """Whether the loop has to be open when they are loaded."""
-        return self.gains.keys() <= frozenset(NAMES)
 
 
 def file_of(rig: str, axis: str) -> Path:
@@ -154,7 +147,7 @@ async def load(axis: Axis, gains: dict[str, int]) -> None:
 
 
 async def restore(axis: Axis, kept: KeptGains) -> None:
-    """Put gains back: registers with the loop open, parameters one by one.
+    """Put gains back with the loop open.
 
     Raises:
         LdcndError: as the daemon refused it; they are still kept.
@@ -162,11 +155,7 @@ async def restore(axis: Axis, kept: KeptGains) -> None:
     """
     try:
         async with asyncio.timeout(PUT_BACK_S):
-            if kept.are_registers:
-                await load(axis, kept.gains)
-            else:
-                for name, value in kept.gains.items():
-                    await _write(axis, name, value)
+            await load(axis, kept.gains)
     except TimeoutError:
         raise WrongState(
             f"axis {kept.axis}: its gains are not back after {PUT_BACK_S:g} s",
@@ -176,19 +165,8 @@ async def restore(axis: Axis, kept: KeptGains) -> None:
     forget(kept)
 
 
-async def _write(axis: Axis, name: str, value: int) -> None:
-    """Write a parameter to RAM; a drive that still ends a record takes none before."""
-    while True:
-        try:
-            await axis.write_parameter(name, value)
-        except BusyTracing:
-            await asyncio.sleep(LOOK_S)
-        else:
-            return
-
-
 async def put_back(rig: Rig, kept: KeptGains, client: str) -> None:
-    """Do the same under control of this client's own: an axis whose gains are registers is off afterwards.
+    """Do the same under control of this client's own: the axis is off afterwards.
 
     Raises:
         WrongState: they are those of another drive; they are still kept.

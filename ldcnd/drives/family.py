@@ -167,19 +167,6 @@ OpenLine = Callable[[BusT, Opener | None, Chain | None], Line]
 """Makes a line: its configuration, what opens it instead of its port, the simulated line that it is."""
 
 
-@dataclass(frozen=True, slots=True)
-class TuningModules:
-    """How axes are tuned: modules that need optional packages, so they are loaded when a person asks for it.
-
-    Attributes:
-        command: `tune` of it is `ldcnd tune`.
-        page: `tune` of it is the step of the commissioning page, which `ABOUT` explains.
-    """
-
-    command: str
-    page: str
-
-
 class Family(ABC, Generic[BusT, SimulatedT]):
     """One drive family.
 
@@ -189,7 +176,7 @@ class Family(ABC, Generic[BusT, SimulatedT]):
         simulated_line: reads a `[[sim]]` table.
         simulated_key: the key of such a table that no other family has: its drives.
         bauds: rates that its lines may run at; none when the rate is fixed.
-        tuning: of its axes; None where nothing is known of that.
+        is_tuned_by_host: whether `ldcnd tune` finds gains for its axes.
     """
 
     name: str
@@ -197,7 +184,7 @@ class Family(ABC, Generic[BusT, SimulatedT]):
     simulated_line: type[SimulatedT]
     simulated_key: str
     bauds: tuple[int, ...] = ()
-    tuning: TuningModules | None = None
+    is_tuned_by_host: bool = False
 
     @abstractmethod
     def open_lines(self, state_dir: Path | None) -> OpenLine[BusT]:

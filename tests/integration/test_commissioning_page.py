@@ -5,26 +5,22 @@ import json
 import os
 import re
 import select
-from types import SimpleNamespace
 
 import pytest
 import serial
 
 from ldcnd.bench.commissioning.record import Record, StepState
-from ldcnd.client.kept_gains import KeptGains, keep, kept_for
 from ldcnd.config.rig import load_config
-from ldcnd.console.commissioning.ldcn import tuning
+from ldcnd.console.commissioning import tuning
 from ldcnd.console.commissioning.messages import Answer, FromPage
 from ldcnd.console.commissioning.page_person import HELD_S
 from ldcnd.console.commissioning.scan_conversation import ScanConversation
 from ldcnd.contract.errors import ErrorCode
 from ldcnd.contract.leases import ListHolders
-from ldcnd.contract.parameters import ReadParameter
 from ldcnd.contract.samples import Moving
 from tests.support.commissioning import AXIS, GAINS, commissioning_rig, rig_text
 from tests.support.commissioning_page import COMMAND, ViewerSession, commissioning_console, commissioning_page, told_to
 from tests.support.console_rig import page, running_console
-from tests.support.trace_rig import MIXED, trace_rig
 
 
 @pytest.fixture(autouse=True)
@@ -213,77 +209,6 @@ async def test_gains_come_back_when_a_page_goes_while_the_axis_is_tuned(tmp_path
         assert await rig.registers() == GAINS
         assert await holder(rig) is None
         assert record(rig).of("gains").result.state is StepState.OPEN
-
-
-@pytest.fixture
-async def steps(tmp_path):
-    """A rig with drives that tune themselves, a console that commissions it, and what keeps a gain's value in RAM."""
-    config = tmp_path / "rig.toml"
-    config.write_text(MIXED.read_text())
-    async with trace_rig() as under_test:
-        under_test.pulses(10_000.0)
-        running = SimpleNamespace(running=under_test.rig, config=config)
-
-        async def gain(name):
-            return (await under_test.rig.client.command("feed", ReadParameter(parameter=name))).value.active
-
-        async with commissioning_console(running) as console:
-            yield SimpleNamespace(console=console, config=config, gain=gain)
-
-
-async def begun_with(opened, gain):
-    """Begin the step that tries gains, and wait for the first record to be agreed to."""
-    await opened.until(lambda view: not view.running and view.steps)
-    opened.say(begin="gains", by="ada")
-    await opened.answer("a gain to try", gain)
-    await opened.answer("a gain to try", "")
-    await opened.answer("for how long the drive records", "0.5")
-    await opened.answer("try these gains on feed", "yes")
-
-
-async def test_gains_of_a_drive_that_tunes_itself_are_tried_and_kept_as_the_command_does(steps):
-    async with commissioning_page(steps.console, "feed") as opened:
-        await begun_with(opened, "Pn102=45")
-        shown = opened.view.lines
-        await opened.answer("record it with the present gains", "yes")
-        await opened.answer("record it with the new gains", "yes")
-        await opened.answer("keep them in the RAM", "yes")
-        view = await opened.ended()
-        left = await steps.gain("Pn102")
-
-    kept = Record.model_validate_json(steps.config.with_name("commissioning-mixed-feed.json").read_text()).of("gains")
-    about = next(each.about for each in view.steps if each.name == "gains")
-    assert "auto-tuning result (Fn007): 100 %" in shown
-    assert "tried in its RAM" in about
-    assert left == 45
-    assert (kept.result.state, kept.by) == (StepState.DONE, "ada")
-    assert ("Pn102", 45) in [(each.what, each.value) for each in kept.result.figures]
-    assert "ldcnd params set feed Pn102 45 --eeprom" in kept.result.text
-    assert kept.result.proposals == ()
-
-
-async def test_a_page_that_goes_while_gains_are_tried_leaves_the_old_ones_and_so_does_the_next_after_a_kill(steps):
-    before = await steps.gain("Pn102")
-    async with commissioning_page(steps.console, "feed") as opened:
-        await begun_with(opened, "Pn102=45")
-        await opened.answer("record it with the present gains", "yes")
-        await opened.asked("record it with the new gains")
-        tried = await steps.gain("Pn102")
-    after = await steps.gain("Pn102")
-    keep(KeptGains(rig="mixed", axis="feed", gains={"Pn102": 41}))  # as a killed one has left it
-    async with commissioning_page(steps.console, "feed") as opened:
-        await opened.until(lambda view: not view.running and view.steps)
-        opened.say(begin="gains")
-        await opened.answer("put the former gains back now", "yes")
-        await opened.answer("a gain to try", "Pn102")
-        await opened.answer("a gain to try", "")
-        await opened.answer("are the gains of feed right as they are", "yes")
-        view = await opened.ended()
-
-    assert (tried, after, await steps.gain("Pn102")) == (45, before, 41)
-    assert kept_for("mixed", "feed") is None
-    assert opened.state("gains") == "done"
-    assert "'Pn102' is not NAME=VALUE, such as Pn100=80" in view.lines
 
 
 async def test_a_second_page_is_told_who_has_the_axis(rig, console):

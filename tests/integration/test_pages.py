@@ -87,10 +87,6 @@ NOT_RUN = {
     ("docs/how-to/tune.md", "ldcnd tune x --bandwidth 25 --yes --plot tune.png"): (
         "test_the_command_tunes_draws_and_prints_its_report_as_json"
     ),
-    ("docs/how-to/tune.md", "ldcnd tune feed"): "test_the_command_shows_tries_and_puts_back",
-    ("docs/how-to/tune.md", "ldcnd tune feed --set Pn102=45 --record 2 --yes"): (
-        "test_the_command_shows_tries_and_puts_back"
-    ),
     ("docs/how-to/tune.md", "ldcnd tune x --put-back"): "test_gains_of_a_tuning_that_was_killed_are_put_back_by_hand",
     (MONITOR, "ldcnd metrics"): "test_metrics_are_served_over_http_by_a_process_of_their_own",
     (MONITOR, "ldcnd foxglove"): "test_a_daemon_is_shown_by_a_process_of_its_own",

@@ -156,7 +156,7 @@ def rig_on(loop):
 @pytest.mark.timeout(300)
 def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr("ldcnd.cli.ldcn.tune.end_as_interrupted", lambda: None)
+    monkeypatch.setattr("ldcnd.cli.tune.end_as_interrupted", lambda: None)
     monkeypatch.setattr("sys.stdin", io.StringIO())
     picture = tmp_path / "tune.png"
 

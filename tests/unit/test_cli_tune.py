@@ -4,8 +4,7 @@ import pytest
 
 from ldcnd.bench.tuning.ldcn import guided
 from ldcnd.bench.tuning.ldcn.report import Estimate, LoopMargins, MoveFigures, TuningReport
-from ldcnd.cli.ldcn import tune
-from ldcnd.cli.tune import TuneOptions
+from ldcnd.cli import tune
 from ldcnd.contract.errors import ConfigError
 
 PREDICTED = MoveFigures(settling_s=0.016, settled=True, overshoot=0.022, following_error=0.111, error=0.0)
@@ -29,7 +28,7 @@ def test_without_numpy_one_line_names_the_extra(monkeypatch):
     monkeypatch.setattr(tune, "find_spec", lambda _: None)
 
     with pytest.raises(ConfigError, match=r"pip install 'ldcnd\[tune\]'$"):
-        tune.tune(None, None, TuneOptions(None, None, (), None, None, dry_run=False, yes=True))
+        tune._require_numpy()
 
 
 def test_predicted_stands_beside_measured():

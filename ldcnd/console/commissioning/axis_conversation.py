@@ -12,7 +12,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config
 from ldcnd.console.commissioning.conversation import Conversation
 from ldcnd.console.commissioning.messages import CurveView, FromPage, StepView, View
-from ldcnd.console.commissioning.tuning import OfferedTuning, offered
+from ldcnd.console.commissioning.tuning import ABOUT, is_offered, tune
 from ldcnd.console.rigs import Rigs
 from ldcnd.contract.errors import UnknownVerb
 
@@ -40,7 +40,7 @@ class AxisConversation(Conversation):
         self._curves: tuple[CurveView, ...] = ()
         self._unit = ""
         self._seen: object = None
-        self._tuning: OfferedTuning | None = None
+        self._is_tuned_here = False
 
     @override
     def shown(self) -> View:
@@ -54,7 +54,7 @@ class AxisConversation(Conversation):
     async def refresh(self) -> None:
         self._seen = self._outside()
         config = load_config(self._config)
-        self._tuning = offered(config, self._axis)
+        self._is_tuned_here = is_offered(config, self._axis)
         self._record = records.read(records.file_of(self._config, config.rig, self._axis), config.rig, self._axis)
         if config.rig in self._rigs.names:
             await self._opened(self._visitor)
@@ -71,8 +71,8 @@ class AxisConversation(Conversation):
         walk = Walk(checklist, self.person, str(self._config), lambda kept: self._keep(checklist, kept))
         await walk.put_back_gains()
         possible = checklist.record.of(begun.begin).result.state is not StepState.NOT_POSSIBLE
-        if begun.begin == TUNING and self._tuning and possible:
-            await self._tune(self._tuning, checklist, walk)
+        if begun.begin == TUNING and self._is_tuned_here and possible:
+            await self._tune(checklist, walk)
         else:
             await walk.one(begun.begin)
 
@@ -89,9 +89,9 @@ class AxisConversation(Conversation):
         self._record = checklist.record
         self.person.tell(kept.result.text)
 
-    async def _tune(self, offer: OfferedTuning, checklist: Checklist, walk: Walk) -> None:
+    async def _tune(self, checklist: Checklist, walk: Walk) -> None:
         """Tune the axis, keep the result as that of the step, and offer its gains for the configuration."""
-        tuning = await offer.tune(self._rigs.client(self._record.rig), self.person, self._axis)
+        tuning = await tune(self._rigs.client(self._record.rig), self.person, self._axis)
         if tuning is None:
             return
         self._curves, self._unit = tuning.curves, tuning.unit
@@ -106,12 +106,11 @@ class AxisConversation(Conversation):
 
     def _step_view(self, kept: StepRecord) -> StepView:
         step, result = STEPS[kept.step], kept.result
-        tuning = self._tuning
         impossible = result.state is StepState.NOT_POSSIBLE
         return StepView(
             name=kept.step,
             title=step.title,
-            about=tuning.about if tuning and kept.step == TUNING and not impossible else step.about,
+            about=ABOUT if self._is_tuned_here and kept.step == TUNING and not impossible else step.about,
             state=result.state.value.replace("_", " "),
             text=kept.reopened or result.text,
             at=kept.at,

@@ -28,7 +28,6 @@ from ldcnd.drives.family import (
     Trial,
     TrialMove,
     Tries,
-    TuningModules,
     bus_settings,
 )
 from ldcnd.drives.ldcn import acceptance, examination, scan
@@ -66,7 +65,7 @@ class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBu
     bus_config = LdcnBusConfig
     simulated_line = SimulatedLdcnLineConfig
     simulated_key = "module"
-    tuning = TuningModules("ldcnd.cli.ldcn.tune", "ldcnd.console.commissioning.ldcn.tuning")
+    is_tuned_by_host = True
     bauds = (9600, 19_200, 57_600, 115_200, 230_400)
     examination = (
         "Examine adapter, drives and timing of an LDCN or NMC line; exits with 1 when something must be put right."

@@ -30,7 +30,6 @@ from ldcnd.drives.family import (
     Trial,
     TrialMove,
     Tries,
-    TuningModules,
     bus_settings,
 )
 from ldcnd.drives.line_plan import Poll, Urgent
@@ -92,7 +91,6 @@ class SmartStepFamily(
     bus_config = SmartStepBusConfig
     simulated_line = SimulatedSmartStepLineConfig
     simulated_key = "unit"
-    tuning = TuningModules("ldcnd.cli.smartstep.tune", "ldcnd.console.commissioning.smartstep.tuning")
     examination = (
         "Examine the SmartSteps of one line, best with RUN off; exits with 1 when something must be put right."
     )
