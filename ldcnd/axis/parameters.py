@@ -6,7 +6,6 @@ from ldcnd.contract.parameters import (
     AlarmReport,
     ClearCounter,
     CounterReply,
-    DriveProfile,
     EepromCount,
     ListParameters,
     MonitorReading,
@@ -20,7 +19,6 @@ from ldcnd.contract.parameters import (
     ReadAllParameters,
     ReadMonitors,
     ReadParameter,
-    ReadProfile,
     RestartEepromCount,
     WriteParameter,
 )
@@ -95,15 +93,5 @@ class Parameters:
             case ReadAlarms():
                 present, history = await access.alarms()
                 return AlarmReport(command_id=command_id, axis=axis, verb=verb, present=present, history=history)
-            case ReadProfile():
-                return DriveProfile(
-                    command_id=command_id,
-                    axis=axis,
-                    verb=verb,
-                    model=self._driver.spec.model,
-                    identity=self._driver.identity,
-                    self_hearing=access.self_hearing,
-                    assumptions=access.assumptions(),
-                )
             case _:
                 raise NotSupported(f"axis {axis}: {verb} is not for parameters", axis=axis, value=verb.value)

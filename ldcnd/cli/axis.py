@@ -46,7 +46,6 @@ HOMES = {
     "faults": "ldcnd.cli.axis_state:faults",
     "watch": "ldcnd.cli.axis_state:watch",
     "jog": "ldcnd.cli.jog:jog",
-    "profile": "ldcnd.cli.axis_drive:profile",
     "monitors": "ldcnd.cli.axis_drive:monitors",
     "read-monitors": "ldcnd.cli.axis_drive:read_monitors",
     "alarms": "ldcnd.cli.axis_drive:alarms",

@@ -11,31 +11,10 @@ from ldcnd.contract.parameters import (
     ClearCounter,
     CounterName,
     CounterReply,
-    DriveProfile,
     ReadAlarms,
     ReadMonitors,
-    ReadProfile,
 )
 from ldcnd.contract.samples import MonitorName, MonitorSample
-
-
-@click.command()
-@click.argument("axis", type=AXIS)
-@with_target
-def profile(target: Target, axis: str) -> None:
-    """Show how the drive of AXIS is taken to behave, with what was verified and what is assumed."""
-
-    async def work(client: RigClient) -> DriveProfile:
-        await axis_of(client, axis)
-        return await client.command(axis, ReadProfile())
-
-    reply = target.run(work)
-    hearing = ", RECEIVES ITS OWN REPLIES: nothing is written" if reply.self_hearing else ""
-    lines = [f"{axis}: {reply.model}, {reply.identity or 'not answering'}{hearing}"]
-    for each in reply.assumptions:
-        setting = f" = {each.setting}" if each.setting else ""
-        lines.append(f"  {each.verification:14} [{each.confidence:6}] {each.key}{setting}: {each.question}")
-    target.show(reply, *lines)
 
 
 @click.command()

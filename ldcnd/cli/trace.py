@@ -207,11 +207,6 @@ def _summary(trace: Trace) -> list[str]:
     lines += [_extremes(channel, column) for channel, column in zip(header.channels, trace.values, strict=True)]
     if header.drive:
         lines.append(f"words taken as {header.drive.word_layout}, {header.drive.byte_order} byte first")
-        lines += [
-            f"assumed [{assumption.confidence}]: {assumption.question}"
-            for assumption in header.drive.assumptions
-            if assumption.verification == "assumed"
-        ]
     if header.problem:
         lines.append(f"uncertain: {header.problem}")
     return lines

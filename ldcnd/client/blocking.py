@@ -102,7 +102,6 @@ class Axis(Facade[asynchronous.Axis]):
     clear_counter = _waiting(asynchronous.Axis.clear_counter)
     restart_eeprom_count = _waiting(asynchronous.Axis.restart_eeprom_count)
     read_alarms = _waiting(asynchronous.Axis.read_alarms)
-    read_profile = _waiting(asynchronous.Axis.read_profile)
     read_monitors = _waiting(asynchronous.Axis.read_monitors)
     plan_parameters = _waiting(asynchronous.Axis.plan_parameters)
     move_analog = _moving(asynchronous.Axis.move_analog)

@@ -45,7 +45,6 @@ from ldcnd.contract.parameters import (
     ClearCounter,
     CounterName,
     CounterReply,
-    DriveProfile,
     EepromCount,
     ListParameters,
     Memory,
@@ -59,7 +58,6 @@ from ldcnd.contract.parameters import (
     ReadAllParameters,
     ReadMonitors,
     ReadParameter,
-    ReadProfile,
     RestartEepromCount,
     WriteParameter,
 )
@@ -376,10 +374,6 @@ class AxisVerbs(ABC):
     async def read_alarms(self) -> AlarmReport:
         """Read the present alarm and the alarm history."""
         return await self._send(ReadAlarms)
-
-    async def read_profile(self) -> DriveProfile:
-        """Return the drive's assumed behaviour, with its assumptions; sends nothing to the drive."""
-        return await self._send(ReadProfile)
 
     async def read_monitors(self, *, monitors: tuple[MonitorName, ...] = ()) -> MonitorReport:
         """Read monitors once, published or not.

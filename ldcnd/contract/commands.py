@@ -50,7 +50,6 @@ class Verb(StrEnum):
     CLEAR_COUNTER = "clear_counter"
     RESTART_EEPROM_COUNT = "restart_eeprom_count"
     READ_ALARMS = "read_alarms"
-    READ_PROFILE = "read_profile"
     READ_MONITORS = "read_monitors"
     PLAN_PARAMETERS = "plan_parameters"
     MOVE_ANALOG = "move_analog"

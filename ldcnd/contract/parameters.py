@@ -211,34 +211,6 @@ class AlarmReport(CommandReply):
     """Ten entries, the newest first as far as is known."""
 
 
-class AssumptionInfo(Frozen):
-    """Something about a drive that its manual leaves open."""
-
-    key: str
-    """Its name in the profile."""
-    question: str
-    """The assumption, or the open question."""
-    confidence: str
-    """Source of the assumption, by the marks of the reference page."""
-    verification: str
-    """Result of a test on the drive: assumed, verified or contradicted."""
-    setting: str | None
-    """The setting that the profile assumes; null where it has no switch for it."""
-
-
-class DriveProfile(CommandReply):
-    """How a drive is taken to behave, and what it said about itself."""
-
-    model: str
-    """The configured model."""
-    identity: str | None
-    """The identity that the drive reported; null while it has not answered."""
-    self_hearing: bool
-    """The drive takes its own replies for commands: nothing may be written on such wires."""
-    assumptions: tuple[AssumptionInfo, ...]
-    """All that is not certain."""
-
-
 class MonitorReading(Frozen):
     """One monitor of a drive, read once."""
 
@@ -360,14 +332,6 @@ class ReadAlarms(ParameterCommand[AlarmReport]):
     needs_lease = False
 
 
-class ReadProfile(ParameterCommand[DriveProfile]):
-    """Return the drive's assumed behaviour, with its assumptions; sends nothing to the drive."""
-
-    verb = Verb.READ_PROFILE
-    effect = Effect.QUESTION
-    needs_lease = False
-
-
 class ReadMonitors(ParameterCommand[MonitorReport]):
     """Read monitors once, published or not."""
 
@@ -388,7 +352,6 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     ClearCounter,
     RestartEepromCount,
     ReadAlarms,
-    ReadProfile,
     ReadMonitors,
 )
 """The commands of this file."""

@@ -12,7 +12,6 @@ from pydantic import Field
 
 from ldcnd.contract.commands import AxisCommand, Capability, Command, CommandReply, Verb
 from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
-from ldcnd.contract.parameters import AssumptionInfo
 from ldcnd.contract.samples import Sample
 
 MOST_CHANNELS = 8
@@ -134,8 +133,6 @@ class DriveTraceInfo(Frozen):
     """Source of the trigger: none, configured (the drive's, bits of 5004H), or host (polled, then started)."""
     command_pulse_gear: str
     """Gearing of command pulses that was assumed."""
-    assumptions: tuple[AssumptionInfo, ...]
-    """The assumptions of the drive's profile that bear on a trace."""
 
 
 class TraceHeader(Sample):
@@ -175,7 +172,7 @@ class TraceHeader(Sample):
     raw_columns: tuple[str, ...] = ()
     """Names of the columns of `raw` in each chunk."""
     drive: DriveTraceInfo | None = None
-    """Settings and assumptions of a drive's own recorder; null for a trace by the host."""
+    """Settings of a drive's own recorder, and how its words were read; null for a trace by the host."""
 
 
 class TraceChunk(Sample):

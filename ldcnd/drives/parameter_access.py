@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 from ldcnd.contract.parameters import (
     AlarmEntry,
-    AssumptionInfo,
     CounterName,
     DriveFacts,
     ParameterInfo,
@@ -133,16 +132,7 @@ class ParameterAccess(ABC):
     async def monitors(self, names: tuple[MonitorName, ...]) -> tuple[MonitorValue, ...]:
         """Read monitors once, all of them where none is named; those that the drive lacks are left out."""
 
-    @abstractmethod
-    def assumptions(self) -> tuple[AssumptionInfo, ...]:
-        """Return what is not certain about the drive."""
-
     @property
     @abstractmethod
     def eeprom_writes(self) -> int | None:
         """How many writes the drive's EEPROM has taken in all; None where they are not counted."""
-
-    @property
-    @abstractmethod
-    def self_hearing(self) -> bool:
-        """Whether the drive takes its own replies for commands."""

@@ -24,7 +24,7 @@ PAGES = {
     "trace/sim/x": "Record x",
     "tuning/sim/x": "Test move",
     "tuning/mixed/feed": "Record",
-    "parameters/mixed/feed": "Alarms and assumptions",
+    "parameters/mixed/feed": "Alarms and counters",
     "network": "sim · line0",
     "events": "Commands and how they ended",
     "commissioning": "3. The axes",

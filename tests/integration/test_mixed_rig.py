@@ -16,7 +16,6 @@ from ldcnd.contract.parameters import (
     ClearCounter,
     CounterName,
     CounterReply,
-    DriveProfile,
     ListParameters,
     Memory,
     ParameterDump,
@@ -25,7 +24,6 @@ from ldcnd.contract.parameters import (
     ReadAlarms,
     ReadAllParameters,
     ReadParameter,
-    ReadProfile,
     WriteParameter,
 )
 from ldcnd.contract.samples import (
@@ -221,15 +219,6 @@ async def test_an_alarm_that_a_drive_enters_in_its_history_is_an_event(tmp_path)
     (alarm,) = [event for event in events if event.verb == "alarm_history"]
     assert (alarm.code, alarm.status, alarm.client) == ("alarm_0051", "failed", None)
     assert alarm.reason == "A.51: Overspeed: new in the alarm history of the drive"
-
-
-async def test_the_profile_lists_its_assumptions(tmp_path):
-    async with mixed_rig(tmp_path, two_drives()) as rig:
-        reply = await rig.client.command("feed", ReadProfile())
-
-    assert isinstance(reply, DriveProfile)
-    assumptions = {assumption.key: assumption for assumption in reply.assumptions}
-    assert (assumptions["run_active_low"].verification, assumptions["run_active_low"].setting) == ("assumed", "True")
 
 
 async def test_a_stop_on_the_other_line_is_not_delayed(tmp_path):

@@ -87,9 +87,7 @@ def check_against_record(trace, points, layout):
     assert trace.values[0][99] < 100.0 <= trace.values[0][100]
     assert {later - earlier for earlier, later in pairwise(trace.offsets_ns)} == {4_000_000}
     assert info.word_layout == layout.value
-    assert {"trace_word_layout", "trace_byte_order", "trigger_word"} <= {
-        assumption.key for assumption in info.assumptions
-    }
+    assert header.quality == "uncertain"
 
 
 @pytest.mark.parametrize(

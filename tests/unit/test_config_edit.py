@@ -10,8 +10,8 @@ from tests.support.process import ROOT
 MIXED = (ROOT / "config" / "mixed.toml").read_text()
 BITS = {"trace1": "0x0000", "trace2": "0x0010", "io": "0x0020", "rising": "0x4000", "falling": "0x8000"}
 LAYOUT = {
-    "smartstep.trace": {"word_layout": '"lsb-io-shift"'},
-    "smartstep.verified": {"trace_word_layout": '"verified"'},
+    "smartstep": {"audit_s": "30.0"},
+    "smartstep.trace": {"word_layout": '"lsb-io-shift"', "verified": "true"},
 }
 HEAD = MIXED[: MIXED.index("[bus.axis.smartstep]")]
 TAIL = MIXED[MIXED.index('[[bus.axis]]\nname = "spool"') :]
@@ -40,7 +40,6 @@ def test_tables_that_are_missing_come_behind_the_axis(config):
 
 INLINE = """[bus.axis.smartstep]
 trace = { word_layout = "msb-io", chunk_bytes = 100 }
-verified = { wiring = "verified" }
 """
 TABLES = """[bus.axis.smartstep.trace]
 word_layout = "msb-io" # as on the bench
@@ -58,8 +57,7 @@ def test_values_that_are_there_are_replaced_and_others_kept(config, own):
     unit = smartstep_of(config, "feed")
     assert unit.trace.word_layout == "lsb-io-shift"
     assert unit.trace.chunk_bytes == (100 if "chunk_bytes" in own else 200)
-    assert unit.verified["trace_word_layout"] == "verified"
-    assert ("wiring" in unit.verified) is ("wiring" in own)
+    assert (unit.trace.verified, unit.audit_s) == (True, 30.0)
     assert ("# as on the bench" in config.read_text()) is ("# as on the bench" in own)
     assert config.read_text().endswith("\n# the other drive\n" + TAIL)
 

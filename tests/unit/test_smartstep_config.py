@@ -60,7 +60,6 @@ def test_unit_0_is_a_unit(tmp_path):
         (('framing = "8n1-soft-parity"', 'echo = "expect"'), ["echo", "four wires"]),
         (("torque_reference", "torque"), ["monitors", "torque"]),
         (("monitors", "eeprom_budget = 10001\nmonitors"), ["eeprom_budget", "10000"]),
-        (("monitors", 'settled = { wiring = "bench_verified" }\nmonitors'), ["settled", "called verified"]),
         (('port = "/dev/ttyUSB0"', 'port = "sim:z"'), ["sim:z"]),
     ],
 )

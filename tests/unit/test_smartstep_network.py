@@ -143,7 +143,7 @@ async def test_a_line_on_which_a_drive_hears_itself_stays_down_and_nothing_more_
         with pytest.raises(WrongState, match="its own replies"):
             await line.axis("u1").parameters.read("Pn109")
 
-        assert line.axis("u1").parameters.self_hearing
+        assert line.axis("u1").words.self_hearing
     assert not any(data.startswith((b"W1020", b"W11")) for data in sent(line))
 
 

@@ -6,6 +6,7 @@ from ldcnd.drives.smartstep.parameters import (
     PN000,
     PN10A,
     PN100,
+    Confidence,
     Fact,
     Limits,
     Parameter,
@@ -15,7 +16,6 @@ from ldcnd.drives.smartstep.parameters import (
     unit_number,
     with_digit,
 )
-from ldcnd.drives.smartstep.profiles import Confidence
 
 MANUAL = """
 0000 0001 0100 0101 0102 0103 0109 010A 0110 0200 0202 0203 0204 0207 0208 0304 0401 0402 0403 0500 0505 0600

@@ -9,7 +9,6 @@ from ldcnd.drives.smartstep.addresses import OperatingMode, Register
 from ldcnd.drives.smartstep.monitors import ALARMS, MONITORS
 from ldcnd.drives.smartstep.packet import ResponseStatus
 from ldcnd.drives.smartstep.parameters import PARAMETERS, Fact, Parameter
-from ldcnd.drives.smartstep.profiles import ASSUMPTIONS
 from ldcnd.drives.smartstep.trace_data import DataObject, IoObject
 
 ROOT = Path(__file__).parents[2]
@@ -51,7 +50,6 @@ TABLES = {
     "response status": [(f"{each.value:X}", each.function.name.lower().replace("_", " ")) for each in ResponseStatus],
     "operating modes": [(f"{code.value:04X}H", code.name) for code in OperatingMode],
     "trace codes": [(f"{code.value:02X}H", code.name) for code in [*DataObject, *IoObject]],
-    "assumptions": [(each.key, each.question, each.confidence.value) for each in ASSUMPTIONS],
 }
 
 

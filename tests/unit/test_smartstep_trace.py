@@ -1,6 +1,7 @@
 """Tests of the recorder of a SmartStep: what the tracer does on a line that fails, and the upload of its memories."""
 
 import asyncio
+from dataclasses import replace
 
 import pytest
 
@@ -24,8 +25,6 @@ from ldcnd.drives.smartstep.profiles import (
     CountUnit,
     SmartStepProfile,
     StringChecksum,
-    TraceWordLayout,
-    Verification,
 )
 from ldcnd.drives.smartstep.trace_upload import TraceUpload
 from ldcnd.line.flight_recorder import WireEvent
@@ -269,47 +268,15 @@ async def test_a_triggered_trace_whose_execute_got_lost_waits_in_a_drive_that_ha
         assert recorded.trigger_index == 0
 
 
-@pytest.mark.parametrize("layout", [TraceWordLayout.LSB_IO_SHIFT, TraceWordLayout.LSB_IO_MASK])
-async def test_words_that_contradict_the_monitors_make_a_trace_uncertain(layout):
-    async with smartstep_line([running(SimulatedVariant(trace_word_layout=layout))]) as line:
-        recorded = await taken(line, channels=("speed_feedback", "bkir"), interval_s=0.004)
-
-        assert "monitor 800" in recorded.problems[0]
-
-
-async def test_words_that_agree_with_the_monitors_verify_the_layout():
+async def test_values_are_uncertain_until_the_layout_was_verified_on_the_drive():
     async with smartstep_line([running()]) as line:
-        recorded = await taken(line, channels=("speed_feedback", "bkir"), interval_s=0.004)
+        assumed = await taken(line, channels=("speed_feedback",))
+    async with smartstep_line([running()], profile=replace(SMARTSTEP, trace_verified=True)) as line:
+        verified = await taken(line, channels=("speed_feedback",))
 
-        assumptions = {each.key: each.verification for each in recorded.drive.assumptions}
-        assert recorded.problems == ()
-        assert assumptions["trace_word_layout"] == "verified"
-        assert recorded.values[0][250] == pytest.approx(90.0, abs=0.4)
-
-
-async def test_a_layout_that_no_reading_tells_apart_is_marked():
-    async with smartstep_line([running()]) as line:
-        short = await taken(line, channels=("speed_feedback",))  # over before a monitor can be read beside it
-
-    verified = SMARTSTEP.verified("trace_word_layout", Verification.VERIFIED)
-    verified = verified.verified("trace_byte_order", Verification.VERIFIED)
-    async with smartstep_line([running()], profile=verified) as line:
-        configured = await taken(line, channels=("speed_feedback",))
-
-    assert "not verified" in short.problems[0]
-    assert configured.problems == ()
-
-
-async def test_what_a_long_trace_has_verified_holds_for_short_ones_until_the_drive_may_be_another():
-    async with smartstep_line([running()]) as line:
-        tracer = line.axis("u1").tracer
-        await taken(line, channels=("speed_feedback", "bkir"), interval_s=0.004)
-        short = await taken(line, channels=("speed_feedback",))
-        tracer.forget()
-        forgotten = await taken(line, channels=("speed_feedback",))
-
-    assert short.problems == ()
-    assert forgotten.problems
+    assert "ldcnd doctor verify" in assumed.problems[0]
+    assert verified.problems == ()
+    assert verified.values[0][250] == pytest.approx(90.0, abs=0.4)
 
 
 async def test_a_trace_that_was_ended_from_elsewhere_is_no_trace():

@@ -7,6 +7,7 @@ import pytest
 
 from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import load_config
+from ldcnd.contract.errors import DriveFault
 from ldcnd.drives.smartstep.parameters import PN202, PN203
 from ldcnd.drives.smartstep.profiles import (
     SMARTSTEP,
@@ -16,8 +17,8 @@ from ldcnd.drives.smartstep.profiles import (
     StringChecksum,
     TraceWordLayout,
 )
-from ldcnd.drives.smartstep.tools import verified_tables
-from ldcnd.drives.smartstep.verification import Stimulus, verify_traces
+from ldcnd.drives.smartstep.tools import verified_keys
+from ldcnd.drives.smartstep.verification import verify_traces
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.process import ROOT
 from tests.support.smartstep_line import simulated, smartstep_line
@@ -41,26 +42,13 @@ VARIANTS = [
         strict=True,
     )
 ]
-TURNED_S, EACH_S = 20.0, 0.005
 
 
-def person(unit):
-    """Do with the drive what is asked of a person."""
+def person(unit, rate=100_000.0):
+    """Send the command pulses that are asked for."""
 
-    async def act(stimulus: Stimulus) -> None:
-        drive, now_s = unit.drive, asyncio.get_running_loop().time()
-        if stimulus is Stimulus.PULSES:
-            drive.set_pulse_rate(3000.0, now_s)
-        if stimulus is not Stimulus.TURN:
-            return
-
-        def turned(at_s: float) -> None:
-            drive.advance(at_s)
-            drive.motor.speed = 40_000.0
-
-        unit._events.clear()
-        for step in range(round(TURNED_S / EACH_S)):
-            unit.schedule(now_s + step * EACH_S, turned)
+    async def act(_request: str) -> None:
+        unit.drive.set_pulse_rate(rate, asyncio.get_running_loop().time())
 
     return act
 
@@ -84,22 +72,36 @@ async def test_a_drive_shows_how_its_traces_are_laid_out_and_geared(variant, tmp
     assert sum(unit.drive.memory.writes.values()) == 0
     config = tmp_path / "mixed.toml"
     config.write_text((ROOT / "config" / "mixed.toml").read_text())
-    set_for_axis(config, "feed", verified_tables(list(found.values())))
+    set_for_axis(config, "feed", {"smartstep.trace": verified_keys(list(found.values()))})
     (feed,) = [each.smartstep for bus in load_config(config).bus for each in bus.axis if each.name == "feed"]
     assert feed.trace.word_layout is variant.trace_word_layout
     assert feed.trace.command_pulse_gear is variant.command_pulse_gear
-    assert set(feed.verified) == set(found)
+    assert feed.trace.verified
 
 
-async def test_what_a_person_does_not_stimulate_stays_open_and_is_not_written():
-    async def nothing(_stimulus: Stimulus) -> None:
-        return
-
+@pytest.mark.parametrize("rate", [0.0, 100.0])
+async def test_what_the_pulses_do_not_tell_apart_stays_open_and_is_not_written(rate):
     unit = simulated(1)
     async with smartstep_line([unit]) as line:
         words = line.axis("u1").words
-        found = {each.key: each async for each in verify_traces(line.bus, words, SMARTSTEP, nothing)}
+        found = {each.key: each async for each in verify_traces(line.bus, words, SMARTSTEP, person(unit, rate))}
 
     assert found["command_pulse_gear"].setting is None
-    assert "1/1" in found["command_pulse_gear"].text
-    assert "command_pulse_gear" not in verified_tables(list(found.values()))["smartstep.verified"]
+    assert "faster pulses" in found["command_pulse_gear"].text
+    assert not {"command_pulse_gear", "verified"} & verified_keys(list(found.values())).keys()
+
+
+async def test_pulses_that_change_during_the_trace_verify_nothing():
+    unit = simulated(1)
+    async with smartstep_line([unit]) as line:
+
+        async def act(_request: str) -> None:
+            loop = asyncio.get_running_loop()
+            unit.drive.set_pulse_rate(100_000.0, loop.time())
+            loop.call_later(2.0, lambda: unit.drive.set_pulse_rate(0.0, loop.time()))
+
+        with pytest.raises(DriveFault, match="before the trace"):
+            async for _ in verify_traces(line.bus, line.axis("u1").words, SMARTSTEP, act):
+                pass
+
+    assert unit.drive.mode == 0

@@ -26,7 +26,6 @@ from ldcnd.drives.smartstep.profiles import (
     StringChecksum,
     TraceWordLayout,
     TriggerMap,
-    Verification,
     Wiring,
 )
 from ldcnd.drives.toml import refuse_duplicates
@@ -69,7 +68,9 @@ class SmartStepTraceConfig(Frozen):
     command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
     """Gearing of command pulses to motor speed."""
     trigger_map: TriggerMapConfig | None = None
-    """The bits of the trigger condition; without them traces have no trigger."""
+    """The bits of the trigger condition; without them the host watches for the trigger."""
+    verified: bool = False
+    """Whether the layout was compared with the drive, see `ldcnd doctor verify`; values are uncertain until then."""
 
     @field_validator("chunk_bytes")
     @classmethod
@@ -91,6 +92,7 @@ class SmartStepTraceConfig(Frozen):
             trace_verify=self.verify,
             command_pulse_gear=self.command_pulse_gear,
             trigger_map=TriggerMap(**bits.model_dump()) if bits else None,
+            trace_verified=self.verified,
         )
 
 
@@ -159,14 +161,10 @@ class SmartStepUnitConfig(Frozen):
     """/ALM is 1 in alarm."""
     trace: SmartStepTraceConfig = SmartStepTraceConfig()
     """How its recorder is taken to work."""
-    verified: Mapping[Annotated[str, Field(title="assumption")], Verification] = {}
-    """Results of tests on the drive for the assumptions of its profile, by their keys."""
 
     @model_validator(mode="before")
     @classmethod
     def _renamed(cls, document: object) -> object:
-        if isinstance(document, dict) and "settled" in document:
-            raise ValueError('settled: the key is called verified now, and its value "bench_verified" is "verified"')
         if isinstance(document, dict) and document.get("eeprom_write") == "confirm":
             raise ValueError('eeprom_write: "confirm" never differed from "allow"; use "allow" or "deny"')
         return document
@@ -376,10 +374,7 @@ class SmartStepBusConfig(BusConfig):
             reset_active_low=unit.reset_active_low,
             alarm_output_high=unit.alarm_output_high,
         )
-        profile = unit.trace.assumed_of(profile)
-        for key, verification in unit.verified.items():
-            profile = profile.verified(key, verification)
-        return profile
+        return unit.trace.assumed_of(profile)
 
 
 def simulated_units(settings: Sequence[SimulatedUnitConfig], now_s: float) -> list[SimulatedUnit]:

@@ -162,7 +162,7 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
             self._audit.wrote,
             self._audit.may_have_written,
         )
-        self.tracer = self._tracer = SmartStepTracer(bus, self.words, spec.profile)
+        self.tracer = SmartStepTracer(bus, self.words, spec.profile)
         self._rates_hz = spec.rates_hz
         self._bus = bus
         self.wires_checked = True
@@ -176,7 +176,6 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
 
     def identified(self, type_word: int, version: int) -> None:
         """Take driver type (8800H) and software version (8518H); both types of the manual have one word."""
-        self._tracer.forget()
         known = driver_type(type_word)
         title = "R7D-APL or R7D-APH" if known is DriverType.R7D_AP else f"unlisted type {type_word:04X}H"
         self.identity = f"SmartStep {title} (version {version:04X}H)"

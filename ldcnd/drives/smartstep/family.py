@@ -53,8 +53,8 @@ from ldcnd.drives.smartstep.packet import HIGHEST_UNIT, CommandCutter, SmartStep
 from ldcnd.drives.smartstep.parameter_store import EepromRules
 from ldcnd.drives.smartstep.parameters import PARAMETERS, digit_texts
 from ldcnd.drives.smartstep.poller import Basic, Item
-from ldcnd.drives.smartstep.profiles import ASSUMPTIONS, Echo, Framing, SmartStepProfile
 from ldcnd.drives.smartstep.profiles import SMARTSTEP as PROFILE
+from ldcnd.drives.smartstep.profiles import Echo, Framing, SmartStepProfile
 from ldcnd.drives.smartstep.transfer import check_values, listed
 from ldcnd.drives.toml import read_toml
 from ldcnd.drives.transcript import Describe
@@ -167,10 +167,6 @@ model = "{drive.model}"
 unit = "count"  # your unit, and counts_per_unit = counts of one of it
 rates = {{ position = 0.5, velocity = 1, state = 1 }}
 """
-
-    @override
-    def assumptions(self) -> Sequence[Mapping[str, str]]:
-        return [{"key": each.key, "says": each.question} for each in ASSUMPTIONS]
 
     @override
     def trial(

@@ -29,7 +29,6 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.parameters import (
     AlarmEntry,
-    AssumptionInfo,
     CounterName,
     DigitInfo,
     DriveFacts,
@@ -65,7 +64,7 @@ from ldcnd.drives.smartstep.parameters import (
     find_parameter,
     unit_number,
 )
-from ldcnd.drives.smartstep.profiles import EepromWrite, SmartStepProfile, assumption_info
+from ldcnd.drives.smartstep.profiles import EepromWrite, SmartStepProfile
 from ldcnd.drives.smartstep.transfer import plan_writes
 from ldcnd.drives.smartstep.words import Words
 from ldcnd.log import get_logger
@@ -145,11 +144,6 @@ class UnitParameters(ParameterAccess):
             value=text,
             remedy=Remedy("{}, or allow unlisted ones", step("list_parameters")),
         )
-
-    @property
-    @override
-    def self_hearing(self) -> bool:
-        return self._words.self_hearing
 
     @override
     def known(self) -> tuple[ParameterInfo, ...]:
@@ -363,10 +357,6 @@ class UnitParameters(ParameterAccess):
             value = await read_counter(self._words, MONITOR_COUNTERS[name])
             return counter_value(name, value.signed, resolved=value.quality is CounterQuality.RESOLVED)
         return word_value(name, await self._words.read(WORDS[name].address), self._profile)
-
-    @override
-    def assumptions(self) -> tuple[AssumptionInfo, ...]:
-        return tuple(assumption_info(self._profile, each) for each in self._profile.assumptions)
 
     # -- results -----------------------------------------------------------------------------------------------------
 

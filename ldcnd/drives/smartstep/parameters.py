@@ -7,11 +7,11 @@ Source: manual 3, "Correspondence of addresses and user parameters for drivers";
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from enum import Enum
 from typing import Generic, TypeVar
 
 from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.drives.smartstep.addresses import EEPROM_AREA, RAM_OFFSET
-from ldcnd.drives.smartstep.profiles import Confidence
 
 ValueT = TypeVar("ValueT")
 LONGEST_NUMBER = 3
@@ -19,6 +19,17 @@ LONGEST_NUMBER = 3
 DIGITS = 4
 UNIT_DIGIT = 2
 """The unit number is Pn000.2: digits count from the right (INFERRED_HIGH)."""
+
+
+class Confidence(Enum):
+    """Where a fact about a parameter comes from."""
+
+    STATED = "S"
+    """The manual says so."""
+    RELATED = "X"
+    """A public manual of a related drive says so."""
+    RECOLLECTED = "M"
+    """No source was found; a hint for people, never a reason to refuse."""
 
 
 @dataclass(frozen=True, slots=True)

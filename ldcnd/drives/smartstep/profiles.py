@@ -1,40 +1,13 @@
-"""Open questions of the SmartStep manual: assumptions as switches, with the confidence of each default.
+"""How one drive is taken to behave where its manual leaves room.
 
-The manual lost its figures and has misprints. A profile says how one drive is taken to behave; each switch that rests
-on inference is an assumption with a name, a default, and a way to verify it on the drive.
+The manual lost its figures and has misprints. Each field of a profile stands for a place where it is silent or
+contradicts itself; the comment at the field says where the default comes from. `ldcnd doctor verify` compares what
+bears on traces with the drive; the values of its traces are uncertain until then.
 Source: manual, all chapters; where it is silent, public manuals of related drives.
 """
 
-from dataclasses import dataclass, replace
-from enum import Enum, StrEnum
-
-from ldcnd.contract.errors import ConfigError
-from ldcnd.contract.parameters import AssumptionInfo
-
-
-class Confidence(Enum):
-    """Where a fact comes from, strongest first."""
-
-    STATED = "S"
-    """The manual says so."""
-    CORRECTED = "S*"
-    """The manual says so through an evident misprint."""
-    RELATED = "X"
-    """A public manual of a related drive says so."""
-    INFERRED_HIGH = "I-high"
-    INFERRED_MEDIUM = "I-med"
-    INFERRED_LOW = "I-low"
-    RECOLLECTED = "M"
-    """No source was found; a hint for people, never a reason to refuse."""
-    OPEN = "?"
-
-
-class Verification(StrEnum):
-    """The result of a test of an assumption on the drive."""
-
-    ASSUMED = "assumed"
-    VERIFIED = "verified"
-    CONTRADICTED = "contradicted"
+from dataclasses import dataclass
+from enum import StrEnum
 
 
 class Framing(StrEnum):
@@ -132,50 +105,6 @@ class TriggerMap:
     falling: int
 
 
-@dataclass(frozen=True, slots=True)
-class Assumption:
-    """One uncertain item.
-
-    Attributes:
-        key: the profile field that switches it, or a name of its own where no switch is possible.
-        confidence: of the default.
-    """
-
-    key: str
-    question: str
-    confidence: Confidence
-    verification: Verification = Verification.ASSUMED
-
-
-ASSUMPTIONS: tuple[Assumption, ...] = (
-    Assumption("framing", "does the adapter make 7E1 characters, or ldcnd", Confidence.STATED),
-    Assumption("wiring", "four wires; does a drive on two hear itself", Confidence.STATED),
-    Assumption("echo", "does the host hear its own characters", Confidence.INFERRED_HIGH),
-    Assumption(
-        "first_character_s", "0.2 s run from the command's CR to the first reply character", Confidence.INFERRED_MEDIUM
-    ),
-    Assumption("string_checksum", "the header alone is covered", Confidence.INFERRED_MEDIUM),
-    Assumption("string_count_unit", "the count counts bytes of memory", Confidence.INFERRED_HIGH),
-    Assumption("trace_chunk_bytes", "the longest string is not given", Confidence.OPEN),
-    Assumption("trace_word_layout", "bit 15 is the I/O bit, the value has 15 bits", Confidence.INFERRED_MEDIUM),
-    Assumption("trace_byte_order", "the high byte comes first", Confidence.INFERRED_HIGH),
-    Assumption("trigger_word", "0000H means no trigger; other bits unknown", Confidence.INFERRED_HIGH),
-    Assumption("command_pulse_gear", "numerator over denominator", Confidence.INFERRED_MEDIUM),
-    Assumption("encoder_counts_per_rev", "8000, the divisor of the printed speed formula", Confidence.INFERRED_HIGH),
-    Assumption("trace_full_scale", "8701H and 8702H take settings", Confidence.INFERRED_LOW),
-    Assumption("alarm_91_92", "91 and 92 are warnings unless /ALM is active", Confidence.INFERRED_MEDIUM),
-    Assumption("run_active_low", "RUN is on while its bit is 0", Confidence.INFERRED_MEDIUM),
-    Assumption("reset_active_low", "RESET is on while its bit is 0", Confidence.INFERRED_MEDIUM),
-    Assumption("alarm_output_high", "/ALM is 1 in alarm", Confidence.INFERRED_MEDIUM),
-    Assumption("eeprom_changes_ram", "does an EEPROM write change the RAM value at once", Confidence.OPEN),
-    Assumption("unit_digit", "Pn000.2 is bits 11 to 8", Confidence.INFERRED_HIGH),
-    Assumption("switches_rule", "switch 6 off: switches overrule parameters", Confidence.RECOLLECTED),
-    Assumption("atomic_counter", "a string reference reads both counter halves at one instant", Confidence.OPEN),
-    Assumption("untriggered_start", "an untriggered trace starts at point 0", Confidence.INFERRED_HIGH),
-    Assumption("alarm_history_order", "history entry 0 is the newest", Confidence.INFERRED_MEDIUM),
-)
-
-
 RESPONSE_S = 0.3
 """A drive answers within 0.2 s (manual 2.1), taken as command CR to first reply character, plus 0.1 s of margin."""
 
@@ -191,70 +120,35 @@ class SmartStepProfile:
         attempts: how often a repeatable command is sent in all; like `gap_s` and `quiet_s` it is for the line's owner.
         trace_chunk_bytes: 2 to 1000, even.
         trace_verify: read each chunk twice; the string checksum may not cover the data.
+        trace_verified: the layout, byte order and gear of traces were compared with this drive.
     """
 
-    framing: Framing = Framing.SEVEN_EVEN
-    wiring: Wiring = Wiring.FOUR_WIRE
-    echo: Echo = Echo.NONE
+    framing: Framing = Framing.SEVEN_EVEN  # manual 2.1; soft parity for adapters that cannot make it
+    wiring: Wiring = Wiring.FOUR_WIRE  # manual 1.1 has no other; on two wires a drive may take its replies for commands
+    echo: Echo = Echo.NONE  # not in the manual: on four wires the host's receiver is on the other pair
     first_character_s: float = RESPONSE_S
     gap_s: float = 0.06
     quiet_s: float = 0.005
     attempts: int = 3
     eeprom_write: EepromWrite = EepromWrite.ALLOW
-    string_checksum: StringChecksum = StringChecksum.AUTO
-    string_count_unit: CountUnit = CountUnit.BYTES
-    trace_chunk_bytes: int = 200
+    string_checksum: StringChecksum = StringChecksum.AUTO  # manual 2.2: its place is given, not what it covers
+    string_count_unit: CountUnit = CountUnit.BYTES  # manual 2.2 says "data count"; 1000 addresses hold 500 points
+    trace_chunk_bytes: int = 200  # manual 2.2 gives no longest string
     trace_verify: bool = True
-    trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
-    trace_byte_order: ByteOrder = ByteOrder.BIG
-    trigger_map: TriggerMap | None = None
-    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
-    encoder_counts_per_rev: int = 8000
-    run_active_low: bool = True
+    trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO  # the figure of manual 4 (9) is lost
+    trace_byte_order: ByteOrder = ByteOrder.BIG  # manual 4 (9) is silent; words of commands have the high byte first
+    trigger_map: TriggerMap | None = None  # the figure of manual 4 (7) is lost
+    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN  # manual 4, "Unit conversion", has it both ways
+    encoder_counts_per_rev: int = 8000  # the divisor of the speed formula, manual 4, "Unit conversion"
+    trace_verified: bool = False
+    run_active_low: bool = True  # manual 3, 8005H, gives bits, not their levels; this one and the next two are inferred
     reset_active_low: bool = True
     alarm_output_high: bool = True
-    assumptions: tuple[Assumption, ...] = ASSUMPTIONS
 
     @property
     def trigger_word(self) -> TriggerWordSource:
         """Where the drive's own trigger comes from."""
         return TriggerWordSource.CONFIGURED if self.trigger_map else TriggerWordSource.NONE
 
-    def verified(self, key: str, verification: Verification) -> "SmartStepProfile":
-        """Return this profile with the result of a test on the drive.
-
-        Raises:
-            ConfigError: no assumption has this key.
-        """
-        if all(assumption.key != key for assumption in self.assumptions):
-            known = ", ".join(assumption.key for assumption in self.assumptions)
-            raise ConfigError(f"there is no assumption {key!r}; there are {known}", value=key)
-        assumptions = tuple(
-            replace(each, verification=verification) if each.key == key else each for each in self.assumptions
-        )
-        return replace(self, assumptions=assumptions)
-
-    def is_verified(self, key: str) -> bool:
-        """Tell whether a test on the drive has confirmed what this profile says about an assumption."""
-        return any(each.key == key and each.verification is Verification.VERIFIED for each in self.assumptions)
-
 
 SMARTSTEP = SmartStepProfile()
-
-
-def assumption_info(profile: SmartStepProfile, assumption: Assumption) -> AssumptionInfo:
-    """Describe one assumption and what the profile assumes."""
-    return AssumptionInfo(
-        key=assumption.key,
-        question=assumption.question,
-        confidence=assumption.confidence.value,
-        verification=assumption.verification.value,
-        setting=_setting(profile, assumption.key),
-    )
-
-
-def _setting(profile: SmartStepProfile, key: str) -> str | None:
-    value = getattr(profile, key, None)
-    if value is None:
-        return None
-    return str(value.value if isinstance(value, Enum) else value)

@@ -1,4 +1,4 @@
-"""The drive's own recorder as a `Tracer`: set up, armed, waited for, compared with monitors, uploaded.
+"""The drive's own recorder as a `Tracer`: set up, armed, waited for, uploaded.
 
 Settings are made before Data Trace Mode is entered and read back; afterwards the drive takes none (e=9). They are read
 once more at the end: a drive that was switched off meanwhile is in its normal mode too, with nothing in its memory. A
@@ -13,7 +13,6 @@ be read.
 import asyncio
 import contextlib
 import math
-from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -30,7 +29,7 @@ from ldcnd.contract.errors import (
     TraceTimedOut,
     ValueOutOfRange,
 )
-from ldcnd.contract.traces import DriveTraceInfo, TakeTrace, TracePhase, TraceSource, TraceTrigger
+from ldcnd.contract.traces import TakeTrace, TracePhase, TraceSource, TraceTrigger
 from ldcnd.drives.smartstep.addresses import OperatingMode, Register, TraceRegister
 from ldcnd.drives.smartstep.commands import read_operating_mode, reference, write_trace_register
 from ldcnd.drives.smartstep.modes import (
@@ -44,19 +43,7 @@ from ldcnd.drives.smartstep.modes import (
 )
 from ldcnd.drives.smartstep.monitors import signed_word
 from ldcnd.drives.smartstep.parameters import PN202, PN203
-from ldcnd.drives.smartstep.profiles import SmartStepProfile, TriggerWordSource, Verification
-from ldcnd.drives.smartstep.trace_check import (
-    CLOCK_ERROR,
-    TRIGGER_LATE_S,
-    Comparison,
-    Judgement,
-    Reading,
-    Samples,
-    Shown,
-    comparisons,
-    judge,
-    trigger_problem,
-)
+from ldcnd.drives.smartstep.profiles import SmartStepProfile, TriggerWordSource
 from ldcnd.drives.smartstep.trace_data import (
     LONGEST_INTERVAL,
     POINTS,
@@ -73,14 +60,18 @@ from ldcnd.drives.smartstep.trace_result import (
     CHANNELS,
     DATA,
     SIGNALS,
+    TRIGGER_LATE_S,
     Assignment,
+    ChannelMonitor,
     TraceMemory,
     assign,
     granted_channels,
+    monitor_of,
     raw_columns,
     recorded,
     trigger_condition,
     trigger_operand,
+    trigger_problem,
 )
 from ldcnd.drives.smartstep.trace_upload import TraceUpload
 from ldcnd.drives.smartstep.words import Words
@@ -107,12 +98,9 @@ LAST_READING_S = 5.0
 """Longest wait for the reading of the operating mode that decides whether a trace has finished, seconds."""
 SLACK = 1.2
 """A drive's clock may be off, and its recorder may begin late."""
+CLOCK_ERROR = 0.02
+"""How far the clock of a drive may be off, as a fraction; the manual gives no accuracy."""
 LARGEST_CYCLEC_US = 0xFFFF
-COMPARED_EACH = 6
-"""Number of comparisons of a trace with the monitors; a longer trace is compared at `LONGEST_UNCOMPARED_S`."""
-LONGEST_UNCOMPARED_S = 1.0
-MOST_SHOWN = 120
-"""Newest readings of monitors that are kept while a trace waits for its trigger."""
 FULL_SCALE_REGISTERS: Mapping[str, TraceRegister] = MappingProxyType(
     {"torque_reference": TraceRegister.MAXTRQC, "speed_feedback": TraceRegister.OSVELCC}
 )
@@ -148,11 +136,7 @@ class _Setup:
 
 
 class SmartStepTracer(Tracer):
-    """See `Tracer`.
-
-    Attributes:
-        possible: the readings of the drive's words that its traces have left; None for any.
-    """
+    """See `Tracer`."""
 
     source = TraceSource.DRIVE
     channels = CHANNELS
@@ -162,16 +146,6 @@ class SmartStepTracer(Tracer):
         self._bus = bus
         self._words = words
         self._profile = profile
-        self.possible: frozenset[Reading] | None = None
-
-    def forget(self) -> None:
-        """The drive may be another one: what traces have verified about it counts no more."""
-        self.possible = None
-
-    def _judge(self, setup: _Setup, samples: Samples, shown: tuple[Shown, ...]) -> Judgement:
-        judgement = judge(self._profile, setup.constants, setup.assignment, samples, shown, self.possible)
-        self.possible = judgement.possible
-        return judgement
 
     async def arm(self, request: TakeTrace) -> ArmedTrace:
         """See `Tracer`. Checks everything that needs no reply before the first exchange with the drive."""
@@ -212,7 +186,7 @@ class SmartStepTracer(Tracer):
                 originals,
                 problems,
             )
-            armed = ArmedSmartStep(self._bus, words, profile, setup, self._judge)
+            armed = ArmedSmartStep(self._bus, words, profile, setup)
             if not by_host:
                 await armed.start()
         except BaseException:
@@ -247,7 +221,7 @@ class SmartStepTracer(Tracer):
                 value=request.pre_trigger,
                 limit=0,
                 nearest=0,
-                remedy="leave pre_trigger out, or find them: `ldcnd doctor trigger-bits --help`",
+                remedy="leave pre_trigger out, or configure smartstep.trace.trigger_map",
             )
         least_s, most_s = period_s(SHORTEST_INTERVAL, 1), period_s(LONGEST_INTERVAL, LARGEST_CYCLEC_US)
         if interval_s != "fastest" and not least_s / 2 <= interval_s <= most_s:
@@ -280,7 +254,7 @@ class SmartStepTracer(Tracer):
                     f"axis {words.axis}: the drive does not let {register.name} ({register:04X}H) be set",
                     axis=words.axis,
                     value=value,
-                    remedy='leave full_scale out, and configure verified = { trace_full_scale = "contradicted" }',
+                    remedy="leave full_scale out",
                 ) from refusal
 
     async def _constants(self, request: TakeTrace) -> tuple[TraceConstants, tuple[str, ...]]:
@@ -308,7 +282,6 @@ class ArmedSmartStep(ArmedTrace):
         words: Words,
         profile: SmartStepProfile,
         setup: _Setup,
-        judged: Callable[[_Setup, Samples, tuple[Shown, ...]], Judgement],
     ) -> None:
         """Prepare the trace.
 
@@ -317,7 +290,6 @@ class ArmedSmartStep(ArmedTrace):
             words: the drive.
             profile: how it is taken to behave.
             setup: its settings.
-            judged: compares its words with the monitors, knowing what earlier traces of the drive have shown.
         """
         request = setup.request
         self.granted = Granted(
@@ -332,9 +304,6 @@ class ArmedSmartStep(ArmedTrace):
         self._words = words
         self._profile = profile
         self._setup = setup
-        self._judged = judged
-        self._comparable = list(comparisons(setup.assignment))
-        self._shown: deque[Shown] = deque(maxlen=MOST_SHOWN)
         self._loop = asyncio.get_running_loop()
         self._execution = Execution(self._loop.time(), self._loop.time())
         self._running_at_s = self._loop.time()
@@ -387,15 +356,15 @@ class ArmedSmartStep(ArmedTrace):
         if trigger is None:  # the source says otherwise
             return 0.0
         watch = TriggerWatch(trigger, signal=trigger.channel in SIGNALS)
-        comparison = next(each for each in comparisons(self._setup.assignment) if each.channel == trigger.channel)
+        shown = monitor_of(trigger.channel)
         before_s = self._loop.time()
         try:
             async with asyncio.timeout(request.timeout_s):
                 while True:
                     asked_s = self._loop.time()
-                    word = await self._read(comparison)
+                    word = await self._read(shown)
                     if word is not None:
-                        if watch.fires(comparison.value_of(word), ready=True):
+                        if watch.fires(shown.value_of(word), ready=True):
                             break
                         before_s = asked_s
         except TimeoutError:
@@ -409,39 +378,21 @@ class ArmedSmartStep(ArmedTrace):
 
     # -- recording ---------------------------------------------------------------------------------------------------
 
-    async def _read(self, comparison: Comparison) -> int | None:
+    async def _read(self, shown: ChannelMonitor) -> int | None:
         """Read a monitor; None when the line lost it or the drive has none."""
         try:
-            return await self._words.ask(reference(self._words.unit, comparison.monitor.address), Lane.BACKGROUND)
+            return await self._words.ask(reference(self._words.unit, shown.monitor.address), Lane.BACKGROUND)
         except ReplyTimeout:
             return None
 
-    async def _compare(self) -> None:
-        """Read the monitors of the channels once."""
-        for address in dict.fromkeys(each.monitor.address for each in self._comparable):
-            same = [each for each in self._comparable if each.monitor.address == address]
-            from_s = self._loop.time()
-            try:
-                word = await self._read(same[0])
-            except AddressRefused:
-                self._comparable = [each for each in self._comparable if each not in same]
-                continue
-            if word is not None:
-                until_s = self._loop.time()
-                self._shown += [Shown(each, each.value_of(word), from_s, until_s) for each in same]
-
     async def _wait_until_done(self) -> float:
         """Return when the drive was seen in its normal mode; `_running_at_s` is when it was last seen tracing."""
-        words, spacing_s = self._words, min(POINTS * self._setup.interval_s / COMPARED_EACH, LONGEST_UNCOMPARED_S)
-        compared_at_s = -math.inf
+        words = self._words
         deadline_s = self._loop.time() + self._limit_s
         try:
             # A busy line answers late; only a drive that still traces after its time has not finished.
             async with asyncio.timeout(self._limit_s + LAST_READING_S):
                 while True:
-                    if self._loop.time() >= compared_at_s + spacing_s and not self._is_over():
-                        compared_at_s = self._loop.time()
-                        await self._compare()
                     asked_at_s = self._loop.time()
                     overdue = asked_at_s >= deadline_s
                     lane = Lane.COMMAND if overdue else Lane.BACKGROUND
@@ -461,11 +412,6 @@ class ArmedSmartStep(ArmedTrace):
             raise TraceTimedOut(
                 f"axis {words.axis}: {waited} within {math.ceil(self._limit_s)} s", axis=words.axis
             ) from None
-
-    def _is_over(self) -> bool:
-        """Tell whether the points have been taken, where that can be foreseen: then a monitor shows what came after."""
-        ends_at_s = self._execution.sent_s + POINTS * self._setup.interval_s
-        return self._setup.trigger is None and self._loop.time() >= ends_at_s
 
     def _pause_s(self) -> float:
         """Return the time to the next reading of the mode: short around the end, where it can be foreseen."""
@@ -523,8 +469,6 @@ class ArmedSmartStep(ArmedTrace):
     ) -> Recorded:
         setup, profile = self._setup, self._profile
         result = recorded(profile, setup.constants, setup.assignment, setup.settings, memory, first_s)
-        samples = Samples(memory.in_order(), setup.interval_s, *first_s)
-        judgement = self._judged(setup, samples, tuple(self._shown))
         trigger = setup.trigger
         if trigger and result.trigger_index is not None:
             column = result.values[setup.request.channels.index(trigger.channel)]
@@ -532,10 +476,9 @@ class ArmedSmartStep(ArmedTrace):
             problems += (missing,) if missing else ()
         return replace(
             result,
-            drive=_with_verdict(result.drive, judgement),
             zero_from_s=result.zero_from_s - (late_s if trigger else 0.0),
             trigger_late_s=late_s,
-            problems=(*judgement.problems, *result.problems, *setup.problems, *problems),
+            problems=(*result.problems, *setup.problems, *problems),
         )
 
     def _level(self, trigger: TraceTrigger) -> float:
@@ -544,19 +487,6 @@ class ArmedSmartStep(ArmedTrace):
             return 0.0
         count = signed_word(self._setup.settings[TraceRegister.TRGC2])
         return count * scale(self._profile, self._setup.constants, DATA[trigger.channel])
-
-
-def _with_verdict(info: DriveTraceInfo | None, judgement: Judgement) -> DriveTraceInfo | None:
-    """Mark the assumptions that this trace has verified or contradicted."""
-    if info is None:
-        return None
-    verdicts = dict.fromkeys(judgement.contradicted, Verification.CONTRADICTED)
-    verdicts.update(dict.fromkeys(judgement.verified, Verification.VERIFIED))
-    assumptions = tuple(
-        each.model_copy(update={"verification": verdicts[each.key].value}) if each.key in verdicts else each
-        for each in info.assumptions
-    )
-    return info.model_copy(update={"assumptions": assumptions})
 
 
 async def put_back(words: Words, originals: Mapping[TraceRegister, int]) -> bool:

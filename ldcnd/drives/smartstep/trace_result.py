@@ -1,23 +1,35 @@
-"""Channels of a trace on the two memories of a drive, and the finished trace with its assumptions.
+"""Channels of a trace on the two memories of a drive, and the finished trace.
 
-Each memory holds one value and one bit. The layout of a word is not certain, so the words themselves and everything
-that was assumed stay with the result. Pure.
-Source: manual 4, settings 3, 7 and 9, "Unit conversion".
+Each memory holds one value and one bit. The layout of a word is not certain, so the words themselves and how they were
+read stay with the result, and values are uncertain until the layout was compared with the drive. Pure.
+Source: manual 3, monitors 8000H to 8008H; 4, settings 3, 7 and 9, "Unit conversion", notes on the trigger.
 """
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from types import MappingProxyType
 
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.traces import DriveTraceInfo, TraceChannel, TraceTrigger, TriggerKind
 from ldcnd.drives.smartstep.addresses import TraceRegister
+from ldcnd.drives.smartstep.monitors import (
+    INPUT_SIGNALS,
+    OUTPUT_SIGNALS,
+    POSITION_DEVIATION,
+    REFERENCE_PULSE_SPEED,
+    SPEED_FEEDBACK,
+    TORQUE_REFERENCE,
+    InputSignal,
+    Monitor,
+    OutputSignal,
+)
 from ldcnd.drives.smartstep.profiles import (
     SmartStepProfile,
     StringChecksum,
     TraceWordLayout,
     TriggerWordSource,
-    assumption_info,
 )
 from ldcnd.drives.smartstep.trace_data import (
     FULL_SCALE,
@@ -36,12 +48,29 @@ from ldcnd.drives.smartstep.trace_data import (
     unit_of,
     unwrap,
 )
-from ldcnd.drives.tracer import Recorded, level_of
+from ldcnd.drives.tracer import SIGNAL_LEVEL, Recorded, level_of
 
 MEMORIES = 2
 DATA: Mapping[str, DataObject] = MappingProxyType({each.name.lower(): each for each in DataObject})
 SIGNALS: Mapping[str, IoObject] = MappingProxyType({each.name.lower(): each for each in IoObject})
 CHANNELS = (*DATA, *SIGNALS)
+_VALUE_MONITORS: Mapping[DataObject, Monitor] = MappingProxyType(
+    {
+        DataObject.TORQUE_REFERENCE: TORQUE_REFERENCE,
+        DataObject.SPEED_FEEDBACK: SPEED_FEEDBACK,
+        DataObject.COMMAND_PULSE_SPEED: REFERENCE_PULSE_SPEED,
+        DataObject.POSITION_DEVIATION: POSITION_DEVIATION,
+    }
+)
+_SIGNAL_MONITORS: Mapping[IoObject, tuple[Monitor, int]] = MappingProxyType(
+    {
+        IoObject.RUN: (INPUT_SIGNALS, InputSignal.RUN),
+        IoObject.RESET: (INPUT_SIGNALS, InputSignal.RESET),
+        IoObject.ALM: (OUTPUT_SIGNALS, OutputSignal.ALM),
+        IoObject.INP: (OUTPUT_SIGNALS, OutputSignal.INP),
+        IoObject.BKIR: (OUTPUT_SIGNALS, OutputSignal.BKIR),
+    }
+)
 EDGES = frozenset({TriggerKind.RISING, TriggerKind.FALLING, TriggerKind.EITHER, TriggerKind.CHANGE})
 """Trigger kinds that a drive has; with both edges it is any change (manual 4 (7))."""
 
@@ -71,6 +100,25 @@ class Assignment:
         if channel in DATA:
             return self.data.index(DATA[channel])
         return self.io.index(SIGNALS[channel])
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelMonitor:
+    """The monitor that shows what a channel records; for a signal one bit of it."""
+
+    monitor: Monitor
+    bit: int | None = None
+
+    def value_of(self, word: int) -> float:
+        """Return what the word of the monitor says of the channel, in its unit; a signal is 0 or 1."""
+        return float(self.monitor.value_of(word)) if self.bit is None else float(bool(word & self.bit))
+
+
+def monitor_of(channel: str) -> ChannelMonitor:
+    """Return the monitor of a channel."""
+    if channel in DATA:
+        return ChannelMonitor(_VALUE_MONITORS[DATA[channel]])
+    return ChannelMonitor(*_SIGNAL_MONITORS[SIGNALS[channel]])
 
 
 def assign(axis: str, channels: tuple[str, ...]) -> Assignment:
@@ -123,7 +171,7 @@ def trigger_condition(
     if bits is None:
         raise NotSupported(
             "the bits of the trigger condition are not known for this drive",
-            remedy="trace without a trigger, or find its bits: `ldcnd doctor trigger-bits --help`",
+            remedy="trace without a trigger, or configure smartstep.trace.trigger_map",
         )
     word = bits.io if trigger.channel in SIGNALS else (bits.trace1, bits.trace2)[assignment.memory(trigger.channel)]
     if kind is not TriggerKind.FALLING:
@@ -146,21 +194,6 @@ def trigger_operand(
     if trigger.channel in SIGNALS:
         return assignment.memory(trigger.channel)
     return trigger_level(profile, constants, DATA[trigger.channel], level_of(trigger))
-
-
-BEARING = (
-    "string_checksum",
-    "string_count_unit",
-    "trace_chunk_bytes",
-    "trace_word_layout",
-    "trace_byte_order",
-    "trigger_word",
-    "command_pulse_gear",
-    "encoder_counts_per_rev",
-    "untriggered_start",
-    "trace_full_scale",
-)
-"""The assumptions that bear on a trace."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,7 +248,7 @@ def recorded(
     memory: TraceMemory,
     first_s: tuple[float, float],
 ) -> Recorded:
-    """Put a trace together; whether its values are right is for trace_check.py to say.
+    """Put a trace together.
 
     Args:
         profile: how the drive is taken to behave.
@@ -255,16 +288,66 @@ def _column(
 def _problems(
     profile: SmartStepProfile, assignment: Assignment, points: tuple[tuple[TracePoint, ...], ...]
 ) -> list[str]:
-    """Say what cannot be if the words are laid out as assumed."""
+    """Say why values are uncertain: how the words are laid out was not compared with the drive, or cannot be."""
     if profile.trace_word_layout is TraceWordLayout.RAW:
-        return []
-    return [
-        f"trace {memory + 1} has values beyond {FULL_SCALE}, so its words are hardly laid out as"
-        f" {profile.trace_word_layout.value}"
-        for memory, column in enumerate(points)
-        if assignment.data[memory] in (DataObject.TORQUE_REFERENCE, DataObject.SPEED_FEEDBACK)
-        and is_beyond_full_scale(column)
-    ]
+        return ["the words of the trace memory are published as they are, without a layout"]
+    problems = []
+    if not profile.trace_verified:
+        problems.append("the layout of its words is assumed: `ldcnd doctor verify` compares it with the drive")
+    for memory, column in enumerate(points):
+        if not is_beyond_full_scale(column):
+            continue
+        if assignment.data[memory] in (DataObject.TORQUE_REFERENCE, DataObject.SPEED_FEEDBACK):
+            problems.append(
+                f"trace {memory + 1} has values beyond {FULL_SCALE}, so its words are hardly laid out as"
+                f" {profile.trace_word_layout.value}"
+            )
+        elif profile.trace_word_layout is not TraceWordLayout.LSB_IO_MASK:  # which alone has room for 16 bits
+            problems.append(f"trace {memory + 1} goes beyond {FULL_SCALE}: what a drive records then is not known")
+    return problems
+
+
+TRIGGER_LATE_S = 0.002
+"""A trigger is detected at most so late (manual 4, note 1)."""
+
+
+def trigger_problem(
+    trigger: TraceTrigger, level: float, column: Sequence[float | None], index: int, interval_s: float
+) -> str | None:
+    """Return what is wrong when the recorded values show no trigger where the drive says that it was.
+
+    A drive whose trace was ended from elsewhere is in its normal mode, too, and says anything. The condition may have
+    been met `TRIGGER_LATE_S` before it was detected.
+
+    Args:
+        trigger: what the drive waited for.
+        level: as it was set in the drive, in the unit of the channel.
+        column: the values of its channel.
+        index: of the sample at which the trigger was detected.
+        interval_s: between two samples.
+    """
+    first = max(0, index - math.ceil(TRIGGER_LATE_S / interval_s) - 1)
+    near = [value for value in column[first : index + 2] if value is not None]
+    if trigger.channel in SIGNALS:
+        level = SIGNAL_LEVEL
+    edges = list(pairwise(near))
+    if index == 0:  # nothing was recorded before the trigger, so only the level after it can be seen
+        edges = [(-math.inf, near[0])] if trigger.kind is TriggerKind.RISING else [(math.inf, near[0])]
+    rose = any(before < level <= after for before, after in edges)
+    fell = any(after < level <= before for before, after in edges)
+    changed = any(before != after for before, after in edges)
+    met = {
+        TriggerKind.RISING: rose,
+        TriggerKind.FALLING: fell,
+        TriggerKind.EITHER: changed,
+        TriggerKind.CHANGE: changed,
+    }
+    if met.get(trigger.kind, True):
+        return None
+    return (
+        f"the values show no {trigger.kind.value} trigger of {trigger.channel} at sample {index}: the trace was ended"
+        " from elsewhere, or the trigger bits or the layout are wrong"
+    )
 
 
 def _info(
@@ -294,5 +377,4 @@ def _info(
         string_count_unit=profile.string_count_unit.value,
         trigger_word_source=memory.trigger_word_source.value,
         command_pulse_gear=profile.command_pulse_gear.value,
-        assumptions=tuple(assumption_info(profile, each) for each in profile.assumptions if each.key in BEARING),
     )

@@ -1,51 +1,50 @@
-"""Verifying what the manual leaves open about traces, on the drive itself: strings first, then words, then the gear.
+"""Verifying what the manual leaves open about traces, once, on the drive itself: strings first, then words and gear.
 
-Three lengths of the same string tell what its count counts. Short traces beside the monitors of their channels leave
-the readings of a word that agree with both; a person turns the shaft by hand, so that values are not zero, and lets
-command pulses come in, so that their gear shows. The recorder's working registers are set; EEPROM is not written, the
-drive moves nothing.
-Source: manual 2.2, data string reference command; 3; 4, settings 3 and "Unit conversion".
+Strings of three lengths tell what their count counts. One trace of command pulses at a constant speed, between two
+readings of their monitor, leaves the ways to read a word that agree with both; the level of RESET beside it tells where
+the signal's bit sits. The recorder's working registers are set; EEPROM is not written, the drive moves nothing.
+Source: manual 2.2, data string reference command; 3, 8005H and 8007H; 4, settings 3 and "Unit conversion".
 """
 
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from dataclasses import dataclass, replace
-from enum import StrEnum
+from itertools import product
 
 from ldcnd.contract.errors import BadReply, ByteCountRefused, DriveFault
 from ldcnd.contract.traces import TakeTrace
 from ldcnd.drives.smartstep.addresses import TRACE_1_AREA
-from ldcnd.drives.smartstep.commands import AGREEING_REPLIES, LONGEST_STRING_BYTES, string_reference
-from ldcnd.drives.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum
+from ldcnd.drives.smartstep.commands import LONGEST_STRING_BYTES, string_reference
+from ldcnd.drives.smartstep.profiles import (
+    ByteOrder,
+    CommandPulseGear,
+    CountUnit,
+    SmartStepProfile,
+    StringChecksum,
+    TraceWordLayout,
+)
 from ldcnd.drives.smartstep.trace import SmartStepTracer
-from ldcnd.drives.smartstep.trace_check import Reading, readings
+from ldcnd.drives.smartstep.trace_data import DataObject, TraceConstants, decode_word, scale
+from ldcnd.drives.smartstep.trace_result import monitor_of
 from ldcnd.drives.smartstep.words import Words
+from ldcnd.drives.tracer import Recorded
 from ldcnd.line.bus import Bus
 
 INTERVAL_S = 0.004
-"""Of the traces: two seconds, in which each monitor is read several times."""
-ATTEMPTS = 3
-"""Traces for one question; each leaves fewer readings."""
+"""Sampling interval of the trace, seconds: two seconds in all."""
 SHORTEST_STRING_BYTES = 4
-WORDS = ("trace_word_layout", "trace_byte_order")
-GEAR = "command_pulse_gear"
+PULSES = "RUN off, RESET not pressed: let command pulses come in, fast and at a constant speed, until the next message"
+SPEED, SIGNAL = CHANNELS = ("command_pulse_speed", "reset")
+LAYOUTS = tuple(each for each in TraceWordLayout if each is not TraceWordLayout.RAW)
+KEYS = ("trace_word_layout", "trace_byte_order", "command_pulse_gear")
+Reading = tuple[TraceWordLayout, ByteOrder, CommandPulseGear]
 Setting = str | int
-
-
-class Stimulus(StrEnum):
-    """The action of a person while a trace is recorded."""
-
-    REST = "leave the drive alone, RUN off and RESET not pressed"
-    TURN = "turn the shaft by hand, RUN off, to and fro, until the next message"
-    PULSES = "let command pulses come in, at a constant speed, until the next message"
-
-
-Act = Callable[[Stimulus], Awaitable[None]]
-"""Returns when the person has begun."""
+Act = Callable[[str], Awaitable[None]]
+"""Asks a person for something; returns when it has begun."""
 
 
 @dataclass(frozen=True, slots=True)
 class Verified:
-    """The drive's evidence on one assumption.
+    """The drive's evidence on one setting of its profile.
 
     Attributes:
         key: the field of the profile.
@@ -59,10 +58,10 @@ class Verified:
 
 
 async def verify_traces(bus: Bus, words: Words, profile: SmartStepProfile, act: Act) -> AsyncIterator[Verified]:
-    """Verify the assumptions that bear on traces; yields each one once.
+    """Verify the settings of a profile that bear on traces; yields each one once.
 
     Raises:
-        DriveFault: the drive declines, or its traces contradict each other.
+        DriveFault: the drive declines, the pulses did not stay as they were, or no known layout agrees with them.
         BusError: the line failed.
     """
     strings = await _string_settings(words, profile)
@@ -74,27 +73,33 @@ async def verify_traces(bus: Bus, words: Words, profile: SmartStepProfile, act: 
         trace_chunk_bytes=int(strings["trace_chunk_bytes"]),
         string_checksum=StringChecksum.AUTO,
     )
-    tracer = SmartStepTracer(bus, words, profile)
-    checksum = StringChecksum.AUTO
-    # At rest a signal that is high shows its bit and the byte order; only a value that is not zero shows its scale.
-    for stimulus in (Stimulus.REST, *[Stimulus.TURN] * ATTEMPTS):
-        await act(stimulus)
-        checksum = await _trace(tracer, ("speed_feedback", "position_deviation", "run", "reset"))
-        if _is_single(tracer, profile, WORDS) and checksum is not StringChecksum.AUTO:
-            break
-    yield (
-        Verified("string_checksum", None, "the traces leave a choice: every variant is taken")
-        if checksum is StringChecksum.AUTO
-        else Verified("string_checksum", checksum.value, f"{checksum.value}, by {AGREEING_REPLIES} replies or more")
-    )
-    for key in WORDS:
-        yield _of(tracer, profile, key, "a value that is not zero would tell them apart: turn the shaft faster")
-    for _ in range(ATTEMPTS):
-        await act(Stimulus.PULSES)
-        await _trace(tracer, ("command_pulse_speed", "reset"))
-        if _is_single(tracer, profile, (GEAR,)):
-            break
-    yield _of(tracer, profile, GEAR, "pulses at a gear Pn202/Pn203 other than 1/1 would tell them apart")
+    await act(PULSES)
+    before = await _shown(words)
+    armed = await SmartStepTracer(bus, words, profile).arm(TakeTrace(channels=CHANNELS, interval_s=INTERVAL_S))
+    recorded = await armed.record(lambda *_: None)
+    after = await _shown(words)
+    if abs(before[SPEED] - after[SPEED]) > 1 or before[SIGNAL] != after[SIGNAL]:
+        raise DriveFault(
+            f"axis {words.axis}: the pulses came at {before[SPEED]:g} r/min before the trace and at {after[SPEED]:g}"
+            " after it, or RESET has changed",
+            axis=words.axis,
+            remedy="keep their speed constant, and verify again",
+        )
+    checksum = recorded.drive.string_checksum if recorded.drive else StringChecksum.AUTO
+    if checksum == StringChecksum.AUTO:
+        yield Verified("string_checksum", None, "the trace leaves a choice: every variant is taken")
+    else:
+        yield Verified("string_checksum", checksum, f"{checksum}, by the replies of the trace")
+    agreeing = _agreeing(profile, recorded, before)
+    if not agreeing:
+        raise DriveFault(f"axis {words.axis}: no known layout of trace words agrees with the monitors", axis=words.axis)
+    for key, values in zip(KEYS, zip(*agreeing, strict=True), strict=True):
+        left = sorted({each.value for each in values})
+        if len(left) == 1:
+            yield Verified(key, left[0], f"{left[0]}, by a trace beside its monitors")
+        else:
+            advice = "faster pulses, at a gear Pn202/Pn203 of 4/1, would tell them apart"
+            yield Verified(key, None, f"{', '.join(left)} agree with the monitors; {advice}")
 
 
 async def _string_settings(words: Words, profile: SmartStepProfile) -> Mapping[str, Setting]:
@@ -121,35 +126,31 @@ async def _string_settings(words: Words, profile: SmartStepProfile) -> Mapping[s
     raise DriveFault(f"axis {words.axis}: strings have a length that no unit of their count explains", axis=words.axis)
 
 
-async def _trace(tracer: SmartStepTracer, channels: tuple[str, ...]) -> StringChecksum:
-    """Record a trace, which leaves fewer readings; return the checksum variant that its replies have shown.
-
-    Raises:
-        DriveFault: no reading agrees with the monitors.
-    """
-    armed = await tracer.arm(TakeTrace(channels=channels, interval_s=INTERVAL_S))
-    recorded = await armed.record(lambda *_: None)
-    if tracer.possible is None:
-        raise DriveFault(f"no known layout of trace words agrees with the monitors: {'; '.join(recorded.problems)}")
-    return StringChecksum(recorded.drive.string_checksum) if recorded.drive else StringChecksum.AUTO
+async def _shown(words: Words) -> Mapping[str, float]:
+    """Return what the monitors say of the channels."""
+    monitors = {channel: monitor_of(channel) for channel in CHANNELS}
+    return {channel: each.value_of(await words.read(each.monitor.address)) for channel, each in monitors.items()}
 
 
-def _left(tracer: SmartStepTracer, profile: SmartStepProfile, key: str) -> list[Setting]:
-    """Return the settings of an assumption that the traces have left.
-
-    Only the quotient of gear and encoder counts shows, so the gear is that with the counts of the profile.
-    """
-    possible: list[Reading] = readings(profile) if tracer.possible is None else list(tracer.possible)
-    counts = profile.encoder_counts_per_rev
-    return sorted({getattr(each, key) for each in possible if each.encoder_counts_per_rev == counts})
-
-
-def _is_single(tracer: SmartStepTracer, profile: SmartStepProfile, keys: tuple[str, ...]) -> bool:
-    return all(len(_left(tracer, profile, key)) == 1 for key in keys)
-
-
-def _of(tracer: SmartStepTracer, profile: SmartStepProfile, key: str, advice: str) -> Verified:
-    left = _left(tracer, profile, key)
-    if len(left) == 1:
-        return Verified(key, left[0], f"{left[0]}, by traces beside their monitors")
-    return Verified(key, None, f"{', '.join(map(str, left))} agree with the monitors; {advice}")
+def _agreeing(profile: SmartStepProfile, recorded: Recorded, shown: Mapping[str, float]) -> list[Reading]:
+    """Return the ways to read the words of a trace by which they are what the monitors show."""
+    info, (column, *_) = recorded.drive, recorded.raw
+    if info is None:
+        return []
+    gear = (info.gear_numerator or 1, info.gear_denominator or 1)
+    constants = TraceConstants(info.cyclec_us, info.maxtrqc, info.osvelcc, *gear)
+    agreeing: list[Reading] = []
+    for layout, order, pulse_gear in product(LAYOUTS, ByteOrder, CommandPulseGear):
+        words = {int(word or 0) for word in column}
+        if order is not profile.trace_byte_order:
+            words = {(word >> 8 | word << 8) & 0xFFFF for word in words}
+        points = [decode_word(word, layout) for word in words]
+        factor = scale(replace(profile, command_pulse_gear=pulse_gear), constants, DataObject.COMMAND_PULSE_SPEED)
+        # A monitor has whole units; a point whole counts, and one layout loses the lowest bit of them.
+        slack = 1.0 + 2 * factor
+        if all(
+            abs(point.value * factor - shown[SPEED]) <= slack and float(bool(point.io)) == shown[SIGNAL]
+            for point in points
+        ):
+            agreeing.append((layout, order, pulse_gear))
+    return agreeing

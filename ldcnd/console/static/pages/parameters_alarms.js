@@ -1,8 +1,7 @@
-/** Alarms of a drive and its history, and what is not certain about the drive. */
+/** Alarms of a drive and its history, and its counters. */
 
 import { html, useState } from "../html.js";
 import { Action, Panel, Table } from "../parts/controls.js";
-import { words } from "../parts/format.js";
 import { Mark } from "../parts/state.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
@@ -11,14 +10,11 @@ const LEVELS = { alarm: "bad", warning: "warn", unknown: "warn" };
 
 export function AlarmPanel({ axis }) {
   const [report, setReport] = useState(null);
-  const [profile, setProfile] = useState(null);
   const [cleared, setCleared] = useState(null);
-  return html`<${Panel} title="Alarms and assumptions">
+  return html`<${Panel} title="Alarms and counters">
     <p class="row">
       <${Action} act=${() => command(axis, "read_alarms")} onDone=${setReport}
         obstacle=${obstacle(axis, "parameters")}>Read alarms<//>
-      <${Action} act=${() => command(axis, "read_profile")} onDone=${setProfile}
-        obstacle=${obstacle(axis, "none")}>Show assumptions<//>
     </p>
     <p class="row">${["command", "feedback"].map(
       (counter) => html`<${Action} act=${() => command(axis, "clear_counter", { counter })} onDone=${setCleared}
@@ -36,15 +32,6 @@ export function AlarmPanel({ axis }) {
         <th scope="row">${when}</th><td class="number">${entry.code.toString(16).toUpperCase().padStart(2, "0")}</td>
         <td>${entry.text}</td><td><${Mark}
           level=${when === "now" ? (LEVELS[entry.kind] ?? "") : ""}>${entry.kind}<//></td></tr>`,
-      )} />`
-    }
-    ${
-      profile &&
-      html`<${Table} label="Assumptions" head=${["Assumption", "What is assumed or asked", "Assumed", "From", "Verification"]}
-      rows=${profile.assumptions.map(
-        (assumption) => html`<tr>
-        <th scope="row">${words(assumption.key)}</th><td>${assumption.question}</td><td>${assumption.setting ?? "–"}</td><td>${assumption.confidence}</td>
-        <td><${Mark} level=${assumption.verification === "contradicted" ? "bad" : ""}>${words(assumption.verification)}<//></td></tr>`,
       )} />`
     }
   <//>`;
