@@ -6,13 +6,12 @@ from pathlib import Path
 
 import click
 
-from ldcnd.cli import replay
 from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.typed import Finite, NewFile, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.contract.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer, Snapshot
-from ldcnd.daemon.replay import config_of
+from ldcnd.daemon.capture import config_of
 from ldcnd.drives.known import FAMILIES
 from ldcnd.drives.transcript import Describe
 from ldcnd.line.capture import Capture, CaptureHeader, capture_lines, parse_capture
@@ -46,10 +45,7 @@ DISSECTOR = click.option(
 
 @click.group()
 def command() -> None:
-    """Show the lines of a running daemon, and play back what was on them."""
-
-
-command.add_command(replay.command)
+    """Show the lines of a running daemon, and what was on them."""
 
 
 @command.command("set-io")
@@ -146,8 +142,8 @@ def list_buses(target: Target) -> None:
 def wire_log(target: Target, bus: str, seconds: float, form: str | None, out: Path | None) -> None:
     """Show what was on the line BUS in the last seconds, or write it to a file.
 
-    text is a capture: bytes, with their meaning as comments; `ldcnd bus replay` plays it back. words has the meaning
-    alone. pcapng is for Wireshark with the plugin of --dissector. --json prints or writes one object a record instead.
+    text is a capture: bytes, with their meaning as comments. words has the meaning alone. pcapng is for Wireshark with
+    the plugin of --dissector. --json prints or writes one object a record instead.
     """
     log, header, describe = target.run(lambda client: _fetch(client, bus, seconds))
     _render(Capture(header, parse_records(log.lines)), describe, form, out, as_json=target.as_json)

@@ -67,7 +67,6 @@ class ErrorCode(StrEnum):
     # the daemon
     CONFIG_INVALID = "config_invalid"
     SESSION_FAILED = "session_failed"
-    REPLAY_DEVIATION = "replay_deviation"
     INTERNAL = "internal"
 
 
@@ -537,16 +536,6 @@ class SessionError(LdcndError):
     code = ErrorCode.SESSION_FAILED
     retryable = True
     way_out = "check the endpoint, and that the daemon runs"
-
-
-class ReplayDeviation(LdcndError):
-    """The daemon that a capture is played to does not send what was sent when the capture was made."""
-
-    code = ErrorCode.REPLAY_DEVIATION
-    way_out = (
-        "the message names the packet; play it with the configuration and the version of ldcnd that it was "
-        "made with, or find out which change it was"
-    )
 
 
 class InternalError(LdcndError):

@@ -16,6 +16,8 @@ from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
 
+from pydantic import ValidationError
+
 from ldcnd.axis.clock import Clock
 from ldcnd.config.rig import CapturesConfig, RigConfig, ZenohConfig
 from ldcnd.contract.errors import ConfigError
@@ -175,6 +177,24 @@ def of_one_line(config: RigConfig, bus: str) -> RigConfig:
     simulated = tuple(line for line in config.sim if f"sim:{line.name}" == lines[0].port)
     alone = {"bus": lines, "sim": simulated, "zenoh": ZenohConfig(), "state_dir": None, "captures": CapturesConfig()}
     return config.model_copy(update=alone)
+
+
+def config_of(header: CaptureHeader, beside: RigConfig | None = None) -> RigConfig:
+    """Return the configuration that a capture belongs to: the one given, or the one in the capture; its line only.
+
+    Raises:
+        ConfigError: there is none, it has no such line, or this version cannot use it.
+    """
+    if beside is None:
+        if header.config is None:
+            raise ConfigError(
+                "there is no configuration in the capture", remedy="name the file it was made with: --config FILE"
+            )
+        try:
+            beside = RigConfig.model_validate(header.config)
+        except ValidationError as error:
+            raise ConfigError(f"the configuration in the capture does not fit this version: {error}") from error
+    return of_one_line(beside, header.bus)
 
 
 class CaptureWatch:

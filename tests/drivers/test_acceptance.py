@@ -16,7 +16,6 @@ from ldcnd.drives.known import FAMILIES
 from ldcnd.drives.ldcn.acceptance import ASSUMPTIONS, accept, trial_bus
 from ldcnd.drives.smartstep.config import SimulatedUnitConfig, simulated_units
 from ldcnd.line.capture import Capture, parse_capture
-from ldcnd.line.replay import Replay
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -24,6 +23,7 @@ from ldcnd.sim.pty import PtyLine
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
 from tests.support.plugged_rig import MODELS
+from tests.support.recorded_line import Replay
 from tests.support.serial_adapter import Plug
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, el=4000, cl=0, sr=1, deadband=0)

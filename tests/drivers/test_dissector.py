@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from ldcnd.cli import bus
 from ldcnd.config.rig import load_config
-from ldcnd.daemon.replay import config_of
+from ldcnd.daemon.capture import config_of
 from ldcnd.drives.ldcn.packet import Command, PacketReader, Status, StatusItem, decode_status, status_bytes
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.smartstep.packet import PACKET_CHARACTERS, decode_command, decode_reply

@@ -6,11 +6,12 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.contract.errors import ConfigError, MalformedRequest, ReplayDeviation
-from ldcnd.daemon.replay import config_of
+from ldcnd.contract.errors import ConfigError, MalformedRequest
+from ldcnd.daemon.capture import config_of
 from ldcnd.line.capture import Capture, parse_capture
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from tests.support.captures import FOLDER, NAMES, record, replayed
+from tests.support.recorded_line import ReplayDeviation
 
 
 def kept(name):
@@ -80,7 +81,7 @@ def test_the_first_packet_that_is_another_one_ends_the_replay_and_is_named():
     with pytest.raises(ReplayDeviation) as deviation:
         replayed(spoilt(capture, number, data=b"\xaa\x01\x02"))
 
-    assert deviation.value.message == (
+    assert str(deviation.value) == (
         f"packet 100 (record {number}, {at_s:.9f} s): expected 'sent aa 01 02',"
         f" got 'sent {data.hex(' ')}' at {at_s:.9f} s"
     )

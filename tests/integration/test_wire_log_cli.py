@@ -2,11 +2,13 @@
 
 import json
 import re
+import shutil
 
 import pytest
 
 from ldcnd.line.capture import parse_capture
 from ldcnd.line.flight_recorder import WireEvent
+from tests.support.captures import FOLDER
 from tests.support.command_line import run_all
 from tests.support.process import ROOT, daemon
 
@@ -15,6 +17,7 @@ pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 PAGE = (ROOT / "docs" / "how-to" / "replay-a-capture.md").read_text(encoding="utf-8")
 ON_PAGE = re.findall(r"^ldcnd bus wire-log .+$", PAGE, re.MULTILINE)
+ON_FILES = re.findall(r"^ldcnd bus convert .+$", PAGE, re.MULTILINE)
 
 
 async def test_a_line_is_dumped_as_a_capture_in_words_as_json_and_for_wireshark(tmp_path):
@@ -37,3 +40,13 @@ async def test_a_line_is_dumped_as_a_capture_in_words_as_json_and_for_wireshark(
     assert any(record["event"] == "received" and "position" in record["words"] for record in records)
     assert refusal.code == 1
     assert "line0" in refusal.errors
+
+
+async def test_what_the_page_does_with_a_capture_can_be_done(tmp_path):
+    shutil.copy(FOLDER / "power_loss.capture", tmp_path / "fault.capture")
+
+    ran = await run_all(tmp_path, *ON_FILES)
+
+    assert [each.code for each in ran] == [0, 0], ran
+    assert "node 1: ReadStatus" in ran[0].printed
+    assert (tmp_path / "fault.pcapng").read_bytes()[:4] == b"\x0a\x0d\x0d\x0a"

@@ -13,12 +13,12 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.capture import lines_of
-from ldcnd.daemon.replay import config_of, play, published_line, virtual_time
+from ldcnd.daemon.capture import config_of, lines_of
 from ldcnd.line.capture import Capture
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.session import Sample
 from ldcnd.sim.jumping_loop import JumpingLoop
+from tests.support.replay import play, published_line, virtual_time
 
 FOLDER = Path(__file__).parents[1] / "captures"
 NAMES = ("clean_start", "power_loss", "corrupted_line")

@@ -10,24 +10,21 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
-from pydantic import ValidationError
-
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.codec import Encoding, as_json
-from ldcnd.contract.errors import ConfigError, MalformedRequest, ReplayDeviation
+from ldcnd.contract.errors import MalformedRequest
 from ldcnd.contract.keys import RIG_ITSELF, Keys
 from ldcnd.contract.leases import Acquire
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.daemon.capture import of_one_line
 from ldcnd.daemon.dispatch import STOP
 from ldcnd.daemon.leases import random_token
-from ldcnd.line.capture import Capture, CaptureHeader
+from ldcnd.line.capture import Capture
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from ldcnd.line.port_url import SOCKET
-from ldcnd.line.replay import Replay
 from ldcnd.net.memory_session import MemoryBroker, MemorySession
 from ldcnd.net.session import Sample
 from ldcnd.sim.jumping_loop import JumpingLoop
+from tests.support.recorded_line import Replay, ReplayDeviation
 
 Take = Callable[[Sample], None]
 """Gets every sample, event and report as it is published."""
@@ -71,24 +68,6 @@ def awake_at_s(capture: Capture) -> tuple[float, ...]:
 def virtual_time(capture: Capture) -> JumpingLoop:
     """Return an event loop on which a capture is played in no time, as awake as the host was then."""
     return JumpingLoop(capture.header.started_s, awake_at_s(capture))
-
-
-def config_of(header: CaptureHeader, beside: RigConfig | None = None) -> RigConfig:
-    """Return the configuration to play a capture with: the one given, or the one in the capture; its line only.
-
-    Raises:
-        ConfigError: there is none, it has no such line, or this version cannot use it.
-    """
-    if beside is None:
-        if header.config is None:
-            raise ConfigError(
-                "there is no configuration in the capture", remedy="name the file it was made with: --config FILE"
-            )
-        try:
-            beside = RigConfig.model_validate(header.config)
-        except ValidationError as error:
-            raise ConfigError(f"the configuration in the capture does not fit this version: {error}") from error
-    return of_one_line(beside, header.bus)
 
 
 async def play(capture: Capture, config: RigConfig, take: Take) -> Played:
