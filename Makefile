@@ -30,20 +30,15 @@ check: .venv/ready
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
 	.venv/bin/lint-imports
-	.venv/bin/ldcnd schema check
 	$(PY) -m tests.words
+	$(PY) -m tools check
 
 fix: .venv/ready
-	.venv/bin/ldcnd schema client
+	$(PY) -m tools client
 	.venv/bin/ruff format .
 	.venv/bin/ruff check --fix .
 	.venv/bin/ruff format .
-	.venv/bin/ldcnd schema write
-	.venv/bin/ldcnd schema configuration
-	.venv/bin/ldcnd schema cli
-	.venv/bin/ldcnd schema python
-	.venv/bin/ldcnd schema keys docs/reference/keys.md
-	.venv/bin/ldcnd schema errors docs/reference/errors.md
+	$(PY) -m tools
 	$(PY) -m tests.support.verb_table
 
 # the site in build/docs, warnings as errors

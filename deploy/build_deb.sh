@@ -47,7 +47,7 @@ install -Dm644 -t "$doc/examples" "$here/drop-ins/"{realtime,nice,lan,single-lin
 install -Dm644 "$here/INSTALL.md" "$doc/INSTALL.md"
 install -Dm644 "$source/LICENSE" "$doc/copyright"
 "$opt/bin/python" "$here/sbom.py" ${extras//,/ } > "$doc/sbom.cdx.json"
-"$opt/bin/ldcnd" schema man "$root/usr/share/man/man1" >/dev/null
+(cd "$source" && "$opt/bin/python" -m tools man "$root/usr/share/man/man1")
 gzip -9n "$root"/usr/share/man/man1/*.1
 plugins=$root/usr/lib/$("$python" -c 'import sysconfig; print(sysconfig.get_config_var("MULTIARCH"))')/wireshark/plugins
 mkdir -p "$plugins"

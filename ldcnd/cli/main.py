@@ -47,7 +47,7 @@ COMMANDS = {
     "doctor": ("ldcnd.cli.doctor", "Examine a line by reading only, before a daemon uses it."),
     "accept": ("ldcnd.cli.accept", "Try real drives against what the documents say, and keep a report of it."),
     "pki": ("ldcnd.cli.pki", "Make certificates and access rules for a network with mutual TLS."),
-    "schema": ("ldcnd.cli.schema", "Write or check the JSON Schemas of the public models."),
+    "schema": ("ldcnd.cli.schema", "Write the JSON Schemas of the public models."),
 }
 
 

@@ -82,7 +82,7 @@ class Jogging(Facade[jog.Jogging]):
 class Axis(Facade[asynchronous.Axis]):
     """An axis that a program controls or watches; a method for each verb, as `ldcnd.Axis` has."""
 
-    # made by `ldcnd schema client`: begin
+    # made by `python -m tools client`: begin
     power = _waiting(asynchronous.Axis.power)
     move_absolute = _moving(asynchronous.Axis.move_absolute)
     move_relative = _moving(asynchronous.Axis.move_relative)
@@ -113,7 +113,7 @@ class Axis(Facade[asynchronous.Axis]):
     preview = _waiting(asynchronous.Axis.preview)
     report_shadow = _waiting(asynchronous.Axis.report_shadow)
 
-    # made by `ldcnd schema client`: end
+    # made by `python -m tools client`: end
 
     stop = _waiting(asynchronous.Axis.stop)
     take_trace = _waiting(asynchronous.Axis.take_trace)

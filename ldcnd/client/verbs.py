@@ -1,4 +1,4 @@
-"""The verbs of an axis as methods; made from the command classes by `ldcnd schema client`, not edited."""
+"""The verbs of an axis as methods; made from the command classes by `make fix`, not edited."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping

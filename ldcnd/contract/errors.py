@@ -555,12 +555,3 @@ ERRORS: Mapping[str, type[LdcndError]] = MappingProxyType(
     {code: next(error for error in _classes() if vars(error).get("code") is code) for code in ErrorCode}
 )
 """The class that an error reply is rebuilt to, by code; the first one where two share a code."""
-
-
-def as_markdown() -> str:
-    """Return all codes as one Markdown table."""
-    lines = ["| code | what it means | what to do | retryable |", "|---|---|---|---|"]
-    for code, error in ERRORS.items():
-        meaning = " ".join((error.__doc__ or "").split())
-        lines.append(f"| `{code}` | {meaning} | {error.way_out} | {'yes' if error.retryable else 'no'} |")
-    return "\n".join(lines) + "\n"

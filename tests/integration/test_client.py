@@ -14,8 +14,6 @@ from pathlib import Path
 import pytest
 
 import ldcnd
-from ldcnd.cli.client_reference import client_reference
-from ldcnd.cli.verb_methods import method_name, verb_methods, with_blocking_methods
 from ldcnd.client import blocking
 from ldcnd.client.axis import Axis
 from ldcnd.client.loop_thread import loop_thread
@@ -33,6 +31,8 @@ from ldcnd.net.memory_session import MemoryBroker
 from tests.support.process import ROOT, daemon
 from tests.support.rig import EPOCH_NS, RunningRig, running_rig, two_axes
 from tests.support.session_pair import free_endpoint
+from tools.client_reference import client_reference
+from tools.verb_methods import method_name, verb_methods, with_blocking_methods
 
 CLIENT = ROOT / "ldcnd" / "client"
 

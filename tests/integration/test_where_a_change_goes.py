@@ -21,10 +21,11 @@ import asyncio, json
 from ldcnd.cli.quantities import sample_text
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.contract import all_schemas, channels
+from ldcnd.daemon.contract import all_schemas
 from ldcnd.contract.samples import LinkState
 from tests.support.rig import SIMULATED, running_rig
 from tests.support.verb_table import empty_cells
+from tools.channels import channels
 
 def config():
     document = load_config(SIMULATED).model_dump(mode="json", exclude_unset=True)
@@ -139,13 +140,13 @@ def add_model(house: Path) -> None:
 def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy in which a verb, an item and a model were added, each by its list."""
     copy = tmp_path_factory.mktemp("house")
-    for part in ("ldcnd", "tests/support", "docs", "config"):
+    for part in ("ldcnd", "tests/support", "tools", "docs", "config"):
         shutil.copytree(ROOT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__", "images"))
     (copy / "tests" / "__init__.py").touch()
     for add in (add_verb, add_item, add_model):
         add(copy)
     shutil.copy(ROOT / "pyproject.toml", copy)
-    run(copy, "-m", "ldcnd", "schema", "client")
+    run(copy, "-m", "tools", "client")
     run(copy, "-m", "ruff", "format", "--no-cache", "ldcnd")
     run(copy, "-m", "ruff", "check", "--fix", "--no-cache", "ldcnd")
     return copy

@@ -9,13 +9,13 @@ from types import CodeType, FunctionType
 import click
 
 from ldcnd.cli.main import cli
-from ldcnd.cli.verb_methods import method_name
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import COMMANDS
 from ldcnd.contract.commands import About, Command
 from ldcnd.contract.frozen import Frozen
 from tests.support.process import ROOT
+from tools.verb_methods import method_name
 
 PAGE = ROOT / "docs" / "reference" / "verbs.md"
 PLACES = ("client", "command line")

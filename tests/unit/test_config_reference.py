@@ -1,7 +1,7 @@
 import re
 from pathlib import Path
 
-from ldcnd.config.reference import config_reference
+from tools.config_reference import config_reference
 
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "configuration.md"
 

@@ -2,14 +2,15 @@
 
 from pathlib import Path
 
-from ldcnd.contract.errors import ERRORS, ErrorCode, as_markdown
+from ldcnd.contract.errors import ERRORS, ErrorCode
+from tools.__main__ import errors_table
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "reference" / "errors.md").read_text()
 
 
 def test_the_page_is_made_of_the_classes():
-    assert PAGE.endswith(as_markdown())
+    assert PAGE.endswith(errors_table())
 
 
 def test_every_code_has_one_class_that_says_what_to_do():

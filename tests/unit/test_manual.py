@@ -4,11 +4,11 @@ import shutil
 import subprocess
 
 import pytest
-from click.testing import CliRunner
 
-from ldcnd.cli.main import COMMANDS, cli
-from ldcnd.cli.manual import as_markdown, entries, man_pages
+from ldcnd.cli.main import COMMANDS
 from tests.support.pages import ROOT
+from tools.__main__ import write_man_pages
+from tools.manual import as_markdown, entries, man_pages
 
 PAGES = man_pages()
 REFERENCE = as_markdown()
@@ -37,7 +37,6 @@ def test_groff_takes_every_man_page_without_a_warning():
 
 
 def test_the_man_pages_are_written_into_a_folder(tmp_path):
-    result = CliRunner().invoke(cli, ["schema", "man", str(tmp_path / "man1")], catch_exceptions=False)
+    write_man_pages(tmp_path / "man1")
 
-    assert result.exit_code == 0
     assert {path.name for path in (tmp_path / "man1").iterdir()} == set(PAGES)

@@ -1,34 +1,24 @@
 """What the documents about keys and security say is so: keys and schemas exist."""
 
-import json
 import re
-from functools import cache
 from pathlib import Path
 
-import jsonschema_rs
 import pytest
-from click.testing import CliRunner
 
-from ldcnd.cli.main import cli
 from ldcnd.contract.catalogue import AXIS_COMMANDS, RIG_COMMANDS
 from ldcnd.contract.codec import MAX_PAYLOAD_BYTES, Encoding
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.contract.keys import Keys, matches
 from ldcnd.contract.samples import TelemetryItem
-from ldcnd.daemon.asyncapi import asyncapi_document, asyncapi_text
-from ldcnd.daemon.contract import Kind, all_schemas, as_markdown, channels
+from ldcnd.daemon.contract import all_schemas
 from ldcnd.ops.pki.access import RULES
+from tools.__main__ import renew_table
+from tools.channels import Kind, channels, keys_table
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"
 KEYS = Keys("rig")
-document = cache(asyncapi_document)
-OFFICIAL = jsonschema_rs.Draft7Validator(
-    json.loads((ROOT / "tests" / "vectors" / "asyncapi" / "asyncapi-3.0.0.json").read_text())
-)
-"""As the AsyncAPI Initiative publishes it."""
-DRAFT = "https://json-schema.org/draft/2020-12/schema"
 
 
 def page(name: str) -> str:
@@ -40,7 +30,7 @@ def spelled(key: str) -> str:
 
 
 def test_the_page_has_the_keys_of_the_code() -> None:
-    assert page("keys.md").endswith(as_markdown()), "run `ldcnd schema keys docs/reference/keys.md`"
+    assert page("keys.md").endswith(keys_table()), "run `make fix`"
 
 
 def test_the_page_tells_the_encodings_of_the_code() -> None:
@@ -95,77 +85,10 @@ def test_channel_names_are_unique() -> None:
     assert len(names) == len(set(names))
 
 
-def references(node: object) -> set[str]:
-    if isinstance(node, dict):
-        own = {node["$ref"]} if isinstance(node.get("$ref"), str) else set()
-        return own.union(*(references(value) for value in node.values()))
-    if isinstance(node, list):
-        return set().union(*(references(value) for value in node))
-    return set()
-
-
-def test_every_reference_of_the_asyncapi_document_leads_somewhere() -> None:
-    for reference in references(document()):
-        node: object = document()
-        for part in reference.removeprefix("#/").split("/"):
-            assert isinstance(node, dict)
-            assert part in node, reference
-            node = node[part]
-
-
-def test_the_asyncapi_document_has_the_structure_of_version_3() -> None:
-    assert document()["asyncapi"] == "3.0.0"
-    assert set(document()) == {"asyncapi", "info", "defaultContentType", "channels", "operations", "components"}
-    for name, operation in document()["operations"].items():
-        channel = document()["channels"][name]
-        own = {f"#/channels/{name}/messages/{message}" for message in channel["messages"]}
-        assert operation["channel"] == {"$ref": f"#/channels/{name}"}
-        assert operation["action"] in ("send", "receive")
-        assert {message["$ref"] for message in operation["messages"]} <= own
-        if operation["action"] == "receive":
-            assert {message["$ref"] for message in operation["reply"]["messages"]} <= own
-            assert len(operation["reply"]["messages"]) == 2
-        assert set(channel.get("parameters", {})) == set(re.findall(r"\{(\w+)\}", channel["address"]))
-        assert re.fullmatch(r"[A-Za-z0-9._-]+", name)
-
-
-def test_the_asyncapi_document_is_valid_by_the_official_schema() -> None:
-    OFFICIAL.validate(json.loads(asyncapi_text()))
-
-
-@pytest.mark.parametrize(
-    ("path", "wrong"),
-    [
-        (("asyncapi",), "2.6.0"),
-        (("info", "version"), None),
-        (("channels", "tele_axis_position", "addresses"), "ldcn"),
-        (("operations", "tele_axis_position", "action"), "publish"),
-        (("operations", "tele_axis_position", "channel"), "tele_axis_position"),
-        (("components", "messages", "position_sample", "payloads"), {}),
-    ],
-)
-def test_the_official_schema_finds_what_is_wrong(path: tuple[str, ...], wrong: object) -> None:
-    document = json.loads(asyncapi_text())
-    node = document
-    for name in path[:-1]:
-        node = node[name]
-    node[path[-1]] = wrong
-
-    assert not OFFICIAL.is_valid(document)
-
-
-def test_the_schemas_of_the_asyncapi_document_are_json_schemas() -> None:
-    for schema in document()["components"]["schemas"].values():
-        assert schema.get("$schema", DRAFT) == DRAFT
-        jsonschema_rs.meta.validate({"$schema": DRAFT} | schema)
-    json.dumps(document())
-
-
-def test_the_command_line_renews_the_table_and_nothing_else(tmp_path: Path) -> None:
+def test_a_page_gets_a_new_table_and_nothing_else(tmp_path: Path) -> None:
     copy = tmp_path / "keys.md"
     copy.write_text(page("keys.md").replace("`ldcn/<rig>/@stop/<axis>`", "`old`"))
 
-    result = CliRunner().invoke(cli, ["schema", "keys", str(copy)], catch_exceptions=False)
+    renew_table(copy, keys_table())
 
-    assert result.exit_code == 0
     assert copy.read_text() == page("keys.md")

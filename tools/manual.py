@@ -14,7 +14,7 @@ EXIT_STATUS = tuple((str(code), f"{meaning[:1].upper()}{meaning[1:]}.") for code
 INTRODUCTION = """# Command line
 
 `ldcnd COMMAND --help` says the same, and so do the man pages of the Debian package. Every command that uses a daemon
-takes the options for finding it besides its own. This page is written by `ldcnd schema cli`.
+takes the options for finding it besides its own. This page is written by `make fix`.
 
 The shell completes commands, options, axes of the daemon and fault codes with this line in `~/.bashrc`:
 `eval "$(_LDCND_COMPLETE=bash_source ldcnd)"`; zsh and fish likewise, with `zsh_source` and `fish_source`.

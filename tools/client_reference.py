@@ -1,4 +1,4 @@
-"""The reference of the Python client, made from signatures and docstrings; `ldcnd schema python` writes it."""
+"""The reference of the Python client, made from signatures and docstrings; `make fix` writes it."""
 
 import inspect
 import re

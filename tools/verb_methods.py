@@ -1,6 +1,6 @@
 """The methods of the Python client, one for each command of an axis, made from the command classes.
 
-`ldcnd schema client` writes them into `ldcnd/client/verbs.py`: type checkers and editors see signatures that nothing
+`python -m tools client` writes them into `ldcnd/client/verbs.py`: type checkers and editors see signatures that nothing
 has to be kept equal to.
 """
 
@@ -19,9 +19,9 @@ from ldcnd.contract.traces import TakeTrace
 BY_HAND = (Stop, TakeTrace)
 """`Axis` has these itself: a stop has a key of its own, and a trace is fetched when it is complete."""
 WIDTH = 120
-BEGIN = "    # made by `ldcnd schema client`: begin\n"
-END = "    # made by `ldcnd schema client`: end\n"
-HEADER = '''"""The verbs of an axis as methods; made from the command classes by `ldcnd schema client`, not edited."""
+BEGIN = "    # made by `python -m tools client`: begin\n"
+END = "    # made by `python -m tools client`: end\n"
+HEADER = '''"""The verbs of an axis as methods; made from the command classes by `make fix`, not edited."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable

@@ -1,0 +1,98 @@
+"""Writes what is generated and committed: schemas, the client's methods, reference pages.
+
+`python -m tools client` writes the methods of the client alone, also when those that there are cannot be loaded;
+`python -m tools check` fails when the schemas are not what the models say; `python -m tools man FOLDER` writes
+man pages.
+"""
+
+import argparse
+import sys
+from pathlib import Path
+
+from ldcnd.contract.errors import ERRORS
+from ldcnd.daemon.contract import all_schemas, write_schemas
+from tools.channels import keys_table
+from tools.verb_methods import verb_methods, with_blocking_methods
+
+ROOT = Path(__file__).parents[1]
+REFERENCE = ROOT / "docs" / "reference"
+SCHEMAS = ROOT / "schemas"
+
+
+def main() -> None:
+    """Do what the first argument says; without one, write everything but the client's methods."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="?", choices=("all", "client", "check", "man"), default="all")
+    parser.add_argument("folder", nargs="?", type=Path, help="of the man pages")
+    options = parser.parse_args()
+    match options.what:
+        case "client":
+            write_client()
+        case "check":
+            check()
+        case "man":
+            write_man_pages(options.folder)
+        case _:
+            write_all()
+
+
+def write_client() -> None:
+    """Write the methods of the Python client; `make fix` formats them."""
+    folder = ROOT / "ldcnd" / "client"
+    (folder / "verbs.py").write_text(verb_methods(), encoding="utf-8")
+    blocking = folder / "blocking.py"
+    blocking.write_text(with_blocking_methods(blocking.read_text(encoding="utf-8")), encoding="utf-8")
+
+
+def write_all() -> None:
+    """Write the schemas and the reference pages."""
+    # not above: the client's methods can be written also when those that there are cannot be loaded
+    from tools.client_reference import client_reference  # noqa: PLC0415
+    from tools.config_reference import config_reference  # noqa: PLC0415
+    from tools.manual import as_markdown  # noqa: PLC0415
+
+    write_schemas(SCHEMAS)
+    pages = {"configuration": config_reference(), "cli": as_markdown(), "python": client_reference()}
+    for name, text in pages.items():
+        (REFERENCE / f"{name}.md").write_text(text, encoding="utf-8")
+    for name, table in {"keys": keys_table(), "errors": errors_table()}.items():
+        renew_table(REFERENCE / f"{name}.md", table)
+
+
+def check() -> None:
+    """End the program with an error when the schemas differ from what the models say."""
+    schemas = all_schemas()
+    on_disk = {path.stem: path.read_text(encoding="utf-8") for path in SCHEMAS.glob("*.json")}
+    differing = sorted(name for name in schemas.keys() | on_disk.keys() if schemas.get(name) != on_disk.get(name))
+    if differing:
+        sys.exit(f"{SCHEMAS} differs from the models in: {', '.join(differing)}; run `make fix`")
+
+
+def write_man_pages(folder: Path) -> None:
+    """Write the man pages of all commands into a folder."""
+    from tools.manual import man_pages  # noqa: PLC0415 - likewise
+
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, text in man_pages().items():
+        (folder / name).write_text(text, encoding="utf-8")
+
+
+def renew_table(page: Path, table: str) -> None:
+    """Replace the table at the end of a page."""
+    before, found, _ = page.read_text(encoding="utf-8").partition(table.partition("\n")[0])
+    if not found:
+        sys.exit(f"{page}: has no such table")
+    page.write_text(before + table, encoding="utf-8")
+
+
+def errors_table() -> str:
+    """Return all codes as one Markdown table."""
+    lines = ["| code | what it means | what to do | retryable |", "|---|---|---|---|"]
+    for code, error in ERRORS.items():
+        meaning = " ".join((error.__doc__ or "").split())
+        lines.append(f"| `{code}` | {meaning} | {error.way_out} | {'yes' if error.retryable else 'no'} |")
+    return "\n".join(lines) + "\n"
+
+
+if __name__ == "__main__":
+    main()
