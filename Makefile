@@ -45,11 +45,10 @@ fix: .venv/ready
 docs: .venv/ready
 	.venv/bin/sphinx-build -W --keep-going -q -b html -d build/doctrees docs build/docs
 
-# wheel, sdist and the bill of materials, the same bytes from the same commit
+# wheel and sdist, the same bytes from the same commit
 dist: export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct)
 dist: .venv/ready
 	$(PY) -m hatchling build -d dist
-	$(PY) deploy/sbom.py > dist/sbom.cdx.json
 
 # the installed package on the kernel's own serial drivers, in a machine under QEMU; skipped with the reason where there is none
 test-drivers: .venv/ready

@@ -1,6 +1,6 @@
 #!/bin/bash
 # build_deb.sh OUT_DIR: a Debian package of this checkout for the Debian release it runs on, with an environment of its
-# own in /opt/ldcnd on Debian's Python. Prints the package's path. Needs uv and dpkg-deb.
+# own in /opt/ldcnd on Debian's Python. Prints the package's path. Needs uv, cyclonedx-bom (both in .venv) and dpkg-deb.
 # EXTRAS: optional parts to put in. COMPRESSION: xz, or none where time matters more than size. UV_OFFLINE=1: nothing is
 # fetched. Same input and SOURCE_DATE_EPOCH: same bytes.
 set -euo pipefail
@@ -9,6 +9,7 @@ out=$(mkdir -p "$1" && cd "$1" && pwd)
 here=$(cd "$(dirname "$0")" && pwd)
 source=$(dirname "$here")
 uv=${UV:-$(PATH=$PATH:$source/.venv/bin command -v uv)}
+bom=${CYCLONEDX:-$(PATH=$PATH:$(dirname "$uv") command -v cyclonedx-py)}
 python=${PYTHON:-/usr/bin/python3}
 extras=${EXTRAS-fast,journal}
 export SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-1700000000} PYTHONHASHSEED=0
@@ -46,7 +47,7 @@ install -Dm644 "$here/modules-load.d/ldcnd.conf" "$root/usr/lib/modules-load.d/l
 install -Dm644 -t "$doc/examples" "$here/drop-ins/"{realtime,nice,lan,single-line}.conf "$source"/config/*.toml
 install -Dm644 "$here/INSTALL.md" "$doc/INSTALL.md"
 install -Dm644 "$source/LICENSE" "$doc/copyright"
-"$opt/bin/python" "$here/sbom.py" ${extras//,/ } > "$doc/sbom.cdx.json"
+"$bom" environment "$opt/bin/python" --of JSON --output-reproducible --output-file "$doc/sbom.cdx.json"
 (cd "$source" && "$opt/bin/python" -m tools man "$root/usr/share/man/man1")
 gzip -9n "$root"/usr/share/man/man1/*.1
 plugins=$root/usr/lib/$("$python" -c 'import sysconfig; print(sysconfig.get_config_var("MULTIARCH"))')/wireshark/plugins

@@ -123,7 +123,7 @@ def add_model(house: Path) -> None:
     profiles = house / "ldcnd" / "drivers" / "ldcn" / "profiles.py"
     insert(
         profiles,
-        'LS_231 = Profile("ls-231"',
+        "LS_231 = Profile(",
         'LS_999 = replace(LS_182AP, name="ls-999", title="Logosol LS-999", device_id=91, versions=range(1, 2))\n',
     )
     insert(profiles, "        LS_231,\n", "        LS_999,\n")

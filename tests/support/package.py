@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PARTS = ("ldcnd", "schemas", "deploy", "config", "pyproject.toml", "constraints.txt", "README.md", "LICENSE")
+PARTS = ("ldcnd", "schemas", "tools", "deploy", "config", "pyproject.toml", "constraints.txt", "README.md", "LICENSE")
 BUILD_TIME_S = 55.0
 """For a build by itself; the first one on a machine fetches packages."""
 

@@ -1,16 +1,12 @@
 """What is handed out: the same bytes from the same source, with everything in it, and a list of what it needs."""
 
-import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 import tarfile
 import tomllib
 import zipfile
 from pathlib import Path
-from typing import Any
 
 import pytest
 from hatchling.builders.sdist import SdistBuilder
@@ -93,7 +89,7 @@ def test_the_sdist_has_what_building_testing_and_reading_takes(twice: list[dict[
         "constraints.txt",
         "Makefile",
         "CONTRIBUTING.md",
-        "deploy/sbom.py",
+        "deploy/build_deb.sh",
         "docs/conf.py",
         "docs/tutorials/first-rig.md",
         "examples/move_and_watch.py",
@@ -101,48 +97,3 @@ def test_the_sdist_has_what_building_testing_and_reading_takes(twice: list[dict[
         "tests/unit/test_packaging.py",
     } <= names
     assert not [name for name in names if name.startswith(("docs/faults/", "build/", ".venv/"))]
-
-
-def bill(*extras: str) -> dict[str, Any]:
-    """Return the bill of materials of this environment."""
-    done = subprocess.run(  # noqa: S603 - our own script
-        [sys.executable, str(ROOT / "deploy" / "sbom.py"), *extras],
-        env=os.environ | {"SOURCE_DATE_EPOCH": EPOCH},
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=True,
-    )
-    document: dict[str, Any] = json.loads(done.stdout)
-    assert "://" not in done.stdout  # no address of anything
-    return document
-
-
-@pytest.mark.system
-def test_the_bill_of_materials_has_what_is_pinned_and_nothing_dangling() -> None:
-    document = bill()
-    parts = {part["name"]: part for part in document["components"]}
-    refs = {part["bom-ref"] for part in parts.values()} | {document["metadata"]["component"]["bom-ref"]}
-
-    assert (document["bomFormat"], document["specVersion"]) == ("CycloneDX", "1.6")
-    assert document["metadata"]["timestamp"] == "2023-11-14T22:13:20+00:00"
-    assert {"pydantic", "eclipse-zenoh", "mcap", "prometheus-client", "matplotlib"} <= set(parts)
-    assert not {"pytest", "mypy", "sphinx", "hypothesis"} & set(parts)
-    assert all(part["licenses"] for part in parts.values())
-    assert len(refs) == len(parts) + 1
-    for link in document["dependencies"]:
-        assert {link["ref"], *link["dependsOn"]} <= refs
-    assert {(name, part["version"]) for name, part in parts.items()} <= PINS
-
-
-@pytest.mark.system
-def test_an_extra_that_is_not_asked_for_is_not_on_the_bill() -> None:
-    names = {part["name"] for part in bill("fast", "journal")["components"]}
-
-    assert "uvloop" in names
-    assert "matplotlib" not in names
-
-
-def test_an_extra_that_does_not_exist_is_refused() -> None:
-    with pytest.raises(subprocess.CalledProcessError):
-        bill("nonsense")
