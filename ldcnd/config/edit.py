@@ -1,11 +1,14 @@
 """Writing settings of one axis into a configuration, its comments and its order left as they are."""
 
-import json
-import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
+
+import tomlkit
+from tomlkit.exceptions import TOMLKitError
+from tomlkit.items import InlineTable, Table
 
 from ldcnd import durable
 from ldcnd.config.rig import load_config
@@ -38,18 +41,17 @@ def edited_for_axis(config: Path, axis: str, tables: Mapping[str, Literals]) -> 
     Raises:
         ConfigError: as there.
     """
-    lines = config.read_text(encoding="utf-8").splitlines()
-    with draft_of(config) as draft:
-        for place in _places(lines, axis):
-            end = _end_of_axis(lines, place)
-            section = lines[place:end]
+    document = tomlkit.parse(config.read_text(encoding="utf-8"))
+    with suppress(KeyError, TOMLKitError):
+        for each in [each for bus in document["bus"] for each in bus["axis"] if each["name"] == axis]:
             for name, values in tables.items():
-                _set(section, name, values)
-            edited = "\n".join([*lines[:place], *section, *lines[end:]]) + "\n"
-            draft.write_text(edited, encoding="utf-8")
-            with suppress(ConfigError):
-                if _holds(draft, axis, tables):
-                    return edited
+                _set(each, name, values)
+    edited = tomlkit.dumps(document)
+    with draft_of(config) as draft:
+        draft.write_text(edited, encoding="utf-8")
+        with suppress(ConfigError):
+            if _holds(draft, axis, tables):
+                return edited
     by_hand = "\n".join(_table(name, values) for name, values in tables.items())
     raise ConfigError(f"{config}: put this behind axis {axis} by hand:\n{by_hand}")
 
@@ -86,80 +88,38 @@ def _table(name: str, values: Literals) -> str:
     return "\n".join([header, *(f"{key} = {literal}" for key, literal in values.items())])
 
 
-def _places(lines: list[str], axis: str) -> list[int]:
-    """Return where the tables begin that have this name."""
-    named = [n for n, line in enumerate(lines) if re.match(rf"\s*name\s*=\s*[\"']{re.escape(axis)}[\"']", line)]
-    headers = [n for n, line in enumerate(lines) if line.lstrip().startswith("[[")]
-    return [begin for n in named if (begin := max((each for each in headers if each < n), default=-1)) >= 0]
-
-
-def _end_of_axis(lines: list[str], place: int) -> int:
-    """Return where the next table of an array begins; empty lines and remarks before it are its own."""
-    end = next((n for n in range(place + 1, len(lines)) if lines[n].lstrip().startswith("[[")), len(lines))
-    while end > place and (not lines[end - 1].strip() or lines[end - 1].lstrip().startswith("#")):
-        end -= 1
-    return end
-
-
-def _set(section: list[str], name: str, values: Literals) -> None:
-    """Set the values of a table among the lines of an axis: in its own lines, in one of its parent, or at the end."""
-    if not name:
-        _replace(section, 1, values)
-        return
-    header = f"[{AXIS}.{name}]"
-    if header in [line.strip() for line in section]:
-        _replace(section, [line.strip() for line in section].index(header) + 1, values)
-        return
-    parent, _, leaf = name.rpartition(".")
-    inline = next((n for n, line in enumerate(section) if re.match(rf"\s*{re.escape(leaf)}\s*=\s*\{{", line)), None)
-    if inline is not None and _table_at(section, inline) == (f"[{AXIS}.{parent}]" if parent else f"[[{AXIS}]]"):
-        held = {key: _literal(value) for key, value in tomllib.loads(section[inline])[leaf].items()}
-        section[inline] = f"{leaf} = {_inline({**held, **values})}{_remark(section[inline])}"
-        return
-    section += ["", *_table(name, values).splitlines()]
-
-
-def _replace(section: list[str], start: int, values: Literals) -> None:
+def _set(axis: Any, name: str, values: Literals) -> None:  # noqa: ANN401 - tables of tomlkit have no common type
+    """Set the values of a table below an axis, which is made where it is missing."""
+    table, parts = axis, name.split(".") if name else []
+    for depth, part in enumerate(parts, 1):
+        if part not in table and isinstance(table, InlineTable):
+            table[part] = tomlkit.inline_table()
+        elif part not in table:
+            behind = _taken_end(axis)
+            table[part] = tomlkit.table(is_super_table=depth < len(parts))
+            _end(axis).extend(behind)
+        table = table[part]
     for key, literal in values.items():
-        end = next((n for n in range(start, len(section)) if section[n].lstrip().startswith("[")), len(section))
-        known = [n for n in range(start, end) if re.match(rf"\s*{re.escape(key)}\s*=", section[n])]
-        if known:
-            section[known[0]] = f"{key} = {literal}{_remark(section[known[0]])}"
-        else:
-            section.insert(_behind_keys(section, start, end), f"{key} = {literal}")
+        behind = [] if isinstance(table, InlineTable) else _taken_end(table)
+        table[key] = tomlkit.value(literal)
+        if behind:
+            _end(table).extend(behind)
 
 
-def _behind_keys(section: list[str], start: int, end: int) -> int:
-    """Return where another key of a table goes: behind its last line that is neither empty nor a remark."""
-    while end > start and (not section[end - 1].strip() or section[end - 1].lstrip().startswith("#")):
-        end -= 1
-    return end
+def _end(table: Any) -> list[Any]:  # noqa: ANN401 - as above
+    """Return the items of the last table in a table, which is itself where it has no other."""
+    body: list[Any] = table.value.body
+    last = next((item for key, item in reversed(body) if key is not None), None)
+    return _end(last) if isinstance(last, Table) else body
 
 
-def _remark(line: str) -> str:
-    found = re.search(r"\s+#[^\"']*$", line)
-    return found.group() if found else ""
-
-
-def _table_at(section: list[str], place: int) -> str:
-    """Return the header of the table that a line is in."""
-    return next(line.split("#")[0].strip() for line in reversed(section[:place]) if line.lstrip().startswith("["))
-
-
-def _literal(value: object) -> str:
-    match value:
-        case bool():
-            return str(value).lower()
-        case dict():
-            return _inline({key: _literal(each) for key, each in value.items()})
-        case str():
-            return json.dumps(value, ensure_ascii=False)
-        case _:
-            return str(value)
-
-
-def _inline(values: Literals) -> str:
-    return f"{{ {', '.join(f'{key} = {literal}' for key, literal in values.items())} }}"
+def _taken_end(table: Any) -> list[Any]:  # noqa: ANN401 - as above
+    """Remove the empty lines and remarks at the end of a table, which are about what follows, and return them."""
+    body = _end(table)
+    taken: list[Any] = []
+    while body and body[-1][0] is None:
+        taken.insert(0, body.pop())
+    return taken
 
 
 def _holds(draft: Path, axis: str, tables: Mapping[str, Literals]) -> bool:

@@ -62,14 +62,21 @@ def test_values_that_are_there_are_replaced_and_others_kept(config, own):
     assert config.read_text().endswith("\n# the other drive\n" + TAIL)
 
 
-def test_a_file_that_is_laid_out_otherwise_is_left_alone(config):
-    text = HEAD + "smartstep = { eeprom_budget = 9000 }\n" + TAIL
-    config.write_text(text)
+def test_a_table_in_one_line_gets_further_ones_inside(config):
+    config.write_text(HEAD + "smartstep = { eeprom_budget = 9000 }\n" + TAIL)
 
+    set_for_axis(config, "feed", LAYOUT)
+
+    assert smartstep_of(config, "feed").trace.verified
+    assert smartstep_of(config, "feed").eeprom_budget == 9000
+    assert config.read_text().endswith(TAIL)
+
+
+def test_values_that_no_configuration_has_leave_the_file_alone(config):
     with pytest.raises(ConfigError, match="by hand"):
-        set_for_axis(config, "feed", LAYOUT)
+        set_for_axis(config, "feed", {"smartstep.trace": {"word_layout": '"sideways"'}})
 
-    assert config.read_text() == text
+    assert config.read_text() == MIXED
     assert list(config.parent.iterdir()) == [config]
 
 
