@@ -1,22 +1,31 @@
 """`ldcnd axis`: show axes and move them."""
 
+import asyncio
+import sys
+from functools import partial
+
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
-from ldcnd.cli.derived import derived
-from ldcnd.cli.lazy_group import LazyGroup
-from ldcnd.cli.quantities import number, sample_text, seconds
+from ldcnd.cli.main import LazyGroup
+from ldcnd.cli.output import end_as_interrupted, show_lines
+from ldcnd.cli.quantities import number, rounded, sample_text, seconds
 from ldcnd.cli.rig import stop_rig
-from ldcnd.cli.sending import Sender, commanding
+from ldcnd.cli.sending import NAME, Sender, commanding, derived, halted, halting
+from ldcnd.cli.terminal import keys, repetitions
 from ldcnd.cli.typed import Finite, axis_of
+from ldcnd.client.jog import Jogging
+from ldcnd.client.lease import Control, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import (
+    LONGEST_HOLD_S,
     BufferMode,
     Direction,
     Halt,
     Home,
     HomeMethod,
     HomeStop,
+    Jog,
     MoveAbsolute,
     MoveAnalog,
     MoveRelative,
@@ -35,6 +44,7 @@ from ldcnd.contract.commands import (
     SetPwm,
     Track,
 )
+from ldcnd.contract.errors import ConfigError, LeaseExpired
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import TelemetryItem
 
@@ -42,14 +52,14 @@ WAIT = click.option("--wait", is_flag=True, help="Return when it has ended; Ctrl
 LEAVE = click.option("--leave-running", is_flag=True, help="With --wait: Ctrl-C ends the wait only, the axis moves on.")
 
 HOMES = {
-    "list": "ldcnd.cli.axis_state:list_axes",
-    "faults": "ldcnd.cli.axis_state:faults",
-    "watch": "ldcnd.cli.axis_state:watch",
-    "jog": "ldcnd.cli.jog:jog",
-    "monitors": "ldcnd.cli.axis_drive:monitors",
-    "read-monitors": "ldcnd.cli.axis_drive:read_monitors",
-    "alarms": "ldcnd.cli.axis_drive:alarms",
-    "clear-counter": "ldcnd.cli.axis_drive:clear_counter",
+    "list": "ldcnd.cli.looking:list_axes",
+    "faults": "ldcnd.cli.looking:faults",
+    "watch": "ldcnd.cli.looking:watch",
+    "jog": "ldcnd.cli.axis:jog",
+    "monitors": "ldcnd.cli.looking:monitors",
+    "read-monitors": "ldcnd.cli.looking:read_monitors",
+    "alarms": "ldcnd.cli.looking:alarms",
+    "clear-counter": "ldcnd.cli.looking:clear_counter",
 }
 """The commands that are not in this file; they are loaded when they are used."""
 
@@ -252,3 +262,87 @@ def _held(value: float | None, error: float | None) -> str:
     if value is None:
         return "unknown"
     return f"{value:.6g}" + (f" ({error:+.2g} by rounding)" if error else "")
+
+
+LEASE_S = 1.0
+"""The daemon applies `loss.client` so soon when this program disappears."""
+HOLD_S = 0.4
+"""Longest time between two repetitions of the key that reach the daemon; then it ends the jog."""
+RENEW_EACH_S = 0.1
+
+
+@click.command(context_settings={"ignore_unknown_options": True})
+@click.argument("axis", type=AXIS)
+@click.argument("velocity", type=Finite())
+@click.option("--for", "for_s", type=Finite(0, 3600, min_open=True), help="Duration, seconds.")
+@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
+@click.option("--force", is_flag=True, help="Take control from its holder.")
+@with_target
+def jog(
+    target: Target, axis: str, velocity: float, for_s: float | None, acceleration: float | None, *, force: bool
+) -> None:
+    """Run AXIS at VELOCITY (units a second, signed) while the space bar is held, or with --for for a time.
+
+    The axis is under control of this command meanwhile. It is halted when the key is released, when the time is over,
+    at Ctrl-C and when the terminal goes; if this program dies, the daemon ends the jog within half a second.
+    """
+    command = of_options(Jog, velocity=velocity, acceleration=acceleration, hold_s=HOLD_S)
+    if for_s is None and not sys.stdin.isatty():
+        raise ConfigError("there is no keyboard here", remedy="say how long to run with --for SECONDS")
+
+    async def work(client: RigClient) -> str:
+        info = await axis_of(client, axis)
+        async with (
+            control(client, f"{NAME} jog", axis, lease_s=LEASE_S, force=force) as held,
+            halting(client, info),
+        ):
+            if for_s is None:
+                await _while_pressed(client, info, held, command)
+            else:
+                await _for_a_time(info, held, command, for_s)
+            return await halted(client, info)
+
+    end_as_interrupted()
+    show_lines(target.run(work))
+
+
+async def _for_a_time(info: AxisInfo, held: Control, command: Jog, for_s: float) -> None:
+    """Run the axis for a time, in seconds, or until its software limit."""
+    jog = Jogging(partial(held.command, info.axis), command)
+    reply = await jog.begin()
+    show_lines(f"{info.axis}: runs at {rounded(reply.velocity or command.velocity)} {info.unit}/s for {for_s:g} s")
+    try:
+        async with asyncio.timeout(for_s):
+            while True:
+                await jog.held()
+    except TimeoutError:
+        return
+    except LeaseExpired:
+        if held.lost:
+            raise
+
+
+async def _while_pressed(client: RigClient, info: AxisInfo, held: Control, command: Jog) -> None:
+    """Run the axis whenever the space bar is held, until another key is pressed."""
+    first = command.model_copy(update={"hold_s": LONGEST_HOLD_S})
+    with keys() as pressed:
+        show_lines("hold the space bar to run, any other key ends", err=True)
+        while await pressed.get() == " ":
+            jog = Jogging(partial(held.command, info.axis), first)
+            await jog.begin()
+            try:
+                await _renewed_until_released(pressed, jog)
+            except LeaseExpired:
+                if held.lost:
+                    raise
+            show_lines(await halted(client, info), err=True)
+
+
+async def _renewed_until_released(pressed: "asyncio.Queue[str]", jog: Jogging) -> None:
+    """Keep a jog alive with the repetitions of the key; return when it is not repeated any more."""
+    loop = asyncio.get_running_loop()
+    due_s = loop.time()
+    async for _ in repetitions(pressed, " "):
+        if loop.time() >= due_s:
+            due_s = loop.time() + RENEW_EACH_S
+            await jog.renew(hold_s=HOLD_S)

@@ -1,28 +1,42 @@
-"""`ldcnd commission`: the checklist that takes an axis from its first motion to a configuration and a report."""
+"""Commands that bring an axis into service and keep it there: the checklist, tuning, friction that grows."""
 
+import asyncio
 import getpass
 import sys
 from datetime import UTC, datetime
+from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ldcnd import durable
-from ldcnd.bench.commissioning.checklist import STEPS, Checklist, axis_of
+from ldcnd.bench.commissioning.checklist import STEPS, Checklist
+from ldcnd.bench.commissioning.checklist import axis_of as configured_axis
 from ldcnd.bench.commissioning.record import StepRecord
 from ldcnd.bench.commissioning.report import html_of
 from ldcnd.bench.commissioning.walk import Walk
 from ldcnd.bench.person import Left, Person
-from ldcnd.cli.connection import AxisName, Target
-from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.output import FAILED, show_lines
-from ldcnd.cli.terminal_person import TerminalPerson
-from ldcnd.cli.typed import Finite, NewFile, force_option
+from ldcnd.cli.connection import AXIS, AxisName, Target, with_target
+from ldcnd.cli.output import FAILED, end_as_interrupted, on_end, show_lines
+from ldcnd.cli.quantities import save_figure, stacked_rows
+from ldcnd.cli.terminal import AssentingPerson, TerminalPerson
+from ldcnd.cli.typed import Finite, NewFile, axis_of, force_option
+from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
+from ldcnd.client.kept_gains import put_back as put_back_gains
+from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config
-from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.errors import ConfigError, NotSupported, WrongState
+from ldcnd.drives.known import FAMILIES
 from ldcnd.version import version
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ldcnd.bench.tuning.ldcn.guided import Tuned
+    from ldcnd.bench.tuning.ldcn.watching import ShadowAlarm
 
 
 @click.command()
@@ -50,7 +64,7 @@ from ldcnd.version import version
     "--connect", "-e", multiple=True, envvar="LDCND_CONNECT", help="Zenoh endpoint of the daemon, or HOST:PORT."
 )
 @click.option("--login", type=click.Path(path_type=Path), help="Zenoh configuration file, as `ldcnd pki` makes it.")
-def command(
+def commission(
     axis: str,
     config: Path,
     name: str | None,
@@ -70,7 +84,7 @@ def command(
     the configuration and written when you say so.
     """
     rig = load_config(config)
-    axis_of(rig, axis)
+    configured_axis(rig, axis)
     target = Target(connect, (), login, rig.rig, as_json=as_json)
     person = TerminalPerson(for_s)
 
@@ -147,3 +161,195 @@ def _write_report(path: Path, checklist: Checklist, config: Path) -> None:
     except OSError as error:
         raise ConfigError(f"{path}: cannot be written: {error.strerror}") from error
     show_lines(f"{path}: written", err=True)
+
+
+ROWS = 2
+"""Of the picture: positions above, following errors below."""
+STYLES = {"new gains, predicted": "--", "command": ":k"}
+
+
+@click.command()
+@click.argument("axis", type=AXIS)
+@click.option(
+    "--bandwidth",
+    "bandwidth_hz",
+    type=Finite(1, 200),
+    help="Wanted crossover of the loop, Hz; that which settles soonest when missing.",
+)
+@click.option(
+    "--within",
+    type=Finite(0, min_open=True),
+    help="Stay within this distance of where the axis stands, in its unit; 2000 counts when missing.",
+)
+@click.option("--dry-run", is_flag=True, help="Say what it would do, and do nothing.")
+@click.option("--yes", is_flag=True, help="Do not ask before moving, nor before applying.")
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Draw the test moves, measured beside predicted, to a picture such as a PNG; needs the extra `plot`.",
+)
+@click.option("--put-back", is_flag=True, help="Put back the gains that a tuning has left behind that was cut short.")
+@with_target
+def tune(
+    target: Target,
+    axis: str,
+    bandwidth_hz: float | None,
+    within: float | None,
+    plot: Path | None,
+    *,
+    dry_run: bool,
+    yes: bool,
+    put_back: bool,
+) -> None:
+    """Find gains for AXIS: move it a little, identify it, propose, apply, verify.
+
+    An axis whose gains are registers must be off and stay where it is then. It is off afterwards. What it will do is
+    said before it moves; it moves within the stated distance only. The old gains come back at Ctrl-C, on any fault, and
+    when the new ones are not better; if this program or its host dies, --put-back restores them. It needs the extra
+    `tune`. A drive that tunes itself is not tuned here.
+    """
+    info = target.run(lambda client: axis_of(client, axis))
+    if put_back:
+        kept = target.run(lambda client: _put_back(client, axis))
+        gains = ", ".join(f"{name} = {value}" for name, value in kept.gains.items())
+        target.show(kept, f"{axis}: off, with its old gains: {gains}")
+        return
+    family = FAMILIES.get(info.family)
+    if family is None or not family.is_tuned_by_host:
+        raise NotSupported(f"axis {axis}: the gains of a {info.model} are not found by the host", axis=axis)
+    _require_numpy()
+    figure = stacked_rows(ROWS)[0] if plot else None  # missing matplotlib is reported before anything moves
+    if dry_run:
+        _plan(target, axis, within)
+        return
+    tuned = _tune(target, axis, within, bandwidth_hz, asks=not yes)
+    if figure and plot:
+        _draw(figure, tuned)
+        save_figure(figure, plot)
+    _show(target, tuned)
+
+
+async def _put_back(client: RigClient, axis: str) -> KeptGains:
+    rig = Rig(client, await client.daemon())
+    kept = kept_for(rig.name, axis)
+    if kept is None:
+        raise WrongState(
+            f"axis {axis}: no gains of an unfinished tuning are kept on this host ({file_of(rig.name, axis)})",
+            axis=axis,
+            remedy="type it on the host that tuned; or restart the daemon, which loads the configured gains",
+        )
+    await put_back_gains(rig, kept, program_name("ldcnd tune"))
+    return kept
+
+
+def _plan(target: Target, axis: str, within: float | None) -> None:
+    from ldcnd.bench.tuning.ldcn import plan as plans  # noqa: PLC0415 - needs an optional package
+    from ldcnd.bench.tuning.ldcn import report as reports  # noqa: PLC0415 - likewise
+
+    plan = target.run(lambda client: plans.plan(client, axis, within))
+    target.show(reports.plan_reported(plan), *plan.lines, "Nothing was sent to the drive.")
+
+
+def _tune(target: Target, axis: str, within: float | None, bandwidth_hz: float | None, *, asks: bool) -> "Tuned":
+    """Tune an axis.
+
+    Raises:
+        click.Abort: the person has left, or did not agree to the proposal; the old gains are back.
+    """
+    from ldcnd.bench.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
+
+    async def tuned(client: RigClient) -> "Tuned | None":
+        person = TerminalPerson(None) if asks else AssentingPerson(None)
+        try:
+            return await guided.tune(client, person, axis, within, bandwidth_hz)
+        except Left:
+            return None
+
+    end_as_interrupted()
+    outcome = target.run(tuned)
+    if outcome is None:
+        raise click.Abort
+    if outcome.report.after is None and outcome.report.objection is None:
+        target.show(outcome.report)
+        raise click.Abort
+    return outcome
+
+
+def _show(target: Target, tuned: "Tuned") -> None:
+    from ldcnd.bench.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
+
+    report = tuned.report
+    target.show(report, *guided.table(report), *guided.ending(report))
+    if not report.applied:
+        sys.exit(FAILED)
+
+
+def _require_numpy() -> None:
+    """Refuse to begin without the optional package.
+
+    Raises:
+        ConfigError: it is missing.
+    """
+    if find_spec("numpy") is None:
+        raise ConfigError("tuning needs numpy; install it with: pip install 'ldcnd[tune]'")
+
+
+def _draw(figure: "Figure", tuned: "Tuned") -> None:
+    """Draw the test moves: positions, and what they are behind the command."""
+    above, below = figure.axes
+    for curve in tuned.curves:
+        times_ms = [each * 1e3 for each in curve.times_s]
+        style = STYLES.get(curve.label, "-")
+        above.plot(times_ms, curve.positions, style, label=curve.label)
+        below.plot(times_ms, curve.following_errors, style, label=curve.label)
+    unit = tuned.report.unit
+    above.set_ylabel(f"position\n[{unit}]")
+    below.set_ylabel(f"following error\n[{unit}]")
+    below.set_xlabel("ms")
+    above.legend(fontsize="small")
+    figure.suptitle(f"{tuned.report.axis}: test move")
+
+
+@click.command()
+@click.argument(
+    "reports", metavar="REPORT...", nargs=-1, required=True, type=click.Path(path_type=Path, dir_okay=False)
+)
+@with_target
+def shadow(target: Target, reports: tuple[Path, ...]) -> None:
+    """Watch axes for friction, load and coupling (LDCN drives that report their position error), until SIGTERM.
+
+    Each REPORT is what `ldcnd tune AXIS --json` has printed; it names the axis. The first 100 motions teach what is
+    usual, and are kept on this host; later ones are compared. It takes no lease, moves nothing and stops nothing.
+    Needs the extra `tune`.
+    """
+    if find_spec("numpy") is None:
+        raise ConfigError("the shadow needs numpy; install it with: pip install 'ldcnd[tune]'")
+    from ldcnd.bench.tuning.ldcn.watching import read_report, watch  # noqa: PLC0415 - needs an optional package
+
+    plants = [read_report(path) for path in reports]
+    twice = {plant.axis for plant in plants if [each.axis for each in plants].count(plant.axis) > 1}
+    if twice:
+        raise ConfigError(f"two reports are of axis {min(twice)}", value=min(twice), remedy="name the newer one only")
+
+    async def work(client: RigClient) -> None:
+        ending = asyncio.Event()
+        on_end(ending.set)
+        await watch(client, plants, lambda alarm: target.show(alarm, _line(alarm)), _tell, ending)
+
+    target.run(work)
+
+
+def _tell(line: str) -> None:
+    show_lines(line, err=True)
+
+
+def _line(alarm: "ShadowAlarm") -> str:
+    at = datetime.fromtimestamp(alarm.t / 1e9, UTC).isoformat(timespec="seconds")
+    if alarm.over:
+        return f"{at} {alarm.axis}: {alarm.figure} is as usual again: {alarm.value:.3g} {alarm.unit}"
+    low = "" if alarm.low is None else f"{alarm.low:.3g} to "
+    return (
+        f"{at} {alarm.axis}: {alarm.figure} is {alarm.value:.3g} {alarm.unit} over {alarm.motions} motions,"
+        f" {alarm.latest:.3g} in the last five; usual is {alarm.usual:.3g}, allowed {low or 'up to '}{alarm.high:.3g}:"
+        f" {alarm.meaning}"
+    )

@@ -7,8 +7,7 @@ from collections.abc import Mapping
 import click
 
 from ldcnd.cli.connection import Target, of_options, with_target
-from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.output import FAILED, show_lines
+from ldcnd.cli.output import FAILED, end_as_interrupted, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, commanding, halted
 from ldcnd.cli.typed import Finite, axis_of, number_of

@@ -1,17 +1,54 @@
-"""`ldcnd record`: what a rig publishes, in MCAP files for Foxglove and PlotJuggler."""
+"""Commands on recordings: make, recover, convert and draw them."""
 
 import sys
 import time
+from collections.abc import Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
 from ldcnd.cli.connection import Target, with_target
-from ldcnd.cli.ending import on_end
-from ldcnd.cli.recording_file import EXIT_INCOMPLETE, RECORDING, require_mcap, tell_damages, utc
-from ldcnd.cli.typed import Whole
+from ldcnd.cli.output import on_end
+from ldcnd.cli.quantities import save_figure, stacked_rows
+from ldcnd.cli.typed import NewFile, Whole, force_option
 from ldcnd.client.rig_client import RigClient
+from ldcnd.client.trace_file import column_title
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.events import FINAL, CommandEvent, CommandStatus
+
+if TYPE_CHECKING:
+    from ldcnd.lab.recording.reading import AxisHistory
+
+
+RECORDING = click.Path(path_type=Path, exists=True, dir_okay=False)
+EXIT_INCOMPLETE = 1
+"""The recording is damaged; what could be read of it was used."""
+
+
+def require_mcap() -> None:
+    """Refuse to go on without the extra.
+
+    Raises:
+        ConfigError: it is missing.
+    """
+    try:
+        import mcap  # noqa: F401, PLC0415 - an optional package
+    except ImportError as error:
+        raise ConfigError("mcap is not installed", remedy="install ldcnd[record]") from error
+
+
+def tell_damages(path: Path, damages: Sequence[object]) -> None:
+    """Say what cannot be read of a recording."""
+    for damage in damages:
+        click.echo(f"{path}, {damage}", err=True)
+
+
+def utc(t_ns: int) -> str:
+    """Return an instant for people."""
+    return datetime.fromtimestamp(t_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 
@@ -25,7 +62,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 )
 @click.option("--rotate-mb", type=Whole(1), default=250, show_default=True, help="Begin a new file then.")
 @with_target
-def command(target: Target, out: Path | None, rotate_mb: int) -> None:
+def record(target: Target, out: Path | None, rotate_mb: int) -> None:
     """Record everything that a rig publishes until SIGTERM or SIGINT; a killed recorder loses one second at most."""
     if click.get_current_context().invoked_subcommand:
         return
@@ -39,7 +76,7 @@ def command(target: Target, out: Path | None, rotate_mb: int) -> None:
         raise click.ClickException(f"{error.filename or out}: cannot be written: {error.strerror}") from error
 
 
-@command.command("recover")
+@record.command("recover")
 @click.argument("damaged", type=RECORDING)
 @click.argument("whole", type=FILE)
 def recover_file(damaged: Path, whole: Path) -> None:
@@ -53,7 +90,7 @@ def recover_file(damaged: Path, whole: Path) -> None:
     click.echo(f"{saved.messages} messages recovered{until}; {saved.losses.missing.total()} missing in between")
 
 
-@command.command("export")
+@record.command("export")
 @click.argument("recording", type=RECORDING)
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 def export(recording: Path, folder: Path) -> None:
@@ -85,3 +122,72 @@ async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
                 await recorder.run(gave_way)
     finally:
         click.echo(recorder.summary, err=True)  # only now: until the subscriptions are gone, more is recorded
+
+
+NS_PER_S = 1e9
+MOST_LABELS = 40
+"""Maximum number of event labels; the names of more would overlap."""
+
+
+@click.command()
+@click.argument("recording", type=RECORDING)
+@click.argument("axis")
+@click.option("--output", "-o", type=NewFile(), required=True, help="Picture to write, such as a PNG.")
+@force_option
+def plot(recording: Path, axis: str, output: Path) -> None:
+    """Draw AXIS of RECORDING: its quantities, commands and faults against time; needs the extras record and plot."""
+    require_mcap()
+    from ldcnd.lab.recording.reading import Recording, axis_history  # noqa: PLC0415 - needs an optional package
+
+    file = Recording(recording)
+    history = axis_history(file, axis)
+    plot_axis(history, output)
+    if history.not_understood:
+        click.echo(f"{history.not_understood} messages of another version were left out", err=True)
+    if file.damages:
+        tell_damages(recording, file.damages)
+        sys.exit(EXIT_INCOMPLETE)
+
+
+def plot_axis(history: "AxisHistory", path: Path) -> None:
+    """Draw each quantity above the next, commands as lines and faults as shades across all of them.
+
+    Raises:
+        ConfigError: matplotlib is missing, there is nothing to draw, or the file cannot be written.
+    """
+    if not history.series:
+        raise ConfigError(f"axis {history.axis}: the recording has no value of it", value=history.axis)
+    first_ns = min(series.t_ns[0] for series in history.series)
+    last_ns = max(series.t_ns[-1] for series in history.series)
+
+    def seconds(t_ns: int) -> float:
+        return (t_ns - first_ns) / NS_PER_S
+
+    figure, rows = stacked_rows(len(history.series))
+    for axes, series in zip(rows, history.series, strict=True):
+        axes.plot([seconds(t_ns) for t_ns in series.t_ns], series.values, linewidth=1.0)
+        axes.set_ylabel(column_title(series.title, series.unit).replace(" [", "\n["))
+        for since_ns, until_ns in history.faults:
+            end_ns = last_ns if until_ns is None else until_ns
+            axes.axvspan(seconds(since_ns), seconds(end_ns), color="tab:red", alpha=0.15, linewidth=0)
+    marks = list(_marks(history.events))
+    for event in marks:
+        at_s = seconds(event.t)
+        colour = "tab:green" if event.status in {CommandStatus.ACCEPTED, CommandStatus.DONE} else "tab:red"
+        for axes in rows:
+            axes.axvline(at_s, color=colour, linewidth=0.6, linestyle=":")
+        if len(marks) <= MOST_LABELS:
+            label = f" {event.verb} {event.status}"
+            rows[0].annotate(
+                label, (at_s, 1.0), xycoords=("data", "axes fraction"), rotation=90, fontsize=6, ha="right", va="top"
+            )
+    rows[-1].set_xlabel("s")
+    figure.suptitle(f"{history.axis}, from {utc(first_ns)}")
+    save_figure(figure, path)
+
+
+def _marks(events: list[CommandEvent]) -> Iterator[CommandEvent]:
+    """Leave out what lies between the beginning of a command and its end."""
+    for event in events:
+        if event.status is CommandStatus.ACCEPTED or event.status in FINAL:
+            yield event

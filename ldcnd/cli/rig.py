@@ -1,14 +1,26 @@
-"""Commands for a whole rig: stop, reset, power and the speed override."""
+"""Commands for a whole rig: stop, reset, power, speed override, control, and rehearsals of a loss."""
 
+import asyncio
+import json
+import os
+import shlex
 import sys
+from collections.abc import Callable
 
 import click
 
-from ldcnd.cli.connection import AXIS, Target, with_target
+from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.output import FAILED, UNREACHABLE, show_error, show_lines
+from ldcnd.cli.quantities import rounded
 from ldcnd.cli.sending import NAME, Sender, commanding
-from ldcnd.contract.commands import Power, Reset
-from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis
+from ldcnd.cli.typed import Finite, axis_of
+from ldcnd.client.lease import control
+from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.commands import MoveVelocity, Power, Reset
+from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError, UnknownAxis, WrongState
+from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.rig_commands import Rehearse, SetSpeedOverride
+from ldcnd.contract.samples import AxisState, StateSample, TelemetryItem
 
 
 def stop_rig(target: Target, axis: str | None) -> None:
@@ -62,3 +74,193 @@ def reset(sender: Sender, axes: tuple[str, ...]) -> None:
 def power(sender: Sender, switch: str, axes: tuple[str, ...]) -> None:
     """Close (on) or open (off) the position loops of each AXIS, or of all axes; nothing moves."""
     sender.send_to_all(axes, Power(on=switch == "on"))
+
+
+@click.command()
+@click.argument("percent", type=Finite(0, 100), required=False)
+@commanding
+def speed(sender: Sender, percent: float | None) -> None:
+    """Set the speed override of the rig to PERCENT of every velocity; without PERCENT show it.
+
+    At 0 what moves is halted and nothing begins. Raising it needs control of the axes where moving them would.
+    """
+
+    async def shown(client: RigClient) -> str:
+        states = [await client.state(info.axis) for info in await client.axes()]
+        return ", ".join(sorted({f"{rounded(state.speed_override)} %" for state in states if state}))
+
+    if percent is None:
+        show_lines(sender.target.run(shown))
+        return
+    leases = (sender.lease,) if sender.lease else ()
+    request = of_options(SetSpeedOverride, percent=percent, leases=leases, client=None if sender.lease else NAME)
+    reply = sender.target.run(lambda client: client.ask(request))
+    told = [f"{axis}: goes on at another speed" for axis in reply.changed] + [
+        f"{axis}: halted" for axis in reply.halted
+    ]
+    sender.target.show(reply, f"speed override {rounded(reply.percent)} %", *told)
+
+
+@click.group()
+def lease() -> None:
+    """See who controls which axis, and take control."""
+
+
+@lease.command("list")
+@with_target
+def list_holders(target: Target) -> None:
+    """Show who controls each axis."""
+    reply = target.run(lambda client: client.ask(ListHolders()))
+    needed = "a motion needs control" if reply.required else "an axis that is not controlled is open to all"
+    lines = [f"{each.axis:8} {each.client or 'not controlled'}" for each in reply.holders]
+    target.show(reply, *lines, f"({needed})")
+
+
+@lease.command(context_settings={"allow_interspersed_args": False})
+@click.option("--axis", "axes", type=AXIS, multiple=True, help="This axis; may be repeated. All axes when missing.")
+@click.option("--name", default=NAME, show_default=True, help="Who holds it, for people.")
+@click.option(
+    "--seconds",
+    "lease_s",
+    type=Finite(0.2, 60),
+    default=2.0,
+    show_default=True,
+    help="The daemon applies `loss.client` so soon when this program disappears.",
+)
+@click.option("--force", is_flag=True, help="Take control from its holder.")
+@click.argument("program", nargs=-1, metavar="[-- PROGRAM...]")
+@with_target
+def hold(
+    target: Target, axes: tuple[str, ...], name: str, lease_s: float, program: tuple[str, ...], *, force: bool
+) -> None:
+    """Hold control until Ctrl-C, or for as long as PROGRAM runs.
+
+    The lease is printed, and in $LDCND_LEASE of PROGRAM, where all commands of ldcnd find it.
+    """
+
+    async def work(client: RigClient) -> int:
+        for axis in axes:
+            await axis_of(client, axis)
+        async with control(client, name, *axes, lease_s=lease_s, force=force) as held:
+            if program:
+                environment = {**os.environ, "LDCND_LEASE": held.lease.lease}
+                running = await asyncio.create_subprocess_exec(*program, env=environment)
+                return await running.wait()
+            target.show(held.lease, f"{held.lease.lease}  controls {', '.join(held.lease.axes)}; Ctrl-C releases it")
+            await held.over.wait()
+            why = f": {held.lost.message}" if held.lost else ""
+            raise LeaseExpired(f"control is lost{why}", remedy="hold it again")
+
+    try:
+        code = target.run(work)
+    except FileNotFoundError as error:
+        raise click.UsageError(f"{shlex.join(program)}: {error.strerror}") from error
+    sys.exit(code)
+
+
+RUN_UP_S = 0.5
+"""Time in motion before the loss, seconds."""
+PATIENCE_S = 30.0
+
+
+@click.group()
+def drill() -> None:
+    """Rehearse a loss on an axis that may move, and report measured times."""
+
+
+def _moving(work: Callable[..., None]) -> Callable[..., None]:
+    """Give a drill the axis and the velocity at which it is caught."""
+    for option in (
+        click.confirmation_option("--yes", prompt="The axis will move. Go on?"),
+        click.option("--velocity", type=Finite(), required=True, help="Units a second, signed."),
+        click.argument("axis", type=AXIS),
+    ):
+        work = option(work)
+    return work
+
+
+@drill.command("client-loss")
+@_moving
+@click.option("--lease", "lease_s", type=Finite(), default=1.0, show_default=True, help="Length of the lease, seconds.")
+@with_target
+def client_loss(target: Target, axis: str, velocity: float, lease_s: float) -> None:
+    """Take control, jog, and disappear: how long until the axis reacts, and until it is at rest?"""
+
+    async def work(client: RigClient) -> dict[str, float]:
+        if client.lease:
+            raise WrongState(
+                f"axis {axis}: `ldcnd lease hold`, which runs this, goes on renewing its lease: no client is lost",
+                axis=axis,
+                remedy="run it outside",
+            )
+        request = Acquire(client="drill", axes=(axis,), lease_s=lease_s)
+        lease = await client.ask(request)
+        began_s = asyncio.get_running_loop().time()
+        await client.command(axis, Power(on=True, lease=lease.lease))
+        await client.command(axis, MoveVelocity(velocity=velocity, lease=lease.lease))
+        reacted_s, stands_s = await _watch(client, axis)
+        return {
+            "lease_s": lease_s,
+            "reacted_after_lease_s": reacted_s - began_s - lease_s,
+            "stands_after_lease_s": stands_s - began_s - lease_s,
+        }
+
+    _report(target, axis, "client loss", target.run(work))
+
+
+@drill.command("daemon-stop")
+@_moving
+@with_target
+def daemon_stop(target: Target, axis: str, velocity: float) -> None:
+    """Jog, and let the daemon apply `loss.daemon` as at its shutdown; it does not end."""
+    _report(target, axis, "daemon stop", target.run(lambda client: _rehearse(client, axis, velocity, "daemon_stop")))
+
+
+@drill.command("bus-loss")
+@_moving
+@with_target
+def bus_loss(target: Target, axis: str, velocity: float) -> None:
+    """Jog, and have the daemon drop the line and open it again."""
+    _report(target, axis, "bus loss", target.run(lambda client: _rehearse(client, axis, velocity, "bus_loss")))
+
+
+async def _rehearse(client: RigClient, axis: str, velocity: float, kind: str) -> dict[str, float]:
+    """Play a loss under control of the whole rig: a lost line concerns all axes on it."""
+    loop = asyncio.get_running_loop()
+    async with control(client, "drill", lease_s=PATIENCE_S) as held:
+        await held.command(axis, Power(on=True))
+        await held.command(axis, MoveVelocity(velocity=velocity))
+        await asyncio.sleep(RUN_UP_S)
+        began_s = loop.time()
+        request = Rehearse.model_validate({"kind": kind, "axis": axis, "lease": held.lease.lease})
+        await client.ask(request, timeout_s=PATIENCE_S)
+        answered_s = loop.time()
+        reacted_s, stands_s = await _watch(client, axis)
+    return {
+        "carried_out_s": answered_s - began_s,
+        "reacted_s": reacted_s - began_s,
+        "stands_s": stands_s - began_s,
+    }
+
+
+async def _watch(client: RigClient, axis: str) -> tuple[float, float]:
+    """Return when the axis began to come to rest, and when it stood, in loop time."""
+    loop = asyncio.get_running_loop()
+    reacted_s = None
+    async with client.samples(axis, TelemetryItem.STATE) as states, asyncio.timeout(PATIENCE_S):
+        async for _, state in states:
+            if not isinstance(state, StateSample) or state.state is AxisState.CONTINUOUS_MOTION:
+                continue
+            reacted_s = reacted_s or loop.time()
+            if state.state is not AxisState.STOPPING:
+                return reacted_s, loop.time()
+    raise WrongState(f"axis {axis}: no state was published any more", axis=axis)
+
+
+def _report(target: Target, axis: str, what: str, measured: dict[str, float]) -> None:
+    if target.as_json:
+        print(json.dumps({"axis": axis, "drill": what, **{name: round(value, 4) for name, value in measured.items()}}))
+        return
+    print(f"{axis}: {what}")
+    for name, value in measured.items():
+        print(f"  {name.removesuffix('_s').replace('_', ' '):24} {value:8.3f} s")

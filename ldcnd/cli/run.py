@@ -1,15 +1,21 @@
 """`ldcnd run`: the daemon in the foreground."""
 
 import asyncio
+import contextlib
+import json
+import shlex
 import signal
-from collections.abc import Callable
+import sys
+from asyncio.subprocess import PIPE, Process
+from collections.abc import AsyncIterator, Callable
 from functools import partial
 from pathlib import Path
 
 import click
 
-from ldcnd.cli.ending import Terminal
-from ldcnd.cli.served_at import CONSOLE_ADDRESS, parsed_address
+from ldcnd.cli.connection import DEFAULT_ENDPOINT
+from ldcnd.cli.output import Terminal, show_lines
+from ldcnd.cli.typed import CONSOLE_ADDRESS, parsed_address
 from ldcnd.config.plan import require_plan
 from ldcnd.config.rig import RigConfig, load_config, single_line
 from ldcnd.contract.frozen import build_models
@@ -20,6 +26,76 @@ from ldcnd.daemon.systemd import Notifier
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging, get_logger
 from ldcnd.net.zenoh_threads import senders_wait
+
+LINK_S = 20.0
+"""Longest time that the console takes to print its link."""
+END_S = 5.0
+
+
+async def show_first_steps(daemon: Daemon, rig: RigConfig, address: ListenAddress) -> None:
+    """Wait until the lines are up, serve the console, say what to type next; until cancelled.
+
+    Args:
+        daemon: the daemon that starts.
+        rig: its configuration.
+        address: where the console serves.
+    """
+    endpoint = next(iter(rig.zenoh.listen), DEFAULT_ENDPOINT)
+    await daemon.wait_up()
+    async with _console(endpoint, address) as link:
+        show_lines(*first_steps(rig, endpoint, link))
+        await asyncio.Event().wait()
+
+
+def first_steps(rig: RigConfig, endpoint: str, link: str | None) -> list[str]:
+    """Return the lines that a newcomer reads."""
+    axes = [axis for bus in rig.bus for axis in bus.axis]
+    program = _program()
+    at = "" if endpoint == DEFAULT_ENDPOINT else f" -e {shlex.quote(endpoint)}"
+    lines = ["", f"Rig {rig.rig} is up: {', '.join(axis.name for axis in axes)}. Nothing moves unless you ask for it."]
+    lines += ["In a second terminal:", f"  {program} axis list{at}"]
+    if movable := next((axis.name for axis in axes if axis.reference == "at_reset"), None):
+        lines += [f"  {program} axis power {movable} on{at}", f"  {program} axis move {movable} 10 --wait{at}"]
+    lines += [f"  {program} stop{at}    # at any time; software, not an emergency stop"]
+    lines += [f"In a browser, within ten minutes: {link}"] if link else ["No console serves; `ldcnd console` says why."]
+    return [*lines, "Ctrl-C here ends it; what moves is brought to rest first.", ""]
+
+
+def _program() -> str:
+    """Return how this program was called, so that what is printed can be typed."""
+    called = Path(sys.argv[0])
+    with contextlib.suppress(ValueError):
+        return str(called.resolve().relative_to(Path.cwd())) if called.name == "ldcnd" else "ldcnd"
+    return "ldcnd"
+
+
+@contextlib.asynccontextmanager
+async def _console(endpoint: str, address: ListenAddress) -> AsyncIterator[str | None]:
+    """Run a console until the context ends; with its link, or None when it does not serve: the daemon goes on."""
+    words = ("-m", "ldcnd", "console", "--json", "-e", endpoint, "--listen", f"{address.in_url}:{address.port}")
+    try:
+        console = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=PIPE)
+    except OSError:
+        yield None
+        return
+    try:
+        yield await _link(console)
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            console.terminate()
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(END_S):
+                await console.wait()
+
+
+async def _link(console: Process) -> str | None:
+    assert console.stdout  # noqa: S101 - it is piped
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LINK_S):
+            if line := await console.stdout.readline():
+                return str(json.loads(line)["link"])
+    return None
+
 
 log = get_logger("run")
 
@@ -102,7 +178,7 @@ async def serve(rig: RigConfig, load: Callable[[], RigConfig], console: ListenAd
                 async with asyncio.TaskGroup() as group:
                     beside = [group.create_task(senders_wait(), name="senders wait")]
                     if console:
-                        from ldcnd.cli.first_steps import show_first_steps  # noqa: PLC0415 - for a newcomer only
+                        from ldcnd.cli.run import show_first_steps  # noqa: PLC0415 - for a newcomer only
 
                         beside.append(group.create_task(show_first_steps(daemon, rig, console), name="console"))
                     try:

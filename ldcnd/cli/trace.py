@@ -7,9 +7,8 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
-from ldcnd.cli.ending import end_as_interrupted
-from ldcnd.cli.figure import save_figure, stacked_rows
-from ldcnd.cli.output import show_passing
+from ldcnd.cli.output import end_as_interrupted, show_passing
+from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.typed import Finite, NewFile, Whole, axis_of, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace

@@ -1,18 +1,19 @@
 """Typed input: names with the nearest right one, and numbers as `ldcnd.contract.number_text` reads them."""
 
 import os
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import click
 from typing_extensions import override
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.errors import UnknownAxis
+from ldcnd.contract.errors import ConfigError, UnknownAxis
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, read_number, read_whole
+from ldcnd.listen_address import ListenAddress, parse_listen_address
 
 NEAR = 0.4
 """How alike two names must be, from 0 to 1."""
@@ -127,3 +128,29 @@ def _keep_force(context: click.Context, _parameter: click.Parameter, force: bool
 
 
 force_option = click.option("--force", cls=ForceOption)
+
+
+CONSOLE_ADDRESS = "127.0.0.1:8470"
+CommandT = TypeVar("CommandT", bound=Callable[..., object])
+
+
+def address_option(name: str, default: str) -> Callable[[CommandT], CommandT]:
+    """Return an option of that name, whose value is a `ListenAddress`; anything but HOST:PORT is wrong usage."""
+    return click.option(
+        name,
+        callback=parsed_address,
+        default=default,
+        show_default=True,
+        metavar="HOST:PORT",
+        help="Where to serve; port 0 is any.",
+    )
+
+
+def parsed_address(_context: click.Context, _parameter: click.Parameter, value: str | None) -> ListenAddress | None:
+    """Return what is written as HOST:PORT; None for nothing."""
+    if value is None:
+        return None
+    try:
+        return parse_listen_address(value)
+    except ConfigError as error:
+        raise click.BadParameter(error.message) from error

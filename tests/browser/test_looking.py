@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from ldcnd.cli.parameter_file import load_parameters
+from ldcnd.cli.params import load_parameters
 from ldcnd.client.trace_file import load_trace
 from ldcnd.client.traces import fetch_trace, trace_header
 from ldcnd.contract.commands import HomeMethod, HomeStop, MoveVelocity, Power, ReportShadow, SetGains

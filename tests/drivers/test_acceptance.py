@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.cli.accept import capture_of, command
+from ldcnd.cli.examine import accept as accept_command
+from ldcnd.cli.examine import capture_of
 from ldcnd.contract.health import Finding, Verdict
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.family import TrialMove
@@ -153,7 +154,7 @@ def test_smartsteps_are_tried_and_their_capture_plays_back_to_the_same_findings(
         thread = threading.Thread(target=line.run, args=(stopped.is_set,), name="line")
         thread.start()
         arguments = [str(line.path), "--family", "smartstep", "--units", "1,2", "--out", str(tmp_path)]
-        done = CliRunner().invoke(command, arguments)
+        done = CliRunner().invoke(accept_command, arguments)
         stopped.set()
         thread.join(5)
 
@@ -166,7 +167,7 @@ def test_smartsteps_are_tried_and_their_capture_plays_back_to_the_same_findings(
 
 
 def test_assumptions_are_listed_without_a_port():
-    done = CliRunner().invoke(command, ["--list"])
+    done = CliRunner().invoke(accept_command, ["--list"])
 
     assert done.exit_code == 0
     assert done.output.count("confirmed_by") == len(ASSUMPTIONS)
@@ -176,4 +177,4 @@ def test_assumptions_are_listed_without_a_port():
     "arguments", [[], ["/dev/x", "--move", "1"], ["/dev/x", "--move", "1", "--gains", "1,2,3,4,5,6"]]
 )
 def test_command_refuses_to_move_without_gains_or_a_dead_man(arguments: list[str]):
-    assert CliRunner().invoke(command, arguments).exit_code == 2
+    assert CliRunner().invoke(accept_command, arguments).exit_code == 2

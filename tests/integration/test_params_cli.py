@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.cli.parameter_file import load_parameters
+from ldcnd.cli.params import load_parameters
 from ldcnd.config.rig import load_config
 from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000
 from ldcnd.sim.smartstep.cable import smartstep_chain

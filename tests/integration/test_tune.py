@@ -13,7 +13,7 @@ from ldcnd.bench.tuning.ldcn.plan import plan
 from ldcnd.bench.tuning.ldcn.plant import Plant
 from ldcnd.bench.tuning.ldcn.report import plan_reported, reported
 from ldcnd.bench.tuning.ldcn.session import measure, verify
-from ldcnd.cli import tune
+from ldcnd.cli.commission import tune
 from ldcnd.cli.connection import Target
 from ldcnd.client.kept_gains import file_of, kept_for, put_back
 from ldcnd.client.lease import control
@@ -156,23 +156,23 @@ def rig_on(loop):
 @pytest.mark.timeout(300)
 def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, monkeypatch, capsys):
     pytest.importorskip("matplotlib")
-    monkeypatch.setattr("ldcnd.cli.tune.end_as_interrupted", lambda: None)
+    monkeypatch.setattr("ldcnd.cli.commission.end_as_interrupted", lambda: None)
     monkeypatch.setattr("sys.stdin", io.StringIO())
     picture = tmp_path / "tune.png"
 
     with rig_on(loop) as rig:
         monkeypatch.setattr(Target, "run", lambda _, work: loop.run_until_complete(work(rig.client)))
         with pytest.raises(click.Abort):  # nothing can be typed here
-            tune.command.main(["x", "--within", "1"], standalone_mode=False)
+            tune.main(["x", "--within", "1"], standalone_mode=False)
         unasked = capsys.readouterr()
-        tune.command.main(["x", "--json", "--dry-run"], standalone_mode=False)
+        tune.main(["x", "--json", "--dry-run"], standalone_mode=False)
         dry = capsys.readouterr()
         untouched = loop.run_until_complete(registers(rig))["kp"]
-        tune.command.main(["x", "--json", "--yes", "--bandwidth", "25", "--plot", str(picture)], standalone_mode=False)
+        tune.main(["x", "--json", "--yes", "--bandwidth", "25", "--plot", str(picture)], standalone_mode=False)
         done = capsys.readouterr()
         loaded = loop.run_until_complete(registers(rig))
         with pytest.raises(WrongState, match="no gains of an unfinished tuning"):
-            tune.command.main(["x", "--put-back"], standalone_mode=False)
+            tune.main(["x", "--put-back"], standalone_mode=False)
 
     assert "it will stay within 1 mm (1000 counts)" in unasked.err
     assert "move x now" in unasked.err

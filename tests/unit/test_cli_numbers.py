@@ -4,8 +4,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.cli.lazy_group import LazyGroup
-from ldcnd.cli.main import cli
+from ldcnd.cli.main import LazyGroup, cli
 from ldcnd.cli.typed import Finite, Whole
 
 

@@ -4,8 +4,7 @@ from datetime import UTC, datetime
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.cli.parameter_file import as_toml, load_parameters
-from ldcnd.cli.params import command
+from ldcnd.cli.params import as_toml, command, load_parameters
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.parameters import DriveFacts, ParameterDump, ParameterValue
 

@@ -10,7 +10,8 @@ from ldcnd.bench.tuning.ldcn.plant import Plant
 from ldcnd.bench.tuning.ldcn.report import Estimate
 from ldcnd.bench.tuning.ldcn.shadow import FigureName
 from ldcnd.bench.tuning.ldcn.watching import ShadowAlarm
-from ldcnd.cli import shadow
+from ldcnd.cli import commission
+from ldcnd.cli.commission import shadow
 from ldcnd.cli.connection import Target
 from ldcnd.contract.errors import ConfigError
 from tests.unit.test_cli_tune import REPORT
@@ -41,11 +42,11 @@ def report(tmp_path):
 
 
 def run(*arguments):
-    shadow.command.main([*arguments], standalone_mode=False)
+    shadow.main([*arguments], standalone_mode=False)
 
 
 def test_without_numpy_one_line_names_the_extra(monkeypatch, report):
-    monkeypatch.setattr(shadow, "find_spec", lambda _: None)
+    monkeypatch.setattr(commission, "find_spec", lambda _: None)
 
     with pytest.raises(ConfigError, match=r"pip install 'ldcnd\[tune\]'$"):
         run(report)
@@ -77,7 +78,7 @@ async def test_alarms_are_lines_or_json(monkeypatch, report, capsys):
             work(None).send(None)
 
     monkeypatch.setattr(watching, "watch", watch)
-    monkeypatch.setattr(shadow, "on_end", lambda _: None)
+    monkeypatch.setattr(commission, "on_end", lambda _: None)
     monkeypatch.setattr(Target, "run", run_work)
 
     run(report)

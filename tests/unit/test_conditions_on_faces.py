@@ -12,7 +12,8 @@ import msgpack
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
-from ldcnd.cli import axis_state, fleet
+from ldcnd.cli.looking import Watched, axes_table, rig_table
+from ldcnd.cli.looking import row as row_of
 from ldcnd.client.axis import Axis
 from ldcnd.client.fleet import AxisReport, RigReport
 from ldcnd.client.overview import AxisNow
@@ -173,17 +174,17 @@ def axis_now(at: Known) -> AxisNow:
 
 
 def axis_list(at: Known) -> str:
-    return axis_state.table([axis_now(at)])[0]
+    return axes_table([axis_now(at)])[0]
 
 
 def axis_list_json(at: Known) -> str:
-    row = json.loads(axis_state.row(axis_now(at)).model_dump_json())
+    row = json.loads(row_of(axis_now(at)).model_dump_json())
     assert {"position", "quality", "age_s", "state", "referenced", "link", "moving"} <= row.keys()
     return " ".join((row["place"], row["state"], *row["condition"]))
 
 
 def axis_watch(at: Known) -> str:
-    watched = axis_state.Watched()
+    watched = Watched()
     watched.begin(axis_now(at))
     watched.text("x", at.faults)
     return f"{watched.text('x', at.position)}\n{watched.text('x', at.state)}"
@@ -214,7 +215,7 @@ def fleet_table(at: Known) -> str:
         line_up=at.case.line_up,
         holder=at.case.holder,
     )
-    return "\n".join(fleet.table(RigReport(rig="sim", instance="a", daemon=None, health=None, axes=(report,))))
+    return "\n".join(rig_table(RigReport(rig="sim", instance="a", daemon=None, health=None, axes=(report,))))
 
 
 def metrics(at: Known) -> str:

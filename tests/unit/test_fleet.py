@@ -8,7 +8,7 @@ from contextlib import AsyncExitStack, asynccontextmanager
 
 import pytest
 
-from ldcnd.cli.fleet import table
+from ldcnd.cli.looking import rig_table
 from ldcnd.client.fleet import survey
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
@@ -66,7 +66,7 @@ async def test_every_rig_is_listed_with_its_axes_and_is_well():
         assert view.health
         assert [axis.info.axis for axis in view.axes] == ["x", "y", "z", "c"]
         assert all(axis.state and axis.state.link is LinkState.UP for axis in view.axes)
-        text = "\n".join(table(view))
+        text = "\n".join(rig_table(view))
         assert text.startswith(f"{view.rig}  ldcnd {view.daemon.version}  run {view.instance}  well")
         assert "x            ls-182ap" in text
 
@@ -79,7 +79,7 @@ async def test_a_daemon_that_is_alive_and_answers_nothing_is_told():
 
     assert [(view.rig, view.instance) for view in views] == [("lathe", "l9"), ("mill", "m1")]
     assert "does not answer" in views[0].problems[0]
-    assert "! is alive and does not answer" in "\n".join(table(views[0]))
+    assert "! is alive and does not answer" in "\n".join(rig_table(views[0]))
     assert views[1].problems == ()
 
 

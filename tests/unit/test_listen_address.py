@@ -3,7 +3,7 @@
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.cli import console, foxglove, metrics
+from ldcnd.cli.serve import console, foxglove, metrics
 from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 
@@ -39,7 +39,7 @@ def test_what_is_no_address_is_refused(text):
 
 @pytest.mark.parametrize(
     ("command", "option"),
-    [(console.command, "--listen"), (metrics.command, "--address"), (foxglove.command, "--address")],
+    [(console, "--listen"), (metrics, "--address"), (foxglove, "--address")],
 )
 def test_every_command_that_serves_calls_it_wrong_usage(command, option):
     answer = CliRunner().invoke(command, [option, "localhost"])

@@ -1,4 +1,4 @@
-"""`ldcnd accept`: try real drives against what the documents say; keeps a report and a capture to send."""
+"""Commands that use a port themselves: find drives, examine them, try them against the documents."""
 
 import asyncio
 import json
@@ -7,21 +7,155 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import click
 
+from ldcnd.bench.begun import SCANNED, begun_with, scan_port, write
 from ldcnd.cli.typed import Finite, Whole
-from ldcnd.config.rig import RigConfig
+from ldcnd.config.edit import set_for_axis
+from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.contract.errors import ConfigError, NotSupported
 from ldcnd.contract.health import Finding, Verdict
 from ldcnd.contract.number_text import NotANumber, read_whole
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.family import TrialMove, Tries
-from ldcnd.drives.known import DEFAULT, FAMILIES
+from ldcnd.drives.family import ConfigFiles, Examines, TrialMove, Tries
+from ldcnd.drives.known import DEFAULT, FAMILIES, chain_of
+from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.opened import show_findings
 from ldcnd.line.bus import Bus
 from ldcnd.line.capture import Capture, CaptureHeader, capture_lines
 from ldcnd.log import configure_logging
 from ldcnd.version import version
+
+NOTHING_FOUND = 1
+"""Exit code: no drive answers, or something must be put right first."""
+
+
+@click.command()
+@click.argument("port")
+@click.option("--family", type=click.Choice(list(SCANNED)), help="Search for drives of this family only.")
+@click.option(
+    "--address",
+    "give_addresses",
+    is_flag=True,
+    help="Reset and address a chain on which nothing can be moving; the motors lose their positions.",
+)
+@click.option(
+    "--write",
+    "file",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Add what was found and is not in it yet to a configuration, or begin one.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print JSON lines.")
+def scan(port: str, family: str | None, file: Path | None, *, give_addresses: bool, as_json: bool) -> None:
+    """Find out which drives are on PORT, at which rate and in which state; no daemon may use it meanwhile.
+
+    Listens, then probes addresses 1 to 32, or units 0 to F, at every rate: 10 to 20 seconds. It only reads: nothing
+    moves, nothing is reset, nothing gets an address, unless --address says so. Exits with 1 when no drive is found.
+    """
+    configure_logging(level="error")  # findings say the rest
+    wrong = False
+
+    def show(finding: Finding) -> None:
+        nonlocal wrong
+        wrong = wrong or finding.verdict is Verdict.WRONG
+        remedy = f"\n{'':28}> {finding.remedy}" if finding.remedy else ""
+        text = f"{finding.axis:8} {finding.verdict:5} {finding.what:12} {finding.text}{remedy}"
+        print(finding.model_dump_json() if as_json else text, flush=True)
+
+    for name in (family,) if family else SCANNED:
+        if not as_json:
+            print(f"searching for {name} drives", file=sys.stderr, flush=True)
+        wrong = False
+        drives = asyncio.run(scan_port(SCANNED[name], port, show, give_addresses=give_addresses))
+        if drives:
+            if file:
+                print("\n".join(write(begun_with(file, name, port, drives))), file=sys.stderr)
+            break
+    sys.exit(NOTHING_FOUND if wrong or not drives else 0)
+
+
+FILES = ConfigFiles(
+    lambda file: load_config(file).bus, lambda file, settings: chain_of(settings, load_config(file).sim), set_for_axis
+)
+
+
+class Examinations(click.Group):
+    """One command for each family, and what else a family can examine."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
+        """Return the names of all commands."""
+        return list(self._commands())
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+        """Return the command of that name."""
+        return self._commands().get(cmd_name)
+
+    @staticmethod
+    def _commands() -> dict[str, click.Command]:
+        commands = {
+            name: _examination(name, family) for name, family in FAMILIES.items() if isinstance(family, Examines)
+        }
+        more = {
+            str(each.name): each
+            for family in FAMILIES.values()
+            if isinstance(family, Examines)
+            for each in family.commands(FILES)
+        }
+        return commands | more
+
+
+@click.command(cls=Examinations)
+def doctor() -> None:
+    """Examine a line; only reads by default. No daemon may use it meanwhile."""
+
+
+def _examination(family_name: str, family: Examines[Any]) -> click.Command:
+    """Return the command that examines lines of a family."""
+
+    def examine(config: Path, name: str, *, as_json: bool) -> None:
+        rig = load_config(config)
+        settings = next((bus for bus in rig.bus if bus.name == name and bus.family == family_name), None)
+        if settings is None:
+            raise ConfigError(f"{config}: no {family_name} line {name!r}")
+        wrong = False
+
+        def show(finding: Finding) -> None:
+            nonlocal wrong
+            wrong = wrong or finding.verdict is Verdict.WRONG
+            assumption = f"  [{finding.verifies}]" if finding.verifies else ""
+            remedy = f"\n{'':31}> {finding.remedy}" if finding.remedy else ""
+            text = f"{finding.axis:8} {finding.verdict:5} {finding.what:16} {finding.text}{assumption}{remedy}"
+            print(finding.model_dump_json() if as_json else text, flush=True)
+
+        configure_logging(level="error")  # findings say the rest
+        asyncio.run(examine_line(rig, settings, show))
+        sys.exit(1 if wrong else 0)
+
+    options: list[click.Parameter] = [
+        click.Option(
+            ["--config"], type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML)."
+        ),
+        click.Option(["--bus", "name"], required=True, help="The line to examine."),
+        click.Option(["--json", "as_json"], is_flag=True, help="Print JSON lines."),
+    ]
+    return click.Command(family_name, callback=examine, params=options, help=family.examination)
+
+
+async def examine_line(rig: RigConfig, settings: BusConfig, show: Callable[[Finding], None]) -> None:
+    """Open a line, examine it and every configured drive on it, and close it.
+
+    Raises:
+        BusDown: the port does not open.
+    """
+    family = FAMILIES[settings.family]
+    if not isinstance(family, Examines):
+        raise NotSupported(f"bus {settings.name}: lines of family {settings.family} are not examined")
+    line = family.open_lines(None)(settings, None, chain_of(settings, rig.sim))
+    line.bus.resync = line.network.resync
+    await show_findings(line.bus, settings.port, family.examine(line, settings), show)
+
 
 HELD_S = 1.0
 """Time without Enter after which the dead-man counts as released, seconds."""
@@ -42,7 +176,7 @@ TRIED = {name: family for name, family in FAMILIES.items() if isinstance(family,
 @click.option("--velocity", type=Finite(1), default=1000.0, show_default=True, help="Counts per second.")
 @click.option("--acceleration", type=Finite(1), default=10_000.0, show_default=True, help="Counts per s^2.")
 @click.option("--list", "list_only", is_flag=True, help="Print the assumptions and what would confirm them, and end.")
-def command(  # noqa: PLR0917 - click passes them by name
+def accept(  # noqa: PLR0917 - click passes them by name
     port: str | None,
     family: str,
     units: str,

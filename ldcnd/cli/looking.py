@@ -1,0 +1,447 @@
+"""Commands that show a rig and change nothing: axes, drives, obstacles, events, faults; all rigs at once."""
+
+import asyncio
+import sys
+from datetime import UTC, datetime
+from difflib import get_close_matches
+
+import click
+from click.shell_completion import CompletionItem
+
+from ldcnd.cli.connection import AXIS, Target, with_target
+from ldcnd.cli.output import typed
+from ldcnd.cli.quantities import decimals, sample_text
+from ldcnd.cli.typed import Finite, Whole, axis_of
+from ldcnd.client.events import follow_events, latest_events
+from ldcnd.client.fleet import AxisReport, RigReport, survey
+from ldcnd.client.overview import AxisNow, overview
+from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.codec import remedy_of
+from ldcnd.contract.commands import Why, WhyReply
+from ldcnd.contract.condition import Place, assess
+from ldcnd.contract.errors import ConfigError, LdcndError, NotSupported, SessionError
+from ldcnd.contract.events import ALARM_HISTORY, DRIVE_CHANGED, REFERENCE, UNSETTLED, CommandEvent
+from ldcnd.contract.fault_pages import codes, page_text
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.parameters import (
+    AlarmReport,
+    ClearCounter,
+    CounterName,
+    CounterReply,
+    ReadAlarms,
+    ReadMonitors,
+)
+from ldcnd.contract.samples import (
+    AxisState,
+    FaultSample,
+    LinkState,
+    MonitorName,
+    MonitorSample,
+    Moving,
+    PositionSample,
+    Quality,
+    Sample,
+    StateSample,
+    TelemetryItem,
+)
+from ldcnd.lab.top.columns import as_text
+from ldcnd.lab.top.follow import follow
+from ldcnd.lab.top.glance import RigGlance
+from ldcnd.lab.top.rig_view import RigView
+from ldcnd.net.session import Session
+
+SILENT_S = 3.0
+"""Time without a sample after which `axis watch` says why, seconds."""
+
+
+class AxisRow(AxisInfo):
+    """An axis as `axis list --json` has it: its description, and how it is now."""
+
+    position: float | None
+    """Where it is, as far as `place` says so; null before the first position."""
+    quality: Quality | None
+    """How much the position is worth."""
+    age_s: float | None
+    """Age of the position, seconds."""
+    place: Place
+    """Whether the position says where the axis is."""
+    state: AxisState | None
+    """PLCopen state."""
+    referenced: bool
+    """The position is valid."""
+    link: LinkState | None
+    """Whether the drive answers."""
+    moving: Moving
+    """Whether it moves; unknown is an answer of its own and never means no."""
+    condition: tuple[str, ...]
+    """Everything that is to be said of it, in a few words each, the worst first."""
+
+
+@click.command("list")
+@with_target
+def list_axes(target: Target) -> None:
+    """Show every axis: where it is, its state, whether it moves, and whether its drive answers.
+
+    A position in brackets does not say where the axis is; the words behind it say why.
+    """
+    axes = target.run(overview)
+    for now, line in zip(axes, axes_table(axes), strict=True):
+        target.show(row(now), line)
+
+
+def axes_table(axes: list[AxisNow]) -> list[str]:
+    """Return a line for each axis; a number that does not say where the axis is stands in brackets."""
+    cells = [
+        (
+            now.info.axis,
+            now.info.model,
+            f"{now.info.bus}/{now.info.address}",
+            now.condition.position(_digits(now), now.info.unit, now.age_s),
+            now.condition.state,
+            f"moving {row(now).moving}",
+            f"link {now.state.link if now.state else 'unknown'}",
+            ", ".join(now.condition.notes),
+        )
+        for now in axes
+    ]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return ["  ".join(map(str.ljust, each, widths)).rstrip() for each in cells]
+
+
+def _digits(now: AxisNow) -> str | None:
+    return f"{now.position.value:.{decimals(now.info)}f}" if now.position else None
+
+
+def row(now: AxisNow) -> AxisRow:
+    """Return an axis as `--json` has it."""
+    state, position = now.state, now.position
+    return AxisRow(
+        **now.info.model_dump(),
+        position=position.value if position else None,
+        quality=position.quality if position else None,
+        age_s=now.age_s,
+        place=now.condition.place,
+        state=state.state if state else None,
+        referenced=state is not None and state.referenced and now.condition.live,
+        link=state.link if state else None,
+        moving=state.moving if state and now.condition.live else Moving.UNKNOWN,
+        condition=now.condition.notes,
+    )
+
+
+@click.command()
+@click.argument("axis", type=AXIS)
+@with_target
+def faults(target: Target, axis: str) -> None:
+    """Show the faults that AXIS has had, oldest first; `ldcnd fault CODE` explains them."""
+    for each in target.run(lambda client: axis_of(client, axis)).past_faults:
+        at = datetime.fromtimestamp(each.since / 1e9, UTC).isoformat(timespec="milliseconds")
+        target.show(each, f"{at} {each.code:16} {each.source:7} {each.text}")
+
+
+@click.command()
+@click.argument("axis", type=AXIS, default="*")
+@click.option("--item", type=click.Choice([item.value for item in TelemetryItem]), help="Only this item.")
+@click.option("--count", type=Whole(min=1), help="End after this many samples.")
+@with_target
+def watch(target: Target, axis: str, item: str | None, count: int | None) -> None:
+    """Show the telemetry of AXIS, an axis or an I/O module (or of all), as it comes."""
+
+    async def work(client: RigClient) -> None:
+        if axis != "*" and axis not in {module.name for bus in await client.buses() for module in bus.modules}:
+            await axis_of(client, axis)
+        seen, watched = 0, Watched()
+        async with client.samples(axis, item or "*") as samples:
+            _say_conditions(watched, await overview(client), axis)
+            while seen != count:
+                try:
+                    async with asyncio.timeout(SILENT_S):
+                        name, sample = await anext(samples)
+                except TimeoutError:
+                    await _say_silence(client, axis)
+                    continue
+                target.show(sample, f"{name:8} {watched.text(name, sample)}")
+                seen += 1
+
+    target.run(work)
+
+
+class Watched:
+    """The last state and faults of the axes that are watched: they say what their positions are worth."""
+
+    def __init__(self) -> None:
+        self._states: dict[str, StateSample] = {}
+        self._faults: dict[str, FaultSample] = {}
+        self._now: dict[str, AxisNow] = {}
+
+    def begin(self, now: AxisNow) -> None:
+        """Take what is known of an axis before its first sample."""
+        self._now[now.info.axis] = now
+        if now.state:
+            self._states[now.info.axis] = now.state
+
+    def text(self, name: str, sample: Sample) -> str:
+        """Return a sample in words, with the condition of its axis where that matters."""
+        if isinstance(sample, FaultSample):
+            self._faults[name] = sample
+        if isinstance(sample, StateSample):
+            self._states[name] = sample
+        if name in self._now and isinstance(sample, PositionSample | StateSample):
+            condition = assess(self._states.get(name), self._faults.get(name))
+            if isinstance(sample, PositionSample):
+                return f"position {condition.position(f'{sample.value:.4f}', sample.unit)}"
+            return f"state    {condition.summary}"
+        return sample_text(sample)
+
+
+def _say_conditions(watched: Watched, axes: list[AxisNow], wanted: str) -> None:
+    """Say at once what is wrong: an axis that does not answer brings no sample that would."""
+    for now in axes:
+        if wanted in ("*", now.info.axis):
+            watched.begin(now)
+            if now.condition.wrong:
+                click.echo(f"{now.info.axis:8} {_all_of(now)}", err=True)
+
+
+async def _say_silence(client: RigClient, wanted: str) -> None:
+    try:
+        found = await overview(client)
+    except LdcndError as error:
+        click.echo(f"no sample for {SILENT_S:g} s: {error.message}", err=True)
+        return
+    for now in found:
+        if wanted in ("*", now.info.axis) and not now.condition.live:
+            click.echo(f"{now.info.axis:8} no sample for {SILENT_S:g} s: {_all_of(now)}", err=True)
+
+
+def _all_of(now: AxisNow) -> str:
+    where = now.condition.position(_digits(now), now.info.unit, now.age_s)
+    return f"{where}, {now.condition.summary}"
+
+
+@click.command()
+@click.argument("axis", type=AXIS)
+@with_target
+def monitors(target: Target, axis: str) -> None:
+    """Show the last values of the monitors of AXIS."""
+
+    async def work(client: RigClient) -> dict[MonitorName, MonitorSample]:
+        info = await axis_of(client, axis)
+        if not info.monitors:
+            raise NotSupported(f"axis {axis} has no monitors: its drive is a {info.model}", axis=axis)
+        return await client.monitors(axis)
+
+    for name, sample in target.run(work).items():
+        high = f"  high: {', '.join(sample.high)}" if sample.high else ""
+        target.show(sample, f"{name:22} {sample.value:8d} {sample.unit:14} {sample.title}{high}  ({sample.quality})")
+
+
+@click.command()
+@click.argument("axis", type=AXIS)
+@with_target
+def alarms(target: Target, axis: str) -> None:
+    """Show the present alarm of AXIS and the history that its drive keeps."""
+
+    async def work(client: RigClient) -> AlarmReport:
+        await axis_of(client, axis)
+        return await client.command(axis, ReadAlarms())
+
+    reply = target.run(work)
+    past = (f"  {place} {entry.code:04X}H {entry.text}" for place, entry in enumerate(reply.history))
+    target.show(reply, f"{axis}: {reply.present.code:04X}H {reply.present.text}", *past)
+
+
+@click.command("read-monitors")
+@click.argument("axis", type=AXIS)
+@click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice([name.value for name in MonitorName]))
+@with_target
+def read_monitors(target: Target, axis: str, names: tuple[str, ...]) -> None:
+    """Read monitors of AXIS once, published or not; all of them without a NAME."""
+    command = ReadMonitors(monitors=tuple(MonitorName(name) for name in names))
+    reply = target.run(lambda client: client.command(axis, command))
+    for each in reply.readings:
+        on = "" if each.active is None else f"  on: {', '.join(each.active) or 'none'}"
+        high = f"  high: {', '.join(each.high)}" if each.high else ""
+        target.show(each, f"{each.monitor:24} {each.value:>8} {each.unit:14}{each.title}{high}{on}")
+
+
+@click.command("clear-counter")
+@click.argument("axis", type=AXIS)
+@click.argument("counter", type=click.Choice([name.value for name in CounterName]))
+@with_target
+def clear_counter(target: Target, axis: str, counter: str) -> None:
+    """Set a pulse counter of AXIS to 0; command pulses must be stopped, and the motor must stand."""
+
+    async def work(client: RigClient) -> CounterReply:
+        await axis_of(client, axis)
+        return await client.command(axis, ClearCounter(counter=CounterName(counter)))
+
+    reply = target.run(work)
+    remarks = "".join(f"; {remark}" for remark in reply.remarks)
+    target.show(reply, f"{axis}: the {counter} counter is cleared and reads {reply.value}{remarks}")
+
+
+@click.command()
+@click.argument("axis", type=AXIS)
+@with_target
+def why(target: Target, axis: str) -> None:
+    """Tell why AXIS cannot move now, and what would clear that; exits with 1 when something is in the way."""
+
+    async def work(client: RigClient) -> WhyReply:
+        await axis_of(client, axis)
+        return await client.ask(Why(), axis)
+
+    reply = target.run(work)
+    lines = [f"{axis}: {'ready to move' if reply.can_move else 'cannot move now'}"]
+    for cause in reply.causes:
+        known = remedy_of(cause)
+        remedy = known and known.phrased(lambda step: typed(step, axis))
+        lines.append(f"  {cause.text}{f': {remedy}' if remedy else ''}")
+        if cause.page:
+            lines.append(f"    more: ldcnd fault {cause.page.rpartition('/')[2]}")
+    if reply.first_fault:
+        lines.append(f"  first fault since the last reset: {reply.first_fault}")
+    target.show(reply, *lines)
+    if not reply.can_move:
+        sys.exit(1)
+
+
+@click.command()
+@click.option("--axis", type=AXIS, help="Only this axis.")
+@click.option("--count", type=Whole(1, 1000), default=50, show_default=True, help="Maximum number of events.")
+@click.option("--follow", is_flag=True, help="Go on with those that come, until Ctrl-C; none is lost silently.")
+@with_target
+def events(target: Target, axis: str | None, count: int, *, follow: bool) -> None:
+    """Show the latest events of the rig, oldest first."""
+
+    async def work(client: RigClient) -> None:
+        if axis is not None:
+            await axis_of(client, axis)
+        if not follow:
+            for event in await latest_events(client, count, axis):
+                _show(target, event)
+            return
+        async with follow_events(client, axis) as events:
+            for event in await latest_events(client, count, axis):
+                _show(target, event)
+            async for event in events:
+                _show(target, event)
+
+    target.run(work)
+
+
+def _show(target: Target, event: CommandEvent) -> None:
+    at = datetime.fromtimestamp(event.t / 1e9, UTC).isoformat(timespec="milliseconds")
+    if event.verb in (ALARM_HISTORY, DRIVE_CHANGED, UNSETTLED, REFERENCE):
+        code = f"{event.code}: " if event.code else ""
+        target.show(event, f"{at} {event.axis:8} {event.verb:14} {code}{event.reason}")
+        return
+    who = f"{event.client or 'unnamed'} ({f'login {event.login}' if event.login else 'not authenticated'})"
+    why = f": {event.reason}" if event.reason else ""
+    target.show(event, f"{at} {event.axis:8} {event.verb:14} {event.status:10} by {who} ({event.command_id}){why}")
+
+
+ENOUGH_S = 2.5
+"""Two reports of each line come in this time, so rates are known."""
+
+
+@click.command()
+@with_target
+def top(target: Target) -> None:
+    """Show every axis and line of a rig, what is wrong first; S or Esc stops its axes, Q quits.
+
+    Without a terminal, or with --json, the rig is printed once. The stop is no emergency stop.
+    """
+    if target.as_json or not sys.stdout.isatty():
+        glance = target.run(_once)
+        target.show(glance, *as_text(glance))
+        return
+    target.run(_watch)
+
+
+async def _once(client: RigClient) -> RigGlance:
+    loop = asyncio.get_running_loop()
+    view = RigView(client.rig, loop.time())
+    async with asyncio.TaskGroup() as group:
+        following = group.create_task(follow(client, view), name="follow")
+        await asyncio.sleep(ENOUGH_S)
+        following.cancel()
+    return view.glance(loop.time())
+
+
+async def _watch(client: RigClient) -> None:
+    try:
+        from ldcnd.lab.top.screen import TopScreen  # noqa: PLC0415 - an optional package
+    except ImportError as error:
+        raise ConfigError("textual is not installed", remedy="install ldcnd[tui]") from error
+    await TopScreen(client).run_async()
+
+
+@click.command()
+@click.option("--watch", type=Finite(min=0.5, max=3600), help="Period of updates, seconds.")
+@with_target
+def fleet(target: Target, watch: float | None) -> None:
+    """Show every rig across routers: its daemon, its lines and axes, and what is wrong with them.
+
+    With --json, one line for each rig.
+    """
+
+    async def work(session: Session) -> None:
+        while True:
+            fleet = await survey(session, target.rig)
+            if not fleet and watch is None:
+                raise SessionError(
+                    "no rig answers", remedy="start one with `ldcnd run`, or name a router with --connect"
+                )
+            for rig in fleet:
+                target.show(rig, *rig_table(rig))
+            if watch is None:
+                return
+            if not fleet:
+                click.echo("no rig answers", err=True)
+            await asyncio.sleep(watch)
+
+    target.run_session(work)
+
+
+def rig_table(rig: RigReport) -> list[str]:
+    """Return a rig as lines of text: itself, what is wrong, its axes."""
+    version = f"ldcnd {rig.daemon.version}" if rig.daemon else "version unknown"
+    lines = [f"{rig.rig}  {version}  run {rig.instance}  {'needs attention' if rig.problems else 'well'}"]
+    lines += [f"  ! {problem}" for problem in rig.problems]
+    lines += [f"  {_axis(axis)}" for axis in rig.axes]
+    return lines
+
+
+def _axis(axis: AxisReport) -> str:
+    info, state, health = axis.info, axis.state, axis.health
+    where = f"{info.bus}/{info.address}"
+    what = axis.condition.summary
+    link = state.link.value if state else "?"
+    rate = f"{health.rate_hz:6.1f} Hz" if health else "     ? Hz"
+    return f"{info.axis:12} {info.model:14} {where:12} {link:8} {rate}  {what}"
+
+
+class Code(click.types.StringParamType):
+    """A code that has a page; the shell completes it."""
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:  # noqa: ARG002
+        """Return the codes that begin so."""
+        return [CompletionItem(code) for code in sorted(codes()) if code.startswith(incomplete)]
+
+
+@click.command()
+@click.argument("code", required=False, type=Code())
+def fault(code: str | None) -> None:
+    """Explain CODE, a fault or an error: what to check, how to clear it; without CODE list all of them."""
+    if code is None:
+        print("\n".join(sorted(codes())))
+        return
+    page = page_text(code)
+    if page is None:
+        near = next(iter(get_close_matches(code, codes(), 1)), None)
+        meant = f"did you mean {near!r}? " if near else ""
+        raise click.BadParameter(
+            f"there is no page for {code!r}; {meant}`ldcnd fault` lists all of them", param_hint="CODE"
+        )
+    print(page, end="")

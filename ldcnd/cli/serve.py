@@ -1,0 +1,270 @@
+"""Programs that show a rig to others until they are ended: browsers, Prometheus, EPICS, ROS 2, Foxglove."""
+
+import asyncio
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from ldcnd.cli.connection import DEFAULT_ENDPOINT, Target, with_target
+from ldcnd.cli.output import on_end
+from ldcnd.cli.typed import CONSOLE_ADDRESS, Whole, address_option
+from ldcnd.client.health import health_reports
+from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient, Samples
+from ldcnd.contract.errors import ConfigError, UnknownAxis
+from ldcnd.contract.samples import FaultSample, ShadowSample, StateSample, TelemetryItem
+from ldcnd.listen_address import ListenAddress
+from ldcnd.log import configure_logging
+from ldcnd.net.zenoh_settings import ZenohSettings
+
+if TYPE_CHECKING:
+    from ldcnd.console.server import MoreRoutes
+    from ldcnd.lab.metrics import HealthCollector
+
+
+FILE = click.Path(path_type=Path, dir_okay=False)
+
+
+@click.command()
+@click.option(
+    "--connect", "-e", multiple=True, help=f"Zenoh endpoint of a daemon or router; repeatable [{DEFAULT_ENDPOINT}]."
+)
+@click.option("--config", type=FILE, help="Zenoh configuration file to start from, for each endpoint.")
+@click.option("--rig", multiple=True, help="Show this rig only; may be repeated.")
+@address_option("--listen", CONSOLE_ADDRESS)
+@click.option("--host", multiple=True, help="Name under which browsers reach it, beside that; may be repeated.")
+@click.option("--certificate", type=FILE, help="PEM file: serve HTTPS with this certificate.")
+@click.option("--key", type=FILE, help="PEM file with its key.")
+@click.option("--token-file", type=FILE, help="File with the token that lets browsers in, instead of one-time links.")
+@click.option(
+    "--commission",
+    type=FILE,
+    help="Serve the commissioning page for this configuration of a rig: it writes the file, and its steps move axes.",
+)
+@click.option("--json", "as_json", is_flag=True, help="Print the link as a line of JSON.")
+@click.option(
+    "--log-level",
+    type=click.Choice(["debug", "info", "warning", "error"]),
+    default="warning",
+    show_default=True,
+    help="Log nothing below this.",
+)
+def console(
+    connect: tuple[str, ...],
+    config: Path | None,
+    rig: tuple[str, ...],
+    listen: ListenAddress,
+    host: tuple[str, ...],
+    certificate: Path | None,
+    key: Path | None,
+    token_file: Path | None,
+    *,
+    commission: Path | None,
+    as_json: bool,
+    log_level: str,
+) -> None:
+    """Show rigs in a browser until SIGTERM or SIGINT; prints the link that opens it. SIGUSR1 prints another one.
+
+    It stops axes, it is not an emergency stop. With --commission every browser that is let in can also search a port
+    for drives, write the configuration, and run the steps of `ldcnd commission` and `ldcnd tune`.
+    """
+    try:
+        from ldcnd.console.rigs import Endpoint  # noqa: PLC0415 - its packages are optional
+        from ldcnd.console.server import serve  # noqa: PLC0415
+        from ldcnd.console.settings import ConsoleSettings, read_token  # noqa: PLC0415
+    except ImportError as error:
+        raise ConfigError(f"{error.name} is not installed", remedy="install ldcnd[console]") from error
+    configure_logging(level=log_level)
+    endpoints = connect or (() if config else (DEFAULT_ENDPOINT,))
+    settings = ConsoleSettings(
+        endpoints=tuple(
+            Endpoint(name, ZenohSettings(mode="client", connect=(name,), config_file=config, instance="ldcnd console"))
+            for name in endpoints
+        )
+        or (Endpoint(str(config), ZenohSettings(mode=None, config_file=config, instance="ldcnd console")),),
+        rigs=rig,
+        address=listen,
+        hosts=host,
+        certificate=certificate,
+        key=key,
+        token=read_token(token_file) if token_file else None,
+        as_json=as_json,
+    )
+    asyncio.run(serve(settings, _commissioning(commission, endpoints) if commission else None))
+
+
+def _commissioning(config: Path, endpoints: Sequence[str]) -> "MoreRoutes":
+    """Return the routes of the commissioning page for a configuration."""
+    from ldcnd.console.commissioning.routes import Commissioning  # noqa: PLC0415 - its packages are optional
+
+    words = ["ldcnd", "run", "--config", str(config)]
+    if endpoints and endpoints[0] != DEFAULT_ENDPOINT:
+        words += ["--listen", endpoints[0]]  # where this console looks for it
+    return lambda rigs: Commissioning(rigs, config, shlex.join(words)).routes()
+
+
+METRICS_ADDRESS = "127.0.0.1:9464"
+
+
+@click.command()
+@address_option("--address", METRICS_ADDRESS)
+@with_target
+def metrics(target: Target, address: ListenAddress) -> None:
+    """Serve metrics over HTTP until SIGTERM or SIGINT; the daemon itself never waits for a scraper."""
+    target.run(lambda client: _serve_metrics(client, address))
+
+
+async def _serve_metrics(client: RigClient, address: ListenAddress) -> None:
+    try:
+        from prometheus_client import CollectorRegistry  # noqa: PLC0415 - an optional package
+
+        from ldcnd.lab.metrics import HealthCollector, metrics_server  # noqa: PLC0415
+    except ImportError as error:
+        raise ConfigError("prometheus-client is not installed", remedy="pip install 'ldcnd[metrics]'") from error
+    loop = asyncio.get_running_loop()
+    collector = HealthCollector(client.rig, loop.time)
+    registry = CollectorRegistry()
+    registry.register(collector)
+    ending = asyncio.Event()
+    on_end(ending.set)
+    try:
+        async with (
+            health_reports(client, collector.take),
+            client.samples(item=TelemetryItem.SHADOW) as shadows,
+            client.samples(item=TelemetryItem.STATE) as states,
+            client.samples(item=TelemetryItem.FAULT) as faults,
+            metrics_server(registry, address.host, address.port) as port,
+            asyncio.TaskGroup() as group,
+        ):
+            for axis, state in (await client.states()).items():
+                collector.take_state(axis, state)
+            for axis, fault in (await client.faults()).items():
+                collector.take_state(axis, fault)
+            following = [
+                group.create_task(_follow(samples, collector), name="samples") for samples in (shadows, states, faults)
+            ]
+            click.echo(f"metrics on http://{address.in_url}:{port}/metrics")
+            await ending.wait()
+            for task in following:
+                task.cancel()
+    except OSError as error:
+        where = f"{address.in_url}:{address.port}"
+        raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
+
+
+async def _follow(samples: Samples, collector: "HealthCollector") -> None:
+    async for axis, sample in samples:
+        if isinstance(sample, ShadowSample):
+            collector.take_shadow(axis, sample)
+        elif isinstance(sample, StateSample | FaultSample):
+            collector.take_state(axis, sample)
+
+
+EPICS_ADDRESS = "127.0.0.1:5064"
+
+
+@click.command()
+@click.argument("axes", nargs=-1)
+@click.option("--prefix", help="Of every process variable; the rig's name and a colon when missing.")
+@click.option(
+    "--moves", is_flag=True, help="Let puts move the axes, under a lease of this program; it is read-only otherwise."
+)
+@address_option("--address", EPICS_ADDRESS)
+@with_target
+def epics(target: Target, address: ListenAddress, axes: tuple[str, ...], prefix: str | None, moves: bool) -> None:  # noqa: FBT001 - click's
+    """Serve AXES (all of them by default) as motor records until SIGTERM or SIGINT.
+
+    Channel Access does not authenticate clients: with --moves, any client that reaches the address moves axes.
+    """
+    target.run(lambda client: _serve_epics(client, address, axes, prefix, moves=moves))
+
+
+async def _serve_epics(
+    client: RigClient, address: ListenAddress, axes: tuple[str, ...], prefix: str | None, *, moves: bool
+) -> None:
+    try:
+        from ldcnd.lab.epics.gateway import gateway, serve  # noqa: PLC0415 - needs an optional package
+    except ImportError as error:
+        raise ConfigError("caproto is not installed", remedy="pip install 'ldcnd[epics]'") from error
+    rig = Rig(client, await client.daemon())
+    named = f"{rig.name}:" if prefix is None else prefix
+    async with gateway(rig, prefix=named, axes=axes, moves=(axes or rig.axes) if moves else ()) as records:
+        serving = asyncio.create_task(serve(records, address), name="channel access")
+        on_end(lambda: _cancel(serving))
+        click.echo(
+            f"{'motor records' if moves else 'read-only motor records'} {named}{{{','.join(axes or rig.axes)}}}"
+            f" on {address.in_url}:{address.port}"
+        )
+        try:
+            await serving
+        except asyncio.CancelledError:
+            return
+        except OSError as error:
+            where = f"{address.in_url}:{address.port}"
+            raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
+
+
+def _cancel(task: asyncio.Task[None]) -> None:
+    task.cancel()
+
+
+HIGHEST_DOMAIN = 232
+
+
+@click.command()
+@click.argument("axes", nargs=-1)
+@click.option("--router", required=True, help="Zenoh endpoint of the ROS graph's router, such as tcp/127.0.0.1:7447.")
+@click.option("--domain", type=Whole(0, HIGHEST_DOMAIN), default=0, show_default=True, envvar="ROS_DOMAIN_ID")
+@with_target
+def ros2(target: Target, axes: tuple[str, ...], router: str, domain: int) -> None:
+    """Publish AXES (all of them by default) on /joint_states and /diagnostics until SIGTERM or SIGINT; read-only."""
+    target.run(lambda client: _serve_ros2(client, axes, router, domain))
+
+
+async def _serve_ros2(client: RigClient, axes: tuple[str, ...], router: str, domain: int) -> None:
+    from ldcnd.lab.ros2.bridge import run_bridge  # noqa: PLC0415
+    from ldcnd.net.zenoh_session import open_zenoh_session  # noqa: PLC0415 - loads Zenoh
+    from ldcnd.net.zenoh_settings import ZenohSettings  # noqa: PLC0415
+
+    rig = Rig(client, await client.daemon())
+    for axis in axes:
+        if axis not in rig.axes:
+            raise UnknownAxis(
+                f"rig {rig.name} has no axis {axis!r}; it has {', '.join(rig.axes)}", axis=axis, value=axis
+            )
+    endpoint = router if "/" in router else f"tcp/{router}"
+    async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
+        running = asyncio.create_task(run_bridge(rig, session, axes, domain), name="bridge")
+        on_end(lambda: _cancel(running))
+        click.echo(f"rig {rig.name} in ROS domain {domain} through {endpoint}")
+        try:
+            await running
+        except asyncio.CancelledError:
+            return
+
+
+FOXGLOVE_ADDRESS = "127.0.0.1:8765"
+
+
+@click.command()
+@address_option("--address", FOXGLOVE_ADDRESS)
+@with_target
+def foxglove(target: Target, address: ListenAddress) -> None:
+    """Show a rig in Foxglove until SIGTERM or SIGINT; read-only, and open to everyone who can reach the address."""
+    target.run(lambda client: _serve_foxglove(client, address))
+
+
+async def _serve_foxglove(client: RigClient, address: ListenAddress) -> None:
+    try:
+        from ldcnd.lab.recording.live_view import LiveView  # noqa: PLC0415 - needs an optional package
+    except ImportError as error:
+        raise ConfigError("foxglove-sdk is not installed", remedy="install ldcnd[foxglove]") from error
+    ending = asyncio.Event()
+    on_end(ending.set)
+    with LiveView(f"ldcnd {client.rig}", address.host, address.port) as view:
+        async with client.published(view.take):
+            click.echo(f"rig {client.rig} on ws://{address.in_url}:{view.port}")
+            await ending.wait()
