@@ -11,7 +11,7 @@ from ldcnd.cli.main import LazyGroup
 from ldcnd.cli.output import end_as_interrupted, show_lines
 from ldcnd.cli.quantities import number, rounded, sample_text, seconds
 from ldcnd.cli.rig import stop_rig
-from ldcnd.cli.sending import NAME, Sender, commanding, derived, halted, halting
+from ldcnd.cli.sending import NAME, WAITING, Sender, commanding, derived, halted, halting
 from ldcnd.cli.terminal import keys, repetitions
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.jog import Jogging
@@ -23,8 +23,6 @@ from ldcnd.contract.commands import (
     Direction,
     Halt,
     Home,
-    HomeMethod,
-    HomeStop,
     Jog,
     MoveAbsolute,
     MoveAnalog,
@@ -48,16 +46,13 @@ from ldcnd.contract.errors import ConfigError, LeaseExpired
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import TelemetryItem
 
-WAIT = click.option("--wait", is_flag=True, help="Return when it has ended; Ctrl-C halts the axis.")
-LEAVE = click.option("--leave-running", is_flag=True, help="With --wait: Ctrl-C ends the wait only, the axis moves on.")
+WAIT, LEAVE = (click.option(name, is_flag=True, help=text) for name, text in WAITING.items())
 
 HOMES = {
     "list": "ldcnd.cli.looking:list_axes",
-    "faults": "ldcnd.cli.looking:faults",
     "watch": "ldcnd.cli.looking:watch",
     "jog": "ldcnd.cli.axis:jog",
     "monitors": "ldcnd.cli.looking:monitors",
-    "read-monitors": "ldcnd.cli.looking:read_monitors",
     "alarms": "ldcnd.cli.looking:alarms",
     "clear-counter": "ldcnd.cli.looking:clear_counter",
 }
@@ -131,25 +126,6 @@ def move(
     sender.send(axis, request, wait=wait, leave_running=leave_running)
 
 
-@command.command()
-@click.argument("axis", type=AXIS)
-@click.option("--method", type=click.Choice([method.value for method in HomeMethod]), help="What marks the position.")
-@click.option("--velocity", type=Finite(), help="Search velocity, signed; units a second.")
-@click.option("--find-velocity", type=Finite(), help="Speed at which a limit switch is found first; units a second.")
-@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
-@click.option("--position", type=Finite(), help="Value of the reference position.")
-@click.option("--timeout", "timeout_s", type=Finite(), help="Longest search, in seconds.")
-@click.option("--distance", type=Finite(), help="Longest search, in axis units.")
-@click.option("--stop", type=click.Choice([stop.value for stop in HomeStop]), help="How the motor stops there.")
-@click.option("--move-to", type=Finite(), help="Where to go afterwards.")
-@WAIT
-@LEAVE
-@commanding
-def home(sender: Sender, axis: str, *, wait: bool, leave_running: bool, **given: object) -> None:
-    """Search the reference position of AXIS, as configured unless said otherwise."""
-    sender.send(axis, of_options(Home, **given), wait=wait, leave_running=leave_running)
-
-
 @command.command(context_settings={"ignore_unknown_options": True})
 @click.argument("axis")
 @click.option(
@@ -185,23 +161,10 @@ def stop(target: Target, axis: str | None) -> None:
     stop_rig(target, axis)
 
 
-@command.command()
-@click.argument("axis", type=AXIS)
-@commanding
-def halt(sender: Sender, axis: str) -> None:
-    """Bring AXIS to rest; another command may follow."""
-    sender.send(axis, Halt())
-
-
-@command.command()
-@click.argument("axis", type=AXIS)
-@commanding
-def reset(sender: Sender, axis: str) -> None:
-    """Clear the stop latch and the faults of AXIS; nothing moves."""
-    sender.send(axis, Reset())
-
-
 for each in (
+    derived("halt", Halt),
+    derived("reset", Reset),
+    derived("home", Home, moves=True),
     derived("quick-stop", QuickStop),
     derived("set-position", SetPosition, "position"),
     derived("gains", SetGains),

@@ -130,16 +130,6 @@ def row(now: AxisNow) -> AxisRow:
 
 
 @click.command()
-@click.argument("axis", type=AXIS)
-@with_target
-def faults(target: Target, axis: str) -> None:
-    """Show the faults that AXIS has had, oldest first; `ldcnd fault CODE` explains them."""
-    for each in target.run(lambda client: axis_of(client, axis)).past_faults:
-        at = datetime.fromtimestamp(each.since / 1e9, UTC).isoformat(timespec="milliseconds")
-        target.show(each, f"{at} {each.code:16} {each.source:7} {each.text}")
-
-
-@click.command()
 @click.argument("axis", type=AXIS, default="*")
 @click.option("--item", type=click.Choice([item.value for item in TelemetryItem]), help="Only this item.")
 @click.option("--count", type=Whole(min=1), help="End after this many samples.")
@@ -221,9 +211,19 @@ def _all_of(now: AxisNow) -> str:
 
 @click.command()
 @click.argument("axis", type=AXIS)
+@click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice([name.value for name in MonitorName]))
+@click.option("--read", is_flag=True, help="Read them now, published or not.")
 @with_target
-def monitors(target: Target, axis: str) -> None:
-    """Show the last values of the monitors of AXIS."""
+def monitors(target: Target, axis: str, names: tuple[str, ...], *, read: bool) -> None:
+    """Show the last values of the monitors of AXIS; all of them without a NAME."""
+    chosen = tuple(MonitorName(name) for name in names)
+    if read:
+        reply = target.run(lambda client: client.command(axis, ReadMonitors(monitors=chosen)))
+        for each in reply.readings:
+            on = "" if each.active is None else f"  on: {', '.join(each.active) or 'none'}"
+            high = f"  high: {', '.join(each.high)}" if each.high else ""
+            target.show(each, f"{each.monitor:24} {each.value:>8} {each.unit:14}{each.title}{high}{on}")
+        return
 
     async def work(client: RigClient) -> dict[MonitorName, MonitorSample]:
         info = await axis_of(client, axis)
@@ -232,8 +232,10 @@ def monitors(target: Target, axis: str) -> None:
         return await client.monitors(axis)
 
     for name, sample in target.run(work).items():
-        high = f"  high: {', '.join(sample.high)}" if sample.high else ""
-        target.show(sample, f"{name:22} {sample.value:8d} {sample.unit:14} {sample.title}{high}  ({sample.quality})")
+        if not chosen or name in chosen:
+            high = f"  high: {', '.join(sample.high)}" if sample.high else ""
+            line = f"{name:22} {sample.value:8d} {sample.unit:14} {sample.title}{high}  ({sample.quality})"
+            target.show(sample, line)
 
 
 @click.command()
@@ -249,20 +251,6 @@ def alarms(target: Target, axis: str) -> None:
     reply = target.run(work)
     past = (f"  {place} {entry.code:04X}H {entry.text}" for place, entry in enumerate(reply.history))
     target.show(reply, f"{axis}: {reply.present.code:04X}H {reply.present.text}", *past)
-
-
-@click.command("read-monitors")
-@click.argument("axis", type=AXIS)
-@click.argument("names", nargs=-1, metavar="[NAME]...", type=click.Choice([name.value for name in MonitorName]))
-@with_target
-def read_monitors(target: Target, axis: str, names: tuple[str, ...]) -> None:
-    """Read monitors of AXIS once, published or not; all of them without a NAME."""
-    command = ReadMonitors(monitors=tuple(MonitorName(name) for name in names))
-    reply = target.run(lambda client: client.command(axis, command))
-    for each in reply.readings:
-        on = "" if each.active is None else f"  on: {', '.join(each.active) or 'none'}"
-        high = f"  high: {', '.join(each.high)}" if each.high else ""
-        target.show(each, f"{each.monitor:24} {each.value:>8} {each.unit:14}{each.title}{high}{on}")
 
 
 @click.command("clear-counter")
@@ -287,11 +275,10 @@ def clear_counter(target: Target, axis: str, counter: str) -> None:
 def why(target: Target, axis: str) -> None:
     """Tell why AXIS cannot move now, and what would clear that; exits with 1 when something is in the way."""
 
-    async def work(client: RigClient) -> WhyReply:
-        await axis_of(client, axis)
-        return await client.ask(Why(), axis)
+    async def work(client: RigClient) -> tuple[AxisInfo, WhyReply]:
+        return await axis_of(client, axis), await client.ask(Why(), axis)
 
-    reply = target.run(work)
+    info, reply = target.run(work)
     lines = [f"{axis}: {'ready to move' if reply.can_move else 'cannot move now'}"]
     for cause in reply.causes:
         known = remedy_of(cause)
@@ -301,6 +288,9 @@ def why(target: Target, axis: str) -> None:
             lines.append(f"    more: ldcnd fault {cause.page.rpartition('/')[2]}")
     if reply.first_fault:
         lines.append(f"  first fault since the last reset: {reply.first_fault}")
+    for fault in info.past_faults:
+        at = datetime.fromtimestamp(fault.since / 1e9, UTC).isoformat(timespec="milliseconds")
+        lines.append(f"  past fault: {at} {fault.code}: {fault.text}")
     target.show(reply, *lines)
     if not reply.can_move:
         sys.exit(1)

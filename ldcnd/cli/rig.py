@@ -5,7 +5,6 @@ import json
 import os
 import shlex
 import sys
-from collections.abc import Callable
 
 import click
 
@@ -163,65 +162,46 @@ RUN_UP_S = 0.5
 PATIENCE_S = 30.0
 
 
-@click.group()
-def drill() -> None:
-    """Rehearse a loss on an axis that may move, and report measured times."""
-
-
-def _moving(work: Callable[..., None]) -> Callable[..., None]:
-    """Give a drill the axis and the velocity at which it is caught."""
-    for option in (
-        click.confirmation_option("--yes", prompt="The axis will move. Go on?"),
-        click.option("--velocity", type=Finite(), required=True, help="Units a second, signed."),
-        click.argument("axis", type=AXIS),
-    ):
-        work = option(work)
-    return work
-
-
-@drill.command("client-loss")
-@_moving
-@click.option("--lease", "lease_s", type=Finite(), default=1.0, show_default=True, help="Length of the lease, seconds.")
+@click.command()
+@click.argument("loss", type=click.Choice(["client-loss", "bus-loss", "daemon-stop"]))
+@click.argument("axis", type=AXIS)
+@click.option("--velocity", type=Finite(), required=True, help="Units a second, signed.")
+@click.option("--lease", "lease_s", type=Finite(), default=1.0, show_default=True, help="For client-loss, seconds.")
+@click.confirmation_option("--yes", prompt="The axis will move. Go on?")
 @with_target
-def client_loss(target: Target, axis: str, velocity: float, lease_s: float) -> None:
-    """Take control, jog, and disappear: how long until the axis reacts, and until it is at rest?"""
+def drill(target: Target, loss: str, axis: str, velocity: float, lease_s: float) -> None:
+    """Jog AXIS, rehearse a loss, and report how long until the axis reacts and until it is at rest.
+
+    client-loss takes control and disappears; bus-loss has the daemon drop the line and open it again; daemon-stop has
+    it apply `loss.daemon` as at its shutdown, without ending.
+    """
 
     async def work(client: RigClient) -> dict[str, float]:
-        if client.lease:
-            raise WrongState(
-                f"axis {axis}: `ldcnd lease hold`, which runs this, goes on renewing its lease: no client is lost",
-                axis=axis,
-                remedy="run it outside",
-            )
-        request = Acquire(client="drill", axes=(axis,), lease_s=lease_s)
-        lease = await client.ask(request)
-        began_s = asyncio.get_running_loop().time()
-        await client.command(axis, Power(on=True, lease=lease.lease))
-        await client.command(axis, MoveVelocity(velocity=velocity, lease=lease.lease))
-        reacted_s, stands_s = await _watch(client, axis)
-        return {
-            "lease_s": lease_s,
-            "reacted_after_lease_s": reacted_s - began_s - lease_s,
-            "stands_after_lease_s": stands_s - began_s - lease_s,
-        }
+        if loss == "client-loss":
+            return await _lose_client(client, axis, velocity, lease_s)
+        return await _rehearse(client, axis, velocity, loss.replace("-", "_"))
 
-    _report(target, axis, "client loss", target.run(work))
+    _report(target, axis, loss.replace("-", " "), target.run(work))
 
 
-@drill.command("daemon-stop")
-@_moving
-@with_target
-def daemon_stop(target: Target, axis: str, velocity: float) -> None:
-    """Jog, and let the daemon apply `loss.daemon` as at its shutdown; it does not end."""
-    _report(target, axis, "daemon stop", target.run(lambda client: _rehearse(client, axis, velocity, "daemon_stop")))
-
-
-@drill.command("bus-loss")
-@_moving
-@with_target
-def bus_loss(target: Target, axis: str, velocity: float) -> None:
-    """Jog, and have the daemon drop the line and open it again."""
-    _report(target, axis, "bus loss", target.run(lambda client: _rehearse(client, axis, velocity, "bus_loss")))
+async def _lose_client(client: RigClient, axis: str, velocity: float, lease_s: float) -> dict[str, float]:
+    """Move an axis under a lease that is not renewed."""
+    if client.lease:
+        raise WrongState(
+            f"axis {axis}: `ldcnd lease hold`, which runs this, goes on renewing its lease: no client is lost",
+            axis=axis,
+            remedy="run it outside",
+        )
+    lease = await client.ask(Acquire(client="drill", axes=(axis,), lease_s=lease_s))
+    began_s = asyncio.get_running_loop().time()
+    await client.command(axis, Power(on=True, lease=lease.lease))
+    await client.command(axis, MoveVelocity(velocity=velocity, lease=lease.lease))
+    reacted_s, stands_s = await _watch(client, axis)
+    return {
+        "lease_s": lease_s,
+        "reacted_after_lease_s": reacted_s - began_s - lease_s,
+        "stands_after_lease_s": stands_s - began_s - lease_s,
+    }
 
 
 async def _rehearse(client: RigClient, axis: str, velocity: float, kind: str) -> dict[str, float]:

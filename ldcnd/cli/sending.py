@@ -192,6 +192,13 @@ async def _show(info: AxisInfo, positions: Samples) -> None:
                 show_passing(f"{info.axis}: {number(sample.value, info)}")
 
 
+WAITING = {
+    "--wait": "Return when it has ended; Ctrl-C halts the axis.",
+    "--leave-running": "With --wait: Ctrl-C ends the wait only, the axis moves on.",
+}
+"""Options of a command that moves an axis."""
+
+
 def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False) -> click.Command:
     """Return a command that sends one class to an axis.
 
@@ -203,8 +210,16 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
     """
 
     @commanding
-    def callback(sender: Sender, /, axis: str, *, wait: bool = False, **given: Any) -> None:  # noqa: ANN401 - click's own
-        sender.send(axis, of_options(command, **given), wait=wait)
+    def callback(
+        sender: Sender,
+        /,
+        axis: str,
+        *,
+        wait: bool = False,
+        leave_running: bool = False,
+        **given: Any,  # noqa: ANN401
+    ) -> None:
+        sender.send(axis, of_options(command, **given), wait=wait, leave_running=leave_running)
 
     params: list[click.Parameter] = [click.Argument(["axis"], type=AXIS)]
     for field, described in command.model_fields.items():
@@ -216,7 +231,7 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
         else:
             params.append(_FieldOption(command, field, kind))
     if moves:
-        params.append(click.Option(["--wait"], is_flag=True, help="Return when it has ended; Ctrl-C halts the axis."))
+        params += [click.Option([name], is_flag=True, help=text) for name, text in WAITING.items()]
     target = getattr(callback, "__click_params__", [])
     return click.Command(
         name,
@@ -232,7 +247,8 @@ class _FieldOption(click.Option):
 
     def __init__(self, command: type[Sent], field: str, kind: click.ParamType[Any]) -> None:
         is_flag = command.model_fields[field].annotation is bool
-        super().__init__([f"--{field.replace('_', '-')}"], type=None if is_flag else kind, is_flag=is_flag)
+        name = f"--{field.removesuffix('_s').replace('_', '-')}"  # its meaning says that it is in seconds
+        super().__init__([name, field], type=None if is_flag else kind, is_flag=is_flag)
         self._command = command
         self._field = field
 
