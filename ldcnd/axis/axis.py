@@ -69,7 +69,7 @@ from ldcnd.contract.events import ALARM_HISTORY, REFERENCE, CommandStatus
 from ldcnd.contract.rig_commands import FrozenPosition
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.drives.axis_config import AxisConfig, LossPolicy
-from ldcnd.drives.driver import AxisReading, Drive, Fault, Moves, Readable, Records, StopMode, parameters_of
+from ldcnd.drives.driver import AxisReading, Drive, Fault, Moves, Readable, StopMode
 from ldcnd.drives.network import BringUpReport
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.drives.tracer import Tracer
@@ -266,8 +266,7 @@ class AxisService:
         self._motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, self._read, self.reference)
         self._commands = AxisCommands(self._motion)
         self._queue = CommandQueue(config.name)
-        parameters = parameters_of(driver)
-        self._parameters = Parameters(driver, parameters) if parameters else None
+        self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
         self.traces = TraceRecorder(config.name, self._tracer(driver), publisher, clock)
         self.stop_wanted = asyncio.Event()
         self.returned: Callable[[], None] | None = None
@@ -284,7 +283,7 @@ class AxisService:
 
     def _tracer(self, driver: Drive) -> Tracer:
         """Return the drive's own recorder, or the host's."""
-        if isinstance(driver, Records):
+        if driver.tracer:
             return driver.tracer
         readable = driver if isinstance(driver, Readable) else self._moves
         channels = host_channels(

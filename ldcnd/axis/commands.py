@@ -4,7 +4,7 @@ import math
 from dataclasses import replace
 
 from ldcnd.axis import guards
-from ldcnd.axis.guards import Permit, cannot
+from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
 from ldcnd.axis.procedure import NEVER_S, Procedure
 from ldcnd.axis.procedures.analog import AnalogMove
@@ -53,9 +53,8 @@ from ldcnd.contract.errors import (
     step,
 )
 from ldcnd.contract.samples import AxisState, LinkState, Moving
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Gains, HasOutputs, Motion, StopMode, TakesGains, Warns
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Gains, Motion, StopMode
 from ldcnd.line.exchange import Timing
-from ldcnd.line.transaction import only_while
 
 STEP_RETRY_S = 0.2
 """Delay before a step whose packets were lost is taken again, seconds,"""
@@ -269,7 +268,7 @@ class AxisCommands:
         guards.check_may_power_on(tracker)
         guards.check_stands(tracker)
         await self._motion.check_does_not_coast()
-        if isinstance(self._driver, TakesGains) and self._driver.gains is None:
+        if Verb.SET_GAINS in self._driver.capabilities and self._driver.gains is None:
             raise WrongState(
                 f"axis {tracker.name} has no gains: its loop cannot close",
                 axis=tracker.name,
@@ -304,7 +303,7 @@ class AxisCommands:
             await self._driver.reset()
             self._drop_procedure()
             tracker.switched(on=False, now_s=self._motion.clock.now_s())
-        elif tracker.active_faults and isinstance(self._driver, Warns):
+        elif tracker.active_faults:
             await self._driver.clear_warnings()
         permit.still_wanted()  # a stop that came meanwhile keeps its latch
         tracker.cleared(self._motion.clock.now_s())
@@ -479,7 +478,7 @@ class AxisCommands:
         tracker = self._tracker
         guards.check_reachable(tracker)
         asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name, None)) is not None}
-        held = self._driver.gains if isinstance(self._driver, TakesGains) else None
+        held = self._driver.gains
         if held is None and not {"kp", "el"} <= asked.keys():
             raise WrongState(
                 f"axis {self._config.name} has no gains yet",
@@ -508,7 +507,7 @@ class AxisCommands:
     def take_gains_back(self) -> bool:
         """Have the drive hold the gains of the axis from its next motion on; tell whether others were lent to it."""
         own, self.own_gains = self.own_gains, None
-        if own is None or not isinstance(self._driver, TakesGains):
+        if own is None:
             return False
         self._driver.gains = own
         return True
@@ -516,7 +515,7 @@ class AxisCommands:
     @property
     def gains_differ(self) -> bool:
         """Whether the drive holds other gains than it should, or may."""
-        return isinstance(self._driver, TakesGains) and not self._driver.holds_gains
+        return not self._driver.holds_gains
 
     def _check_tracking_step(self, gains: Gains) -> None:
         """Refuse a position error limit that the next set-point of `track` could exceed.
@@ -540,8 +539,5 @@ class AxisCommands:
 
     async def _set_outputs(self, permit: Permit, request: SetOutputs) -> CommandReply:
         guards.check_reachable(self._tracker)
-        if not isinstance(self._driver, HasOutputs):
-            raise cannot(self._driver.spec, "set outputs")
-        with only_while(permit.ask):
-            await self._driver.set_outputs(request.limit1, request.limit2)
+        await permit.set_outputs(request.limit1, request.limit2)
         return self._motion.reply(permit)

@@ -16,7 +16,7 @@ from typing import Any, NoReturn, Protocol
 from typing_extensions import override
 
 from ldcnd.axis.state import MOTION_STATES, AxisTracker
-from ldcnd.contract.commands import Verb
+from ldcnd.contract.commands import HomeMethod, PinMode, Verb
 from ldcnd.contract.errors import (
     AccelerationLimit,
     AxisUnreachable,
@@ -43,15 +43,12 @@ from ldcnd.drives.driver import (
     Drive,
     Gains,
     HomeCapture,
-    Homes,
     Motion,
     Moves,
     PathStatus,
     PwmOutput,
     StopMode,
-    TakesGains,
-    Tracks,
-    WalksPaths,
+    cannot,
 )
 from ldcnd.drives.network import Network
 from ldcnd.line.exchange import Exchange
@@ -269,41 +266,50 @@ class QuietDrive(Protocol):
     """Calls to a drive that need no permission: none of them can make it move."""
 
     spec: AxisSpec
+    capabilities: frozenset[Verb]
     adc_full_scale: int | None
     retargets: bool
+    gains: Gains | None
+    holds_gains: bool
+    home_methods: frozenset[HomeMethod]
+    capture_s: float
+    path_period_s: float
+    path_packet: int
+    path_most_counts: int
 
     def quantise(self, motion: Motion, most: Ceiling = ...) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
     def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
     def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
     async def stop(self, mode: StopMode) -> StopMode: ...  # noqa: D102
     async def reset(self) -> None: ...  # noqa: D102
+    async def clear_warnings(self) -> None: ...  # noqa: D102
+    async def captured_home(self) -> int: ...  # noqa: D102
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool: ...  # noqa: D102
+    def check_path(self) -> None: ...  # noqa: D102
+    def path_exchanges(self) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
+    async def path_status(self) -> PathStatus: ...  # noqa: D102
 
 
-def homing(drive: QuietDrive) -> Homes:
+def homing(drive: QuietDrive) -> QuietDrive:
     """Return a drive as one that captures its position.
 
     Raises:
         NotSupported: it does not.
     """
-    if isinstance(drive, Homes):
+    if drive.home_methods:
         return drive
     raise cannot(drive.spec, "home")
 
 
-def walking(drive: QuietDrive) -> WalksPaths:
+def walking(drive: QuietDrive) -> QuietDrive:
     """Return a drive as one that walks paths.
 
     Raises:
         NotSupported: it does not.
     """
-    if isinstance(drive, WalksPaths):
+    if drive.path_period_s:
         return drive
     raise cannot(drive.spec, "walk a path")
-
-
-def cannot(spec: AxisSpec, what: str) -> NotSupported:
-    """Return the refusal of what a drive cannot do."""
-    return NotSupported(f"axis {spec.name}: {spec.model} cannot {what}", axis=spec.name)
 
 
 class Unmoved(Moves):
@@ -454,9 +460,9 @@ class Permit:
             await self._gate.driver.start()
 
     async def track(self, position_counts: int) -> None:
-        """Go to a position at once; see `Tracks`."""
+        """Go to a position at once; see `Moves.track`."""
         drive = self._gate.driver
-        if not isinstance(drive, Tracks):
+        if Verb.TRACK not in drive.capabilities:
             raise cannot(drive.spec, "track")
         condition = self.to_move()
         self.begin()
@@ -465,11 +471,10 @@ class Permit:
             await drive.track(position_counts)
 
     async def add_points(self, steps: Sequence[int]) -> PathStatus:
-        """Fill the drive's buffer of path points; see `WalksPaths`. A motion begins only with `start_path`."""
-        drive = walking(self._gate.driver)
+        """Fill the drive's buffer of path points; see `Moves.add_points`. A motion begins only with `start_path`."""
         self.ask_to_move()
         with only_while(self.to_move()):
-            return await drive.add_points(steps)
+            return await self._gate.driver.add_points(steps)
 
     async def power_on(self) -> None:
         """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
@@ -492,13 +497,15 @@ class Permit:
             raise
 
     async def set_gains(self, gains: Gains) -> None:
-        """Load the registers of the loop, which act at once; see `TakesGains`."""
+        """Load the registers of the loop, which act at once; see `Moves.set_gains`."""
         self.ask()
-        drive = self._gate.driver
-        if not isinstance(drive, TakesGains):
-            raise cannot(drive.spec, "take gains")
         with only_while(self.ask):
-            await drive.set_gains(gains)
+            await self._gate.driver.set_gains(gains)
+
+    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
+        """Use limit switch pins as outputs or inputs; see `Moves.set_outputs`."""
+        with only_while(self.ask):
+            await self._gate.driver.set_outputs(limit1, limit2)
 
     def announce(self, motion: Motion, *, anywhere: bool = False) -> None:
         """Have readings judged by a motion that the network is about to start; see `PlausibilityGate.expect`."""

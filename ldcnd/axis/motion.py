@@ -38,7 +38,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, Homes, Motion, StopMode
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, Motion, StopMode
 from ldcnd.line.bus import Bus
 
 LOOK_AGAIN_S = 0.02
@@ -357,7 +357,7 @@ class AxisMotion:
             most_velocity=motion.velocity_counts_per_s,
             most_acceleration=motion.acceleration_counts_per_s2,
             quantise=self.quantise,
-            cycle_s=self.driver.capture_s if isinstance(self.driver, Homes) else 0.0,
+            cycle_s=self.driver.capture_s,
         )
 
     def replanned(self, plan: MotionPlan, motion: Motion) -> MotionPlan:

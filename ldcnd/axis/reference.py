@@ -19,7 +19,7 @@ from ldcnd.contract.errors import LdcndError, WrongState
 from ldcnd.contract.meta import PastFault
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import Drive, Evidence, KeepsMark
+from ldcnd.drives.driver import Drive, Evidence, Moves
 from ldcnd.log import get_logger
 
 LEAST_MARK = 100
@@ -128,7 +128,7 @@ class ReferenceKeeper:
         """
         self.faults: tuple[PastFault, ...] = ()
         self._config = config
-        self._drive = drive if references and isinstance(drive, KeepsMark) else None
+        self._drive = drive if references and isinstance(drive, Moves) and drive.keeps_mark else None
         self._tracker = tracker
         self._telemetry = telemetry
         self._clock = clock
@@ -173,7 +173,7 @@ class ReferenceKeeper:
             ) from error
         self._kept, self._on_disk = None, False
 
-    async def _is_void_without(self, drive: KeepsMark) -> bool:
+    async def _is_void_without(self, drive: Moves) -> bool:
         """Make the drive disagree with whatever reference is on the disk; tell whether it does."""
         try:
             before = await drive.evidence()
@@ -229,7 +229,7 @@ class ReferenceKeeper:
                 return kept.origin + shown.counts - shown.counter, ""
         return None, refusal
 
-    async def _examined(self, drive: KeepsMark, kept: KeptReference) -> tuple[str, Evidence | None]:
+    async def _examined(self, drive: Moves, kept: KeptReference) -> tuple[str, Evidence | None]:
         refusal, shown = "", None
         for _ in range(READINGS):
             try:

@@ -18,7 +18,6 @@ from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import Rig
-from ldcnd.drives.driver import parameters_of
 from ldcnd.line.queue import Lane
 from ldcnd.net.hand_over import Load
 from ldcnd.net.publisher import Publisher, Topic
@@ -199,7 +198,7 @@ class HealthWatch:
             rate_wanted_hz=axis.config.rates.position,
             rate_hz=self._granted_hz(position, asked_hz.get(TelemetryItem.POSITION, 0.0)),
             faults=len(axis.tracker.active_faults),
-            eeprom_writes=parameters.eeprom_writes if (parameters := parameters_of(axis.driver)) else None,
+            eeprom_writes=parameters.eeprom_writes if (parameters := axis.driver.parameters) else None,
             items=tuple(
                 ItemHealth(item=item.value, asked_hz=hz, granted_hz=self._granted_hz(self._topic(name, item), hz))
                 for item, hz in asked_hz.items()

@@ -21,7 +21,7 @@ from ldcnd.daemon.contract import shipped_schemas
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import Rig
-from ldcnd.drives.driver import Drive, registers_of
+from ldcnd.drives.driver import Drive
 from ldcnd.line.queue import Lane
 from ldcnd.net.hand_over import Query
 from ldcnd.net.publisher import Publisher
@@ -167,7 +167,7 @@ def _axis_source(axis: AxisService) -> object:
     """Return what the description of an axis is made of, as far as it changes."""
     driver = axis.driver
     past = axis.reference.faults
-    return axis.config, driver.identity, registers_of(driver), driver.adc_full_scale, axis.traces.channels, past
+    return axis.config, driver.identity, driver.registers(), driver.adc_full_scale, axis.traces.channels, past
 
 
 def bus_info(bus: BusService) -> BusInfo:
@@ -227,7 +227,7 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         priority=config.priority,
         registers=tuple(
             RegisterInfo(name=register.name, value=register.value, provenance=register.provenance, why=register.why)
-            for register in registers_of(driver)
+            for register in driver.registers()
         ),
         past_faults=axis.reference.faults,
     )

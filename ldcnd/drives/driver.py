@@ -12,7 +12,7 @@ from enum import Enum
 from typing import Any
 
 from ldcnd.contract.commands import HomeMethod, PinMode, Verb
-from ldcnd.contract.errors import BusError
+from ldcnd.contract.errors import BusError, NotSupported
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.samples import MonitorName, TelemetryItem
 from ldcnd.drives.parameter_access import MonitorValue, ParameterAccess
@@ -263,8 +263,53 @@ class ReadingListeners:
     alarmed: Callable[[Fault], None]
 
 
+@dataclass(frozen=True, slots=True)
+class PathStatus:
+    """What a drive shows of a path.
+
+    Attributes:
+        commanded_counts: where it commands its motor to be.
+        points: still in its buffer.
+        running: it walks through them.
+        enabled: its loop is closed.
+    """
+
+    commanded_counts: int
+    points: int
+    running: bool
+    enabled: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Evidence:
+    """The drive's evidence about the time since its position was last known.
+
+    Attributes:
+        counts: position, in counts since the drive was reset, as this host counts them.
+        counter: the same as the drive itself counts it, which another host reads, too.
+        mark: what the register for marks holds; 0 after a reset.
+        enabled: the position loop is closed.
+        position_lost: it may have missed counts.
+    """
+
+    counts: int
+    counter: int
+    mark: int
+    enabled: bool
+    position_lost: bool
+
+
+def cannot(spec: AxisSpec, what: str) -> NotSupported:
+    """Return the refusal of what a drive cannot do."""
+    return NotSupported(f"axis {spec.name}: {spec.model} cannot {what}", axis=spec.name)
+
+
+async def nothing() -> None:
+    """Do nothing."""
+
+
 class Drive(ABC):
-    """One drive, as far as all are alike; what it can do it inherits from the contracts below.
+    """One drive, as far as all are alike.
 
     An exchange says what it does (`Exchange.effect`): the bus checks the permit of one that changes anything when its
     turn has come, and that the drive is known to be this one.
@@ -276,6 +321,8 @@ class Drive(ABC):
         adc_full_scale: counts of the A/D converter at full scale; None without one.
         shows_inputs: its readings carry the levels of its inputs.
         monitors: what is published beside the common items.
+        tracer: of the drive's own recorder; None without one.
+        parameters: the drive's parameters; None where they cannot be read.
     """
 
     spec: AxisSpec
@@ -284,6 +331,12 @@ class Drive(ABC):
     adc_full_scale: int | None = None
     shows_inputs: bool = False
     monitors: tuple[MonitorName, ...] = ()
+    tracer: Tracer | None = None
+    parameters: ParameterAccess | None = None
+
+    def registers(self) -> tuple[Register, ...]:
+        """Return what is known of registers that cannot be read back."""
+        return ()
 
 
 class Readable(Drive):
@@ -305,11 +358,34 @@ class PollsItself(Drive):
 class Moves(Readable):
     """It moves. Commands raise the `BusError` that befell them; none is repeated when that could move twice.
 
+    What only some drives can do refuses here with `NotSupported`; `capabilities` and the attributes say who can.
+
     Attributes:
         retargets: it takes a new trapezoid in mid-move and keeps velocity and acceleration within their limits.
+        gains: what is loaded at power-on, and before a motion where the drive is not known to hold it: what was
+            acknowledged last, before that the configuration's; None without either. It may be set to others.
+        holds_gains: the drive is known to hold them; a drive whose gains are not loaded by the host holds its own.
+        home_methods: what can mark the reference position; none for a drive that captures nothing.
+        capture_s: sampling period of the capture inputs: a shorter pulse can be missed, and the captured position
+            lags by up to the distance moved in this time.
+        path_period_s: between two points of a path; 0 for a drive that walks none.
+        path_packet: maximum number of points in one packet.
+        path_most_counts: largest step from one point to the next.
+        keeps_mark: it has a register that a host can set to the present position, and that a reset clears. A mark that
+            is still there proves that the drive was not reset since, so that its counter goes on from where it was.
+        about_to_renumber: awaited before the drive's counter is given another number; it may refuse that.
     """
 
     retargets: bool = False
+    gains: Gains | None = None
+    holds_gains: bool = True
+    home_methods: frozenset[HomeMethod] = frozenset()
+    capture_s: float = 0.0
+    path_period_s: float = 0.0
+    path_packet: int = 0
+    path_most_counts: int = 0
+    keeps_mark: bool = False
+    about_to_renumber: Callable[[], Awaitable[None]] = staticmethod(nothing)
 
     @abstractmethod
     def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
@@ -358,46 +434,38 @@ class Moves(Readable):
     async def reset(self) -> None:
         """Clear the drive's faults as its manual prescribes; the loop is open afterwards if there were any."""
 
+    async def set_gains(self, gains: Gains) -> None:  # noqa: ARG002 - as are all arguments of what refuses
+        """Load the registers of the position loop; they act at once.
 
-class Tracks(ABC):
-    """It follows set-points."""
+        Raises:
+            WrongState: the servo rate would change while the axis moves.
+        """
+        raise cannot(self.spec, "take gains")
 
-    @abstractmethod
-    async def track(self, position_counts: int) -> None:
+    async def track(self, position_counts: int) -> None:  # noqa: ARG002
         """Go to a position at once, without a profile; never repeated."""
+        raise cannot(self.spec, "track")
 
+    async def captured_home(self) -> int:
+        """Return the captured home position, in counts."""
+        raise cannot(self.spec, "home")
 
-@dataclass(frozen=True, slots=True)
-class PathStatus:
-    """What a drive shows of a path.
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:  # noqa: ARG002
+        """Tell whether a reading shows the axis on a limit switch that ends its motions."""
+        return False
 
-    Attributes:
-        commanded_counts: where it commands its motor to be.
-        points: still in its buffer.
-        running: it walks through them.
-        enabled: its loop is closed.
-    """
+    async def clear_warnings(self) -> None:
+        """Clear what is remembered although it has not stopped anything; the loop stays as it is."""
 
-    commanded_counts: int
-    points: int
-    running: bool
-    enabled: bool
+    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:  # noqa: ARG002
+        """Use limit switch pins as outputs or inputs; None leaves a pin as it is.
 
+        Raises:
+            NotSupported: the model cannot.
+            RegisterUnknown: what a pin that is not named is used as is not known.
+        """
+        raise cannot(self.spec, "set outputs")
 
-class WalksPaths(ABC):
-    """It walks through points that are sent to it, at a fixed rate, and stands at the last one when none is left.
-
-    Attributes:
-        path_period_s: between two points.
-        path_packet: maximum number of points in one packet.
-        path_most_counts: largest step from one point to the next.
-    """
-
-    path_period_s: float
-    path_packet: int
-    path_most_counts: int
-
-    @abstractmethod
     def check_path(self) -> None:
         """Refuse a path that this drive cannot walk.
 
@@ -405,166 +473,32 @@ class WalksPaths(ABC):
             NotSupported: it has no path mode.
             WrongState: what it holds of its options is not known.
         """
+        raise cannot(self.spec, "walk a path")
 
-    @abstractmethod
     def path_exchanges(self) -> tuple[Exchange[Any], ...]:
         """Return what `add_points` sends for a full packet, for looking at only."""
+        return ()
 
-    @abstractmethod
     async def path_status(self) -> PathStatus:
-        """Read what it shows."""
+        """Read what it shows of a path: points that are sent at a fixed rate; it stands at the last one."""
+        raise cannot(self.spec, "walk a path")
 
-    @abstractmethod
-    async def add_points(self, steps: Sequence[int]) -> PathStatus:
+    async def add_points(self, steps: Sequence[int]) -> PathStatus:  # noqa: ARG002
         """Append points, counts from one to the next; never repeated."""
+        raise cannot(self.spec, "walk a path")
 
-
-class TakesGains(ABC):
-    """The registers of its position loop can be loaded.
-
-    Attributes:
-        gains: what is loaded at power-on, and before a motion where the drive is not known to hold it: what was
-            acknowledged last, before that the configuration's; None without either. It may be set to others.
-        holds_gains: the drive is known to hold them.
-    """
-
-    gains: Gains | None
-    holds_gains: bool
-
-    @abstractmethod
-    async def set_gains(self, gains: Gains) -> None:
-        """Load the registers; they act at once.
-
-        Raises:
-            WrongState: the servo rate would change while the axis moves.
-        """
-
-
-class Records(ABC):
-    """It has a recorder of its own.
-
-    Attributes:
-        tracer: of the recorder.
-    """
-
-    tracer: Tracer
-
-
-class HasParameters(ABC):
-    """Its parameters can be read."""
-
-    @property
-    @abstractmethod
-    def parameters(self) -> ParameterAccess:
-        """The drive's parameters."""
-
-
-class RemembersRegisters(ABC):
-    """It has registers that cannot be read back."""
-
-    @abstractmethod
-    def registers(self) -> tuple[Register, ...]:
-        """Return what is known of them."""
-
-
-class Homes(ABC):
-    """It captures its position at a mark.
-
-    Attributes:
-        home_methods: what can mark the reference position.
-        capture_s: sampling period of the capture inputs: a shorter pulse can be missed, and the captured position
-            lags by up to the distance moved in this time.
-    """
-
-    home_methods: frozenset[HomeMethod]
-    capture_s: float = 0.0
-
-    @abstractmethod
-    async def captured_home(self) -> int:
-        """Return the captured home position, in counts."""
-
-    @abstractmethod
-    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:
-        """Tell whether a reading shows the axis on a limit switch that ends its motions."""
-
-
-class Warns(ABC):
-    """It remembers what has not stopped anything."""
-
-    @abstractmethod
-    async def clear_warnings(self) -> None:
-        """Clear what is remembered; the loop stays as it is."""
-
-
-class HasOutputs(ABC):
-    """Its limit switch pins can be outputs."""
-
-    @abstractmethod
-    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
-        """Use limit switch pins as outputs or inputs; None leaves a pin as it is.
-
-        Raises:
-            NotSupported: the model cannot.
-            RegisterUnknown: what a pin that is not named is used as is not known.
-        """
-
-
-@dataclass(frozen=True, slots=True)
-class Evidence:
-    """The drive's evidence about the time since its position was last known.
-
-    Attributes:
-        counts: position, in counts since the drive was reset, as this host counts them.
-        counter: the same as the drive itself counts it, which another host reads, too.
-        mark: what the register for marks holds; 0 after a reset.
-        enabled: the position loop is closed.
-        position_lost: it may have missed counts.
-    """
-
-    counts: int
-    counter: int
-    mark: int
-    enabled: bool
-    position_lost: bool
-
-
-async def nothing() -> None:
-    """Do nothing."""
-
-
-class KeepsMark(ABC):
-    """It has a register that a host can set to the present position, and that a reset clears.
-
-    A mark that is still there proves that the drive was not reset since, so that its counter goes on from where it was.
-
-    Attributes:
-        about_to_renumber: awaited before the drive's counter is given another number; it may refuse that.
-    """
-
-    about_to_renumber: Callable[[], Awaitable[None]] = staticmethod(nothing)
-
-    @abstractmethod
     async def evidence(self) -> Evidence:
-        """Read what the drive shows.
+        """Read what the drive shows of the time since its position was last known.
 
         Raises:
             BusError: the line failed.
         """
+        raise cannot(self.spec, "keep a mark")
 
-    @abstractmethod
     async def leave_mark(self) -> None:
         """Have the drive set the register to its position; nothing moves. The register may be that of captures.
 
         Raises:
             BusError: the line failed.
         """
-
-
-def registers_of(drive: Drive) -> tuple[Register, ...]:
-    """Return what is known of the registers of a drive that cannot be read back."""
-    return drive.registers() if isinstance(drive, RemembersRegisters) else ()
-
-
-def parameters_of(drive: Drive) -> ParameterAccess | None:
-    """Return the parameters of a drive; None for one without."""
-    return drive.parameters if isinstance(drive, HasParameters) else None
+        raise cannot(self.spec, "keep a mark")

@@ -31,16 +31,11 @@ from ldcnd.drives.driver import (
     AxisSpec,
     Ceiling,
     Gains,
-    HasOutputs,
     HomeCapture,
-    Homes,
     Motion,
     Moves,
     PwmOutput,
     StopMode,
-    TakesGains,
-    Tracks,
-    Warns,
 )
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, ReplyVerdict, Timing
@@ -68,7 +63,7 @@ STANDING: dict[str, Any] = {"profile_done": True, "velocity_counts_per_s": 0.0}
 Happening = Callable[[], Awaitable[None]]
 
 
-class FakeDrive(Moves, Homes, Warns, Tracks, TakesGains, HasOutputs):
+class FakeDrive(Moves):
     """A drive that records what it is told.
 
     Attributes:

@@ -7,7 +7,7 @@ from ldcnd.axis.procedures.home import plan_search
 from ldcnd.contract.commands import Home, HomeMethod
 from ldcnd.contract.errors import MalformedRequest, NotSupported
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import Homes, StopMode
+from ldcnd.drives.driver import StopMode
 
 PRESET = {
     "method": "reverse_limit",
@@ -19,7 +19,7 @@ PRESET = {
 }
 
 
-class _Drive(Homes):
+class _Drive:
     """All that planning asks of a driver."""
 
     home_methods = frozenset({HomeMethod.INDEX, HomeMethod.REVERSE_LIMIT})

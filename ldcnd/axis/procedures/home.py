@@ -19,7 +19,7 @@ from ldcnd.contract.commands import CommandReply, Home, HomeMethod, HomeStop
 from ldcnd.contract.errors import MalformedRequest, NotSupported
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig, HomeConfig
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, HomeCapture, StopMode, Warns
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, HomeCapture, StopMode
 from ldcnd.log import get_logger
 
 log = get_logger("axis")
@@ -247,8 +247,7 @@ class HomeSequence(Procedure):
         else:
             await driver.stop(search.stop)
         captured = await homing(driver).captured_home()
-        if isinstance(driver, Warns):
-            await driver.clear_warnings()  # homing on the current sets one
+        await driver.clear_warnings()  # homing on the current sets one
         self.permit.still_wanted()
         closed = search.stop is not StopMode.OFF
         if search.method is HomeMethod.POSITION_ERROR and closed:

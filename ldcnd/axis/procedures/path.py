@@ -29,7 +29,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.rig_commands import PathReply
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AxisReading, Homes, Motion, StopMode
+from ldcnd.drives.driver import AxisReading, Motion, StopMode
 from ldcnd.drives.network import Network
 from ldcnd.line.bus import Bus
 from ldcnd.log import get_logger
@@ -157,7 +157,7 @@ class SharedPath(Rendezvous):
         """
         first = next(iter(self._shares.values())).member
         drives = [walking(share.member.motion.driver) for share in self._shares.values()]
-        cycle_s = first.motion.driver.capture_s if isinstance(first.motion.driver, Homes) else 0.0
+        cycle_s = first.motion.driver.capture_s
         plan = walk(axes, max(drive.path_period_s for drive in drives), cycle_s, self._speed)
         if self._max_deviation is not None and plan.deviation > self._max_deviation:
             raise ValueOutOfRange(

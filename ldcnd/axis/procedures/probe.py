@@ -14,7 +14,7 @@ from ldcnd.axis.state import Completion
 from ldcnd.contract.commands import CommandReply, HomeMethod, Probe, ProbeStop
 from ldcnd.contract.errors import MalformedRequest, NotSupported, VelocityLimit
 from ldcnd.contract.samples import AxisState, LatchSample
-from ldcnd.drives.driver import AxisReading, HomeCapture, StopMode, Warns
+from ldcnd.drives.driver import AxisReading, HomeCapture, StopMode
 
 INDEX_SHARE = 0.75
 """Highest velocity as a fraction of that at which an index pulse lasts one servo cycle: shafts turn unevenly."""
@@ -74,7 +74,7 @@ class ProbeMove(Procedure):
             return False
         latched = await homing(motion.driver).captured_home()
         self.permit.still_wanted()
-        if HomeMethod.CURRENT in self._methods and isinstance(motion.driver, Warns):
+        if HomeMethod.CURRENT in self._methods:
             await motion.driver.clear_warnings()
         if self._ahead not in self._methods and homing(motion.driver).stands_on(self._ahead, reading):
             self._end(f"the drive stopped at the {self._ahead.value.replace('_', ' ')} switch")

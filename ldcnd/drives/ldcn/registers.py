@@ -302,7 +302,7 @@ class ServoRegisters(RegisterBook):
     can be read back (LS-182AP manual, "Define Status"; PIC-SERVO manual, 5.2).
 
     Attributes:
-        gains: see `TakesGains`.
+        gains: see `Moves`.
         shown_tick: the servo tick in which the drive counts velocity, seconds, the shortest one that is possible, and
             whether that is uncertain.
     """

@@ -43,21 +43,13 @@ from ldcnd.drives.driver import (
     Ceiling,
     Evidence,
     Gains,
-    HasOutputs,
     HomeCapture,
-    Homes,
-    KeepsMark,
     Motion,
     Moves,
     PathStatus,
     PwmOutput,
     Register,
-    RemembersRegisters,
     StopMode,
-    TakesGains,
-    Tracks,
-    WalksPaths,
-    Warns,
 )
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
@@ -191,10 +183,11 @@ def reading_items(profile: Profile, items: frozenset[TelemetryItem]) -> StatusIt
     return mask
 
 
-class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, RemembersRegisters, KeepsMark):
+class LdcnAxis(Moves):
     """A drive at one address, in the dialect of its profile."""
 
     shows_inputs = True
+    keeps_mark = True
 
     def __init__(self, spec: AxisSpec, profile: Profile, bus: Bus) -> None:
         self.spec = spec
@@ -244,7 +237,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
 
     @property
     def gains(self) -> Gains | None:
-        """See `TakesGains`."""
+        """See `Moves`."""
         return self._book.gains
 
     @gains.setter
@@ -253,7 +246,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
 
     @property
     def holds_gains(self) -> bool:  # type: ignore[override]
-        """See `TakesGains`."""
+        """See `Moves`."""
         return self._book.loaded
 
     @override
@@ -430,7 +423,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         await self._refuse_faults("still", " again")
 
     async def clear_warnings(self) -> None:
-        """See `Warns`: Clear Sticky Bits, nothing else."""
+        """See `Moves`: Clear Sticky Bits, nothing else."""
         await self._clear_sticky_bits()
 
     # -- motion ------------------------------------------------------------------------------------------------------
@@ -709,7 +702,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         return slow or bool(status.velocity)
 
     async def track(self, position_counts: int) -> None:
-        """See `Tracks`: "stop here", the manuals' way to follow a string of positions.
+        """See `Moves`: "stop here", the manuals' way to follow a string of positions.
 
         Raises:
             NotSupported: PIC-SERVO version 1.
@@ -763,7 +756,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
 
     @override
     async def add_points(self, steps: Sequence[int]) -> PathStatus:
-        """See `WalksPaths`. A reply that is lost leaves open whether they were taken: they are never sent again.
+        """See `Moves`. A reply that is lost leaves open whether they were taken: they are never sent again.
 
         Raises:
             OutcomeUnknown: the reply was lost.
@@ -784,7 +777,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
 
     @override
     async def evidence(self) -> Evidence:
-        """See `KeepsMark`: the mark is in the home register."""
+        """See `Moves`: the mark is in the home register."""
         status = await self._bus.execute(commands.read_status(self._node, EVIDENCE_ITEMS), Lane.BACKGROUND)
         if status.home is None or status.position is None:
             raise BadReply(f"axis {self.spec.name}: the status packet lacks position or home")
@@ -818,7 +811,7 @@ class LdcnAxis(Moves, Homes, Warns, Tracks, WalksPaths, TakesGains, HasOutputs, 
         self._book.gains = gains
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
-        """See `HasOutputs`; PIC-SERVO version 4 only."""
+        """See `Moves`; PIC-SERVO version 4 only."""
         if not self.profile.limit_outputs:
             raise NotSupported(f"{self.profile.title} has no limit pins that can be outputs", axis=self.spec.name)
         values = {FAST_PATH: 0}  # of PIC-SERVO CMC, in the same byte

@@ -19,10 +19,8 @@ from ldcnd.drives.driver import (
     AxisReading,
     AxisSpec,
     Fault,
-    HasParameters,
     PollsItself,
     ReadingListeners,
-    Records,
 )
 from ldcnd.drives.parameter_access import MonitorValue, ParameterAccess
 from ldcnd.drives.smartstep.addresses import Register
@@ -131,12 +129,14 @@ class UnitSpec:
     eeprom: EepromRules = field(default_factory=EepromRules)
 
 
-class SmartStepAxis(PollsItself, HasParameters, Records):
+class SmartStepAxis(PollsItself):
     """A drive at one unit number.
 
     Attributes:
         wires_checked: it was seen not to take its own replies for commands; False for one that has not answered yet.
     """
+
+    parameters: ParameterAccess
 
     def __init__(self, spec: UnitSpec, bus: Bus, others: Mapping[int, str] = MappingProxyType({})) -> None:
         """Prepare the axis; sends nothing.
@@ -153,7 +153,7 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
         self.monitors = tuple(name for name in MonitorName if spec.rates_hz.get(name, 0.0) > 0)
         self.words = Words(bus, spec.axis.name, spec.axis.address, spec.profile)
         self._audit = ParameterAudit()
-        self._parameters = UnitParameters(
+        self.parameters = UnitParameters(
             self.words,
             spec.profile,
             spec.eeprom,
@@ -168,11 +168,6 @@ class SmartStepAxis(PollsItself, HasParameters, Records):
         self.wires_checked = True
         self._poller: UnitPoller | None = None
         self._history = AlarmHistory()
-
-    @property
-    @override
-    def parameters(self) -> ParameterAccess:
-        return self._parameters
 
     def identified(self, type_word: int, version: int) -> None:
         """Take driver type (8800H) and software version (8518H); both types of the manual have one word."""
