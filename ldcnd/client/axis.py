@@ -11,7 +11,7 @@ import pydantic
 
 from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control
-from ldcnd.client.motion import Motion, Position, Sent, State, Watched
+from ldcnd.client.motion import Motion, Position, Sent, State
 from ldcnd.client.notebook import table
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, take_trace
@@ -70,7 +70,7 @@ class Positions:
         return decode_received(PositionSample, sample.payload, sample.encoding)
 
 
-class Axis(AxisVerbs, Watched):
+class Axis(AxisVerbs):
     """An axis that a program controls or watches; made by `Rig.control` and `Rig.watch`.
 
     Attributes:

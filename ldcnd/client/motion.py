@@ -1,9 +1,9 @@
 """The state of an axis for a program: its last values with their age, and a motion from start to end."""
 
 import asyncio
-from abc import ABC, abstractmethod
 from collections.abc import AsyncIterator
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 from ldcnd.client.rig_client import CHECK_PERIOD_S
 from ldcnd.contract.commands import CommandReply
@@ -11,6 +11,9 @@ from ldcnd.contract.condition import Condition, assess
 from ldcnd.contract.errors import CommandAborted, DriveFault, LdcndError, OutcomeUnknown, UnknownCommand
 from ldcnd.contract.events import FINAL, CommandOutcome, CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
+
+if TYPE_CHECKING:
+    from ldcnd.client.axis import Axis
 
 SILENT_S = 10.0
 """Time without samples after which the outcome of a motion is unknown, seconds."""
@@ -152,38 +155,6 @@ class Sent:
         return self.asked if is_reply and self.asked is not None else target
 
 
-class Watched(ABC):
-    """An axis whose state and position arrive; `Axis` is one."""
-
-    name: str
-
-    @property
-    @abstractmethod
-    def state(self) -> State:
-        """The last state."""
-
-    @property
-    @abstractmethod
-    def position(self) -> Position:
-        """The last position."""
-
-    @abstractmethod
-    async def news(self, within_s: float) -> bool:
-        """Wait until a state or a position arrives, or control is lost; tell whether that was in time.
-
-        Raises:
-            LeaseExpired: control was lost.
-        """
-
-    @abstractmethod
-    async def outcome(self, command_id: str) -> CommandOutcome:
-        """Query the daemon for the outcome of the command."""
-
-    @abstractmethod
-    async def halt_now(self) -> None:
-        """Halt, in a bounded time and without raising; nothing is sent once control was lost."""
-
-
 @dataclass(slots=True, eq=False)
 class Motion:
     """A command that the drive has acknowledged and that ends later.
@@ -194,7 +165,7 @@ class Motion:
     """
 
     reply: CommandReply
-    _axis: Watched
+    _axis: "Axis"
     ended: State | None = field(default=None, init=False)
 
     @property

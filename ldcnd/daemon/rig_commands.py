@@ -3,8 +3,6 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
 from dataclasses import replace
-from functools import partial
-from typing import Protocol
 
 from ldcnd.axis import guards
 from ldcnd.axis.axis import AxisService
@@ -78,14 +76,10 @@ LINE_OVERHEAD_BYTES = 3
 """Quotation marks and comma in JSON."""
 
 
-class Execute(Protocol):
-    """Carries out a command of an axis, after all checks of the daemon."""
-
-    def __call__(  # noqa: D102 - see above
-        self, axis_name: str, command: AxisCommand[CommandReply], login: str | None = None
-    ) -> Awaitable[CommandReply]: ...
-
-
+Execute = Callable[[str, AxisCommand[CommandReply]], Awaitable[CommandReply]]
+"""Carries out a command of an axis, after all checks of the daemon."""
+ExecuteFor = Callable[[str, AxisCommand[CommandReply], str | None], Awaitable[CommandReply]]
+"""The same for a login."""
 Admit = Callable[[str, str | None], None]
 """Raises when nothing may be moved on an axis under a lease, or without one."""
 
@@ -101,7 +95,7 @@ class RigCommands:
         ledger: Ledger,
         events: EventLog,
         clock: Clock,
-        execute: Execute,
+        execute: ExecuteFor,
         admit: Admit,
     ) -> None:
         """Take what the daemon consists of.
@@ -231,7 +225,9 @@ class RigCommands:
     async def _move_together(
         self, command: MoveTogether | WalkPath, login: str | None
     ) -> MoveTogetherReply | PathReply:
-        execute = partial(self._execute, login=login)
+        def execute(axis: str, share: AxisCommand[CommandReply]) -> Awaitable[CommandReply]:
+            return self._execute(axis, share, login)
+
         reply: MoveTogetherReply | PathReply
         if isinstance(command, WalkPath):
             reply = await walk_path(self._rig, command, execute)
