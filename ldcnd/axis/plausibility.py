@@ -23,6 +23,8 @@ SPEEDS = 2.0
 """Highest speed of an axis, as a multiple of the highest velocity that is configured for it."""
 OPEN_LOOP_SPEEDS = 8.0
 """The same for a shaft that is turned by hand, or by a load."""
+ALIKE = 2.0
+"""Highest ratio of a velocity to the one that confirms it, where it alone would not be believed."""
 APART_S = 0.1
 """Longest time between two consecutive readings, seconds, unless commands delay the line."""
 ROUNDS = 4
@@ -274,7 +276,12 @@ class PlausibilityGate:
 
     def _agrees(self, unconfirmed: _Seen, reading: AxisReading, timing: Timing) -> bool:
         led = self._is_led(unconfirmed, reading, timing.true_until_s, exactly=self._far)
-        return led and _same_status(unconfirmed[0], reading)
+        if not led or not _same_status(unconfirmed[0], reading):
+            return False
+        # a false velocity would explain any way to the next reading: one that no axis has must be shown twice
+        before, now = unconfirmed[0].velocity_counts_per_s, reading.velocity_counts_per_s
+        highest = self._speed if reading.enabled else self._turned_by_hand
+        return abs(now) <= highest or (now * before > 0 and abs(now) <= ALIKE * abs(before))
 
     def is_out_of_reach(self, reading: AxisReading, by_s: float) -> bool:
         """Tell whether no motion can have led to a reading by then, in loop time, from the last one believed."""

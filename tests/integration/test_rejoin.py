@@ -18,6 +18,10 @@ from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
 NAMES = ("x", "y", "z", "c")
 MARGINS_MS = (5, 50)
+CALM_S = 0.5
+"""After a spoilt answer the module answers everything else for so long: what would be sent to it is sent."""
+IDENTITY_QUESTION = b"\x13\x20"
+"""Read Status with the module's identity, without header and address."""
 
 
 def chain_of(*models):
@@ -270,7 +274,9 @@ async def test_drives_come_back_and_lines_are_taken_over_through_noise(seed):
 
 
 @pytest.mark.parametrize("silent_s", [0.6, 1.0, 1.5, 2.0, 2.5, 3.0])
-async def test_an_sc_that_only_left_questions_unanswered_is_not_reset_where_the_port_passes_no_rates_on(silent_s):
+@pytest.mark.parametrize("questions", ["unanswered", "damaged", "another's"])
+async def test_an_sc_whose_replies_fail_for_a_while_is_not_reset_where_the_port_passes_no_rates_on(questions, silent_s):
+    """Neither without an answer at the rate of power-up, nor for a damaged one, nor for one of another model."""
     spec = ChainSpec((ModuleSpec("ls182ap"), ModuleSpec("picservo-sc")), baud_check=False)
     chain = build_chain(spec)
     gains = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000}
@@ -285,7 +291,7 @@ async def test_an_sc_that_only_left_questions_unanswered_is_not_reset_where_the_
         await rig.until("s", lambda state: state.link == "up")
         await rig.client.command("s", Power(on=True))
         now_s, sent = asyncio.get_running_loop().time(), len(rig.sent)
-        chain._injector = MuteModule(2, now_s + silent_s)
+        chain._injector = FailingModule(2, now_s + silent_s, questions)
         await asyncio.sleep(8.0)
 
         resets = {packet.address for packet in rig.sent[sent:] if packet.command is Command.HARD_RESET}
@@ -293,17 +299,30 @@ async def test_an_sc_that_only_left_questions_unanswered_is_not_reset_where_the_
         assert drive(chain, 2).loop.servo_on
 
 
-class MuteModule(FaultInjector):
-    """Loses the replies of one module until an instant."""
+class FailingModule(FaultInjector):
+    """Loses the replies of one module until an instant, or spoils those to questions of who it is."""
 
-    def __init__(self, address: int, until_s: float) -> None:
+    def __init__(self, address: int, until_s: float, questions: str) -> None:
         super().__init__(FaultPlan())
-        self._address, self._until_s, self._mute = address, until_s, False
+        self._address, self._until_s, self._questions = address, until_s, questions
+        self._fails = self._asks = False
+        self._spoilt_s = -CALM_S
 
     def request(self, data: bytes, at_s: float) -> FaultyRequest:
         packet = data[data.rfind(b"\xaa") :]
-        self._mute = at_s < self._until_s and len(packet) > 2 and packet[1] == self._address
+        self._asks = packet[2:4] == IDENTITY_QUESTION
+        ours = at_s < self._until_s and len(packet) > 2 and packet[1] == self._address
+        self._fails = ours and (self._asks or at_s > self._spoilt_s + CALM_S)
+        if self._fails and self._asks and self._questions != "unanswered":
+            self._spoilt_s = at_s
         return FaultyRequest(tuple(data))
 
     def reply(self, data: bytes, at_s: float) -> FaultyReply:
-        return FaultyReply(b"" if self._mute else data)
+        if not self._fails:
+            return FaultyReply(data)
+        if not self._asks or self._questions == "unanswered":
+            return FaultyReply(b"")
+        if self._questions == "damaged":
+            return FaultyReply(data[:-1] + bytes((data[-1] ^ 0x55,)))
+        identity = bytes((data[1] ^ 0x55,))
+        return FaultyReply(data[:1] + identity + data[2:-1] + bytes(((sum(data[:1] + identity + data[2:-1])) & 0xFF,)))
