@@ -49,6 +49,10 @@ LATE_S = 0.02
 LINE_S = 0.04
 """So old is a position at most when it is published."""
 STOPPED_WITHIN_S = 0.25
+STANDS_WITHIN_S = 1.0
+"""The fastest axis decelerates for 0.25 s, and settles."""
+UNSTABLE = ("hunts", "rate", "by hand")
+"""Deeds after which its loop does not hold an axis."""
 LOST_WITHIN_POLLS, PROOFS_S = 5, 0.2
 """Within so many polls, and the proofs of the line between them, a set counter costs the reference."""
 
@@ -175,7 +179,7 @@ class Story:
             await self._befall(deed, by)
             await asyncio.sleep(LOST_WITHIN_POLLS / self.rate_hz + PROOFS_S)
             await self._check(rig, deed, was_stopped=was_stopped)
-            await self._end(rig, last)
+            await self._end(rig, deed, last)
             for task in tasks:
                 task.cancel()
 
@@ -257,7 +261,7 @@ class Story:
         if deed == "nothing" and self.divisor <= STABLE and not self.faults and codes:
             self.flaws.append(f"{codes} though nothing was wrong")
 
-    async def _end(self, rig: ChainRig, last: str) -> None:
+    async def _end(self, rig: ChainRig, deed: str, last: str) -> None:
         loop = asyncio.get_running_loop()
         before, began_s = len(self.stops), loop.time()
         if last == "stop":
@@ -268,8 +272,14 @@ class Story:
             await asyncio.sleep(4 * STOPPED_WITHIN_S)
         if len(self.stops) == before:
             self.flaws.append(f"{last} did not reach the drive")
-        elif not self.faults and self.stops[before] - began_s > STOPPED_WITHIN_S:
+        elif not self.faults and self.stops[before] - began_s > min(STOPPED_WITHIN_S, 2 / self.rate_hz + LATE_S):
             self.flaws.append(f"{last} took {self.stops[before] - began_s:.3f} s")
+        if not self.faults and last != "off" and self.divisor <= STABLE and deed not in UNSTABLE:
+            await asyncio.sleep(STANDS_WITHIN_S)
+            here = self.shaft
+            await asyncio.sleep(STOPPED_WITHIN_S)
+            if abs(self.shaft - here) > EL / 40:
+                self.flaws.append(f"{self.shaft - here:.0f} counts on, {STANDS_WITHIN_S} s after {last}")
         if last == "off" and drive(self.chain, 1).loop.servo_on:
             self.flaws.append("the loop is closed after power off")
 
