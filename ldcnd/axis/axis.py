@@ -607,7 +607,7 @@ class AxisService:
             CommandAborted: a halt, or a later aborting move, came first.
             LdcndError: as the move itself, and as `Permit.ask_to_move`: also what has changed while it waited.
         """
-        ahead = self._last_in_turn if self._successors.locked() else self._under_way
+        ahead = self._last_in_turn if self._successors.locked() else self._active_id
         patience_s = math.inf
         if move.buffer_mode is BufferMode.ABORTING and self.tracker.command:
             permit.ask_to_move()
@@ -632,13 +632,13 @@ class AxisService:
                         await self._changed.wait()
                 except TimeoutError:
                     deadline_s = math.inf
-                    waits(self._under_way or permit.command_id)
+                    waits(self._active_id or permit.command_id)
                 permit.ask()
             permit.ask()
             return await execute()
 
     @property
-    def _under_way(self) -> str | None:
+    def _active_id(self) -> str | None:
         return self.tracker.command.command_id if self.tracker.command else None
 
     async def set_speed_share(self, share: float) -> tuple[bool, bool]:

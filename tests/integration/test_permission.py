@@ -1,13 +1,10 @@
 """Permission is asked when a motion begins, not when its command arrives; on the jumping clock."""
 
-import ast
 import asyncio
 from contextlib import asynccontextmanager
-from pathlib import Path
 
 import pytest
 
-import ldcnd.daemon
 from ldcnd.client.events import latest_events
 from ldcnd.client.lease import Control, control
 from ldcnd.config.rig import RigConfig, load_config
@@ -279,27 +276,6 @@ async def test_what_is_refused_at_once_leaves_one_event():
             await rig.client.command("x", MoveRelative(distance=2.0))
         events = [event for event in await latest_events(rig.client, 100) if event.axis == "x"]
         assert [(event.status, event.number) for event in events] == [("refused", 0)]
-
-
-MOVES = {"load", "start", "track", "power", "set_gains", "start_group", "start_path", "add_points"}
-"""Calls of a driver or a network that can move a motor."""
-MAY_CALL = "guards.py"
-
-
-@pytest.mark.promise("permission-at-motion")
-def test_nothing_in_the_daemon_but_a_permit_calls_what_can_move_a_drive():
-    folder = Path(ldcnd.daemon.__file__).parent
-    found = []
-    for path in folder.rglob("*.py"):
-        if path.name == MAY_CALL:
-            continue
-        for node in ast.walk(ast.parse(path.read_text())):
-            if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in MOVES):
-                continue
-            owner = ast.unparse(node.func.value)
-            if owner.split(".")[-1] in {"driver", "_driver", "network", "_network", "drive", "_drive"}:
-                found.append(f"{path.name}: {ast.unparse(node.func)}")
-    assert not found
 
 
 BUSY = 30
