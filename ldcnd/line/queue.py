@@ -158,9 +158,8 @@ class PollQueue:
         """Return when the next poller is due; infinity when there is none."""
         if self._ahead:
             return self._ahead.due_at_s
-        for rank in self._ranks:
-            if rank:
-                return rank.since_s
+        if self._due:
+            return next(rank.since_s for rank in self._ranks if rank)
         while self._later and self._turns.get(self._later[0][2]) != self._later[0][1]:
             heapq.heappop(self._later)
         return self._later[0][0] if self._later else float("inf")

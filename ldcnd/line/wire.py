@@ -1,8 +1,10 @@
 """One open transport: its rate, the bytes that pass over it, and the record of them."""
 
 import asyncio
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from itertools import accumulate
 from typing import Any
 
 from ldcnd.contract.errors import TransportLost
@@ -40,14 +42,13 @@ class LatencyHistogram:
 
     def quantile_s(self, fraction: float) -> float:
         """Return an upper bound for the given quantile (0 to 1) in seconds; 0 when nothing was counted."""
-        remaining = fraction * sum(self.counts)
-        if not remaining:
+        up_to = tuple(accumulate(self.counts))
+        wanted = fraction * up_to[-1]
+        if not wanted:
             return 0.0
-        for bucket, counted in enumerate(self.counts[:-1]):
-            remaining -= counted
-            if remaining <= 0:
-                return min(bucket_limit_s(bucket), self.longest_s)
-        return self.longest_s  # the last bucket has no limit of its own
+        bucket = bisect_left(up_to, wanted)
+        # the last bucket has no limit of its own
+        return self.longest_s if bucket >= len(up_to) - 1 else min(bucket_limit_s(bucket), self.longest_s)
 
 
 @dataclass(slots=True)
