@@ -222,12 +222,16 @@ class RegisterBook:
 
     def known(self, name: str) -> int | None:
         """Return the value of a register that is known, or None."""
-        holding = self[name]
+        holding = self._holdings.get(name)
         return holding.value if isinstance(holding, Known) else None
 
     def holds(self, values: Mapping[str, int]) -> bool:
         """Tell whether all of these registers, as far as the module has them, are known to hold these values."""
-        return all(self.known(name) == value for name, value in values.items() if name in self._holdings)
+        for name in self._holdings.keys() & values:
+            holding = self._holdings[name]
+            if not isinstance(holding, Known) or holding.value != values[name]:
+                return False
+        return True
 
     def note(self, values: Mapping[str, int], evidence: Provenance) -> None:
         """Enter values that something proves."""
@@ -249,19 +253,16 @@ class RegisterBook:
         Until it is acknowledged, and for good if it is not, a register holds the one value or the other: it stays known
         only where both are the same.
         """
-        self._enter({name: self._either(self[name], int(value)) for name, value in values.items()})
+        self._enter({name: self._either(name, value) for name, value in values.items() if self.known(name) != value})
         yield
         self.note(values, Provenance.WRITTEN_AND_ACKNOWLEDGED)
 
-    @staticmethod
-    def _either(before: Holding, value: int) -> Holding:
-        match before:
-            case Known(old) if old == value:
-                return before
+    def _either(self, name: str, value: int) -> Unknown:
+        match self[name]:
             case Known(old):
-                return Unknown(REPLY_LOST, (old, value))
+                return Unknown(REPLY_LOST, (old, int(value)))
             case Unknown(_, among) if among:
-                return Unknown(REPLY_LOST, tuple(dict.fromkeys((*among, value))))
+                return Unknown(REPLY_LOST, tuple(dict.fromkeys((*among, int(value)))))
         return Unknown(REPLY_LOST)
 
     def published(self) -> tuple[Register, ...]:
@@ -269,7 +270,8 @@ class RegisterBook:
         return tuple(_published(name, holding) for name, holding in self._holdings.items())
 
     def _enter(self, holdings: Mapping[str, Holding]) -> None:
-        self._holdings |= {name: holding for name, holding in holdings.items() if name in self._holdings}
+        for name in self._holdings.keys() & holdings:
+            self._holdings[name] = holdings[name]
 
 
 def _published(name: str, holding: Holding) -> Register:

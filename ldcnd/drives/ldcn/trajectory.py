@@ -10,6 +10,7 @@ velocity it means bit 5, as its own list of bits says.
 import math
 from dataclasses import dataclass, replace
 from enum import IntFlag, StrEnum
+from itertools import compress
 
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.drives.driver import NO_CEILING, AnalogMotion, Ceiling, Motion, PwmOutput
@@ -88,7 +89,7 @@ class Trajectory:
             self.reverse or self.relative,
             self.start_now,
         )
-        return TrajectoryControl(sum(bit for bit, is_set in zip(_BITS, present, strict=True) if is_set))
+        return TrajectoryControl(sum(compress(_BITS, present)))
 
 
 def trajectory_bytes(profile: Profile, control: TrajectoryControl) -> int:
@@ -149,7 +150,7 @@ def decode_trajectory(profile: Profile, data: bytes) -> Trajectory:
 
 def _fields(profile: Profile, control: TrajectoryControl) -> tuple[Field | None, ...]:
     """Return position, velocity, acceleration and PWM or target, None for those that the control byte leaves out."""
-    position, velocity, acceleration, pwm_or_target = (int(control) & bit for bit in _BITS[:4])
+    position, velocity, acceleration, pwm_or_target = [int(control) & bit for bit in _BITS[:4]]
     return (
         POSITION if position else None,
         Field("velocity", 4, 0, profile.most_velocity) if velocity else None,
