@@ -57,8 +57,8 @@ from ldcnd.line.transaction import Condition, only_while
 
 def check_reachable(axis: AxisTracker) -> None:
     """Refuse when the drive does not answer, or is not known to be the one that is configured."""
-    if axis.proof:
-        axis.proof.check()
+    if axis.proof and not axis.proof.holds:
+        raise axis.proof.refusal()
     if axis.link is LinkState.DOWN:
         raise AxisUnreachable(
             f"axis {axis.name}: the drive does not answer", axis=axis.name, remedy="check its power and the line"

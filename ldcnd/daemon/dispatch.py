@@ -507,7 +507,8 @@ class Dispatcher:
             self.authority.check_held(axis, command.lease, self._clock.now_s())
 
         def in_time() -> None:
-            self._refuse_late(axis, command)
+            if command.not_after is not None:
+                self._refuse_late(axis, command)
             if not accepted.is_set() and self._clock.now_s() - arrived_s > command.answer_s - REPLY_S:
                 raise CommandExpired(
                     f"axis {axis}: the turn of {command.verb} came later than its sender waits for a reply",

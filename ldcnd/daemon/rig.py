@@ -147,7 +147,8 @@ class ModuleService:
 
     def _check(self, condition: Condition) -> None:
         """Refuse before anything is noted of outputs: the line asks both again when the turn of a packet has come."""
-        self._driver.proof.check()
+        if not self._driver.proof.holds:
+            raise self._driver.proof.refusal()
         condition()
 
     def _observed(self, reading: IoReading, timing: Timing) -> None:

@@ -11,7 +11,7 @@ from ldcnd.line.exchange import Effect, Exchange, Timing
 from ldcnd.line.flight_recorder import WireEvent, WireLog
 from ldcnd.line.line import Line, Phase, Users
 from ldcnd.line.poller import Poller
-from ldcnd.line.proof import Proofs
+from ldcnd.line.proof import ALWAYS_SENT, Proofs
 from ldcnd.line.queue import POLL, ExchangeQueue, Lane, PhaseOrder
 from ldcnd.line.resync import Resync
 from ldcnd.line.settings import BusSettings
@@ -344,7 +344,7 @@ class Bus(Users):
 
     def _job(self, exchange: Exchange[Any], lane: Lane, *, once: bool = False) -> Job:
         attempts = 1 if once else self.settings.attempts
-        condition = self.proofs.condition(exchange, lane)
+        condition = None if exchange.effect in ALWAYS_SENT else self.proofs.condition(exchange, lane)
         future: asyncio.Future[Any] = self._loop.create_future()
         return Job(exchange, lane, self._loop.time(), future, attempts=attempts, condition=condition)
 

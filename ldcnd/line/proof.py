@@ -77,7 +77,7 @@ class Proof:
         return not self.holds and not self._silent
 
     def refusal(self) -> LdcndError:
-        """Return the refusal of what would change something."""
+        """Return the refusal of what would change something: `AxisUnreachable` if it is silent, or `NotIdentified`."""
         if self._silent:
             return AxisUnreachable(
                 f"{self._what}: the drive does not answer: {self._problem}",
@@ -89,16 +89,6 @@ class Proof:
             axis=self._axis,
             remedy="correct the wiring or the configuration; the line is tried again by itself",
         )
-
-    def check(self) -> None:
-        """Refuse what would change something unless the proof holds.
-
-        Raises:
-            AxisUnreachable: nothing answers there.
-            NotIdentified: something answers that is not known to be what is meant.
-        """
-        if not self.holds:
-            raise self.refusal()
 
 
 class Proofs:
@@ -153,28 +143,24 @@ class Proofs:
         """Refuse what would change something at an address, of a node or of a group.
 
         Raises:
-            AxisUnreachable, NotIdentified: as `Proof.check`, of the first one that lacks its proof.
+            AxisUnreachable, NotIdentified: see `Proof.refusal`, of the first one that lacks its proof.
         """
-        if node in self._nodes:
-            self._nodes[node].check()
-        elif self._groups.get(node):
-            for proof in self._groups[node]:
-                proof.check()
-        else:
+        proofs = (self._nodes[node],) if node in self._nodes else self._groups.get(node)
+        if not proofs:
             raise NotIdentified(
                 f"address {node} is not configured, so nothing that could change anything is sent there", value=node
             )
+        for proof in proofs:
+            if not proof.holds:
+                raise proof.refusal()
 
-    def condition(self, exchange: Exchange[Any], lane: Lane) -> Condition | None:
-        """Return what is checked when the turn of an exchange comes that is queued in this context; None for nothing.
+    def condition(self, exchange: Exchange[Any], lane: Lane) -> Condition:
+        """Return what is checked when the turn of an exchange comes that is queued in this context.
 
         That is its proof, and the permission of a command (`only_while`), which a stop does not need.
         """
-        effect = exchange.effect
-        if effect in ALWAYS_SENT:
-            return None
         permission = condition_in_force() if lane is not Lane.STOP else None
-        passes = _pass.get() if effect is Effect.ARRANGES else None
+        passes = _pass.get() if exchange.effect is Effect.ARRANGES else None
 
         def condition() -> None:
             if not (passes and passes.holds):
