@@ -332,7 +332,7 @@ class AxisTracker:
     def shown(self) -> dict[str, Any]:
         """Return the fields of a state sample besides when, in its order; compared after every poll, so no model."""
         return {
-            "quality": self.quality,
+            "quality": Quality.UNCERTAIN if self.position_lost and self.link is LinkState.UP else QUALITIES[self.link],
             "state": self.state,
             "enabled": self.enabled,
             "referenced": self._referenced,
@@ -375,9 +375,8 @@ class AxisTracker:
     @property
     def quality(self) -> Quality:
         """Quality of a value read just now; never good while it is not known where the axis is."""
-        if self.position_lost and self.link is LinkState.UP:
-            return Quality.UNCERTAIN
-        return QUALITIES[self.link]
+        quality: Quality = self.shown()["quality"]
+        return quality
 
     @property
     def at_rest(self) -> bool:

@@ -152,13 +152,11 @@ class AxisTelemetry:
                         "amplifier_enable": amplifier_enable,
                     }
                 )
-        self._publish(shown, t, t_error_ns, due=TelemetryItem.STATE in asked)
+        self.state(t, t_error_ns, shown, due=TelemetryItem.STATE in asked)
 
-    def state(self, t: int) -> None:
-        """Publish state and faults if they changed."""
-        self._publish(self._tracker.shown(), t, 0)
-
-    def _publish(self, shown: dict[str, Any], t: int, t_error_ns: int, *, due: bool = False) -> None:
+    def state(self, t: int, t_error_ns: int = 0, shown: dict[str, Any] | None = None, *, due: bool = False) -> None:
+        """Publish state, as the tracker shows it by now, and faults if they changed, or if they are due anyway."""
+        shown = shown or self._tracker.shown()
         if due or shown != self._last_state:
             self._last_state, command = shown, shown["command"]
             self._state.publish(
