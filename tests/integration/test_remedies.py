@@ -112,7 +112,7 @@ CASES = {
     "few gains": Case(GAINS, (), "axis gains g --kd 5", "axis gains g --kp KP --el EL"),
     "pin is an output": Case(
         OUTPUTS,
-        ("axis outputs z --limit2 low",),
+        ("axis power z on", "axis outputs z --limit2 low"),
         "axis home z --method forward_limit --velocity 5",
         "axis outputs z --limit1 input --limit2 input",
     ),
