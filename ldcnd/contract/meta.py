@@ -5,7 +5,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from ldcnd.contract.commands import Verb
+from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.plan import PollPriority
 
@@ -40,6 +40,8 @@ class CommandInfo(Frozen):
     """Key of the request: `@cmd/<axis>/<verb>`, or `@cmd/_/<verb>` when it concerns the rig."""
     summary: str
     """Effect of the request."""
+    effect: Effect | None = None
+    """What the command may do to the rig; null from a daemon of an earlier version."""
     request_schema: str
     """Name of the payload's schema under `meta/schema/`."""
     reply_schema: str

@@ -255,6 +255,7 @@ def command_list() -> CommandList:
                 verb=command.verb,
                 key=f"@cmd/{RIG_ITSELF if command.about is About.RIG else '<axis>'}/{command.verb}",
                 summary=command.summary(),
+                effect=command.effect,
                 request_schema=schema_name(command),
                 reply_schema=schema_name(command.reply_model()),
             )

@@ -1,4 +1,4 @@
-"""A daemon that is gone, or silent: the page says so wherever one looks, and no value of it passes for a new one."""
+"""A daemon that is gone, or silent: the page says so wherever one looks, and none of its values passes for new."""
 
 from contextlib import asynccontextmanager
 

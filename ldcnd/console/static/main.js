@@ -10,14 +10,14 @@ import { RigPage } from "./pages/rig.js";
 import { ScopePage } from "./pages/scope.js";
 import { TracePage } from "./pages/trace.js";
 import { TuningPage } from "./pages/tuning.js";
-import { number } from "./parts/format.js";
+import { decimalsOf, number } from "./parts/format.js";
 import { problems } from "./parts/problems.js";
-import { Mark } from "./parts/state.js";
+import { Mark, placeText } from "./parts/state.js";
 import { overrideOf, slowed } from "./pages/rig_speed.js";
 import { StopAll } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
 import { feed } from "./session/feed.js";
-import { commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
+import { axisNamed, commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
 
 const PAGES = [
   ["rig", "Rig", RigPage],
@@ -56,6 +56,13 @@ function Summary() {
       >${rigs.size > 1 ? `${rig.name}: ` : ""}speed override ${number(overrideOf(rig), 0)} %${overrideOf(rig) === 0 ? ": nothing moves" : ""}<//> `)}
     ${mine.length > 0 && html` <span class="mine">You control ${mine.map((axis) => axis.name).join(", ")}</span>`}
   </p>`;
+}
+
+/** Where the axis of the page is, in sight wherever the page is scrolled to. */
+function Strip({ at }) {
+  const axis = at.page === "axis" && axisNamed(at);
+  if (!axis) return null;
+  return html`<p class="strip number">${axis.name} <b>${placeText(axis, decimalsOf(axis.info))}</b> ${axis.info.unit}, ${axis.condition.state}</p>`;
 }
 
 function Notices() {
@@ -105,6 +112,7 @@ function Console() {
         <${Summary} />
         <${StopAll} />
       </div>
+      <${Strip} at=${at} />
       <${Notices} />
     </header>
     <main id="main" tabindex="-1" ref=${main}>

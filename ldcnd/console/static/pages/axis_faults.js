@@ -6,7 +6,7 @@ import { clock, words } from "../parts/format.js";
 import { inPageTerms } from "../parts/remedies.js";
 import { faultPage, Mark } from "../parts/state.js";
 import { command, controls, question } from "../session/control.js";
-import { obstacle } from "../session/obstacles.js";
+import { moves, obstacle } from "../session/obstacles.js";
 
 export function FaultPanel({ axis }) {
   const { faults } = axis;
@@ -80,7 +80,9 @@ export function WhyPanel({ axis }) {
           ? html`<p><${Mark} level="bad">not known<//> ${axis.rig.worth.why}</p>`
           : why &&
         !refusal &&
-        (why.can_move
+        (moves(axis) && why.causes.length === 1
+          ? html`<p>It moves: the next motion waits for the end of this one, or halts it first.</p>`
+          : why.can_move
           ? html`<p>Ready to move: a motion within the limits would be accepted.</p>`
           : html`<p>Not now. Clear in this order:</p><ol class="causes">${why.causes.map(
               (cause) => html`<li>

@@ -76,7 +76,7 @@ function Move({ axis, kinds }) {
   const once = useOnce();
   const set = (name) => (value) => setValues((last) => ({ ...last, [name]: value }));
   const body = bodyOf(verb, values);
-  const missing = unread(usedBy(verb, values)) ?? (body === null ? `${label} is missing.` : null);
+  const missing = unread(usedBy(verb, values)) ?? (body === null ? `${missingOf(verb, values)} is missing.` : null);
   const way = obstacle(axis, verb, body?.buffer_mode !== undefined && body.buffer_mode !== "refuse") ?? missing ?? once.obstacle(body, moves(axis));
   const move = () => once.send(body, moves(axis), () => command(axis, verb, body));
 
@@ -117,6 +117,12 @@ function Move({ axis, kinds }) {
       kind="main" outcome=${(reply) => outcomeOf(axis, reply)}>Move<//></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}
   <//>`;
+}
+
+/** Return the label of the field that a verb misses. */
+function missingOf(verb, values) {
+  const { field, label } = KINDS[verb];
+  return values[field] === null || values[field] === undefined ? label : "For";
 }
 
 /** Return the values that a verb would send, by what their fields are called. */

@@ -32,7 +32,7 @@ export function NowPanel({ axis }) {
       ["A/D input", adc ? html`${number(adc.volts, 3)} <span class="unit">V</span> (${adc.counts})` : "none"],
       ["command", state?.command ? `${words(state.command.verb)}, ${remaining(state.command)}` : "none"],
       ["last motion", lastMotion(axis)],
-      ["last error", state?.last_error ?? "none"],
+      ["last command ended", state?.last_error ?? "done, or not yet"],
     ]} />
     <h3>Status</h3>
     <${StatusLamps} state=${state} live=${live} />
@@ -102,10 +102,10 @@ function Signals({ axis }) {
   const names = signalsOf(axis);
   if (axis.info.family === "smartstep" || !names.length) return null;
   return html`<h3>Drive signals</h3>
-    <ul class="lamps" aria-label="Drive signals">
+    ${snapshot && html`<ul class="lamps" aria-label="Drive signals">
       ${names.map((name) => html`<${Lamp}
-        label=${words(name)} on=${snapshot?.values[name] ?? null} yes="high" no="low" />`)}
-    </ul>
+        label=${words(name)} on=${snapshot.values[name] ?? null} yes="high" no="low" />`)}
+    </ul>`}
     <p class="row"><${Action} act=${() => readSignals(axis)} obstacle=${obstacle(axis, "trace")}
       onDone=${setSnapshot}>Read signals<//>
       <small>${snapshot ? `As they were at ${clock(snapshot.at)}.` : "Takes a trace of two samples; it replaces the last trace."}</small></p>`;

@@ -3,13 +3,15 @@
 import { html, useEffect, useId, useRef, useState } from "../html.js";
 import { HoldButton } from "./hold_button.js";
 
+const FRESH_MS = 500;
+
 /** The question of a conversation's view, with the controls that answer it; nothing without one. */
 export function QuestionPart({ talk }) {
   const { question, held } = talk.view;
   if (!question) return null;
   const parts = { text: TextQuestion, number: TextQuestion, choice: Choices, change: Change, hold: Hold };
   return html`<div class="question" key=${question.number} role="group" aria-label="Question">
-    <${parts[question.kind]} question=${question} held=${held}
+    <${parts[question.kind]} key=${question.number} question=${question} held=${held}
       answer=${(text) => talk.answer(question.number, text)} talk=${talk} />
   </div>`;
 }
@@ -35,7 +37,18 @@ export function CopiedCommand({ command }) {
     <span role="status">${copied ? "Copied" : ""}</span></p>`;
 }
 
+/** A question that has just come cannot be answered: the second Enter or click was meant for the one before it. */
+function useFresh() {
+  const [fresh, setFresh] = useState(true);
+  useEffect(() => {
+    const timer = setTimeout(() => setFresh(false), FRESH_MS);
+    return () => clearTimeout(timer);
+  }, []);
+  return fresh;
+}
+
 function TextQuestion({ question, answer }) {
+  const fresh = useFresh();
   const [text, setText] = useState(question.default ?? "");
   const id = useId();
   const field = useRef();
@@ -53,14 +66,15 @@ function TextQuestion({ question, answer }) {
       ${likely.length > 0 && html`<datalist id=${`${id}-likely`}>
         ${likely.map(({ word }) => html`<option value=${word}></option>`)}</datalist>`}
     </div>
-    <button class="main">Answer</button>
+    <button class="main" disabled=${fresh}>Answer</button>
   </form>`;
 }
 
 function Choices({ question, answer }) {
+  const fresh = useFresh();
   return html`<p>${question.text}?</p>
     <p class="row">${question.choices.map(
-      ({ word, label }) => html`<button key=${word} type="button" onClick=${() => answer(word)}>${label}</button>`,
+      ({ word, label }) => html`<button key=${word} type="button" disabled=${fresh} onClick=${() => answer(word)}>${label}</button>`,
     )}</p>`;
 }
 

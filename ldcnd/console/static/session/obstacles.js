@@ -27,25 +27,17 @@ function controlled(axis) {
 }
 
 const toMove = [heard, controlled, reachable, unlatched, faultless, enabled, standing];
+const toChange = [heard, controlled, reachable];
+/** What other verbs need follows from their effect, which the daemon publishes. */
 const CHECKS = {
   enable: [heard, controlled, reachable, unlatched, faultless, disabled],
   disable: [heard, controlled, reachable, enabled],
   reset: [heard, controlled, reachable, resettable],
   halt: [moving],
   move_absolute: [...toMove, referenced],
-  move_relative: toMove,
-  move_velocity: toMove,
-  jog: toMove,
-  move_analog: toMove,
-  set_pwm: toMove,
-  probe: toMove,
   track: [...toMove, referenced],
-  home: toMove,
   set_position: [heard, controlled, reachable, standing],
-  set_outputs: [heard, controlled, reachable],
-  set_gains: [heard, controlled, reachable],
   parameters: [heard, reachable],
-  write_parameter: [heard, controlled, reachable],
   trace: [heard, reachable],
   none: [heard],
 };
@@ -55,7 +47,8 @@ const CHECKS = {
  * `joins` says that a move may wait for, or end, the one under way.
  */
 export function obstacle(axis, act, joins = false) {
-  for (const check of CHECKS[act]) {
+  const { effects } = axis.rig;
+  for (const check of CHECKS[act] ?? (effects[act] === "motion" ? toMove : toChange)) {
     if (joins && check === standing) continue;
     const text = check(axis);
     if (text) return text;
