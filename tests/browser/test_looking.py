@@ -112,7 +112,7 @@ async def test_a_test_move_is_judged_and_writes_nothing(house):
         await house.sim.until("y", lambda state: state.enabled)
         before, gains = await house.sim.position("y"), await house.sim.registers("y")
 
-        await desk.button("Move 1.000 mm and record").click()
+        await desk.button("Move 1 mm and record").click()
 
         run = desk.page.get_by_role("row", name="Run 1")
         await expect(run).to_contain_text("trapezoid 1.000")
@@ -138,7 +138,7 @@ async def test_the_daemon_is_lost_and_regained(house):
 
         await house.sim.end()
 
-        await expect(desk.panel("Now")).to_contain_text("no data")
+        await expect(desk.panel("Now")).to_contain_text("daemon silent")
         await expect(desk.page.get_by_text("The values below are the last known ones.")).to_be_visible()
         await expect(desk.button("Take control")).to_be_disabled()
         await desk.page.get_by_role("button", name="Stop all axes").click()

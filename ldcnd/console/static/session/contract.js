@@ -8,7 +8,7 @@ export const GAINS = {
   il: { title: "integration limit", min: 0, max: 32767, unit: "" },
   ol: { title: "output limit", min: 0, max: 255, unit: "of 255" },
   cl: { title: "current limit, 0 is off", min: 0, max: 255, unit: "" },
-  el: { title: "position error limit", min: 0, max: 16383, unit: "count" },
+  el: { title: "position error limit", min: 0, max: 32767, unit: "count" },
   deadband: { title: "amplifier deadband compensation", min: 0, max: 255, unit: "" },
   sr: { title: "servo rate divisor, standing axis only", min: 1, max: 255, unit: "" },
 };
