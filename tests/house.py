@@ -35,9 +35,9 @@ from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import MoveAbsolute, Power, SetPosition
 from ldcnd.contract.parameters import ReadAlarms
 from ldcnd.contract.traces import TakeTrace
-from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.console_rig import open_page, running_console
+from tests.support.jumping_loop import JumpingLoop
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 from tests.support.trace_rig import trace_config
 

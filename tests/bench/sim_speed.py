@@ -29,10 +29,10 @@ from ldcnd.drives.ldcn.profiles import LS_182AP
 from ldcnd.line.bus import Bus
 from ldcnd.line.settings import BusSettings
 from ldcnd.sim.chain import Chain
-from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import build_chain
 from ldcnd.sim.ldcn.simulation import SimulatedModuleConfig, SimulationConfig
 from ldcnd.sim.line import open_simulated_line
+from tests.support.jumping_loop import JumpingLoop
 from tests.support.rough_host import enumeration, frame, jog, powered
 
 COUNTS = (1, 8, 31)

@@ -18,11 +18,11 @@ from ldcnd.drives.ldcn.acceptance import ASSUMPTIONS, accept, trial_bus
 from ldcnd.drives.smartstep.config import SimulatedUnitConfig, simulated_units
 from ldcnd.line.capture import Capture, parse_capture
 from ldcnd.sim.chain import Chain
-from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import PtyLine
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
+from tests.support.jumping_loop import JumpingLoop
 from tests.support.plugged_rig import MODELS
 from tests.support.recorded_line import Replay
 from tests.support.serial_adapter import Plug

@@ -20,9 +20,9 @@ from ldcnd.drives.ldcn.received import PlainCommand
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
-from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
+from tests.support.jumping_loop import JumpingLoop
 
 SCHEDULES = 120
 """Of a batch; `make test` lives through the first third of the first one."""

@@ -25,11 +25,11 @@ from ldcnd.contract.samples import LinkState, Moving, PositionSample, Quality, T
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.received import ResetPosition, SetGain, StopMotor
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
-from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.plant import MotorPlant
 from tests.support.chain_rig import ChainRig, drive, rig_on
+from tests.support.jumping_loop import JumpingLoop
 
 MODELS = {"ls-182ap": "ls182ap", "pic-servo-v4": "picservo-v4", "pic-servo-sc": "picservo-sc"}
 COUNTS, EL, NOISE = 1000, 4000, 16

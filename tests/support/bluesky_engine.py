@@ -16,9 +16,9 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.samples import LinkState
 from ldcnd.lab.bluesky import Axis, Devices
 from ldcnd.sim.chain import Chain
-from ldcnd.sim.jumping_loop import JumpingLoop
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
+from tests.support.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig, two_axes
 
 with suppress(ImportError):

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from ldcnd.sim.jumping_loop import JumpingLoop
+from tests.support.jumping_loop import JumpingLoop
 
 
 async def test_an_hour_takes_no_time():

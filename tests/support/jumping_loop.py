@@ -106,7 +106,7 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         self,
         sig: int,
         callback: Callable[..., object],
-        *args: Any,  # noqa: ANN401 - whatever the callback takes
+        *args: Any,
     ) -> None:
         """Handle a signal: from now on every select is a real one, because a signal writes to the pipe by itself."""
         super().add_signal_handler(sig, callback, *args)
@@ -135,7 +135,7 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         self,
         when: float,
         callback: Callable[..., object],
-        *args: Any,  # noqa: ANN401 - whatever the callback takes
+        *args: Any,
         context: Context | None = None,
     ) -> asyncio.TimerHandle:
         """Set a timer, at the next whole nanosecond."""
@@ -146,9 +146,9 @@ class JumpingLoop(asyncio.SelectorEventLoop):
 
     def run_in_executor(  # type: ignore[override] # as above
         self,
-        executor: Executor | None,  # noqa: ARG002 - there is no thread to choose
+        executor: Executor | None,
         func: Callable[..., Any],
-        *args: Any,  # noqa: ANN401 - whatever the function takes
+        *args: Any,
     ) -> asyncio.Future[Any]:
         """Run at once: a thread's work takes no virtual time."""
         future: asyncio.Future[Any] = self.create_future()
