@@ -39,7 +39,6 @@ fix: .venv/ready
 	.venv/bin/ruff check --fix .
 	.venv/bin/ruff format .
 	$(PY) -m tools
-	$(PY) -m tests.support.verb_table
 
 # the site in build/docs, warnings as errors
 docs: .venv/ready
@@ -81,7 +80,8 @@ newcomer: .venv/ready
 	$(PY) -m tests.newcomer $(ARGS)
 
 bench: .venv/ready
-	$(PY) -m tests.bench --json docs/explanation/timing.json
+	mkdir -p build
+	$(PY) -m tests.bench --json build/bench.json
 
 # the pictures of the documentation; needs chromium
 screenshots: .venv/ready

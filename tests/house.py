@@ -2,7 +2,7 @@
 
 It prints the files that a poll, a move, a move of the console's page, and a trace request of each family pass, with
 how often each is entered. `--twins` prints pairs of classes that hold nearly the same fields, `--counts` how large the
-house is.
+house is, `--words` how long the documentation is.
 
 The flows run on a whole daemon, on the jumping clock. A file is entered when one of its functions is called from
 another file; a function that goes on after an await has not been entered again. The simulated line, the client and the
@@ -33,11 +33,13 @@ import ldcnd
 from ldcnd.cli.main import cli
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import MoveAbsolute, Power, SetPosition
+from ldcnd.contract.fault_pages import FOLDER
 from ldcnd.contract.parameters import ReadAlarms
 from ldcnd.contract.traces import TakeTrace
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.console_rig import open_page, running_console
 from tests.support.jumping_loop import JumpingLoop
+from tests.support.pages import ROOT, pages
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 from tests.support.trace_rig import trace_config
 
@@ -299,11 +301,46 @@ def _commands(command: click.Command, context: click.Context) -> int:
     return sum(_commands(each, click.Context(each, parent=context)) for each in found if each)
 
 
+def words() -> dict[str, int]:
+    """Return the words of every page by its path, as `wc -w` counts them; without copies that a build makes."""
+    found = [page for page in pages() if not page.is_relative_to(ROOT / "deploy")]
+    return {str(page.relative_to(ROOT)): len(_text(page).split()) for page in [*found, ROOT / "CHANGELOG.md"]}
+
+
+def too_long(found: dict[str, int]) -> list[str]:
+    """Return what of the documentation is longer than agreed."""
+    decisions = {page: count for page, count in found.items() if page.startswith("docs/adr/")}
+    of_map = found["docs/explanation/architecture.md"]
+    limits = {
+        "words of all pages": (sum(found.values()), 45_000),
+        "words of docs/explanation/architecture.md": (of_map, 900),
+        "lines of CHANGELOG.md": (len(_text(ROOT / "CHANGELOG.md").splitlines()), 60),
+        "decisions": (len(decisions), 15),
+        **{f"words of {page}": (count, 350) for page, count in decisions.items()},
+    }
+    return [f"{count} {what}, at most {most}" for what, (count, most) in limits.items() if count > most]
+
+
+def _text(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def _print_words() -> None:
+    found = words()
+    for page, count in sorted(found.items(), key=lambda item: -item[1]):
+        print(f"{count:6} {page}")
+    faults = sum(len(_text(page).split()) for page in FOLDER.glob("*.md"))
+    print(f"{sum(found.values()):6} in all; {faults} more of fault pages")
+    if exceeded := too_long(found):
+        sys.exit("\n".join(exceeded))
+
+
 def main() -> None:
-    """Print the files of each flow, in order, with how often each is entered; or twins; or counts."""
+    """Print the files of each flow, in order, with how often each is entered; or twins; or counts; or words."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--twins", action="store_true", help="print pairs of classes that hold nearly the same fields")
     parser.add_argument("--counts", action="store_true", help="print lines, files, classes, twins and commands")
+    parser.add_argument("--words", action="store_true", help="print the words of the documentation; 1 if too many")
     options = parser.parse_args()
     structlog.configure(wrapper_class=structlog.make_filtering_bound_logger(logging.CRITICAL))
     if options.twins:
@@ -312,7 +349,9 @@ def main() -> None:
     if options.counts:
         for what, count in counts().items():
             print(f"{count:6} {what}")
-    for name in () if options.twins or options.counts else FLOWS:
+    if options.words:
+        _print_words()
+    for name in () if options.twins or options.counts or options.words else FLOWS:
         way = way_of(name)
         print(f"{name}: {len(way.times)} files, {len(way.calls)} entrances, from {way.first} to {way.last}")
         for file, times in way.times.items():

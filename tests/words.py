@@ -3,6 +3,7 @@
 Every description in `schemas/` is a whole sentence that begins with the thing described and ends with a full stop.
 """
 
+import argparse
 import json
 import re
 import sys
@@ -44,6 +45,7 @@ def fault_of(text: str) -> str | None:
 
 def main() -> int:
     """Print the descriptions that are no sentences; the exit status is 1 if there are any."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     found = {
         f"{path}: {text!r} {fault}"
         for file in sorted(SCHEMAS.glob("*.json"))

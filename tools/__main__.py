@@ -78,7 +78,7 @@ def write_man_pages(folder: Path) -> None:
 
 
 def renew_table(page: Path, table: str) -> None:
-    """Replace the table at the end of a page."""
+    """Replace the list at the end of a page."""
     before, found, _ = page.read_text(encoding="utf-8").partition(table.partition("\n")[0])
     if not found:
         sys.exit(f"{page}: has no such table")
@@ -86,11 +86,11 @@ def renew_table(page: Path, table: str) -> None:
 
 
 def errors_table() -> str:
-    """Return all codes as one Markdown table."""
-    lines = ["| code | what it means | what to do | retryable |", "|---|---|---|---|"]
+    """Return all codes as a Markdown list."""
+    lines = ["All codes; the same request may be sent again later for those that are marked:", ""]
     for code, error in ERRORS.items():
         meaning = " ".join((error.__doc__ or "").split())
-        lines.append(f"| `{code}` | {meaning} | {error.way_out} | {'yes' if error.retryable else 'no'} |")
+        lines.append(f"* `{code}`{' (retryable)' if error.retryable else ''}: {meaning}")
     return "\n".join(lines) + "\n"
 
 

@@ -123,10 +123,13 @@ def _channel(key: str, kind: Kind, sent: type[Frozen], taken: type[Frozen] | Non
 
 
 def keys_table() -> str:
-    """Return all channels as one Markdown table."""
-    lines = ["| key | kind | query carries | daemon sends | what |", "|---|---|---|---|---|"]
+    """Return all channels as a Markdown list; keys below the rig's, payloads that do not follow from the verb."""
+    lines = ["Each key below `ldcn/<rig>/`, what a query carries, and what the daemon sends:", ""]
     for channel in channels():
-        key = channel.key.replace("{", "<").replace("}", ">")
-        taken = f"`{schema_name(channel.taken)}`" if channel.taken else ""
-        lines.append(f"| `{key}` | {channel.kind} | {taken} | `{schema_name(channel.sent)}` | {channel.summary} |")
+        key = channel.key.replace("{", "<").replace("}", ">").removeprefix("ldcn/<rig>/")
+        taken, sent = channel.taken and schema_name(channel.taken), schema_name(channel.sent)
+        usual = channel.kind is Kind.COMMAND and taken == f"{key.rpartition('/')[2]}_request"
+        carried = "" if usual or not taken else f" carries `{taken}`,"
+        answered = "" if channel.kind is Kind.COMMAND and sent == "command_reply" else f" sends `{sent}`"
+        lines.append(f"* `{key}`{carried}{answered}: {channel.summary}")
     return "\n".join(lines) + "\n"

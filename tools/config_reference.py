@@ -14,22 +14,33 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.frozen import attribute_docstrings
 from ldcnd.drives.toml import Variants
 
-PLAIN = {str: "string", int: "integer", float: "number", bool: "true or false", Path: "path"}
+PLAIN = {str: "string", int: "integer", float: "number", bool: "boolean", Path: "path"}
 PREFACE = """# Configuration
 
-A rig is one TOML file. `ldcnd check-config FILE` validates it whole, without opening anything, and names file, key,
-what is wrong and what is allowed; `ldcnd run` does the same before it opens a port. Defaults are those of the models;
-keys that are not listed here are refused.
+Which keys does a rig's file have? A rig is one TOML file. `ldcnd check-config FILE` validates it whole, without opening
+anything, and names file, key, what is wrong and what is allowed; keys that are not listed here are refused. The default
+of a key stands behind the semicolon.
 """
+ELSEWHERE = {
+    "sim.module.behaviour": "[The simulated line](simulator.md#quirks) has its switches with their defaults.",
+    "sim.module.plant": "`schemas/rig_config.json` has its constants, `PlantConfig`.",
+    "sim.unit": "[The simulated line](simulator.md#smartsteps) shows its keys.",
+}
+"""Tables that have a page of their own."""
 
 
 def config_reference() -> str:
     """Return the page, in Markdown."""
-    return PREFACE + "".join(_sections(RigConfig, "", {RigConfig}))
+    return PREFACE + "".join(_sections(RigConfig, "", "", {RigConfig}))
 
 
 def _sections(
-    model: type[BaseModel], path: str, seen: set[type[BaseModel]], family: str = "", common: type[BaseModel] = BaseModel
+    model: type[BaseModel],
+    path: str,
+    role: str,
+    seen: set[type[BaseModel]],
+    family: str = "",
+    common: type[BaseModel] = BaseModel,
 ) -> Iterator[str]:
     """Describe a table and the tables within it, each model once; of a family only what `common` has not alike."""
     fields = {name: field for name, field in model.model_fields.items() if not _alike(field, common, name)}
@@ -38,21 +49,29 @@ def _sections(
         said = attribute_docstrings(common) | said
     title = f"{f'`[{path}]`' if path else 'Top level'}{f', family `{family}`' if family else ''}"
     what = (model.__doc__ or "").strip().splitlines()[0]
-    rows = "".join(_row(name, field, said.get(name, "")) for name, field in fields.items())
+    about = what if not role or what.startswith(role.rstrip(".")) else f"{what} {role}"
+    below = {name: inner for name, field in fields.items() if (inner := _table(field.annotation)[0])}
+    new = {name for name, inner in below.items() if inner not in seen}
+    rows = "".join(_row(name, field, said.get(name, "")) for name, field in fields.items() if name not in new)
+    if path.strip("[]") in ELSEWHERE:
+        yield f"\n## {title}\n\n{about} {ELSEWHERE[path.strip('[]')]}\n"
+        return
     if rows:
-        yield f"\n## {title}\n\n{what}\n\n| key | type | default | meaning |\n|---|---|---|---|\n{rows}"
-    for name, field in fields.items():
-        inner, many = _table(field.annotation)
-        if inner is None or inner in seen:
+        yield f"\n## {title}\n\n{about}\n\n{rows}"
+    for name, inner in below.items():
+        if inner in seen:
             continue
+        many = _table(fields[name].annotation)[1]
         seen.add(inner)
-        below = f"{path.strip('[]')}.{name}".lstrip(".")
-        place = f"[{below}]" if many else below
+        inside = f"{path.strip('[]')}.{name}".lstrip(".")
+        place = f"[{inside}]" if many else inside
         known = common.model_fields.get(name)
         base = _table(known.annotation)[0] if known else None
-        yield from _sections(inner, place, seen, family if base else "", base or BaseModel)
-        for variant, special in _variants(field):
-            yield from _sections(special, place, seen, variant, inner)
+        yield from _sections(
+            inner, place, _role(fields[name], said.get(name, "")), seen, family if base else "", base or BaseModel
+        )
+        for variant, special in _variants(fields[name]):
+            yield from _sections(special, place, "", seen, variant, inner)
 
 
 def _alike(field: FieldInfo, common: type[BaseModel], name: str) -> bool:
@@ -73,25 +92,36 @@ def _marks(annotation: Any) -> list[Variants]:  # noqa: ANN401 - an annotation c
     return list(dict.fromkeys(found for each in inner for found in _marks(each)))
 
 
+def _role(field: FieldInfo, said: str) -> str:
+    """Return what the key of a table says that its own class does not: what holds without it, if it may be missing."""
+    return " ".join(said.split()) if field.get_default(call_default_factory=True) is None else ""
+
+
 def _row(name: str, field: FieldInfo, said: str) -> str:
     default = "required" if field.is_required() else _value(field.get_default(call_default_factory=True))
     meaning = " ".join(said.split())
-    bounds = ", ".join(text for constraint in field.metadata if (text := _bound(constraint)))
-    return f"| `{name}` | {_type(field.annotation)}{f', {bounds}' if bounds else ''} | {default} | {meaning} |\n"
+    bounds = _bounds(field.metadata)
+    value = f"{_type(field.annotation)}{f' {bounds}' if bounds else ''}{f'; {default}' if default else ''}"
+    return f"* `{name}` ({value}): {meaning}\n"
 
 
-def _bound(constraint: object) -> str:
-    signs = {"gt": ">", "ge": ">=", "lt": "<", "le": "<="}
-    return " ".join(
-        f"{signs[name]} {value:g}" for name in signs if (value := getattr(constraint, name, None)) is not None
-    )
+def _bounds(metadata: list[Any]) -> str:
+    found = {
+        sign: f"{value:g}"
+        for constraint in metadata
+        for sign, name in ((">", "gt"), (">=", "ge"), ("<", "lt"), ("<=", "le"))
+        if (value := getattr(constraint, name, None)) is not None
+    }
+    if set(found) == {">=", "<="}:
+        return f"{found['>=']} to {found['<=']}"
+    return ", ".join(f"{sign} {value}" for sign, value in found.items())
 
 
 def _value(value: Any) -> str:  # noqa: ANN401 - a default can be anything
     if value is PydanticUndefined or value is None:
-        return "none"
+        return ""
     if isinstance(value, BaseModel):
-        return "see below"
+        return "see above"
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
     if isinstance(value, StrEnum | str):
@@ -110,7 +140,7 @@ def _type(annotation: Any) -> str:  # noqa: ANN401 - an annotation can be anythi
     if origin in (Union, types.UnionType):
         return " or ".join(_type(part) for part in arguments if part is not type(None))
     if origin is Literal:
-        return " or ".join(f'`"{choice}"`' for choice in arguments)
+        return ", ".join(f'`"{choice}"`' for choice in arguments)
     if origin is tuple:
         rest = [each for each in arguments if each is not Ellipsis]
         count = f"{len(rest)} " if Ellipsis not in arguments else ""
@@ -119,7 +149,7 @@ def _type(annotation: Any) -> str:  # noqa: ANN401 - an annotation can be anythi
     if origin is Mapping:
         return f"table of {_plural(arguments[1])}, by {_key(arguments[0])}"
     if isinstance(annotation, type) and issubclass(annotation, StrEnum):
-        return " or ".join(f'`"{choice}"`' for choice in annotation)
+        return ", ".join(f'`"{choice}"`' for choice in annotation)
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return "table"
     return PLAIN[annotation]

@@ -1,4 +1,4 @@
-"""The command line as pages: a reference in Markdown, and man pages; both are made of what `--help` says."""
+"""The command line as pages: an overview in Markdown, and man pages; both are made of what `--help` says."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -13,11 +13,9 @@ from ldcnd.version import version
 EXIT_STATUS = tuple((str(code), f"{meaning[:1].upper()}{meaning[1:]}.") for code, meaning in EXIT_CODES.items())
 INTRODUCTION = """# Command line
 
-`ldcnd COMMAND --help` says the same, and so do the man pages of the Debian package. Every command that uses a daemon
-takes the options for finding it besides its own. This page is written by `make fix`.
-
-The shell completes commands, options, axes of the daemon and fault codes with this line in `~/.bashrc`:
-`eval "$(_LDCND_COMPLETE=bash_source ldcnd)"`; zsh and fish likewise, with `zsh_source` and `fish_source`.
+Which command does what? `ldcnd COMMAND --help` has its options, and so have the man pages of the Debian package. The
+shell completes commands, options, axes and fault codes with this line in `~/.bashrc` (or `zsh_source`, `fish_source`):
+`eval "$(_LDCND_COMPLETE=bash_source ldcnd)"`.
 
 | exit code | meaning |
 |---|---|
@@ -60,19 +58,18 @@ def target_options() -> tuple[tuple[str, str], ...]:
 
 
 def as_markdown() -> str:
-    """Return the reference of the command line."""
-    parts = [INTRODUCTION + "".join(f"| {code} | {meaning} |\n" for code, meaning in EXIT_STATUS)]
-    parts.append(f"## Finding the daemon\n\n{_table(target_options())}")
-    for name in COMMANDS:
-        for depth, entry in enumerate(entries(name)):
-            title = entry.path if entry.is_group else f"{entry.path} {entry.usage}".strip()
-            parts.append(f"{'###' if depth else '##'} `{title}`\n")
-            parts.append("\n\n".join(entry.paragraphs) + "\n")
-            if entry.asks_a_daemon:
-                parts.append("Uses a daemon: [options](#finding-the-daemon).\n")
-            if entry.options:
-                parts.append(_table(entry.options))
-    return "\n".join(parts)
+    """Return the overview: exit codes, the options for finding a daemon, a line for each command of the top level."""
+    codes = "".join(f"| {code} | {meaning} |\n" for code, meaning in EXIT_STATUS)
+    finding = f"Commands that use a daemon find it by these options:\n\n{_table(target_options())}"
+    lines = "".join(_overview_line(name, summary) for name, (_, summary) in COMMANDS.items())
+    return "\n".join((INTRODUCTION + codes, finding, f"The commands, each with those below it:\n\n{lines}"))
+
+
+def _overview_line(name: str, summary: str) -> str:
+    """Return a command of the top level with what it does, and the commands below it."""
+    own, *below = entries(name)
+    inner = ", ".join(f"`{entry.path.removeprefix(f'{own.path} ')}`" for entry in below)
+    return f"* `{name}`: {summary}{f' {inner}.' if inner else ''}\n"
 
 
 def man_pages() -> Mapping[str, str]:

@@ -6,6 +6,7 @@ import tomllib
 
 import pytest
 
+from ldcnd.contract.fault_pages import FOLDER
 from tests.support.page_reader import PageReader
 from tests.support.pages import ROOT, blocks_of, command_lines, pages, require_command_line
 
@@ -140,6 +141,18 @@ def test_every_link_leads_somewhere() -> None:
             if place and "://" not in place and place != "../how-to/install.md":  # a copy of deploy/INSTALL.md
                 broken += [] if (page.parent / place).exists() else [f"{page}: {target}"]
     assert broken == []
+
+
+def test_every_path_of_this_repository_that_a_page_names_exists() -> None:
+    named = re.compile(r"(?<![\w./$~<-])(?:ldcnd|tests|docs|config|deploy|examples|schemas)/[\w./*<>-]*[\w/*>]")
+    missing = [
+        f"{page.relative_to(ROOT)}: {path}"
+        for page in (*pages(), ROOT / "CHANGELOG.md", *FOLDER.glob("*.md"))
+        for path in sorted(set(named.findall(page.read_text())))
+        if not list(ROOT.glob(re.sub(r"<\w+>", "*", path)))
+    ]
+
+    assert missing == []
 
 
 @pytest.mark.system

@@ -67,7 +67,7 @@ def run(house: Path, *words: str) -> list[str]:
 
 
 def add_verb(house: Path) -> None:
-    commands = house / "ldcnd" / "model" / "commands.py"
+    commands = house / "ldcnd" / "contract" / "commands.py"
     insert(commands, '    SET_OUTPUTS = "set_outputs"\n', '    BLINK = "blink"\n')
     insert(
         commands,
@@ -76,7 +76,7 @@ def add_verb(house: Path) -> None:
         '    times: int = Field(ge=1)\n    """How often."""\n\n\n',
     )
     insert(commands, "    SetOutputs,\n", "    Blink,\n")
-    axis = house / "ldcnd" / "daemon" / "axis" / "commands.py"
+    axis = house / "ldcnd" / "axis" / "commands.py"
     insert(axis, "    AxisCommand,\n", "    Blink,\n")
     insert(
         axis,
@@ -94,7 +94,7 @@ def add_verb(house: Path) -> None:
 
 
 def add_item(house: Path) -> None:
-    samples = house / "ldcnd" / "model" / "samples.py"
+    samples = house / "ldcnd" / "contract" / "samples.py"
     insert(samples, '    ADC = "adc"\n', '    DOUBLED = "doubled"\n')
     insert(
         samples,
@@ -104,7 +104,7 @@ def add_item(house: Path) -> None:
     )
     insert(samples, "    TelemetryItem.ADC: AdcSample,\n", "    TelemetryItem.DOUBLED: DoubledSample,\n")
     insert(
-        house / "ldcnd" / "daemon" / "axis" / "telemetry.py",
+        house / "ldcnd" / "axis" / "telemetry.py",
         "        if TelemetryItem.VELOCITY in asked:\n",
         "        topic = self._publisher.item(self._tracker.name, TelemetryItem.DOUBLED)\n"
         '        doubled = {"t": t, "t_error_ns": t_error_ns, "seq": 0, "quality": quality}\n'
@@ -120,10 +120,10 @@ def add_item(house: Path) -> None:
 
 
 def add_model(house: Path) -> None:
-    profiles = house / "ldcnd" / "drivers" / "ldcn" / "profiles.py"
+    profiles = house / "ldcnd" / "drives" / "ldcn" / "profiles.py"
     insert(
         profiles,
-        "LS_231 = Profile(",
+        'LS_231 = Profile(\n    "ls-231"',
         'LS_999 = replace(LS_182AP, name="ls-999", title="Logosol LS-999", device_id=91, versions=range(1, 2))\n',
     )
     insert(profiles, "        LS_231,\n", "        LS_999,\n")

@@ -1,4 +1,4 @@
-"""Traps of Zenoh that nothing else walks into; the whole list is in docs/reference/zenoh-pitfalls.md."""
+"""Traps of Zenoh that nothing else walks into."""
 
 import asyncio
 import gc

@@ -1,6 +1,5 @@
-"""The table of verbs and where each can be reached; `python -m tests.support.verb_table` writes the page anew."""
+"""Where each verb can be reached: as a method of the client, and by a command of the command line."""
 
-import argparse
 import functools
 import inspect
 from collections.abc import Iterator
@@ -14,17 +13,9 @@ from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import COMMANDS
 from ldcnd.contract.commands import About, Command
 from ldcnd.contract.frozen import Frozen
-from tests.support.process import ROOT
 from tools.verb_methods import method_name
 
-PAGE = ROOT / "docs" / "reference" / "verbs.md"
 PLACES = ("client", "command line")
-HEADER = """# Verbs
-
-Where can a verb be reached? This table is made from the command classes: the method of the client, and the commands of
-the command line that send the class. A cell with words says why a verb is not there as such.
-
-"""
 LEASE = "part of `Rig.control`"
 EXPLAINED = {
     ("acquire", "client"): LEASE,
@@ -50,17 +41,6 @@ METHODS_OF_RIGS = {
     "set_io",
     "set_io_timer",
 }
-MOST_COMMANDS = 2
-"""Of the command line in one cell."""
-
-
-def verb_table() -> str:
-    """Return the page."""
-    lines = [f"| verb | about | {' | '.join(PLACES)} |", "|---|---|" + "---|" * len(PLACES)]
-    for command in COMMANDS:
-        cells = [_cell(command, place) for place in PLACES]
-        lines.append(f"| `{command.verb}` | {command.about} | {' | '.join(cells)} |")
-    return HEADER + "\n".join(lines) + "\n"
 
 
 def empty_cells() -> list[tuple[str, str]]:
@@ -88,14 +68,10 @@ def _found(command: type[Command[Frozen]], place: str) -> str:
 
 
 def _commands_that_send(command: type[Command[Frozen]]) -> str:
-    """Return the commands of the command line from whose code the class is reached, the one of its name first."""
-    name = command.verb.replace("_", "-")
-    sending = sorted(
-        (not path.endswith(f" {name}"), path)
-        for path, reached in _command_line()
-        if command in reached and path.split()[1] not in {"schema", "drill"}
+    """Return the commands of the command line from whose code the class is reached."""
+    return ", ".join(
+        path for path, reached in _command_line() if command in reached and path.split()[1] not in {"schema", "drill"}
     )
-    return ", ".join(f"`{path}`" for _, path in sending[:MOST_COMMANDS])
 
 
 @functools.cache
@@ -137,8 +113,3 @@ def _codes(code: CodeType) -> Iterator[CodeType]:
     for constant in code.co_consts:
         if isinstance(constant, CodeType):
             yield from _codes(constant)
-
-
-if __name__ == "__main__":
-    argparse.ArgumentParser(description=__doc__).parse_args()
-    PAGE.write_text(verb_table(), encoding="utf-8")

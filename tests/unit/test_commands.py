@@ -15,7 +15,6 @@ from tests.support.process import ROOT
 
 VECTORS = json.loads((ROOT / "tests" / "vectors" / "commands.json").read_text(encoding="utf-8"))["commands"]
 BY_VERB = {**AXIS_COMMANDS, **AXIS_QUESTIONS, **RIG_COMMANDS}
-CHANGELOG = ROOT / "CHANGELOG.md"
 
 
 def test_every_verb_of_an_axis_has_one_class():

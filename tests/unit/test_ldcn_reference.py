@@ -5,11 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drives.ldcn.controls import HomingControl, StopControl
 from ldcnd.drives.ldcn.faults import FaultCode
 from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag, StatusItem
 from ldcnd.drives.ldcn.profiles import PROFILES, Support
-from ldcnd.drives.ldcn.trajectory import TrajectoryControl
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "ldcn-nmc.md").read_text(encoding="utf-8")
 
@@ -21,9 +19,6 @@ def bit_of(flag: int) -> str:
 EXPECTED = {
     "commands": [f"| {command.name} | {command.value:X} |" for command in Command],
     "items and flags": [f"| {flag.name} | {bit_of(flag)} |" for flag in [*StatusItem, *StatusFlag, *AuxFlag]],
-    "controls": [
-        f"| {bit_of(flag)} {flag.name} |" for flag in [*TrajectoryControl, *StopControl, *HomingControl]
-    ],
     "faults": [f"| {code.value} |" for code in FaultCode],
     "dialects": [f"| `{profile.name}` |" for profile in PROFILES.values() if profile.support is Support.FULL],
 }  # fmt: skip

@@ -180,7 +180,7 @@ def test_the_reference_lists_the_modules_as_they_are():
 
 def test_the_reference_lists_every_quirk_with_its_default():
     page = REFERENCE.read_text()
-    rows = re.findall(r"^\| `(\w+)` \| (.+?) \| .+ \|$", page[page.index("## Quirks") :], re.MULTILINE)
+    rows = re.findall(r"^\* `(\w+)` \((.+?)\): .+$", page[page.index("## Quirks") :], re.MULTILINE)
     defaults = {field.name: field.default for field in fields(ModuleSettings)}
 
     assert [name for name, _ in rows] == list(defaults)

@@ -6,9 +6,8 @@ from pathlib import Path
 import pytest
 
 from ldcnd.drives.smartstep.addresses import OperatingMode, Register
-from ldcnd.drives.smartstep.monitors import ALARMS, MONITORS
+from ldcnd.drives.smartstep.monitors import MONITORS
 from ldcnd.drives.smartstep.packet import ResponseStatus
-from ldcnd.drives.smartstep.parameters import PARAMETERS, Fact, Parameter
 from ldcnd.drives.smartstep.trace_data import DataObject, IoObject
 
 ROOT = Path(__file__).parents[2]
@@ -20,32 +19,11 @@ def has_row(*cells: str) -> bool:
     return any(row[: len(cells)] == list(cells) for row in ROWS)
 
 
-def shown(fact: Fact | None, text: str) -> str:
-    return f"{text} [{fact.confidence.value}]" if fact else "-"
-
-
-def parameter_row(parameter: Parameter) -> list[str]:
-    unit, limits, default, cycle = parameter.unit, parameter.limits, parameter.default, parameter.power_cycle
-    return [
-        f"{parameter.eeprom_address:04X}H",
-        f"{parameter.ram_address:04X}H",
-        parameter.label,
-        parameter.name,
-        "digits" if parameter.nibbles else shown(unit, unit.value if unit else ""),
-        shown(limits, f"{limits.value.lowest} to {limits.value.highest}" if limits else ""),
-        shown(default, str(default.value) if default else ""),
-        shown(cycle, "yes" if cycle and cycle.value else "no"),
-    ]
-
-
 TABLES = {
-    "parameters": [parameter_row(parameter) for parameter in PARAMETERS],
-    "digits": [(f"{each.label}.{digit.place}", digit.title) for each in PARAMETERS for digit in each.digits],
     "monitors": [
         (f"{each.address:04X}H", each.label, each.title, each.unit or "bits", "signed" if each.signed else "unsigned")
         for each in MONITORS
     ],
-    "alarms": [(f"{known.code:04X}H", known.text, known.kind.value) for known in ALARMS],
     "registers": [(f"{register.value:04X}H", register.name) for register in Register],
     "response status": [(f"{each.value:X}", each.function.name.lower().replace("_", " ")) for each in ResponseStatus],
     "operating modes": [(f"{code.value:04X}H", code.name) for code in OperatingMode],

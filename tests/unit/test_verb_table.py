@@ -1,6 +1,6 @@
 """Every verb can be reached from the client and the command line, or the table says why not."""
 
-from tests.support.verb_table import PAGE, empty_cells, needless_explanations, verb_table
+from tests.support.verb_table import empty_cells, needless_explanations
 
 
 def test_no_cell_is_empty():
@@ -9,7 +9,3 @@ def test_no_cell_is_empty():
 
 def test_nothing_is_explained_that_is_there():
     assert needless_explanations() == []
-
-
-def test_the_page_is_made_of_the_classes():
-    assert PAGE.read_text() == verb_table(), "run `make fix`"
