@@ -12,7 +12,6 @@ from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.contract.keys import Keys, matches
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.daemon.contract import all_schemas
-from ldcnd.ops.pki.access import RULES
 from tools.__main__ import renew_table
 from tools.channels import Kind, channels, keys_table
 
