@@ -10,6 +10,7 @@ from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.typed import Finite, NewFile, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
+from ldcnd.contract.number_text import NotANumber, read_whole
 from ldcnd.contract.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer, Snapshot
 from ldcnd.daemon.capture import config_of
 from ldcnd.drives.known import FAMILIES
@@ -59,12 +60,15 @@ def set_io(
     target: Target, module: str, lines: tuple[str, ...], pwm1: float | None, pwm2: float | None, lease: str | None
 ) -> None:
     """Set outputs of the I/O module MODULE: `4=high 9=low 5=input`; what is left out stays as it is."""
-    wanted: dict[str, list[str]] = {"high": [], "low": [], "input": []}
+    wanted: dict[str, list[int]] = {"high": [], "low": [], "input": []}
     for each in lines:
         line, _, level = each.partition("=")
         if level not in wanted:
             raise click.UsageError(f"{each!r} is not LINE=high, LINE=low or LINE=input")
-        wanted[level].append(line)
+        try:
+            wanted[level].append(read_whole(line))
+        except NotANumber as error:
+            raise click.UsageError(f"{each!r}: {error}") from None
     given = {"high": wanted["high"], "low": wanted["low"], "inputs": wanted["input"]}
     request = of_options(SetIo, module=module, **given, pwm1=pwm1, pwm2=pwm2, lease=lease)
     target.show(*_shown(target.run(lambda client: client.ask(request))))

@@ -56,7 +56,7 @@ class Case:
     then: str = ""
 
 
-LONG = "axis move x 60 --velocity 5"
+MOVING = ("axis power x on", "axis move x 1 --wait", "axis move x 60 --velocity 5")
 HALT = "ldcnd axis halt AXIS and wait"
 GAINS = "ldcnd axis gains AXIS --kp KP --el EL"
 OUTPUTS = "ldcnd axis outputs AXIS --limit1 input --limit2 input"
@@ -73,7 +73,9 @@ DAMAGED = (
     " you know of"
 )
 CASES = {
-    "disabled": Case("ldcnd axis power AXIS on", (), "axis move x 1 --relative --wait", "axis power x on"),
+    "disabled": Case(
+        "ldcnd axis power AXIS on", ("axis power x off",), "axis move x 1 --relative --wait", "axis power x on"
+    ),
     "not homed": Case(
         "ldcnd axis home AXIS or ldcnd axis set-position AXIS POSITION",
         ("axis power n on",),
@@ -87,9 +89,9 @@ CASES = {
         "axis move z 6",
         "axis set-position z POSITION",
     ),
-    "moving": Case(HALT, (LONG,), "axis move x 1 --wait", "axis halt x", waits_s=2.0),
-    "moving, unreferenced": Case(HALT, (LONG,), "axis set-position x 1", "axis halt x", waits_s=2.0),
-    "resetting in motion": Case(HALT, (LONG,), "axis reset x", "axis halt x", waits_s=2.0),
+    "moving": Case(HALT, MOVING, "axis move x 1 --wait", "axis halt x", waits_s=2.0),
+    "moving, unreferenced": Case(HALT, MOVING, "axis set-position x 1", "axis halt x", waits_s=2.0),
+    "resetting in motion": Case(HALT, MOVING, "axis reset x", "axis halt x", waits_s=2.0),
     "latched": Case("ldcnd axis reset AXIS", ("axis stop x",), "axis power x on", "axis reset x"),
     "speed override": Case(
         "ldcnd speed PERCENT above 0 %", ("axis power x on", "speed 0"), "axis move x 1 --wait", "speed PERCENT"
@@ -99,7 +101,7 @@ CASES = {
         (
             "axis power x on",
             "axis gains x --el 1",
-            "axis move x 3 --relative --velocity 60",
+            "axis move x 30 --velocity 40",
             "WAIT 3",
             "axis gains x --el 4000",
         ),
@@ -204,7 +206,8 @@ def send(here: VirtualRig, axis: str, command: AnyCommand) -> Ran:
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_what_a_refusal_names_is_a_way_out_of_the_state_that_refused(rig, case):
     for line in case.before:
-        type_line(rig, line)
+        led = type_line(rig, line)
+        assert led.code == 0, led.errors
     rig.wait(asyncio.sleep(0.5))
 
     refused = type_line(rig, case.refused)
