@@ -337,7 +337,7 @@ class Run:
             async with asyncio.timeout(30):
                 await daemon.wait_up()
             for name, command in (*self._ann.sent[-4:], *self._bob.sent[-2:]):
-                if command.effect is not Effect.REST:
+                if command.effect is not Effect.REST and not command.takes_energy_out:
                     with contextlib.suppress(LdcndError):
                         await rig.command(name, command.model_copy(update={"instance": "first"}), timeout_s=1.0)
                         witness.wrong.append(f"{command.verb} of {name} was accepted from an earlier life")
