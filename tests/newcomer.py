@@ -91,9 +91,7 @@ def _work(root: Path) -> None:
             _timed(
                 "build a wheel", lambda: _run(root, "build-env/bin/python -m hatchling build -t wheel -d dist", BUILD)
             )
-        made = (
-            f'python3 -m venv /root/{name} && /root/{name}/bin/pip install -q -c constraints.txt "{what}[plot,record]"'
-        )
+        made = f'python3 -m venv /root/{name} && /root/{name}/bin/pip install -q -c constraints.txt "{what}[lab,plot]"'
         _timed(f"install from the {name}", lambda made=made: _run(root, made))
         inside = f"PATH=/root/{name}/bin:$PATH /root/{name}/bin/python -m tests.newcomer --inside tutorials"
         _timed(f"all tutorials, from the {name}", lambda inside=inside: print(_run(root, inside), end=""))

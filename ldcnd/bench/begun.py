@@ -6,24 +6,24 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
+from typing import Any
 
+from ldcnd.bench.family import BenchFamily, ScannedDrive
+from ldcnd.bench.known import BENCHES
+from ldcnd.bench.opened import show_findings
 from ldcnd.config.edit import draft_of, write_over
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import Finding
-from ldcnd.drives.family import ScannedDrive, Scans
-from ldcnd.drives.known import FAMILIES
 from ldcnd.drives.line_config import BusConfig
-from ldcnd.drives.opened import show_findings
 
-SCANNED = {name: family for name, family in FAMILIES.items() if isinstance(family, Scans)}
 NEW = """# Begun by `ldcnd scan`; every key is described in docs/reference/configuration.md.
 rig = "rig"
 """
 
 
 async def scan_port(
-    family: Scans, port: str, show: Callable[[Finding], None], *, give_addresses: bool = False
+    family: BenchFamily[Any], port: str, show: Callable[[Finding], None], *, give_addresses: bool = False
 ) -> Sequence[ScannedDrive]:
     """Open a port, scan it for drives of a family, and close it.
 
@@ -58,7 +58,7 @@ def begun_with(file: Path, family_name: str, port: str, drives: Sequence[Scanned
     Raises:
         ConfigError: what is in the file is no configuration, or with these drives it would be none.
     """
-    family = SCANNED[family_name]
+    family = BENCHES[family_name]
     known = [drive for drive in drives if drive.model]
     said = [f"address {drive.address} is left out: {drive.text}" for drive in drives if not drive.model]
     rig = load_config(file) if file.exists() else None

@@ -17,8 +17,6 @@ from ldcnd.drives.known import FAMILIES
 from ldcnd.drives.transcript import Describe
 from ldcnd.line.capture import Capture, CaptureHeader, capture_lines, parse_capture
 from ldcnd.line.flight_recorder import WireEvent, WireRecord, parse_records
-from ldcnd.ops.dissector import install
-from ldcnd.ops.pcapng import encode_pcapng
 
 TEXT, WORDS, PCAPNG = FORMATS = ("text", "words", "pcapng")
 
@@ -30,6 +28,8 @@ OUT = click.option("--out", type=NewFile(), help="Write a file instead of printi
 
 def _install_dissector(context: click.Context, _option: click.Parameter, wanted: bool) -> None:  # noqa: FBT001 - click's
     if wanted and not context.resilient_parsing:
+        from ldcnd.ops.dissector import install  # noqa: PLC0415 - a wing
+
         click.echo(install(Path.home()))
         context.exit()
 
@@ -177,6 +177,8 @@ def _render(capture: Capture, describe: Describe, form: str | None, out: Path | 
     if form == PCAPNG and not as_json:
         if out is None:
             raise click.UsageError("pcapng is not for a terminal: name a file with --out")
+        from ldcnd.ops.pcapng import encode_pcapng  # noqa: PLC0415 - a wing
+
         out.write_bytes(encode_pcapng(records, header.bus, header.zero_ns))
         return
     make = _json_lines if as_json else capture_lines if form == TEXT else _word_lines

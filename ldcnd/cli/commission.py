@@ -4,7 +4,6 @@ import asyncio
 import getpass
 import sys
 from datetime import UTC, datetime
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,11 +15,12 @@ from ldcnd.bench.commissioning.checklist import axis_of as configured_axis
 from ldcnd.bench.commissioning.record import StepRecord
 from ldcnd.bench.commissioning.report import html_of
 from ldcnd.bench.commissioning.walk import Walk
+from ldcnd.bench.known import BENCHES
 from ldcnd.bench.person import Left, Person
 from ldcnd.cli.connection import AXIS, AxisName, Target, with_target
 from ldcnd.cli.output import FAILED, end_as_interrupted, on_end, show_lines
 from ldcnd.cli.quantities import save_figure, stacked_rows
-from ldcnd.cli.terminal import AssentingPerson, TerminalPerson
+from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
 from ldcnd.cli.typed import Finite, NewFile, axis_of, force_option
 from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
 from ldcnd.client.kept_gains import put_back as put_back_gains
@@ -29,7 +29,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError, NotSupported, WrongState
-from ldcnd.drives.known import FAMILIES
+from ldcnd.parts import require
 from ldcnd.version import version
 
 if TYPE_CHECKING:
@@ -206,7 +206,7 @@ def tune(
     An axis whose gains are registers must be off and stay where it is then. It is off afterwards. What it will do is
     said before it moves; it moves within the stated distance only. The old gains come back at Ctrl-C, on any fault, and
     when the new ones are not better; if this program or its host dies, --put-back restores them. It needs the extra
-    `tune`. A drive that tunes itself is not tuned here.
+    `bench`. A drive that tunes itself is not tuned here.
     """
     info = target.run(lambda client: axis_of(client, axis))
     if put_back:
@@ -214,10 +214,10 @@ def tune(
         gains = ", ".join(f"{name} = {value}" for name, value in kept.gains.items())
         target.show(kept, f"{axis}: off, with its old gains: {gains}")
         return
-    family = FAMILIES.get(info.family)
+    family = BENCHES.get(info.family)
     if family is None or not family.is_tuned_by_host:
         raise NotSupported(f"axis {axis}: the gains of a {info.model} are not found by the host", axis=axis)
-    _require_numpy()
+    require("numpy")
     figure = stacked_rows(ROWS)[0] if plot else None  # missing matplotlib is reported before anything moves
     if dry_run:
         _plan(target, axis, within)
@@ -284,16 +284,6 @@ def _show(target: Target, tuned: "Tuned") -> None:
         sys.exit(FAILED)
 
 
-def _require_numpy() -> None:
-    """Refuse to begin without the optional package.
-
-    Raises:
-        ConfigError: it is missing.
-    """
-    if find_spec("numpy") is None:
-        raise ConfigError("tuning needs numpy; install it with: pip install 'ldcnd[tune]'")
-
-
 def _draw(figure: "Figure", tuned: "Tuned") -> None:
     """Draw the test moves: positions, and what they are behind the command."""
     above, below = figure.axes
@@ -320,10 +310,9 @@ def shadow(target: Target, reports: tuple[Path, ...]) -> None:
 
     Each REPORT is what `ldcnd tune AXIS --json` has printed; it names the axis. The first 100 motions teach what is
     usual, and are kept on this host; later ones are compared. It takes no lease, moves nothing and stops nothing.
-    Needs the extra `tune`.
+    Needs the extra `bench`.
     """
-    if find_spec("numpy") is None:
-        raise ConfigError("the shadow needs numpy; install it with: pip install 'ldcnd[tune]'")
+    require("numpy")
     from ldcnd.bench.tuning.ldcn.watching import read_report, watch  # noqa: PLC0415 - needs an optional package
 
     plants = [read_report(path) for path in reports]

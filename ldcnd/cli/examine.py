@@ -11,18 +11,18 @@ from typing import Any
 
 import click
 
-from ldcnd.bench.begun import SCANNED, begun_with, scan_port, write
+from ldcnd.bench.begun import begun_with, scan_port, write
+from ldcnd.bench.family import BenchFamily, TrialMove
+from ldcnd.bench.known import BENCHES, line_of
+from ldcnd.bench.opened import show_findings
 from ldcnd.cli.typed import Finite, Whole
-from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError, NotSupported
 from ldcnd.contract.health import Finding, Verdict
 from ldcnd.contract.number_text import NotANumber, read_whole
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.family import ConfigFiles, Examines, TrialMove, Tries
-from ldcnd.drives.known import DEFAULT, FAMILIES, chain_of
+from ldcnd.drives.known import DEFAULT, FAMILIES
 from ldcnd.drives.line_config import BusConfig
-from ldcnd.drives.opened import show_findings
 from ldcnd.line.bus import Bus
 from ldcnd.line.capture import Capture, CaptureHeader, capture_lines
 from ldcnd.log import configure_logging
@@ -34,7 +34,7 @@ NOTHING_FOUND = 1
 
 @click.command()
 @click.argument("port")
-@click.option("--family", type=click.Choice(list(SCANNED)), help="Search for drives of this family only.")
+@click.option("--family", type=click.Choice(list(BENCHES)), help="Search for drives of this family only.")
 @click.option(
     "--address",
     "give_addresses",
@@ -64,21 +64,16 @@ def scan(port: str, family: str | None, file: Path | None, *, give_addresses: bo
         text = f"{finding.axis:8} {finding.verdict:5} {finding.what:12} {finding.text}{remedy}"
         print(finding.model_dump_json() if as_json else text, flush=True)
 
-    for name in (family,) if family else SCANNED:
+    for name in (family,) if family else BENCHES:
         if not as_json:
             print(f"searching for {name} drives", file=sys.stderr, flush=True)
         wrong = False
-        drives = asyncio.run(scan_port(SCANNED[name], port, show, give_addresses=give_addresses))
+        drives = asyncio.run(scan_port(BENCHES[name], port, show, give_addresses=give_addresses))
         if drives:
             if file:
                 print("\n".join(write(begun_with(file, name, port, drives))), file=sys.stderr)
             break
     sys.exit(NOTHING_FOUND if wrong or not drives else 0)
-
-
-FILES = ConfigFiles(
-    lambda file: load_config(file).bus, lambda file, settings: chain_of(settings, load_config(file).sim), set_for_axis
-)
 
 
 class Examinations(click.Group):
@@ -94,15 +89,8 @@ class Examinations(click.Group):
 
     @staticmethod
     def _commands() -> dict[str, click.Command]:
-        commands = {
-            name: _examination(name, family) for name, family in FAMILIES.items() if isinstance(family, Examines)
-        }
-        more = {
-            str(each.name): each
-            for family in FAMILIES.values()
-            if isinstance(family, Examines)
-            for each in family.commands(FILES)
-        }
+        commands = {name: _examination(name, family) for name, family in BENCHES.items()}
+        more = {str(each.name): each for family in BENCHES.values() for each in family.commands()}
         return commands | more
 
 
@@ -111,7 +99,7 @@ def doctor() -> None:
     """Examine a line; only reads by default. No daemon may use it meanwhile."""
 
 
-def _examination(family_name: str, family: Examines[Any]) -> click.Command:
+def _examination(family_name: str, family: BenchFamily[Any]) -> click.Command:
     """Return the command that examines lines of a family."""
 
     def examine(config: Path, name: str, *, as_json: bool) -> None:
@@ -149,11 +137,10 @@ async def examine_line(rig: RigConfig, settings: BusConfig, show: Callable[[Find
     Raises:
         BusDown: the port does not open.
     """
-    family = FAMILIES[settings.family]
-    if not isinstance(family, Examines):
+    family = BENCHES.get(settings.family)
+    if family is None:
         raise NotSupported(f"bus {settings.name}: lines of family {settings.family} are not examined")
-    line = family.open_lines(None)(settings, None, chain_of(settings, rig.sim))
-    line.bus.resync = line.network.resync
+    line = line_of(rig, settings)
     await show_findings(line.bus, settings.port, family.examine(line, settings), show)
 
 
@@ -162,12 +149,9 @@ HELD_S = 1.0
 GAINS = "kp,kd,ki,il,ol,el"
 
 
-TRIED = {name: family for name, family in FAMILIES.items() if isinstance(family, Tries)}
-
-
 @click.command()
 @click.argument("port", required=False)
-@click.option("--family", type=click.Choice(list(TRIED)), default=DEFAULT, show_default=True)
+@click.option("--family", type=click.Choice(list(BENCHES)), default=DEFAULT, show_default=True)
 @click.option("--units", default="1", show_default=True, help="Unit numbers, as 1,2, of drives that have some.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("acceptance"), show_default=True)
 @click.option("--move", "address", type=Whole(1, 127), help="Let the drive at this address move, too.")
@@ -222,7 +206,7 @@ def _refutes(finding: Finding) -> bool:
 
 
 def _list() -> None:
-    for name, family in TRIED.items():
+    for name, family in BENCHES.items():
         for each in family.assumptions():
             print(json.dumps({"family": name, **each}))
 
@@ -266,7 +250,7 @@ async def _try(
             f"Keep Enter pressed: the drive at address {move.address} moves {move.counts} counts and back.", flush=True
         )
     with _dead_man(wanted=move is not None) as held:
-        trial = TRIED[family].trial(port, units, move, held)
+        trial = BENCHES[family].trial(port, units, move, held)
         await show_findings(trial.bus, port, trial.findings, show)
     config = RigConfig(rig="accept", bus=(trial.settings,)) if trial.settings else None
     capture = capture_of(trial.bus, family, port, zero_ns, config)

@@ -19,7 +19,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
 from ldcnd.contract.commands import Why, WhyReply
 from ldcnd.contract.condition import Place, assess
-from ldcnd.contract.errors import ConfigError, LdcndError, NotSupported, SessionError
+from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.events import ALARM_HISTORY, DRIVE_CHANGED, REFERENCE, UNSETTLED, CommandEvent
 from ldcnd.contract.fault_pages import codes, page_text
 from ldcnd.contract.meta import AxisInfo
@@ -44,10 +44,6 @@ from ldcnd.contract.samples import (
     StateSample,
     TelemetryItem,
 )
-from ldcnd.lab.top.columns import as_text
-from ldcnd.lab.top.follow import follow
-from ldcnd.lab.top.glance import RigGlance
-from ldcnd.lab.top.rig_view import RigView
 from ldcnd.net.session import Session
 
 SILENT_S = 3.0
@@ -329,42 +325,6 @@ def _show(target: Target, event: CommandEvent) -> None:
     who = f"{event.client or 'unnamed'} ({f'login {event.login}' if event.login else 'not authenticated'})"
     why = f": {event.reason}" if event.reason else ""
     target.show(event, f"{at} {event.axis:8} {event.verb:14} {event.status:10} by {who} ({event.command_id}){why}")
-
-
-ENOUGH_S = 2.5
-"""Two reports of each line come in this time, so rates are known."""
-
-
-@click.command()
-@with_target
-def top(target: Target) -> None:
-    """Show every axis and line of a rig, what is wrong first; S or Esc stops its axes, Q quits.
-
-    Without a terminal, or with --json, the rig is printed once. The stop is no emergency stop.
-    """
-    if target.as_json or not sys.stdout.isatty():
-        glance = target.run(_once)
-        target.show(glance, *as_text(glance))
-        return
-    target.run(_watch)
-
-
-async def _once(client: RigClient) -> RigGlance:
-    loop = asyncio.get_running_loop()
-    view = RigView(client.rig, loop.time())
-    async with asyncio.TaskGroup() as group:
-        following = group.create_task(follow(client, view), name="follow")
-        await asyncio.sleep(ENOUGH_S)
-        following.cancel()
-    return view.glance(loop.time())
-
-
-async def _watch(client: RigClient) -> None:
-    try:
-        from ldcnd.lab.top.screen import TopScreen  # noqa: PLC0415 - an optional package
-    except ImportError as error:
-        raise ConfigError("textual is not installed", remedy="install ldcnd[tui]") from error
-    await TopScreen(client).run_async()
 
 
 @click.command()

@@ -74,7 +74,7 @@ COMMANDS = {
     "axis": ("ldcnd.cli.axis", "List, watch, move, stop and home axes of a running daemon."),
     "group": ("ldcnd.cli.group", "Move several axes together."),
     "lease": ("ldcnd.cli.rig:lease", "See who controls which axis; hold control."),
-    "top": ("ldcnd.cli.looking:top", "Show every axis and line of a rig, what is wrong first."),
+    "top": ("ldcnd.cli.top", "Show every axis and line of a rig, what is wrong first."),
     "why": ("ldcnd.cli.looking:why", "Tell why an axis cannot move, and what would clear that."),
     "fleet": ("ldcnd.cli.looking:fleet", "Show every rig, axis, version and health that can be reached."),
     "fault": ("ldcnd.cli.looking:fault", "Explain a fault or an error code: what to check, how to clear it."),
@@ -101,7 +101,7 @@ COMMANDS = {
     ),
     "doctor": ("ldcnd.cli.examine:doctor", "Examine a line by reading only, before a daemon uses it."),
     "accept": ("ldcnd.cli.examine:accept", "Try real drives against what the documents say, and keep a report of it."),
-    "pki": ("ldcnd.cli.prepare:pki", "Make certificates and access rules for a network with mutual TLS."),
+    "pki": ("ldcnd.cli.pki", "Make certificates and access rules for a network with mutual TLS."),
     "schema": ("ldcnd.cli.prepare:schema", "Write the JSON Schemas of the public models."),
 }
 
@@ -166,6 +166,7 @@ def main() -> NoReturn:
         KeyboardInterrupt,
         BrokenPipeError,
         LdcndError,
+        ModuleNotFoundError,
         BaseExceptionGroup,
     ) as error:
         sys.exit(exit_code(error))

@@ -12,6 +12,7 @@ from contextlib import suppress
 import click
 
 from ldcnd.contract.errors import ConfigError, LdcndError, SessionError, Step
+from ldcnd.parts import missing_wing
 from ldcnd.printable import printable
 
 TYPED = {
@@ -107,6 +108,8 @@ def exit_code(error: BaseException) -> int:
         case ConfigError():
             show_lines(*error.message.splitlines(), *_remedy(error), err=True)
             return WRONG_CONFIG
+        case ModuleNotFoundError() if missing := missing_wing(error):
+            return exit_code(missing)
         case LdcndError():
             show_error(error)
             return UNREACHABLE if isinstance(error, SessionError) else FAILED

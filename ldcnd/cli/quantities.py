@@ -21,6 +21,7 @@ from ldcnd.contract.samples import (
     StateSample,
     VelocitySample,
 )
+from ldcnd.parts import require
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -135,10 +136,8 @@ def stacked_rows(count: int) -> "tuple[Figure, list[Axes]]":
     Raises:
         ConfigError: matplotlib is missing.
     """
-    try:
-        module = importlib.import_module("matplotlib.figure")
-    except ImportError as error:
-        raise ConfigError("plotting needs matplotlib; install it with: pip install 'ldcnd[plot]'") from error
+    require("matplotlib")
+    module = importlib.import_module("matplotlib.figure")
     figure: Figure = module.Figure(figsize=(WIDTH_IN, 1.0 + ROW_IN * count), dpi=DOTS_PER_INCH, layout="constrained")
     rows = figure.subplots(count, 1, sharex=True, squeeze=False)
     for (axes,) in rows:

@@ -17,6 +17,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.events import FINAL, CommandEvent, CommandStatus
+from ldcnd.parts import require
 
 if TYPE_CHECKING:
     from ldcnd.lab.recording.reading import AxisHistory
@@ -25,18 +26,6 @@ if TYPE_CHECKING:
 RECORDING = click.Path(path_type=Path, exists=True, dir_okay=False)
 EXIT_INCOMPLETE = 1
 """The recording is damaged; what could be read of it was used."""
-
-
-def require_mcap() -> None:
-    """Refuse to go on without the extra.
-
-    Raises:
-        ConfigError: it is missing.
-    """
-    try:
-        import mcap  # noqa: F401, PLC0415 - an optional package
-    except ImportError as error:
-        raise ConfigError("mcap is not installed", remedy="install ldcnd[record]") from error
 
 
 def tell_damages(path: Path, damages: Sequence[object]) -> None:
@@ -68,7 +57,7 @@ def record(target: Target, out: Path | None, rotate_mb: int) -> None:
         return
     if out is None:
         raise click.UsageError("--out is missing")
-    require_mcap()
+    require("mcap")
     out = dated(out, datetime.now(UTC))
     try:
         target.run(lambda client: _record(client, out, rotate_mb * 1_000_000))
@@ -81,7 +70,7 @@ def record(target: Target, out: Path | None, rotate_mb: int) -> None:
 @click.argument("whole", type=FILE)
 def recover_file(damaged: Path, whole: Path) -> None:
     """Copy what can be read of DAMAGED, such as NAME.mcap.part after a power cut, into WHOLE."""
-    require_mcap()
+    require("mcap")
     from ldcnd.lab.recording.recovery import recover  # noqa: PLC0415 - needs an optional package
 
     saved = recover(damaged, whole)
@@ -95,7 +84,7 @@ def recover_file(damaged: Path, whole: Path) -> None:
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
 def export(recording: Path, folder: Path) -> None:
     """Write RECORDING into FOLDER as CSV: a table for each topic, a row for each message, a column for each value."""
-    require_mcap()
+    require("mcap")
     from ldcnd.lab.recording.tables import export_tables  # noqa: PLC0415 - needs an optional package
 
     done = export_tables(recording, folder)
@@ -136,7 +125,7 @@ MOST_LABELS = 40
 @force_option
 def plot(recording: Path, axis: str, output: Path) -> None:
     """Draw AXIS of RECORDING: its quantities, commands and faults against time; needs the extras record and plot."""
-    require_mcap()
+    require("mcap")
     from ldcnd.lab.recording.reading import Recording, axis_history  # noqa: PLC0415 - needs an optional package
 
     file = Recording(recording)

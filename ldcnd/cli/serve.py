@@ -19,6 +19,7 @@ from ldcnd.contract.samples import FaultSample, ShadowSample, StateSample, Telem
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging
 from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.parts import require
 
 if TYPE_CHECKING:
     from ldcnd.console.server import MoreRoutes
@@ -71,12 +72,11 @@ def console(
     It stops axes, it is not an emergency stop. With --commission every browser that is let in can also search a port
     for drives, write the configuration, and run the steps of `ldcnd commission` and `ldcnd tune`.
     """
-    try:
-        from ldcnd.console.rigs import Endpoint  # noqa: PLC0415 - its packages are optional
-        from ldcnd.console.server import serve  # noqa: PLC0415
-        from ldcnd.console.settings import ConsoleSettings, read_token  # noqa: PLC0415
-    except ImportError as error:
-        raise ConfigError(f"{error.name} is not installed", remedy="install ldcnd[console]") from error
+    require("markdown_it", "starlette", "uvicorn", "websockets")
+    from ldcnd.console.rigs import Endpoint  # noqa: PLC0415 - its packages are optional
+    from ldcnd.console.server import serve  # noqa: PLC0415
+    from ldcnd.console.settings import ConsoleSettings, read_token  # noqa: PLC0415
+
     configure_logging(level=log_level)
     endpoints = connect or (() if config else (DEFAULT_ENDPOINT,))
     settings = ConsoleSettings(
@@ -118,12 +118,11 @@ def metrics(target: Target, address: ListenAddress) -> None:
 
 
 async def _serve_metrics(client: RigClient, address: ListenAddress) -> None:
-    try:
-        from prometheus_client import CollectorRegistry  # noqa: PLC0415 - an optional package
+    require("prometheus_client")
+    from prometheus_client import CollectorRegistry  # noqa: PLC0415 - an optional package
 
-        from ldcnd.lab.metrics import HealthCollector, metrics_server  # noqa: PLC0415
-    except ImportError as error:
-        raise ConfigError("prometheus-client is not installed", remedy="pip install 'ldcnd[metrics]'") from error
+    from ldcnd.lab.metrics import HealthCollector, metrics_server  # noqa: PLC0415
+
     loop = asyncio.get_running_loop()
     collector = HealthCollector(client.rig, loop.time)
     registry = CollectorRegistry()
@@ -185,10 +184,9 @@ def epics(target: Target, address: ListenAddress, axes: tuple[str, ...], prefix:
 async def _serve_epics(
     client: RigClient, address: ListenAddress, axes: tuple[str, ...], prefix: str | None, *, moves: bool
 ) -> None:
-    try:
-        from ldcnd.lab.epics.gateway import gateway, serve  # noqa: PLC0415 - needs an optional package
-    except ImportError as error:
-        raise ConfigError("caproto is not installed", remedy="pip install 'ldcnd[epics]'") from error
+    require("caproto")
+    from ldcnd.lab.epics.gateway import gateway, serve  # noqa: PLC0415 - needs an optional package
+
     rig = Rig(client, await client.daemon())
     named = f"{rig.name}:" if prefix is None else prefix
     async with gateway(rig, prefix=named, axes=axes, moves=(axes or rig.axes) if moves else ()) as records:
@@ -258,10 +256,9 @@ def foxglove(target: Target, address: ListenAddress) -> None:
 
 
 async def _serve_foxglove(client: RigClient, address: ListenAddress) -> None:
-    try:
-        from ldcnd.lab.recording.live_view import LiveView  # noqa: PLC0415 - needs an optional package
-    except ImportError as error:
-        raise ConfigError("foxglove-sdk is not installed", remedy="install ldcnd[foxglove]") from error
+    require("foxglove")
+    from ldcnd.lab.recording.live_view import LiveView  # noqa: PLC0415 - needs an optional package
+
     ending = asyncio.Event()
     on_end(ending.set)
     with LiveView(f"ldcnd {client.rig}", address.host, address.port) as view:

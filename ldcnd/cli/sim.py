@@ -10,17 +10,16 @@ from typing import Any, Self, TextIO
 import click
 
 from ldcnd.cli.typed import ForceOption, NewFile, Whole
-from ldcnd.drives.family import PacketCutter, ServedLine, ServesLines
 from ldcnd.drives.known import FAMILIES
-from ldcnd.drives.simulated_line import FaultPlanConfig
 from ldcnd.drives.toml import read_toml
 from ldcnd.line.capture import CaptureHeader, capture_lines
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
+from ldcnd.sim.family import PacketCutter, ServedLine
 from ldcnd.sim.faults import FaultPlan
+from ldcnd.sim.known import SIMULATED
+from ldcnd.sim.line_config import FaultPlanConfig
 from ldcnd.sim.pty import serve_pty
 from ldcnd.version import version
-
-SERVED = {name: family for name, family in FAMILIES.items() if isinstance(family, ServesLines)}
 
 
 def _serve(
@@ -56,9 +55,9 @@ def _serve(
 
 
 def _served(options: Mapping[str, Any], faults: Callable[[int], FaultPlan]) -> tuple[str, ServedLine]:
-    found = [(name, line) for name, family in SERVED.items() if (line := family.served(options, faults)) is not None]
+    found = [(name, line) for name, family in SIMULATED.items() if (line := family.served(options, faults)) is not None]
     if len(found) != 1:
-        names = [option.opts[0] for family in SERVED.values() for option in family.sim_options()]
+        names = [option.opts[0] for family in SIMULATED.values() for option in family.sim_options()]
         raise click.UsageError(f"a line is described either by {' or by '.join(names)}")
     return found[0]
 
@@ -71,7 +70,7 @@ command = click.Command(
         click.Option(
             ["--pty", "link"], type=click.Path(path_type=Path), help="Make this symbolic link to the terminal."
         ),
-        *(option for family in SERVED.values() for option in family.sim_options()),
+        *(option for family in SIMULATED.values() for option in family.sim_options()),
         click.Option(
             ["--fault-plan"], type=click.Path(path_type=Path), help="What else may go wrong on the wires (TOML)."
         ),

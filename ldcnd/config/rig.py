@@ -5,15 +5,14 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
+from ldcnd.config.simulated import SimulatedLine, simulator
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.drives import known
 from ldcnd.drives.line_config import BusConfig
-from ldcnd.drives.simulated_line import SimulatedLineConfig
 from ldcnd.drives.toml import NAME_CHARACTERS, Name, Variants, read_toml, refuse_duplicates
 
 Bus = Annotated[SerializeAsAny[BusConfig], Variants(known.bus_config, known.bus_configs)]
-SimulatedLine = Annotated[SerializeAsAny[SimulatedLineConfig], Variants(known.simulated_line, known.simulated_lines)]
 
 
 class ZenohConfig(Frozen):
@@ -133,11 +132,7 @@ class RigConfig(Frozen):
             if bus.simulated not in lines:
                 names = ", ".join(sorted(lines)) or "none"
                 raise ValueError(f"port {bus.port!r}: no [[sim]] of that name; there are: {names}")
-            expected = known.FAMILIES[bus.family]
-            if not isinstance(lines[bus.simulated], expected.simulated_line):
-                raise ValueError(  # noqa: TRY004 - of the configuration
-                    f"bus {bus.name}: drives of family {bus.family} are simulated by {expected.simulated_key}s"
-                )
+            simulator().refuse_other_drives(bus, lines[bus.simulated])
         return self
 
     def _check_heartbeat(self) -> None:

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import msgpack
 
+from ldcnd.client.network import Sample, SampleKind
 from ldcnd.contract.codec import Encoding, decode_received
 from ldcnd.contract.condition import UNKNOWN_HOLDER, Condition, Kind, Place, Severity, Trouble, assess
 from ldcnd.contract.errors import LdcndError
@@ -18,7 +19,6 @@ from ldcnd.contract.health import BusHealth
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import FaultSample, PositionSample, StateSample, TelemetryItem
 from ldcnd.contract.samples import Sample as Measured
-from ldcnd.net.session import Sample, SampleKind
 
 TOPIC = "condition"
 """The last chunk of the key under which a page gets the condition of an axis; no daemon publishes it."""

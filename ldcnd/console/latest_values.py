@@ -12,9 +12,9 @@ from typing import Protocol
 
 import msgpack
 
+from ldcnd.client.network import Sample, SampleKind
 from ldcnd.contract.codec import Encoding
 from ldcnd.contract.keys import ROOT
-from ldcnd.net.session import Sample, SampleKind
 
 RIG_TOPIC = "rig"
 """Stands in the place of a topic where an entry tells of the rig itself."""

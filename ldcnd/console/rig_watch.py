@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Mapping
 from contextlib import suppress
 
+from ldcnd.client.network import Sample
 from ldcnd.client.overview import holders_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
@@ -13,7 +14,6 @@ from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.meta import CommandList
 from ldcnd.contract.plan import RigBudget
 from ldcnd.log import get_logger
-from ldcnd.net.session import Sample
 
 log = get_logger("console")
 

@@ -4,15 +4,13 @@ import asyncio
 from collections.abc import Collection
 from dataclasses import dataclass
 
+from ldcnd.client.network import Session, ZenohSettings, open_session
 from ldcnd.client.rig_client import RigClient, daemons
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import EndpointReply, RigReply
 from ldcnd.console.rig_watch import RigWatch
 from ldcnd.contract.errors import ConfigError, SessionError, UnknownAxis
 from ldcnd.log import get_logger
-from ldcnd.net.session import Session
-from ldcnd.net.zenoh_session import open_zenoh_session
-from ldcnd.net.zenoh_settings import ZenohSettings
 
 log = get_logger("console")
 
@@ -93,7 +91,7 @@ class Rigs:
         self._note(endpoint, problem="not connected yet")
         while True:
             try:
-                async with open_zenoh_session(endpoint.settings) as session:
+                async with open_session(endpoint.settings) as session:
                     await self.watch(session, endpoint)
             except (SessionError, ConfigError) as error:
                 self._note(endpoint, problem=error.message)

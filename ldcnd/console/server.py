@@ -17,6 +17,7 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
+from ldcnd.client.network import check_settings
 from ldcnd.console.commands import command_routes
 from ldcnd.console.connections import HANDSHAKE_TIME_S, BoundedH11
 from ldcnd.console.control import control_routes
@@ -31,7 +32,6 @@ from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import LINK_S, Visitors
 from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
-from ldcnd.net.zenoh_config import zenoh_config
 
 END_TIME_S = 1.0
 """Time for open pages to close when the console ends, seconds; then their connections are aborted."""
@@ -88,7 +88,7 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
         ConfigError: the address, the certificate or what was said about Zenoh cannot be used.
     """
     for endpoint in settings.endpoints:
-        zenoh_config(endpoint.settings)  # an error in it is raised now, not retried for ever
+        check_settings(endpoint.settings)  # an error in it is raised now, not retried for ever
     loop = asyncio.get_running_loop()
     values = LatestValues()
     rigs = Rigs(values, settings.rigs)

@@ -13,6 +13,7 @@ from ldcnd.axis.kept import KeptFiles
 from ldcnd.axis.latches import LatchKeeper
 from ldcnd.config.plan import demand_of
 from ldcnd.config.rig import RigConfig
+from ldcnd.config.simulated import simulator
 from ldcnd.contract.codec import Encoding
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.keys import Keys
@@ -26,7 +27,7 @@ from ldcnd.daemon.rig import ModuleService, Rig
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.family import OpenLine
-from ldcnd.drives.known import FAMILIES, chain_of
+from ldcnd.drives.known import FAMILIES
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.line.bus import Bus
 from ldcnd.line.transport import Opener
@@ -34,7 +35,6 @@ from ldcnd.net.publisher import Publisher
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
-from ldcnd.sim.chain import Chain
 
 ENCODINGS = {"msgpack": Encoding.MSGPACK, "json": Encoding.JSON}
 
@@ -63,7 +63,6 @@ def build_daemon(
     session: Session,
     now_ns: Callable[[], int],
     instance: str,
-    chains: Mapping[str, Chain] = MappingProxyType({}),
     openers: Mapping[str, Opener] = MappingProxyType({}),
     next_token: Callable[[], str] = random_token,
     stops: EarlyStops | None = None,
@@ -75,10 +74,12 @@ def build_daemon(
         session: where clients are.
         now_ns: the wall clock, UTC in ns since 1970.
         instance: names this run of the daemon.
-        chains: simulated lines that exist already, by name; the others are built from the configuration.
-        openers: what opens a line instead of its port, by the name of the bus.
+        openers: what opens a line instead of its port, also of a simulated one, by the name of the bus.
         next_token: makes what a lease is known by.
         stops: what takes stops already.
+
+    Raises:
+        ConfigError: a line is simulated, and the simulator is not installed.
     """
     clock = Clock(now_ns)
     publisher = Publisher(session, Keys(config.rig), ENCODINGS[config.telemetry.encoding])
@@ -107,7 +108,7 @@ def build_daemon(
 
     open_lines = {name: FAMILIES[name].open_lines(config.state_dir) for name in {bus.family for bus in config.bus}}
     groups = {group.name: group.axes for bus in config.bus for group in bus.group}
-    buses = tuple(_build_bus(config, bus, open_lines[bus.family], make_axis, chains, openers) for bus in config.bus)
+    buses = tuple(_build_bus(config, bus, open_lines[bus.family], make_axis, openers) for bus in config.bus)
     modules = tuple(
         ModuleService(driver, publisher, clock, tuple(axis.config.name for axis in bus.axes))
         for bus in buses
@@ -131,14 +132,12 @@ def _build_bus(
     settings: BusConfig,
     open_line: OpenLine[Any],
     make_axis: Callable[[AxisConfig, Bus, Drive], AxisService],
-    chains: Mapping[str, Chain],
     openers: Mapping[str, Opener],
 ) -> BusService:
     opener = openers.get(settings.name)
-    chain = None
-    if opener is None:
-        chain = chains.get(settings.simulated) or chain_of(settings, config.sim)
-    line = open_line(settings, opener, chain)
+    if opener is None and settings.simulated:
+        opener = simulator().opener_of(settings, config.sim)
+    line = open_line(settings, opener)
     axes = tuple(make_axis(axis, line.bus, line.network.axes[axis.name]) for axis in settings.axis)
     return BusService(
         line.bus,

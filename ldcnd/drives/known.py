@@ -1,39 +1,46 @@
 """The families that there are: the one list of them."""
 
-import asyncio
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeVar
 
 from ldcnd.drives.family import Family
 from ldcnd.drives.line_config import BusConfig
-from ldcnd.drives.simulated_line import SimulatedLineConfig
-from ldcnd.sim.chain import Chain
 
 DEFAULT = "ldcn"
 HOMES = {DEFAULT: "ldcnd.drives.ldcn.family:LDCN", "smartstep": "ldcnd.drives.smartstep.family:SMARTSTEP"}
 """The module of each family, and behind the colon its name there."""
 
 
-class Families(Mapping[str, Family[Any, Any]]):
-    """The families by name, each loaded when it is used first: a rig seldom has two, and one is a tenth of a daemon."""
+PartT = TypeVar("PartT")
 
-    def __getitem__(self, name: str) -> Family[Any, Any]:
-        """Return a family."""
-        module, _, attribute = HOMES[name].partition(":")
-        family: Family[Any, Any] = getattr(import_module(module), attribute)
-        return family
+
+class ByName(Mapping[str, PartT]):
+    """A part of each family by the family's name, loaded when it is used first: a rig seldom has two families.
+
+    Args:
+        homes: the module of each part, and behind a colon its name there.
+    """
+
+    def __init__(self, homes: Mapping[str, str]) -> None:
+        self._homes = homes
+
+    def __getitem__(self, name: str) -> PartT:
+        """Return the part of a family."""
+        module, _, attribute = self._homes[name].partition(":")
+        part: PartT = getattr(import_module(module), attribute)
+        return part
 
     def __iter__(self) -> Iterator[str]:
-        """Yield their names; loads none."""
-        return iter(HOMES)
+        """Yield the names of families; loads nothing."""
+        return iter(self._homes)
 
     def __len__(self) -> int:
         """Return how many there are."""
-        return len(HOMES)
+        return len(self._homes)
 
 
-FAMILIES = Families()
+FAMILIES: Mapping[str, Family[Any]] = ByName(HOMES)
 
 
 def bus_config(table: Mapping[str, Any]) -> type[BusConfig]:
@@ -51,29 +58,3 @@ def bus_config(table: Mapping[str, Any]) -> type[BusConfig]:
 def bus_configs() -> dict[str, type[BusConfig]]:
     """Return the models of `[[bus]]` tables, by family."""
     return {name: family.bus_config for name, family in FAMILIES.items()}
-
-
-def simulated_line(table: Mapping[str, Any]) -> type[SimulatedLineConfig]:
-    """Return the model that reads a `[[sim]]` table: the one whose drives are in it.
-
-    Raises:
-        ValueError: there are none. Drives of several families are refused by the model of the first.
-    """
-    for family in FAMILIES.values():
-        if table.get(family.simulated_key):
-            return family.simulated_line
-    keys = " or ".join(f"{family.simulated_key}s" for family in FAMILIES.values())
-    raise ValueError(f"a simulated line has either {keys}")
-
-
-def chain_of(settings: BusConfig, lines: Sequence[SimulatedLineConfig]) -> Chain | None:
-    """Return the simulated line that a line of a rig is; None for a real one."""
-    if not settings.simulated:
-        return None
-    line = next(line for line in lines if line.name == settings.simulated)
-    return FAMILIES[settings.family].simulate(line, settings, asyncio.get_running_loop().time())
-
-
-def simulated_lines() -> dict[str, type[SimulatedLineConfig]]:
-    """Return the models of `[[sim]]` tables, by family."""
-    return {name: family.simulated_line for name, family in FAMILIES.items()}

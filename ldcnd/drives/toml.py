@@ -37,9 +37,10 @@ class Variants:
 
         return core_schema.no_info_before_validator_function(read, handler(source))
 
-    def __get_pydantic_json_schema__(self, _common: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
-        """Describe all of them."""
-        return {"anyOf": [handler(model.__pydantic_core_schema__) for model in self.models().values()]}
+    def __get_pydantic_json_schema__(self, common: CoreSchema, handler: GetJsonSchemaHandler) -> JsonSchemaValue:
+        """Describe all of them; where there are none, what they would have in common."""
+        models = self.models().values()
+        return {"anyOf": [handler(model.__pydantic_core_schema__) for model in models]} if models else handler(common)
 
 
 REMOVED_KEYS = {

@@ -8,19 +8,19 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from ldcnd.bench.family import TrialMove
+from ldcnd.bench.known import BENCHES
+from ldcnd.bench.ldcn.acceptance import ASSUMPTIONS, accept, trial_bus
 from ldcnd.cli.examine import accept as accept_command
 from ldcnd.cli.examine import capture_of
 from ldcnd.contract.health import Finding, Verdict
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.family import TrialMove
-from ldcnd.drives.known import FAMILIES
-from ldcnd.drives.ldcn.acceptance import ASSUMPTIONS, accept, trial_bus
-from ldcnd.drives.smartstep.config import SimulatedUnitConfig, simulated_units
 from ldcnd.line.capture import Capture, parse_capture
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import PtyLine
 from ldcnd.sim.smartstep.cable import smartstep_chain
+from ldcnd.sim.smartstep.simulation import SimulatedUnitConfig, simulated_units
 from tests.support.chain_rig import drive, rig_on, simulated_config
 from tests.support.jumping_loop import JumpingLoop
 from tests.support.plugged_rig import MODELS
@@ -49,7 +49,7 @@ def replayed(capture: Capture) -> tuple[Finding, ...]:
         replay = Replay(capture.records, capture.header.until_s, lambda _text: None, slow_host=True)
         (line,) = capture.header.config["bus"] if capture.header.config else [{"axis": []}]
         units = [axis["address"] for axis in line["axis"]]
-        trial = FAMILIES[capture.header.family].trial("/dev/replayed", units, None, lambda: False, replay.open)
+        trial = BENCHES[capture.header.family].trial("/dev/replayed", units, None, lambda: False, replay.open)
         async with asyncio.TaskGroup() as group:
             owner = group.create_task(trial.bus.run(), name="bus accept")
             await trial.bus.wait_opened()

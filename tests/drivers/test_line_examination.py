@@ -5,8 +5,8 @@ from pathlib import Path
 
 import pytest
 
+from ldcnd.bench.ldcn.examination import LineAsConfigured, adapter_findings, examine
 from ldcnd.contract.health import Finding, Verdict
-from ldcnd.drives.ldcn.examination import LineAsConfigured, adapter_findings, examine
 from ldcnd.drives.ldcn.family import open_ldcn_line
 from ldcnd.line.adapter import Adapter, LineErrors, adapter_of
 from ldcnd.sim.chain import Chain, Delivery

@@ -5,15 +5,15 @@ import random
 import pytest
 
 from ldcnd.bench.begun import begun_with, write
+from ldcnd.bench.known import BENCHES
+from ldcnd.bench.opened import with_line
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import Verdict
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.known import FAMILIES
 from ldcnd.drives.ldcn.addressing import NULLS
 from ldcnd.drives.ldcn.packet import Command, PacketReader
 from ldcnd.drives.ldcn.registers import RESET_BAUD
-from ldcnd.drives.opened import with_line
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
@@ -34,7 +34,7 @@ GAINS = Gains(kp=100, kd=1000, ki=50, il=200, ol=255, cl=0, el=4000, sr=1, deadb
 
 async def scanned(chain: Chain, *, give_addresses: bool = False):
     """Scan a line; returns the drives, the findings, and the packets that were sent."""
-    look = FAMILIES["ldcn"].scan(
+    look = BENCHES["ldcn"].scan(
         PORT, give_addresses=give_addresses, opener=lambda: open_simulated_line(chain, RESET_BAUD)
     )
     findings = await with_line(look.bus, PORT, lambda: gathered(look.findings))
@@ -126,7 +126,7 @@ async def test_a_chain_in_any_state_is_told_as_it_is_and_left_as_it_was(seed):
 async def test_nothing_is_sent_to_a_line_that_another_host_uses():
     chain = build_chain(ChainSpec((ModuleSpec("ls-182ap"),)))
     chain.modules[0].address = 1
-    look = FAMILIES["ldcn"].scan(PORT, give_addresses=True, opener=lambda: open_simulated_line(chain, RESET_BAUD))
+    look = BENCHES["ldcn"].scan(PORT, give_addresses=True, opener=lambda: open_simulated_line(chain, RESET_BAUD))
 
     async def scan_beside_another():
         look.bus._line.data_received(bytes((0x09, 0x09)))

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drives.smartstep.config import SimulatedUnitConfig, simulated_units
 from ldcnd.drives.smartstep.profiles import Framing
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.smartstep.cable import smartstep_chain
+from ldcnd.sim.smartstep.simulation import SimulatedUnitConfig, simulated_units
 from tests.guest.machine import Adapter, Bench, booted_guest, far_end, why_no_guest
 from tests.guest.rigs import COST_PORTS, FAST, STEPS, USB
 from tests.support.package import package, why_no_package

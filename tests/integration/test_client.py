@@ -138,7 +138,7 @@ async def test_a_program_goes_on_with_the_daemon_that_follows_a_restart():
     @asynccontextmanager
     async def life(instance: str) -> AsyncIterator[Daemon]:
         async with broker.session() as session, asyncio.TaskGroup() as group:
-            made = build_daemon(two_axes(), session, lambda: EPOCH_NS, instance, {})
+            made = build_daemon(two_axes(), session, lambda: EPOCH_NS, instance)
             running = group.create_task(made.run(), name=instance)
             async with asyncio.timeout(60):
                 while any(axis.tracker.link is not LinkState.UP for axis in made.rig.axes.values()):

@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import replace
 
 import pytest
 from pydantic import ValidationError
@@ -17,7 +16,7 @@ from tests.support.dialect_rig import LS_182AP, SC, V2, V4, Dialect, DialectRig,
 
 @asynccontextmanager
 async def clocked(dialect: Dialect, mhz: float, baud: int) -> AsyncIterator[DialectRig]:
-    quirks = replace(model(dialect.module)[1], version=dialect.version, clock_hz=round(mhz * 1e6))
+    quirks = model(dialect.module)[1].model_copy(update={"version": dialect.version, "clock_hz": round(mhz * 1e6)})
     line = {"clock_mhz": mhz, "baud": baud}
     async with dialect_rig(dialect, settings=quirks, line=line) as rig:
         await rig.power_on()

@@ -9,9 +9,9 @@ import select
 import pytest
 import serial
 
+from ldcnd import parts
 from ldcnd.bench.commissioning.record import Record, StepState
 from ldcnd.config.rig import load_config
-from ldcnd.console.commissioning import tuning
 from ldcnd.console.commissioning.messages import Answer, FromPage
 from ldcnd.console.commissioning.page_person import HELD_S
 from ldcnd.console.commissioning.scan_conversation import ScanConversation
@@ -181,13 +181,13 @@ async def test_gains_come_back_when_a_page_goes_while_motor_and_encoder_are_comp
 
 
 async def test_tuning_says_what_to_install_where_numpy_is_missing(rig, console, monkeypatch):
-    monkeypatch.setattr(tuning, "find_spec", lambda _: None)
+    monkeypatch.setattr(parts, "find_spec", lambda _: None)
     async with commissioning_page(console) as opened:
         await opened.until(lambda view: not view.running and view.steps)
         opened.say(begin="gains")
         view = await opened.until(lambda view: view.problem)
 
-    assert view.problem.remedy == "install it with: pip install 'ldcnd[tune]'"
+    assert view.problem.remedy == "pip install 'ldcnd[bench]'"
 
 
 async def test_gains_come_back_when_a_page_goes_while_the_axis_is_tuned(tmp_path):

@@ -163,7 +163,7 @@ def config_of(dialect: Dialect, axis: dict[str, object]) -> RigConfig:
 
 @asynccontextmanager
 async def powered(dialect: Dialect, axis: dict[str, object]) -> AsyncIterator[MortalRig]:
-    settings = replace(model(dialect.module)[1], version=dialect.version)
+    settings = model(dialect.module)[1].model_copy(update={"version": dialect.version})
     chain = build_chain(ChainSpec((ModuleSpec(dialect.module, PLANT, settings),) * 2))
     async with mortal_rig(config_of(dialect, AXIS | axis), chain) as rig:
         for name in "xy":

@@ -1,7 +1,6 @@
 """What documents leave open about PIC-SERVO SC, CMC and PIC-I/O, played in every variant: the daemon does the same."""
 
 import asyncio
-from dataclasses import fields, replace
 from enum import StrEnum
 
 import pytest
@@ -26,12 +25,11 @@ def variants(model: str) -> dict[str, list[object]]:
     """Return what each switch of this model may also be."""
     default = MODELS[model][1]
     others: dict[str, list[object]] = {}
-    for field in fields(ModuleSettings):
-        value = getattr(default, field.name)
+    for name, value in default:
         if isinstance(value, bool):
-            others[field.name] = [not value]
+            others[name] = [not value]
         elif isinstance(value, StrEnum):
-            others[field.name] = [each for each in type(value) if each is not value]
+            others[name] = [each for each in type(value) if each is not value]
     others["undefined_status_bits"], others["undefined_level_bits"] = [0xFD], [0xF]
     if model == "pic-servo-sc":
         del others["always_obeys_global_reset"]  # its data sheet says so
@@ -102,7 +100,7 @@ async def compared(model: str, settings: list[ModuleSettings]) -> None:
     drives = [ModuleSpec(model, PLANT, each) for each in settings]
     if model == "pic-servo-cmc":
         io = MODELS["pic-io"][1]
-        drives += [ModuleSpec("pic-io", settings=each) for each in (io, replace(io, **chosen("pic-io", 1)))]
+        drives += [ModuleSpec("pic-io", settings=each) for each in (io, io.model_copy(update=chosen("pic-io", 1)))]
     chain = build_chain(ChainSpec(tuple(drives)))
     names = [f"a{place}" for place in range(1, len(settings) + 1)]
     async with running_rig(config(model, len(settings)), {"line": chain}) as rig:
@@ -137,7 +135,7 @@ async def compared(model: str, settings: list[ModuleSettings]) -> None:
 async def test_the_daemon_depends_on_no_open_point(model):
     default = MODELS[model][1]
 
-    await compared(model, [default, *(replace(default, **chosen(model, turn)) for turn in (1, 2))])
+    await compared(model, [default, *(default.model_copy(update=chosen(model, turn)) for turn in (1, 2))])
 
 
 @pytest.mark.soak
@@ -147,4 +145,4 @@ async def test_the_daemon_depends_on_no_open_point_alone(model):
     default = MODELS[model][1]
 
     for name, values in variants(model).items():
-        await compared(model, [default, *(replace(default, **{name: value}) for value in values)])
+        await compared(model, [default, *(default.model_copy(update={name: value}) for value in values)])

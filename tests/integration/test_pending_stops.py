@@ -20,7 +20,7 @@ from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
+from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, openers_of, running_rig
 
 RUN_ON = LossConfig(client=LossPolicy.RUN_TO_TARGET, bus=LossPolicy.RUN_TO_TARGET, daemon=LossPolicy.RUN_TO_TARGET)
 
@@ -183,7 +183,11 @@ async def starting(chain: Chain, **bus: object):
     loop, broker, rig_config = asyncio.get_running_loop(), MemoryBroker(), config(**bus)
     async with broker.session() as session, broker.session() as client_session:
         daemon = build_daemon(
-            rig_config, session, lambda: EPOCH_NS + round(loop.time() * 1e9), "test", {"line0": chain}
+            rig_config,
+            session,
+            lambda: EPOCH_NS + round(loop.time() * 1e9),
+            "test",
+            openers_of(rig_config, {"line0": chain}),
         )
         async with asyncio.TaskGroup() as group:
             running = group.create_task(daemon.run(), name="daemon")

@@ -1,7 +1,5 @@
 """What single habits of hosts in the field do to a simulated chain, and what misprinted frames of the manual do."""
 
-from dataclasses import replace
-
 import pytest
 
 from ldcnd.drives.ldcn.packet import Command
@@ -152,7 +150,7 @@ def test_a_sweep_finds_those_that_are_there(host):
 @pytest.mark.parametrize("seed", range(5))
 def test_the_first_module_listens_as_soon_after_a_reset_as_hosts_expect(pause_s, seed):
     def at_once(settings):
-        return replace(settings, reset_dead_s=0.0)
+        return settings.model_copy(update={"reset_dead_s": 0.0})
 
     modules = tuple(ModuleSpec(name, adjust=at_once) for name in MIXED)
     host = RawHost(build_chain(ChainSpec(modules, seed=seed)))

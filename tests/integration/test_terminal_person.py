@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from ldcnd.bench.person import Left
-from ldcnd.cli.terminal import TerminalPerson
+from ldcnd.cli.terminal_person import TerminalPerson
 from ldcnd.contract.errors import ConfigError
 
 pytestmark = pytest.mark.real_time

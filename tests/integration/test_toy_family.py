@@ -10,8 +10,9 @@ from ldcnd.config.rig import load_config
 from ldcnd.contract.commands import MoveAbsolute, Power, SetPosition, Stop, Verb
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.samples import AxisState, Moving
-from ldcnd.drives.known import HOMES
+from ldcnd.drives import known
 from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.sim import known as simulated
 from tests.support.console_rig import console_of, page
 from tests.support.recordings import checked_topics, recorded_rig
 from tests.toy.family import TOY
@@ -36,7 +37,8 @@ stage = [{ node = 3 }]
 
 @pytest.fixture
 def config(tmp_path, monkeypatch):
-    monkeypatch.setitem(HOMES, TOY.name, "tests.toy.family:TOY")
+    monkeypatch.setitem(known.HOMES, TOY.name, "tests.toy.family:TOY")
+    monkeypatch.setitem(simulated.HOMES, TOY.name, "tests.toy.simulated:SIMULATED_TOYS")
     file = tmp_path / "toys.toml"
     file.write_text(RIG)
     return load_config(file)

@@ -36,6 +36,7 @@ from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.interruptions import CopiedLoop, Interruptions, in_new_loop, run_with_copies
+from tests.support.rig import openers_of
 from tests.support.witness import Witness
 
 LEASE_S = 0.3
@@ -223,7 +224,7 @@ async def all_up(daemon: Daemon) -> None:
 async def life(settings: RigConfig, chain: Chain, instance: str) -> AsyncIterator[tuple[Daemon, MemoryBroker]]:
     broker = MemoryBroker()
     async with broker.session() as session, asyncio.TaskGroup() as group:
-        daemon = build_daemon(settings, session, now_ns, instance, {"a": chain})
+        daemon = build_daemon(settings, session, now_ns, instance, openers_of(settings, {"a": chain}))
         running = group.create_task(daemon.run(), name="daemon")
         yield daemon, broker
         daemon.end()

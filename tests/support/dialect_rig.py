@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TypeVar
 
@@ -119,7 +119,7 @@ async def dialect_rig(
         settings: quirks of the simulated drive; those of the model when missing.
         axis: overrides and additions to the axis's configuration.
     """
-    settings = settings or replace(model(dialect.module)[1], version=dialect.version)
+    settings = settings or model(dialect.module)[1].model_copy(update={"version": dialect.version})
     chain = build_chain(ChainSpec((ModuleSpec(dialect.module, plant, settings),), faults=faults))
     drive = chain.modules[0]
     assert isinstance(drive, SimulatedDrive)

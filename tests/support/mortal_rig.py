@@ -76,7 +76,7 @@ async def mortal_rig(config: RigConfig, chain: Chain) -> AsyncIterator[MortalRig
         return EPOCH_NS + round(loop.time() * 1e9)
 
     async with broker.session() as session, broker.session() as client:
-        daemon = build_daemon(config, session, now_ns, "mortal", {bus.port[4:]: chain}, {bus.name: line.open})
+        daemon = build_daemon(config, session, now_ns, "mortal", {bus.name: line.open})
         running = asyncio.create_task(daemon.run(), name="daemon")
         try:
             async with asyncio.timeout(60):

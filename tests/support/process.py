@@ -33,10 +33,10 @@ def free_port() -> int:
 
 
 @asynccontextmanager
-async def process(*arguments: str) -> AsyncIterator[Process]:
-    """Run `ldcnd ARGUMENTS` until the context ends; it must then leave by itself when asked to."""
+async def process(*arguments: str, tree: Path = ROOT) -> AsyncIterator[Process]:
+    """Run `ldcnd ARGUMENTS` of a source tree until the context ends; it must then leave by itself when asked to."""
     running = await asyncio.create_subprocess_exec(
-        *LDCND, *arguments, stdout=PIPE, stderr=None, cwd=ROOT, env={**os.environ, "PYTHONUNBUFFERED": "1"}
+        *LDCND, *arguments, stdout=PIPE, stderr=None, cwd=tree, env={**os.environ, "PYTHONUNBUFFERED": "1"}
     )
     try:
         yield running
@@ -53,10 +53,10 @@ async def process(*arguments: str) -> AsyncIterator[Process]:
 
 
 @asynccontextmanager
-async def daemon(config: Path) -> AsyncIterator[str]:
-    """Run a daemon on a free port; yields its endpoint once every axis answers."""
+async def daemon(config: Path, tree: Path = ROOT) -> AsyncIterator[str]:
+    """Run a daemon of a source tree on a free port; yields its endpoint once every axis answers."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    async with process("run", "--config", str(config), "--listen", endpoint) as running:
+    async with process("run", "--config", str(config), "--listen", endpoint, tree=tree) as running:
         await answering(running, endpoint)
         yield endpoint
 

@@ -14,8 +14,10 @@ from ldcnd.contract.events import CommandStatus, ReadEvents
 from ldcnd.contract.samples import StateSample
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
+from ldcnd.line.transport import Opener
 from ldcnd.net.memory_session import MemoryBroker, MemorySession
 from ldcnd.sim.chain import Chain
+from ldcnd.sim.known import opener_of
 
 EPOCH_NS = 1_700_000_000_000_000_000
 SIMULATED = Path(__file__).parents[2] / "config" / "simulated.toml"
@@ -73,7 +75,7 @@ async def running_rig(
         return EPOCH_NS + round((loop.time() + clock_off_s()) * 1e9)
 
     async with broker.session() as session, broker.session() as client_session:
-        daemon = build_daemon(config, session, now_ns, "test", chains)
+        daemon = build_daemon(config, session, now_ns, "test", openers_of(config, chains))
         async with asyncio.TaskGroup() as group:
             running = group.create_task(daemon.run(), name="daemon")
             try:
@@ -83,6 +85,13 @@ async def running_rig(
             finally:
                 daemon.end()
                 await running
+
+
+def openers_of(config: RigConfig, chains: Mapping[str, Chain]) -> dict[str, Opener]:
+    """Return what opens simulated lines that exist already, by the name of the bus; `chains` has them by their own."""
+    return {
+        bus.name: opener_of(bus, config.sim, chains[bus.simulated]) for bus in config.bus if bus.simulated in chains
+    }
 
 
 def two_axes() -> RigConfig:

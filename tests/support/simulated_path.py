@@ -1,7 +1,5 @@
 """Path mode on a simulated axis: what a host sends, in points of counts and cycles."""
 
-from dataclasses import replace
-
 from ldcnd.drives.ldcn.packet import AuxFlag, Command, Status
 from ldcnd.drives.ldcn.path import PathPoint, encode_points
 from ldcnd.drives.ldcn.registers import FRACTION, SERVO_CYCLE_S
@@ -17,7 +15,7 @@ class PathAxis(SimulatedAxis):
     """A PIC-SERVO SC, or another device with path mode, with its loop closed."""
 
     def __init__(self, name: str = "pic-servo-sc", plant: MotorPlant | None = None, **quirks: object) -> None:
-        settings = replace(model(name)[1], **quirks)  # type: ignore[arg-type] # the names are those of the settings
+        settings = model(name)[1].model_copy(update=quirks)
         super().__init__(name, plant=plant, settings=settings)
 
     def add(self, *steps: int, cycles: int = LONG, fast_path: bool = False) -> None:

@@ -23,7 +23,7 @@ from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.process import free_port
-from tests.support.rig import RunningRig, running_rig
+from tests.support.rig import RunningRig, openers_of, running_rig
 
 MIXED = Path(__file__).parents[2] / "config" / "mixed.toml"
 SELDOM = RatesConfig(position=0.2, velocity=0.2, adc=0.0, state=0.2)
@@ -131,7 +131,7 @@ async def trace_rig_over_zenoh(variant: SimulatedVariant) -> AsyncIterator[Trace
         open_zenoh_session(ZenohSettings(mode="client", connect=endpoint)) as asking,
         asyncio.TaskGroup() as group,
     ):
-        daemon = build_daemon(config, served, time.time_ns, "test", chains)
+        daemon = build_daemon(config, served, time.time_ns, "test", openers_of(config, chains))
         running = group.create_task(daemon.run(), name="daemon")
         try:
             async with asyncio.timeout(30):

@@ -1,1 +1,1 @@
-"""A drive family that is added by this folder alone: to see that nothing else has to know it."""
+"""A drive family that this folder adds alone: the drives and what simulates them; nothing else has to know it."""

@@ -15,7 +15,6 @@ from typing_extensions import override
 from ldcnd.contract.catalogue import verbs_for
 from ldcnd.contract.commands import Capability, Verb
 from ldcnd.contract.errors import BadReply, NetworkMismatch, NotSupported, ReplyTimeout
-from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.axis_config import MovedAxisConfig
 from ldcnd.drives.cost import LineTiming, cost_of
@@ -36,7 +35,6 @@ from ldcnd.drives.family import Demand, Family, Line, OpenLine, bus_settings
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.line_plan import Poll, Urgent
 from ldcnd.drives.network import BringUpReport, Network
-from ldcnd.drives.simulated_line import SimulatedLineConfig
 from ldcnd.drives.transcript import Describe
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Effect, Exchange, ReplyVerdict
@@ -44,8 +42,6 @@ from ldcnd.line.flight_recorder import WireRecord
 from ldcnd.line.port_url import port_opener
 from ldcnd.line.resync import Resync
 from ldcnd.line.transport import Opener
-from ldcnd.sim.chain import NEVER_S, Chain, Module, Reply
-from ldcnd.sim.line import open_simulated_line
 
 BAUD = 57_600
 FRAME = struct.Struct("<BBBii")
@@ -191,65 +187,6 @@ class ToyNetwork(Network):
         return BringUpReport(BAUD, dict.fromkeys(self._stages, "Toy stage"), reset=False)
 
 
-class SimulatedStage(Module):
-    """A stage that moves at constant velocity."""
-
-    baud = float(BAUD)
-    yields_to_host = False
-
-    def __init__(self, node: int) -> None:
-        self._node = node
-        self._heard = bytearray()
-        self._replies: list[Reply] = []
-        self._enabled = False
-        self._from = self._to = 0
-        self._loaded = (0, 1)
-        self._velocity = 1
-        self._began_s = 0.0
-
-    def hear(self, value: int | None, at_s: float) -> None:
-        self._heard.append(value or 0)
-        if self._heard[0] != REQUEST:
-            self._heard.clear()
-        if len(self._heard) < FRAME_BYTES:
-            return
-        packet, self._heard = bytes(self._heard), bytearray()
-        _head, node, op, position, velocity = FRAME.unpack(packet[:-1])
-        if node != self._node or sum(packet[:-1]) & 0xFF != packet[-1]:
-            return
-        self._obey(Op(op), position, velocity, at_s)
-        now = self._position(at_s)
-        moves = now != self._to
-        flags = (Flag.ENABLED if self._enabled else 0) | (0 if moves else Flag.AT_REST)
-        speed = 0 if not moves else self._velocity if self._to > now else -self._velocity
-        self.next_event_s = at_s + RESPONSE_S / 2
-        self._replies.append(Reply(frame(REPLY, node, flags, now, speed), self.next_event_s, 10 / BAUD))
-
-    def advance(self, to_s: float) -> Reply | None:
-        if not self._replies or self._replies[0].starts_at_s > to_s:
-            return None
-        reply = self._replies.pop(0)
-        self.next_event_s = self._replies[0].starts_at_s if self._replies else NEVER_S
-        return reply
-
-    def _obey(self, op: Op, position: int, velocity: int, at_s: float) -> None:
-        if op in {Op.ENABLE, Op.DISABLE}:
-            self._enabled = op is Op.ENABLE
-        if op in {Op.STOP, Op.DISABLE}:
-            self._from = self._to = self._position(at_s)
-        if op is Op.LOAD:
-            self._loaded = position, max(1, velocity)
-        if op is Op.START and self._enabled:
-            self._from, self._began_s = self._position(at_s), at_s
-            self._to, self._velocity = self._loaded
-
-    def _position(self, at_s: float) -> int:
-        gone = round(self._velocity * (at_s - self._began_s))
-        if gone >= abs(self._to - self._from):
-            return self._to
-        return self._from + (gone if self._to > self._from else -gone)
-
-
 class ToyAxisConfig(MovedAxisConfig):
     """One stage."""
 
@@ -266,27 +203,11 @@ class ToyBusConfig(BusConfig):
     """The drives that are axes."""
 
 
-class SimulatedStageConfig(Frozen):
-    """One simulated stage."""
-
-    node: int = Field(ge=1, le=9)
-    """Its address."""
-
-
-class SimulatedToyLineConfig(SimulatedLineConfig):
-    """A simulated line of stages."""
-
-    stage: tuple[SimulatedStageConfig, ...] = Field(min_length=1, max_length=9)
-    """The drives of the line."""
-
-
-class ToyFamily(Family[ToyBusConfig, SimulatedToyLineConfig]):
+class ToyFamily(Family[ToyBusConfig]):
     """The toys."""
 
     name = "toy"
     bus_config = ToyBusConfig
-    simulated_line = SimulatedToyLineConfig
-    simulated_key = "stage"
 
     @override
     def open_lines(self, state_dir: Path | None) -> OpenLine[ToyBusConfig]:
@@ -307,26 +228,14 @@ class ToyFamily(Family[ToyBusConfig, SimulatedToyLineConfig]):
     def describe(self, models: Mapping[int, str]) -> Describe:
         return _words
 
-    @override
-    def simulate(self, line: SimulatedToyLineConfig, settings: ToyBusConfig, starts_at_s: float) -> Chain:
-        chain = Chain([SimulatedStage(each.node) for each in line.stage], line.faults(starts_at_s))
-        chain.baud = BAUD
-        return chain
-
 
 TOY = ToyFamily()
 
 
-def open_toy_line(settings: ToyBusConfig, opener: Opener | None = None, chain: Chain | None = None) -> Line:
-    if chain is not None and opener is None:
-        opener = _simulated(chain)
+def open_toy_line(settings: ToyBusConfig, opener: Opener | None = None) -> Line:
     bus = Bus(bus_settings(settings, BAUD), opener or port_opener(settings.port, BAUD))
     specs = tuple(AxisSpec(axis.name, axis.address, axis.model, None) for axis in settings.axis)
     return Line(bus, ToyNetwork(bus, specs))
-
-
-def _simulated(chain: Chain) -> Opener:
-    return lambda: open_simulated_line(chain)
 
 
 def _words(record: WireRecord) -> str:

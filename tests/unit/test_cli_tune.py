@@ -2,9 +2,9 @@
 
 import pytest
 
+from ldcnd import parts
 from ldcnd.bench.tuning.ldcn import guided
 from ldcnd.bench.tuning.ldcn.report import Estimate, LoopMargins, MoveFigures, TuningReport
-from ldcnd.cli import commission
 from ldcnd.contract.errors import ConfigError
 
 PREDICTED = MoveFigures(settling_s=0.016, settled=True, overshoot=0.022, following_error=0.111, error=0.0)
@@ -25,10 +25,11 @@ REPORT = TuningReport(
 
 
 def test_without_numpy_one_line_names_the_extra(monkeypatch):
-    monkeypatch.setattr(commission, "find_spec", lambda _: None)
+    monkeypatch.setattr(parts, "find_spec", lambda _: None)
 
-    with pytest.raises(ConfigError, match=r"pip install 'ldcnd\[tune\]'$"):
-        commission._require_numpy()
+    with pytest.raises(ConfigError, match="numpy is not installed") as error:
+        parts.require("numpy")
+    assert error.value.remedy == "pip install 'ldcnd[bench]'"
 
 
 def test_predicted_stands_beside_measured():

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-from dataclasses import replace
 
 import pytest
 
@@ -84,8 +83,8 @@ async def test_the_highest_rate_is_reached_where_every_module_has_it():
 
 
 async def test_a_module_that_does_not_follow_takes_everybody_back_by_reset():
-    follower = SimulatedDrive(LS_182AP, ModuleSettings(20, always_obeys_global_reset=True), MotorPlant())
-    chain = Chain([follower, StuckRate(PIC_SERVO_V4, ModuleSettings(4), MotorPlant())])
+    follower = SimulatedDrive(LS_182AP, ModuleSettings(version=20, always_obeys_global_reset=True), MotorPlant())
+    chain = Chain([follower, StuckRate(PIC_SERVO_V4, ModuleSettings(version=4), MotorPlant())])
     async with bare_network(chain, PAIR) as line:
         report = await line.network.bring_up()
 
@@ -97,7 +96,7 @@ async def test_a_module_that_does_not_follow_takes_everybody_back_by_reset():
 
 @pytest.mark.parametrize("alternate", [False, True])
 async def test_a_drive_whose_clock_is_fast_follows_57600_with_the_divisor_that_makes_it_slower(alternate):
-    fast = ModuleSpec("picservo-v4", settings=ModuleSettings(4, drift_ppm=-20_000.0))
+    fast = ModuleSpec("picservo-v4", settings=ModuleSettings(version=4, drift_ppm=-20_000.0))
     chain = build_chain(ChainSpec((ModuleSpec("ls182ap"), fast)))
     async with bare_network(chain, PAIR, 57_600, LineSpec(alternate_divisors=alternate)) as line:
         report = await line.network.bring_up()
@@ -119,7 +118,7 @@ async def test_a_drive_whose_clock_is_fast_follows_57600_with_the_divisor_that_m
 
 
 async def test_a_lost_change_of_the_rate_is_tried_once_more():
-    chain = Chain([DeafOnce(PIC_SERVO_V4, ModuleSettings(4), MotorPlant()) for _ in PAIR])
+    chain = Chain([DeafOnce(PIC_SERVO_V4, ModuleSettings(version=4), MotorPlant()) for _ in PAIR])
     async with bare_network(chain, specs("pic-servo-v4", "pic-servo-v4")) as line:
         report = await line.network.bring_up()
 
@@ -457,7 +456,7 @@ async def test_where_drives_stand_is_asked_only_for_axes_that_use_it():
 async def test_drives_that_take_long_to_restart_are_addressed_when_they_have(restart_s):
     chain = build_chain(ChainSpec(tuple(ModuleSpec("ls182ap") for _ in FOUR)))
     for module in chain.modules:
-        module.settings = replace(module.settings, reset_dead_s=restart_s)
+        module.settings = module.settings.model_copy(update={"reset_dead_s": restart_s})
 
     took_s, report, line = await seconds_to_bring_up(chain)
 
@@ -480,8 +479,8 @@ class MumblesOnce(SimulatedDrive):
 
 
 async def test_one_lost_reply_does_not_hide_a_module_behind_the_configured_ones():
-    drives = [SimulatedDrive(LS_182AP, ModuleSettings(20), MotorPlant()) for _ in FOUR]
-    chain = Chain([*drives, MumblesOnce(PIC_SERVO_V4, ModuleSettings(4), MotorPlant())])
+    drives = [SimulatedDrive(LS_182AP, ModuleSettings(version=20), MotorPlant()) for _ in FOUR]
+    chain = Chain([*drives, MumblesOnce(PIC_SERVO_V4, ModuleSettings(version=4), MotorPlant())])
 
     _, report, line = await seconds_to_bring_up(chain)
 

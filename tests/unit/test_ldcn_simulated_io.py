@@ -1,7 +1,5 @@
 """A simulated PIC-I/O and PIC-STEP, as hosts see them; frames of the data sheet's kind for address 2."""
 
-from dataclasses import replace
-
 import pytest
 
 from ldcnd.contract.errors import ValueOutOfRange
@@ -32,7 +30,7 @@ class IoHost(SimulatedHost):
     """A host with one PIC-I/O at address 1."""
 
     def __init__(self, wiring=None, events=(), **quirks):
-        settings = replace(model("pic-io")[1], **quirks)
+        settings = model("pic-io")[1].model_copy(update=quirks)
         spec = ModuleSpec("pic-io", settings=settings, wiring=wiring or IoWiring())
         super().__init__(build_chain(ChainSpec((spec,), events=tuple(events))))
         self.address_all()

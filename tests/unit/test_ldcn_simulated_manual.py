@@ -19,7 +19,7 @@ from tests.support.simulated_host import SimulatedHost
 
 
 def axis_with(name, *, plant=None, closed=True, gains=None, **quirks):
-    settings = replace(model(name)[1], **quirks)
+    settings = model(name)[1].model_copy(update=quirks)
     options = {} if gains is None else {"gains": gains}
     return SimulatedAxis(name, plant=plant, settings=settings, closed=closed, **options)
 
@@ -106,7 +106,7 @@ NOP_TO_NOBODY = bytes.fromhex("aa 20 0e 2e")
 
 def two_groups(at_s=0.0001, **quirks):
     """Two modules, each alone in a group without a leader, at 115200; their servo cycles end at a known phase."""
-    settings = replace(model("pic-servo-v4")[1], phase_s=at_s, **quirks)
+    settings = model("pic-servo-v4")[1].model_copy(update={"phase_s": at_s, **quirks})
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-v4", settings=settings),) * 2)))
     host.address_all()
     for address in (1, 2):
@@ -208,7 +208,7 @@ def test_a_burst_at_19200_overwrites_nothing_because_two_bytes_take_longer_than_
 
 @pytest.mark.parametrize("yields", [True, False])
 def test_whether_a_reply_is_dropped_when_the_host_sends_is_a_switch(yields):
-    settings = replace(model("ls-182ap")[1], yields_to_host=yields, reply_latency_s=0.002)
+    settings = model("ls-182ap")[1].model_copy(update={"yields_to_host": yields, "reply_latency_s": 0.002})
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("ls-182ap", settings=settings),))))
     host.chain.write(0.0, encode_packet(Packet(0, Command.SET_ADDRESS, b"\x01\xff")))
     host.wait(0.0045)

@@ -1,7 +1,5 @@
 """What all simulated modules share: the chain, addresses, packets, rate, reset."""
 
-from dataclasses import replace
-
 import pytest
 
 from ldcnd.contract.errors import ValueOutOfRange
@@ -401,7 +399,7 @@ def test_io_module_keeps_its_place_in_the_chain():
 
 
 def test_settings_of_a_module_override_those_of_its_name():
-    settings = replace(MODELS["pic-servo-v1"][1], version=1, phase_s=0.0002)
+    settings = MODELS["pic-servo-v1"][1].model_copy(update={"version": 1, "phase_s": 0.0002})
 
     host = host_on("pic-servo-v1", settings=settings)
 

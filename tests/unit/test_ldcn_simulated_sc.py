@@ -20,7 +20,7 @@ PHASES = AuxFlag.ACCEL_DONE | AuxFlag.SLEW_DONE
 
 
 def sc(*, plant=None, **quirks):
-    return SimulatedAxis("pic-servo-sc", plant=plant, settings=replace(model("pic-servo-sc")[1], **quirks))
+    return SimulatedAxis("pic-servo-sc", plant=plant, settings=model("pic-servo-sc")[1].model_copy(update=quirks))
 
 
 def profile(axis):
@@ -233,7 +233,7 @@ def test_the_index_bit_is_the_level_on_sc_and_its_complement_on_version_4():
 
 @pytest.mark.parametrize("shown", [True, False])
 def test_whether_the_slew_bit_is_set_after_a_reset_is_a_switch(shown):
-    settings = replace(model("pic-servo-sc")[1], aux_after_reset=shown)
+    settings = model("pic-servo-sc")[1].model_copy(update={"aux_after_reset": shown})
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-sc", settings=settings),))))
     host.address_all()
 
@@ -430,7 +430,7 @@ def test_whether_set_gain_without_a_multiplier_restores_it_is_a_switch(kept, mul
 
 @pytest.mark.parametrize("latched", [True, False])
 def test_whether_a_module_behind_a_fault_with_step_inputs_still_hears_is_a_switch(latched):
-    settings = replace(model("pic-servo-sc")[1], steps_hz=100_000.0, address_in_latched=latched)
+    settings = model("pic-servo-sc")[1].model_copy(update={"steps_hz": 100_000.0, "address_in_latched": latched})
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-sc", settings=settings),) * 2)))
     host.address_all()
     host.send(1, Command.SET_GAIN, *encode_gains(host.chain.modules[0].profile, replace(UTILITY_GAINS, el=100)))

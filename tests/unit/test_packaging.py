@@ -18,7 +18,7 @@ from tests.support.pages import ROOT
 
 NOT_SOURCE = shutil.ignore_patterns(".git", ".venv", "build", "dist", "state", "__pycache__", ".*_cache", ".hypothesis")
 EPOCH = "1700000000"
-RUNTIME_EXTRAS = {"fast", "foxglove", "journal", "metrics", "pki", "plot", "record", "tui"}
+RUNTIME_EXTRAS = {"bench", "console", "fast", "foxglove", "journal", "lab", "ops", "plot", "tui"}
 PINS = set(re.findall(r"(?m)^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text()))
 
 

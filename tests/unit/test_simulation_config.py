@@ -9,14 +9,14 @@ import pytest
 
 from ldcnd.cli.sim import command
 from ldcnd.contract.errors import ConfigError
-from ldcnd.drives.simulated_line import FaultPlanConfig
 from ldcnd.drives.toml import read_toml
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import Fault, FaultKind
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, build_chain
 from ldcnd.sim.ldcn.power import Condition
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
-from ldcnd.sim.ldcn.simulation import PlantConfig, Quirks, SimulatedChainConfig, SimulationConfig
+from ldcnd.sim.ldcn.simulation import PlantConfig, SimulatedChainConfig, SimulationConfig
+from ldcnd.sim.line_config import FaultPlanConfig
 from ldcnd.sim.plant import MotorPlant
 
 TESTS = Path(__file__).parents[1]
@@ -55,11 +55,10 @@ def test_a_wrong_file_is_refused_with_file_key_and_reason(tmp_path, text, compla
     assert complaint in refused.value.message
 
 
-def test_every_constant_of_the_plant_and_every_setting_can_be_configured():
+def test_every_constant_of_the_plant_can_be_configured():
     travel = {"reverse_limit_counts", "forward_limit_counts", "seed"}
 
     assert set(PlantConfig.model_fields) == {field.name for field in fields(MotorPlant)} - travel
-    assert set(Quirks.model_fields) == {field.name for field in fields(ModuleSettings)}
 
 
 def test_what_is_left_out_stays_as_it_is_for_the_model(tmp_path):
@@ -181,7 +180,7 @@ def test_the_reference_lists_the_modules_as_they_are():
 def test_the_reference_lists_every_quirk_with_its_default():
     page = REFERENCE.read_text()
     rows = re.findall(r"^\* `(\w+)` \((.+?)\): .+$", page[page.index("## Quirks") :], re.MULTILINE)
-    defaults = {field.name: field.default for field in fields(ModuleSettings)}
+    defaults = {name: field.default for name, field in ModuleSettings.model_fields.items()}
 
     assert [name for name, _ in rows] == list(defaults)
     for name, told in rows:

@@ -1,5 +1,5 @@
+from ldcnd.bench.smartstep.examination import examine
 from ldcnd.contract.health import Finding, Verdict
-from ldcnd.drives.smartstep.commissioning import examine
 from ldcnd.drives.smartstep.packet import decode_command
 from ldcnd.drives.smartstep.parameters import PN000, PN100
 from ldcnd.drives.smartstep.profiles import StringChecksum, Wiring

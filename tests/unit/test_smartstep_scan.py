@@ -2,9 +2,9 @@
 
 import pytest
 
+from ldcnd.bench.opened import show_findings
+from ldcnd.bench.smartstep.family import SMARTSTEP_BENCH, SOFT_PARITY
 from ldcnd.contract.health import Verdict
-from ldcnd.drives.opened import show_findings
-from ldcnd.drives.smartstep.family import SMARTSTEP, SOFT_PARITY
 from ldcnd.drives.smartstep.network import smartstep_opener
 from ldcnd.drives.smartstep.profiles import Framing, Wiring
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
@@ -17,7 +17,7 @@ async def scanned(units, **line):
     chain = smartstep_chain(units, framing=Framing.SOFT_PARITY, **line)
     found = []
     opener = smartstep_opener(lambda: open_simulated_line(chain), SOFT_PARITY)
-    look = SMARTSTEP.scan("sim", give_addresses=False, opener=opener)
+    look = SMARTSTEP_BENCH.scan("sim", give_addresses=False, opener=opener)
     await show_findings(look.bus, "sim", look.findings, found.append)
     assert [f"unit {drive.address:X}" for drive in look.drives] == [each.axis for each in found if each.axis != "-"]
     return found

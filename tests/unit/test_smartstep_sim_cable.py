@@ -8,7 +8,6 @@ import pytest
 
 from ldcnd.contract.errors import OutcomeUnknown, ReplyTimeout
 from ldcnd.drives.smartstep.commands import FLUSH, Refusal, probe, reference, string_reference, write_eeprom, write_ram
-from ldcnd.drives.smartstep.config import SimulatedUnitConfig, simulated_units
 from ldcnd.drives.smartstep.packet import DAMAGED, ResponseStatus, add_parity, strip_parity
 from ldcnd.drives.smartstep.parameters import PN000, PN100, PN102
 from ldcnd.drives.smartstep.profiles import Framing, TraceWordLayout, Wiring
@@ -19,6 +18,7 @@ from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.sim.smartstep.cable import SimulatedCable, smartstep_chain
+from ldcnd.sim.smartstep.simulation import SimulatedUnitConfig, simulated_units
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 

@@ -5,6 +5,8 @@ from itertools import product
 
 import pytest
 
+from ldcnd.bench.smartstep.tools import verified_keys
+from ldcnd.bench.smartstep.verification import verify_traces
 from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import DriveFault
@@ -17,8 +19,6 @@ from ldcnd.drives.smartstep.profiles import (
     StringChecksum,
     TraceWordLayout,
 )
-from ldcnd.drives.smartstep.tools import verified_keys
-from ldcnd.drives.smartstep.verification import verify_traces
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.process import ROOT
 from tests.support.smartstep_line import simulated, smartstep_line

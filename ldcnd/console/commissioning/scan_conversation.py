@@ -5,13 +5,14 @@ from pathlib import Path
 
 from typing_extensions import override
 
-from ldcnd.bench.begun import SCANNED, begun_with, scan_port, write
+from ldcnd.bench.begun import begun_with, scan_port, write
+from ldcnd.bench.family import ScannedDrive
+from ldcnd.bench.known import BENCHES
+from ldcnd.bench.opened import ports
 from ldcnd.console.commissioning.conversation import Conversation
 from ldcnd.console.commissioning.messages import FromPage, View
 from ldcnd.contract.errors import UnknownVerb
 from ldcnd.contract.health import Finding
-from ldcnd.drives.family import ScannedDrive
-from ldcnd.line.adapter import ports
 
 SCAN = "scan"
 ANY = "any"
@@ -52,9 +53,9 @@ class ScanConversation(Conversation):
         port = ""
         while not port:
             port = await person.pick("on which port", ports())
-        families = {**{name: f"{name} drives" for name in SCANNED}, ANY: "not known: search for all of them"}
+        families = {**{name: f"{name} drives" for name in BENCHES}, ANY: "not known: search for all of them"}
         wanted = await person.choose("which drives", families)
-        names = list(SCANNED) if wanted == ANY else [wanted]
+        names = list(BENCHES) if wanted == ANY else [wanted]
         for give_addresses in (False, True):
             if give_addresses and not await person.confirm(CONSENT):
                 return
@@ -66,7 +67,7 @@ class ScanConversation(Conversation):
 
     async def _found(self, name: str, port: str, *, give_addresses: bool) -> list[ScannedDrive]:
         self.person.tell(f"searching for {name} drives on {port}: 10 to 20 seconds")
-        drives = await scan_port(SCANNED[name], port, self._show, give_addresses=give_addresses)
+        drives = await scan_port(BENCHES[name], port, self._show, give_addresses=give_addresses)
         return list(drives)
 
     def _show(self, finding: Finding) -> None:

@@ -1,10 +1,10 @@
 """Tuning as a step of the checklist: what is asked before, and the result that the record keeps."""
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 
 from ldcnd.bench.commissioning.checklist import CLIENT, STEPS
 from ldcnd.bench.commissioning.record import Figure, Proposal, Result, Series, StepState
+from ldcnd.bench.known import BENCHES
 from ldcnd.bench.person import Person
 from ldcnd.client.kept_gains import LEASE_S, open_loop
 from ldcnd.client.rig import Rig
@@ -12,8 +12,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.client.standstill import seen
 from ldcnd.config.rig import RigConfig
 from ldcnd.console.commissioning.messages import CurveView
-from ldcnd.contract.errors import ConfigError
-from ldcnd.drives.known import FAMILIES
+from ldcnd.parts import require
 
 WITHIN_COUNTS = 2000
 """Proposed distance from where the axis stands, counts."""
@@ -43,7 +42,8 @@ class Tuning:
 
 def is_offered(config: RigConfig, axis: str) -> bool:
     """Tell whether the gains of an axis of a configuration are found here."""
-    return any(FAMILIES[bus.family].is_tuned_by_host and axis in [each.name for each in bus.axis] for bus in config.bus)
+    families = [BENCHES.get(bus.family) for bus in config.bus if axis in [each.name for each in bus.axis]]
+    return any(family is not None and family.is_tuned_by_host for family in families)
 
 
 async def tune(client: RigClient, person: Person, name: str) -> Tuning | None:
@@ -54,8 +54,7 @@ async def tune(client: RigClient, person: Person, name: str) -> Tuning | None:
         Left: the person has left; the old gains are back.
         LdcndError: it cannot be tuned; likewise.
     """
-    if find_spec("numpy") is None:
-        raise ConfigError("tuning needs numpy", remedy="install it with: pip install 'ldcnd[tune]'")
+    require("numpy")
     from ldcnd.bench.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
 
     rig = Rig(client, await client.daemon())

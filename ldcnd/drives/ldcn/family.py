@@ -1,75 +1,41 @@
-"""The family of LDCN and NMC drives: from the configuration of a line to its bus, plan, simulator and tools."""
+"""The family of LDCN and NMC drives: from the configuration of a line to its bus and its plan."""
 
 import math
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-import click
 from typing_extensions import override
 
-from ldcnd.contract.errors import ConfigError
-from ldcnd.contract.health import Finding
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.cost import LineTiming, cost_of
-from ldcnd.drives.family import (
-    Demand,
-    Examines,
-    Family,
-    Line,
-    OpenLine,
-    Scan,
-    ScannedDrive,
-    Scans,
-    ServedLine,
-    ServesLines,
-    Trial,
-    TrialMove,
-    Tries,
-    bus_settings,
-)
-from ldcnd.drives.ldcn import acceptance, examination, scan
+from ldcnd.drives.family import Demand, Family, Line, OpenLine, bus_settings
 from ldcnd.drives.ldcn.config import LdcnBusConfig
 from ldcnd.drives.ldcn.costs import price_list
 from ldcnd.drives.ldcn.io_module import poll_io
 from ldcnd.drives.ldcn.network import PERIOD_S, LdcnNetwork, watch_module
-from ldcnd.drives.ldcn.packet import PacketReader
 from ldcnd.drives.ldcn.profiles import CYCLE_CLOCKS, PROFILES
-from ldcnd.drives.ldcn.registers import RESET_BAUD, BaudCodes, actual_baud, baud_at_reset, baud_divisor
+from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud, baud_at_reset, baud_divisor
 from ldcnd.drives.ldcn.transcript import LdcnTranscript
 from ldcnd.drives.line_plan import Poll, Urgent
 from ldcnd.drives.price_list import PriceList
 from ldcnd.drives.response_times import PeriodicTask
-from ldcnd.drives.toml import read_toml
 from ldcnd.drives.transcript import Describe
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
 from ldcnd.line.port_url import SOCKET, port_opener
 from ldcnd.line.settings import ServoCycle
 from ldcnd.line.transport import Opener
-from ldcnd.sim.chain import Chain
-from ldcnd.sim.faults import FaultPlan
-from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, ChainSpec, ModuleSpec, build_chain
-from ldcnd.sim.ldcn.simulation import SimulatedLdcnLineConfig, SimulationConfig
-from ldcnd.sim.line import open_simulated_line
-
-DEFAULT_SEED = 1
 
 
-class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBusConfig], Scans, Tries, ServesLines):
+class LdcnFamily(Family[LdcnBusConfig]):
     """LDCN (Logosol) and NMC (J R Kerr)."""
 
     name = "ldcn"
     bus_config = LdcnBusConfig
-    simulated_line = SimulatedLdcnLineConfig
-    simulated_key = "module"
-    is_tuned_by_host = True
     bauds = (9600, 19_200, 57_600, 115_200, 230_400)
-    examination = (
-        "Examine adapter, drives and timing of an LDCN or NMC line; exits with 1 when something must be put right."
-    )
 
     @override
     def open_lines(self, state_dir: Path | None) -> OpenLine[LdcnBusConfig]:
@@ -94,112 +60,18 @@ class LdcnFamily(Family[LdcnBusConfig, SimulatedLdcnLineConfig], Examines[LdcnBu
     def describe(self, models: Mapping[int, str]) -> Describe:
         return LdcnTranscript({node: PROFILES[model] for node, model in models.items() if model in PROFILES}).describe
 
-    @override
-    def simulate(self, line: SimulatedLdcnLineConfig, settings: LdcnBusConfig, starts_at_s: float) -> Chain:
-        return build_chain(line.spec(starts_at_s=starts_at_s))
-
-    @override
-    def examine(self, line: Line, settings: LdcnBusConfig) -> AsyncIterator[Finding]:
-        if not isinstance(line.network, LdcnNetwork):
-            raise TypeError(f"{settings.name} is no line of this family")
-        configured = examination.LineAsConfigured(
-            settings.name, settings.port, settings.adapter_latency_ms, settings.margin_ms, settings.axis[0].model
-        )
-        return examination.examine(line.bus, line.network, configured)
-
-    @override
-    def scan(self, port: str, *, give_addresses: bool, opener: Opener | None = None) -> Scan:
-        bus = acceptance.trial_bus(opener or port_opener(port, RESET_BAUD))
-        look = scan.LineScan(bus, port, give_addresses=give_addresses)
-        return Scan(bus, look.findings(), look.drives)
-
-    @override
-    def configured_line(self, name: str, port: str, drives: Sequence[ScannedDrive]) -> str:
-        return scan.configured_line(name, port, drives)
-
-    @override
-    def configured_drive(self, name: str, drive: ScannedDrive) -> str:
-        return scan.configured_drive(name, drive)
-
-    @override
-    def assumptions(self) -> Sequence[Mapping[str, str]]:
-        return [
-            {"key": each.key, "says": each.says, "confirmed_by": each.confirmed_by} for each in acceptance.ASSUMPTIONS
-        ]
-
-    @override
-    def trial(
-        self,
-        port: str,
-        units: Sequence[int],
-        move: TrialMove | None,
-        held: Callable[[], bool],
-        opener: Opener | None = None,
-    ) -> Trial:
-        bus = acceptance.trial_bus(opener or port_opener(port, RESET_BAUD))
-        return Trial(bus, acceptance.accept(bus, move, held))
-
-    @override
-    def sim_options(self) -> Sequence[click.Option]:
-        return (
-            click.Option(["--chain"], help=f"The modules in daisy-chain order, of: {', '.join(MODELS)}."),
-            click.Option(
-                ["--file"], type=click.Path(path_type=Path), help="The modules and what happens to them (TOML)."
-            ),
-        )
-
-    @override
-    def served(self, options: Mapping[str, Any], faults: Callable[[int], FaultPlan]) -> ServedLine | None:
-        chain, file = options["chain"], options["file"]
-        if chain is None and file is None:
-            return None
-        if chain is not None and file is not None:
-            raise click.UsageError("a line is described either by --chain or by --file")
-        spec = _named(chain, options["seed"]) if file is None else _written(file, options["seed"])
-        more = (*spec.faults.faults, *faults(spec.seed).faults)
-        spec = replace(spec, baud_check=spec.baud_check or options["baud_check"], faults=FaultPlan(more, spec.seed))
-        described = {
-            "modules": [module.name for module in spec.modules],
-            "baud_check": spec.baud_check,
-            "seed": spec.seed,
-        }
-        return ServedLine(build_chain(spec), described, RESET_BAUD, PacketReader, baud_check=spec.baud_check)
-
 
 LDCN = LdcnFamily()
 
 
-def open_ldcn_line(settings: LdcnBusConfig, opener: Opener | None = None, chain: Chain | None = None) -> Line:
-    """Return a line that is not open yet; a line that has no chain is opened by its port or by `opener`."""
+def open_ldcn_line(settings: LdcnBusConfig, opener: Opener | None = None) -> Line:
+    """Return a line that is not open yet, which is opened by its port or by `opener`."""
     baud = settings.baud if settings.port.startswith(SOCKET) else baud_at_reset(settings.clock_hz)
-    if opener is None and chain is not None:
-        opener = _simulated(chain, baud)
     bus = Bus(
         bus_settings(settings, baud, cycle=servo_cycle(settings), coalesce_s=settings.coalesce_ms / 1000),
         opener or port_opener(settings.port, baud, working_baud=settings.baud, rs485=settings.transmitter),
     )
     return Line(bus, LdcnNetwork(bus, tuple(axis.spec() for axis in settings.axis), settings.baud, settings.spec()))
-
-
-def _simulated(chain: Chain, baud: int) -> Opener:
-    return lambda: open_simulated_line(chain, baud)
-
-
-def _named(chain: str, seed: int | None) -> ChainSpec:
-    names = [OLD_NAMES.get(name, name) for name in chain.replace(",", " ").split()]
-    unknown = [name for name in names if name not in MODELS]
-    if unknown or not names:
-        wrong = f"no such module: {', '.join(unknown)}" if unknown else "no module"
-        raise ConfigError(f"--chain: {wrong}; known are {', '.join(MODELS)}")
-    modules = tuple(ModuleSpec(name) for name in names)
-    return ChainSpec(modules, baud_check=False, seed=DEFAULT_SEED if seed is None else seed)
-
-
-def _written(file: Path, seed: int | None) -> ChainSpec:
-    config = read_toml(file, SimulationConfig)
-    if seed is not None:
-        config = config.model_copy(update={"seed": seed})
-    return config.spec(baud_check=config.baud_check, delivery=config.delivery)
 
 
 # -- the load of a line ----------------------------------------------------------------------------------------------

@@ -10,11 +10,11 @@ from typing import Self
 
 from foxglove import Channel, Context, Schema, start_server
 
+from ldcnd.client.network import Sample, SampleKind
 from ldcnd.contract.codec import to_json
 from ldcnd.contract.errors import ConfigError, LdcndError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.lab.recording.messages import decode_published, message_of, schema_of
-from ldcnd.net.session import Sample, SampleKind
 
 
 class LiveView:

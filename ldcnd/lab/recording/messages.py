@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from pydantic import Field
 
+from ldcnd.client.network import Sample
 from ldcnd.contract.codec import decode_received, read_received, to_json
 from ldcnd.contract.events import CommandEvent, CommandStatus
 from ldcnd.contract.frozen import Frozen, schema_text
@@ -20,7 +21,6 @@ from ldcnd.contract.keys import ROOT
 from ldcnd.contract.samples import SAMPLE_MODELS, MonitorSample
 from ldcnd.contract.samples import Sample as Measurement
 from ldcnd.contract.traces import TraceChunk, TraceHeader
-from ldcnd.net.session import Sample
 
 Published = Measurement | CommandEvent | BusHealth | DaemonHealth
 

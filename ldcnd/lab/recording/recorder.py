@@ -11,10 +11,10 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
+from ldcnd.client.network import Sample, SampleKind
 from ldcnd.contract.errors import LdcndError
 from ldcnd.lab.recording.mcap_file import Losses, McapFile
 from ldcnd.lab.recording.messages import entry_of
-from ldcnd.net.session import Sample, SampleKind
 
 FLUSH_PERIOD_S = 1.0
 """Period of writes to the disk, seconds: a recorder that is killed loses no more."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Mapping
 from contextlib import AsyncExitStack
 
+from ldcnd.client.network import Session
 from ldcnd.client.rig import Rig
 from ldcnd.contract.condition import Alarm, Place, assess
 from ldcnd.contract.meta import AxisInfo
@@ -20,7 +21,6 @@ from ldcnd.contract.samples import (
 )
 from ldcnd.lab.ros2.cdr import DIAGNOSTIC_ARRAY, JOINT_STATE, DiagnosticArray, DiagnosticStatus, JointState
 from ldcnd.lab.ros2.graph import Node, Publisher, advertise
-from ldcnd.net.session import Session
 
 SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "rev": math.tau}
 """Metres or radians in a unit; axes in other units have no joint."""

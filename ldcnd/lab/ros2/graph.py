@@ -7,8 +7,8 @@ import struct
 from dataclasses import dataclass
 from itertools import count
 
+from ldcnd.client.network import Declaration, Qos, Session
 from ldcnd.lab.ros2.cdr import MessageType
-from ldcnd.net.session import Declaration, Qos, Session
 
 DEPTH = 10
 """Of a publisher's history, as its token says; values are not kept."""

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
+from ldcnd.client.network import Sample, SampleKind
 from ldcnd.contract.codec import decode_received
 from ldcnd.contract.condition import SHARED, UNKNOWN_HOLDER, Kind, Severity, Trouble, assess, line_troubles
 from ldcnd.contract.frozen import Frozen
@@ -24,7 +25,6 @@ from ldcnd.contract.samples import (
     VelocitySample,
 )
 from ldcnd.lab.top.glance import AxisGlance, BusGlance, RigGlance
-from ldcnd.net.session import Sample, SampleKind
 
 SILENT_S = 3.0
 """Time without a report after which a daemon is shown as silent: three reports."""

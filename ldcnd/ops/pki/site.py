@@ -14,9 +14,9 @@ from typing import Annotated
 
 from pydantic import Field, ValidationError
 
+from ldcnd.client.network import LEASE_MS, RETRY_MS
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
-from ldcnd.net.zenoh_settings import LEASE_MS, RETRY_MS
 from ldcnd.ops.pki.access import (
     PERMITTED_AT_ROUTER,
     PERMITTED_BEHIND_ROUTER,

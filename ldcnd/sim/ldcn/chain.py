@@ -2,7 +2,7 @@
 
 import random
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from ldcnd.contract.errors import ValueOutOfRange
@@ -206,9 +206,8 @@ def _happening(event: TimedEvent, module: SimulatedModule) -> Callable[[float], 
 
 def _build_module(spec: ModuleSpec, dice: random.Random) -> SimulatedModule:
     profile, default = model(spec.name)
-    drawn = replace(
-        default, phase_s=dice.uniform(0.0, SERVO_CYCLE_S), drift_ppm=dice.uniform(-MOST_DRIFT_PPM, MOST_DRIFT_PPM)
-    )
+    phase_s, drift_ppm = dice.uniform(0.0, SERVO_CYCLE_S), dice.uniform(-MOST_DRIFT_PPM, MOST_DRIFT_PPM)
+    drawn = default.model_copy(update={"phase_s": phase_s, "drift_ppm": drift_ppm})
     settings = spec.adjust(spec.settings or drawn)
     if profile.support is Support.FULL:
         drive = SimulatedDrive(profile, settings, spec.plant)

@@ -4,10 +4,17 @@ The default of a switch is what the document of the model says, or, where it say
 on. docs/reference/simulator.md lists them with their reasons.
 """
 
-from dataclasses import dataclass
 from enum import StrEnum
+from typing import Literal
 
+from pydantic import Field, SerializerFunctionWrapHandler, model_serializer
+
+from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ
+from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
+
+MOST_DRIFT_PPM = 30_000.0
+"""Beyond any crystal: with the 3.3 % by which the printed divisor misses 57600, a drive no longer follows that rate."""
 
 
 class CommandBuffer(StrEnum):
@@ -112,111 +119,112 @@ class LimitInPath(StrEnum):
     NOTHING = "nothing"
 
 
-@dataclass(frozen=True, slots=True)
-class ModuleSettings:
-    """Version, clock and quirks of one module.
+class ModuleSettings(Frozen):
+    """How one module behaves where manuals and data sheets leave room; what is left out is as the model has it."""
 
-    Attributes:
-        version: second byte of its identity.
-        phase_s: where its servo cycles lie, 0 to 0.000512.
-        clock_hz: of the module.
-        drift_ppm: how much longer its servo cycles and its bits are than nominal.
-        reply_latency_s: added between the end of the cycle and the reply.
-        reset_dead_s: how long it is deaf after Hard Reset and power-up; no manual says it.
-        always_obeys_global_reset: obeys Hard Reset to FF in any group; PIC-SERVO up to version 5 and PIC-I/O do so only
-            in group FF.
-        yields_to_host: drops its reply as soon as the host sends, also one that is due.
-        command_buffer: effect of a new packet on a command that has not been executed yet.
-        address_in_latched: once it has an address it receives, whatever the level of its address input.
-        unknown_baud: effect of an unlisted code of Set Baud Rate on PIC-SERVO SC.
-        undefined_status_bits: of a PIC-I/O's status byte, of which only bit 1 is defined.
-        undefined_level_bits: of the upper half of a PIC-I/O's second input byte.
-        synch_output_once: a PIC-I/O applies stored outputs once, not with each Synch Output.
-        counter_cleared_by_mode: Set Timer Mode sets a PIC-I/O's counter to 0.
-        stop_clears_velocity: stopping smoothly or abruptly sets the velocity register to 0.
-        position_error_clearing: what clears pos_error.
-        sense_counts_per_a: A/D counts per ampere of motor current (PIC-SERVO).
-        encoder_counts_per_s: faster transitions are lost; None for the model's rate, 0 for no limit.
-        analog_end: when a motion to an analog target begins to stop (Logosol).
-        peak_current_a: the motor current cannot exceed it (Logosol); 0 for no limit.
-        overload_s: limited for so long without a pause, the drive trips.
-        deadband_at_zero: deadband compensation is also added to an output of 0.
-        il_times_256: the integral sum is bounded by 256 times IL instead of by IL.
-        velocity_sign: of the velocity item while the motor runs forward, 1 or -1; None for the model's.
-        relative_to: what a relative goal is added to.
-        reset_in_motion: what Reset Position does to the goal of a move that is under way.
-        home_shifts: Reset Position also shifts the captured home position.
-        aux_after_reset: auxiliary bit 4 is set after a reset as at any standstill, before the loop is closed first.
-        path_overflow: what happens to points that the buffer has no room for.
-        half_point: what becomes of an odd byte behind the points.
-        path_without_servo: what path mode does while the servo is off.
-        path_takes_points_in_motion: points are taken during another motion, too.
-        path_starts_empty: a start with an empty buffer begins a path with the first point that comes.
-        path_restarts: another start goes on to the next point at once.
-        path_cleared_by_stop: Stop Motor, or another motion, clears the points that are left.
-        path_cleared_by_fault: the servo being switched off by an error does.
-        path_counts_point_under_way: the number of points left includes the one that is walked through.
-        path_ends_with_buffer: PATH_MODE falls when the last point begins, not when it ends.
-        path_rate_at_load: the fast path option counts when a point is loaded, not when it begins.
-        path_move_done: MOVE_DONE is set during a path,
-        path_slew: and auxiliary bit 4 is.
-        path_ignores_divisor: the servo rate divisor of a CMC does not slow its path.
-        path_ended_by_enable: Stop Motor with the enable bit alone ends a path.
-        excluded_options: what PIC-SERVO SC does with options that exclude each other.
-        gains_keep_multiplier: Set Gain without a step multiplier leaves that as it is instead of setting it to 1.
-        steps_hz: of a pulse train at the step input of PIC-SERVO SC; negative in reverse.
-        limit_in_path: what limit protection does to a path.
-        advanced_sticky: a CMC keeps its advanced features when a later Stop Motor lacks their bit.
-        items_before_advanced: a CMC sends status items 6 and 7 before its advanced features are on.
-    """
-
-    version: int
-    clock_hz: int = CLOCK_HZ
-    phase_s: float = 0.0
-    drift_ppm: float = 0.0
-    reply_latency_s: float = 0.0
-    reset_dead_s: float = 0.001
+    version: int = Field(default=1, ge=0, le=255)
+    """Second byte of its identity; the model's when left out."""
+    clock_hz: int = Field(default=CLOCK_HZ, ge=10_000_000, le=20_000_000)
+    """Its clock, PIC-SERVO up to version 5; servo cycle and rates follow it."""
+    phase_s: float = Field(default=0.0, ge=0, lt=SERVO_CYCLE_S)
+    """Phase of its servo cycles, in seconds; drawn from the seed when left out."""
+    drift_ppm: float = Field(default=0.0, ge=-MOST_DRIFT_PPM, le=MOST_DRIFT_PPM)
+    """How much longer its servo cycles and its bits are than nominal; drawn from the seed when left out."""
+    reply_latency_s: float = Field(default=0.0, ge=0, le=10)
+    """Added between the end of the servo cycle and the reply."""
+    reset_dead_s: float = Field(default=0.001, ge=0, le=10)
+    """How long it is deaf after Hard Reset and power-up, in seconds. A host that takes a port for drained as soon as \
+it has written needs 0: a terminal does not wait for the line."""
     always_obeys_global_reset: bool = False
+    """Whether Hard Reset to FF is obeyed in any group, or only in group FF; the model's way when left out."""
     yields_to_host: bool = True
+    """Whether it drops its reply as soon as the host sends."""
     command_buffer: CommandBuffer = CommandBuffer.OVERWRITTEN
+    """Effect of a new packet on a command that has not been executed yet."""
     address_in_latched: bool = False
+    """Whether it receives the host's packets once it has an address, whatever the level of its address input."""
     unknown_baud: UnknownBaud = UnknownBaud.KEPT
-    undefined_status_bits: int = 0
-    undefined_level_bits: int = 0
+    """Effect of an unlisted code of Set Baud Rate on PIC-SERVO SC."""
+    undefined_status_bits: int = Field(default=0, ge=0, le=255)
+    """Set in a PIC-I/O's status byte, of which only bit 1 is defined."""
+    undefined_level_bits: int = Field(default=0, ge=0, le=15)
+    """The upper half of a PIC-I/O's second input byte."""
     synch_output_once: bool = False
+    """Whether a PIC-I/O applies stored outputs once, or with each Synch Output."""
     counter_cleared_by_mode: bool = False
+    """Whether Set Timer Mode sets a PIC-I/O's counter to 0."""
     stop_clears_velocity: bool = True
+    """Whether stopping smoothly or abruptly sets the velocity register to 0; the model's way when left out."""
     position_error_clearing: PositionErrorClearing = PositionErrorClearing.BY_COMMAND
-    sense_counts_per_a: float = 12.0
-    encoder_counts_per_s: float | None = None
+    """Event that clears the position error bit: Clear Sticky Bits only, or closing the loop, too."""
+    sense_counts_per_a: float = Field(default=12.0, ge=0)
+    """A/D counts per ampere of motor current, PIC-SERVO."""
+    encoder_counts_per_s: float | None = Field(default=None, ge=0)
+    """Faster encoder transitions are lost; the model's rate when left out, 0 for no limit."""
     analog_end: AnalogEnd = AnalogEnd.EQUAL
-    peak_current_a: float = 9.0
-    overload_s: float = 0.65
+    """Whether a motion to an analog target begins to stop at the exact value only, or also behind it."""
+    peak_current_a: float = Field(default=9.0, ge=0)
+    """The motor current cannot exceed it, Logosol; 0 for no limit."""
+    overload_s: float = Field(default=0.65, gt=0)
+    """How long a Logosol drive limits its current without a pause before it trips."""
     deadband_at_zero: bool = False
+    """Whether deadband compensation is also added to an output of 0."""
     il_times_256: bool = True
-    velocity_sign: int | None = None
+    """Whether the integral sum is bounded by 256 times IL or by IL."""
+    velocity_sign: Literal[-1, 1] | None = None
+    """Sign of the velocity item while the motor runs forward; the model's when left out."""
     relative_to: RelativeTo = RelativeTo.START
+    """Command position to which a relative goal is added, PIC-SERVO SC: that of the load or of the start."""
     reset_in_motion: ResetInMotion = ResetInMotion.GOAL_KEPT
+    """Effect of Reset Position on the goal of a move that is under way."""
     home_shifts: bool = False
+    """Whether Reset Position also shifts the captured home position."""
     aux_after_reset: bool = False
+    """Whether auxiliary bit 4 is set after a reset, PIC-SERVO SC."""
     path_overflow: PathOverflow = PathOverflow.DROP_EXCESS
+    """Effect of path points that exceed the buffer."""
     half_point: HalfPoint = HalfPoint.IGNORED
+    """Effect of an odd byte after path points."""
     path_without_servo: PathWithoutServo = PathWithoutServo.WAITS
+    """Behaviour of path mode while the servo is off."""
     path_takes_points_in_motion: bool = True
+    """Whether path points are taken during another motion, too."""
     path_starts_empty: bool = False
+    """Whether a start with an empty buffer begins a path with the first point that comes."""
     path_restarts: bool = False
+    """Whether another start goes on to the next point at once."""
     path_cleared_by_stop: bool = True
+    """Whether Stop Motor clears the path points that are left."""
     path_cleared_by_fault: bool = False
+    """Whether the servo being switched off by an error does."""
     path_counts_point_under_way: bool = False
+    """Whether the number of points left includes the one under way."""
     path_ends_with_buffer: bool = False
+    """Whether PATH_MODE falls when the last point begins, or when it ends."""
     path_rate_at_load: bool = False
+    """Whether the fast path option counts when a point is loaded, or when it begins."""
     path_move_done: bool = True
+    """Whether MOVE_DONE is set during a path."""
     path_slew: bool = True
+    """Whether auxiliary bit 4 is set during a path."""
     path_ignores_divisor: bool = False
+    """Whether the servo rate divisor of a CMC leaves its path as it is."""
     path_ended_by_enable: bool = False
+    """Whether Stop Motor with the enable bit alone ends a path."""
     excluded_options: ExcludedOptions = ExcludedOptions.OBEYED
+    """Effect of options of I/O Control that exclude each other, PIC-SERVO SC."""
     gains_keep_multiplier: bool = False
-    steps_hz: float = 0.0
+    """Whether Set Gain without a step multiplier leaves that as it is, PIC-SERVO SC."""
+    steps_hz: float = Field(default=0.0, ge=-1_000_000, le=1_000_000)
+    """A pulse train at the step input of PIC-SERVO SC, negative in reverse."""
     limit_in_path: LimitInPath = LimitInPath.ENDS_PATH
+    """Effect of limit protection on a path, PIC-SERVO SC."""
     advanced_sticky: bool = True
+    """Whether a CMC keeps its advanced features when a later Stop Motor lacks their bit."""
     items_before_advanced: bool = False
+    """Whether a CMC sends status items 6 and 7 before its advanced features are on."""
+
+    @model_serializer(mode="wrap")
+    def _only_what_is_given(self, dump: SerializerFunctionWrapHandler):  # type: ignore[no-untyped-def] # noqa: ANN202 - a type would stand in the schema
+        """Leave out what the model of the module decides: a dump that is read again means the same."""
+        return {name: value for name, value in dump(self).items() if name in self.model_fields_set}

@@ -12,31 +12,15 @@ from pydantic import AfterValidator, Field, model_validator
 from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.ldcn.pic_io import LINES
 from ldcnd.drives.ldcn.profiles import PIC_IO, Support, identify
-from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.drives.simulated_line import SimulatedFaultConfig, SimulatedLineConfig
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, Analog, ChainSpec, Line, ModuleSpec, TimedEvent
 from ldcnd.sim.ldcn.io import IoWiring
 from ldcnd.sim.ldcn.power import Condition
-from ldcnd.sim.ldcn.quirks import (
-    AnalogEnd,
-    CommandBuffer,
-    ExcludedOptions,
-    HalfPoint,
-    LimitInPath,
-    ModuleSettings,
-    PathOverflow,
-    PathWithoutServo,
-    PositionErrorClearing,
-    RelativeTo,
-    ResetInMotion,
-    UnknownBaud,
-)
+from ldcnd.sim.ldcn.quirks import ModuleSettings
+from ldcnd.sim.line_config import FaultyLineConfig, SimulatedFaultConfig
 from ldcnd.sim.plant import MotorPlant
 
-MOST_DRIFT_PPM = 30_000.0
-"""Beyond any crystal: with the 3.3 % by which the printed divisor misses 57600, a drive no longer follows that rate."""
 ENDLESS_TRAVEL_COUNTS = (-(1 << 30), 1 << 30)
 
 
@@ -105,112 +89,6 @@ class PlantConfig(Frozen):
     """Whether the counter stands still while the shaft turns, and the drive does not notice."""
 
 
-class Quirks(Frozen):
-    """How one module behaves where manuals and data sheets leave room; what is left out is as the model has it."""
-
-    version: int | None = Field(default=None, ge=0, le=255)
-    """Second byte of its identity."""
-    clock_hz: int | None = Field(default=None, ge=10_000_000, le=20_000_000)
-    """Its clock, PIC-SERVO up to version 5; servo cycle and rates follow it. 20 MHz when left out."""
-    phase_s: float | None = Field(default=None, ge=0, lt=SERVO_CYCLE_S)
-    """Phase of its servo cycles, in seconds; drawn from the seed when left out."""
-    drift_ppm: float | None = Field(default=None, ge=-MOST_DRIFT_PPM, le=MOST_DRIFT_PPM)
-    """How much longer its servo cycles and its bits are than nominal; drawn from the seed when left out."""
-    reply_latency_s: float | None = Field(default=None, ge=0, le=10)
-    """Added between the end of the servo cycle and the reply."""
-    reset_dead_s: float | None = Field(default=None, ge=0, le=10)
-    """How long it is deaf after Hard Reset and power-up; 0.001. A host that takes a port for drained as soon as it has
-written needs 0: a terminal does not wait for the line."""
-    always_obeys_global_reset: bool | None = None
-    """Whether Hard Reset to FF is obeyed in any group, or only in group FF."""
-    yields_to_host: bool | None = None
-    """Whether it drops its reply as soon as the host sends."""
-    command_buffer: CommandBuffer | None = None
-    """Effect of a new packet on a command that has not been executed yet."""
-    address_in_latched: bool | None = None
-    """Whether it receives the host's packets once it has an address, whatever the level of its address input."""
-    unknown_baud: UnknownBaud | None = None
-    """Effect of an unlisted code of Set Baud Rate on PIC-SERVO SC."""
-    undefined_status_bits: int | None = Field(default=None, ge=0, le=255)
-    """Set in a PIC-I/O's status byte, of which only bit 1 is defined."""
-    undefined_level_bits: int | None = Field(default=None, ge=0, le=15)
-    """The upper half of a PIC-I/O's second input byte."""
-    synch_output_once: bool | None = None
-    """Whether a PIC-I/O applies stored outputs once, or with each Synch Output."""
-    counter_cleared_by_mode: bool | None = None
-    """Whether Set Timer Mode sets a PIC-I/O's counter to 0."""
-    stop_clears_velocity: bool | None = None
-    """Whether stopping smoothly or abruptly sets the velocity register to 0."""
-    position_error_clearing: PositionErrorClearing | None = None
-    """Event that clears the position error bit: Clear Sticky Bits only, or closing the loop, too."""
-    sense_counts_per_a: float | None = Field(default=None, ge=0)
-    """A/D counts per ampere of motor current, PIC-SERVO."""
-    encoder_counts_per_s: float | None = Field(default=None, ge=0)
-    """Faster encoder transitions are lost; the model's rate when left out, 0 for no limit."""
-    analog_end: AnalogEnd | None = None
-    """Whether a motion to an analog target begins to stop at the exact value only, or also behind it."""
-    peak_current_a: float | None = Field(default=None, ge=0)
-    """The motor current cannot exceed it, Logosol; 0 for no limit."""
-    overload_s: float | None = Field(default=None, gt=0)
-    """How long a Logosol drive limits its current without a pause before it trips."""
-    deadband_at_zero: bool | None = None
-    """Whether deadband compensation is also added to an output of 0."""
-    il_times_256: bool | None = None
-    """Whether the integral sum is bounded by 256 times IL or by IL."""
-    velocity_sign: Literal[-1, 1] | None = None
-    """Sign of the velocity item while the motor runs forward; the model's when left out."""
-    relative_to: RelativeTo | None = None
-    """Command position to which a relative goal is added, PIC-SERVO SC: that of the load or of the start."""
-    reset_in_motion: ResetInMotion | None = None
-    """Effect of Reset Position on the goal of a move that is under way."""
-    home_shifts: bool | None = None
-    """Whether Reset Position also shifts the captured home position."""
-    aux_after_reset: bool | None = None
-    """Whether auxiliary bit 4 is set after a reset, PIC-SERVO SC."""
-    path_overflow: PathOverflow | None = None
-    """Effect of path points that exceed the buffer."""
-    half_point: HalfPoint | None = None
-    """Effect of an odd byte after path points."""
-    path_without_servo: PathWithoutServo | None = None
-    """Behaviour of path mode while the servo is off."""
-    path_takes_points_in_motion: bool | None = None
-    """Whether path points are taken during another motion, too."""
-    path_starts_empty: bool | None = None
-    """Whether a start with an empty buffer begins a path with the first point that comes."""
-    path_restarts: bool | None = None
-    """Whether another start goes on to the next point at once."""
-    path_cleared_by_stop: bool | None = None
-    """Whether Stop Motor clears the path points that are left."""
-    path_cleared_by_fault: bool | None = None
-    """Whether the servo being switched off by an error does."""
-    path_counts_point_under_way: bool | None = None
-    """Whether the number of points left includes the one under way."""
-    path_ends_with_buffer: bool | None = None
-    """Whether PATH_MODE falls when the last point begins, or when it ends."""
-    path_rate_at_load: bool | None = None
-    """Whether the fast path option counts when a point is loaded, or when it begins."""
-    path_move_done: bool | None = None
-    """Whether MOVE_DONE is set during a path."""
-    path_slew: bool | None = None
-    """Whether auxiliary bit 4 is set during a path."""
-    path_ignores_divisor: bool | None = None
-    """Whether the servo rate divisor of a CMC leaves its path as it is."""
-    path_ended_by_enable: bool | None = None
-    """Whether Stop Motor with the enable bit alone ends a path."""
-    excluded_options: ExcludedOptions | None = None
-    """Effect of options of I/O Control that exclude each other, PIC-SERVO SC."""
-    gains_keep_multiplier: bool | None = None
-    """Whether Set Gain without a step multiplier leaves that as it is, PIC-SERVO SC."""
-    steps_hz: float | None = Field(default=None, ge=-1_000_000, le=1_000_000)
-    """A pulse train at the step input of PIC-SERVO SC, negative in reverse."""
-    limit_in_path: LimitInPath | None = None
-    """Effect of limit protection on a path, PIC-SERVO SC."""
-    advanced_sticky: bool | None = None
-    """Whether a CMC keeps its advanced features when a later Stop Motor lacks their bit."""
-    items_before_advanced: bool | None = None
-    """Whether a CMC sends status items 6 and 7 before its advanced features are on."""
-
-
 class IoConfig(Frozen):
     """Wiring of a PIC-I/O."""
 
@@ -249,7 +127,7 @@ class SimulatedModuleConfig(Frozen):
     """Positions of the limit switches, in counts from the power-up position; endless when left out."""
     plant: PlantConfig = PlantConfig()
     """Constants of the machine."""
-    behaviour: Quirks = Quirks()
+    behaviour: ModuleSettings = ModuleSettings()
     """Behaviour where the manuals allow variants."""
     conditions: tuple[Condition, ...] = ()
     """Faults around the drive at power-up."""
@@ -273,7 +151,7 @@ class SimulatedModuleConfig(Frozen):
         if self.conditions and not self.is_drive:
             raise ValueError(f"conditions: a {self.model} has no motor")
         profile, version = MODELS[self.model][0], self.behaviour.version
-        if version is not None and version not in profile.versions:
+        if "version" in self.behaviour.model_fields_set and version not in profile.versions:
             known = identify(profile.device_id, version)
             other = f"that is a {known.name}" if known else "no such device is known"
             raise ValueError(f"behaviour.version: a {self.model} has no version {version}; {other}")
@@ -289,12 +167,12 @@ class SimulatedModuleConfig(Frozen):
         Args:
             seed: of the potentiometer's noise.
         """
-        given = self.behaviour.model_dump(exclude_none=True)
+        given = {name: getattr(self.behaviour, name) for name in self.behaviour.model_fields_set}
         reverse, forward = self.travel_counts or ENDLESS_TRAVEL_COUNTS
         travel = MotorPlant(reverse_limit_counts=reverse, forward_limit_counts=forward, seed=seed)
 
         def adjust(settings: ModuleSettings) -> ModuleSettings:
-            return replace(settings, **given)
+            return settings.model_copy(update=given)
 
         plant = replace(travel, **self.plant.model_dump(exclude_none=True))
         wiring = self.io.wiring() if self.io else IoWiring()
@@ -411,7 +289,7 @@ class SimulationConfig(SimulatedChainConfig):
     """Replies reach the host in one piece, or byte by byte."""
 
 
-class SimulatedLdcnLineConfig(SimulatedChainConfig, SimulatedLineConfig):
+class SimulatedLdcnLineConfig(SimulatedChainConfig, FaultyLineConfig):
     """A simulated line of modules."""
 
     module: tuple[SimulatedModuleConfig, ...] = Field(min_length=1, max_length=31)

@@ -10,9 +10,10 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ldcnd.bench.family import ScannedDrive
+from ldcnd.bench.ldcn.examination import LineAsConfigured, adapter_findings, lost_on_line, measured, polls_hz
 from ldcnd.contract.errors import BusDown, BusError
 from ldcnd.contract.health import Finding, Verdict
-from ldcnd.drives.family import ScannedDrive
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import (
     ANY_DIALECT,
@@ -27,7 +28,6 @@ from ldcnd.drives.ldcn.addressing import (
 from ldcnd.drives.ldcn.adoption import MOTION_ITEMS, STILL_COUNTS, WATCH_S, Found
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.costs import price_list
-from ldcnd.drives.ldcn.examination import LineAsConfigured, adapter_findings, lost_on_line, measured, polls_hz
 from ldcnd.drives.ldcn.faults import Knowledge, diagnose
 from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag
 from ldcnd.drives.ldcn.profiles import PIC_IO, PROFILES, Profile, Support

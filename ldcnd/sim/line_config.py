@@ -5,8 +5,8 @@ from typing import Self
 
 from pydantic import Field, model_validator
 
+from ldcnd.config.simulated import SimulatedLineConfig
 from ldcnd.contract.frozen import Frozen
-from ldcnd.drives.toml import Name
 from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
 
 
@@ -45,11 +45,9 @@ class FaultPlanConfig(Frozen):
     """Added to those of the line."""
 
 
-class SimulatedLineConfig(Frozen):
-    """One simulated line, used by `port = "sim:NAME"`; its family adds the drives."""
+class FaultyLineConfig(SimulatedLineConfig):
+    """One simulated line, and what may go wrong on its wires; its family adds the drives."""
 
-    name: Name
-    """The name in `port = "sim:NAME"`."""
     seed: int = 1
     """Seed of all random values."""
     fault: tuple[SimulatedFaultConfig, ...] = ()

@@ -8,10 +8,11 @@ import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, replace
 
+from ldcnd.bench.family import TrialMove
+from ldcnd.bench.ldcn.examination import Held
 from ldcnd.contract.errors import BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.contract.health import Finding, Verdict
 from ldcnd.drives.driver import AxisSpec, Motion, StopMode
-from ldcnd.drives.family import TrialMove
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import (
     ANY_DIALECT,
@@ -25,7 +26,6 @@ from ldcnd.drives.ldcn.addressing import (
     read_identity,
 )
 from ldcnd.drives.ldcn.commands import Node, unanswered
-from ldcnd.drives.ldcn.examination import Held
 from ldcnd.drives.ldcn.packet import Status, StatusFlag, StatusItem
 from ldcnd.drives.ldcn.profiles import Profile, Support
 from ldcnd.drives.ldcn.registers import RESET_BAUD, SERVO_CYCLE_S, BaudCodes

@@ -6,7 +6,10 @@ from typing import TypeVar
 
 from ldcnd.contract.errors import BusDown
 from ldcnd.contract.health import Finding
+from ldcnd.line.adapter import ports
 from ldcnd.line.bus import Bus
+
+__all__ = ["ports", "show_findings", "with_line"]
 
 OPEN_TIME_S = 5.0
 ResultT = TypeVar("ResultT")

@@ -7,21 +7,20 @@ from pathlib import Path
 
 import click
 
+from ldcnd.bench.known import line_of
+from ldcnd.bench.opened import with_line
+from ldcnd.bench.smartstep.verification import KEYS, Verified, verify_traces
+from ldcnd.config.edit import set_for_axis
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError
-from ldcnd.drives.family import ConfigFiles
-from ldcnd.drives.line_config import BusConfig
-from ldcnd.drives.opened import with_line
 from ldcnd.drives.smartstep.config import SmartStepBusConfig
 from ldcnd.drives.smartstep.drive import SmartStepAxis
-from ldcnd.drives.smartstep.family import open_smartstep_line
-from ldcnd.drives.smartstep.verification import KEYS, Verified, verify_traces
 from ldcnd.line.bus import Bus
 from ldcnd.log import configure_logging
-from ldcnd.sim.chain import Chain
 
 
-def commands(files: ConfigFiles) -> tuple[click.Command, ...]:
-    """Return the commands, which read and write the configuration by `files`."""
+def commands() -> tuple[click.Command, ...]:
+    """Return the commands."""
 
     @click.command()
     @click.option("--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML).")
@@ -42,10 +41,9 @@ def commands(files: ConfigFiles) -> tuple[click.Command, ...]:
                 state = "open" if each.setting is None else "verified"
                 click.echo(f"{each.key:22} {state:8} {each.text}")
 
-        settings = _line_of(files.lines(config), config, name, axis)
-        asyncio.run(_with_drive(settings, axis, work, lambda: files.chain(config, settings)))
+        asyncio.run(_with_drive(config, name, axis, work))
         if write:
-            files.set_for_axis(config, axis, {"smartstep.trace": verified_keys(found)})
+            set_for_axis(config, axis, {"smartstep.trace": verified_keys(found)})
             click.echo(f"written to {config}")
         sys.exit(1 if any(each.setting is None for each in found) else 0)
 
@@ -68,18 +66,15 @@ async def _act(request: str) -> None:
     await asyncio.to_thread(click.prompt, f"{request}; Enter", default="", show_default=False, err=True)
 
 
-def _line_of(lines: Sequence[BusConfig], config: Path, name: str, axis: str) -> SmartStepBusConfig:
-    for line in lines:
+def _line_of(rig: RigConfig, config: Path, name: str, axis: str) -> SmartStepBusConfig:
+    for line in rig.bus:
         if line.name == name and isinstance(line, SmartStepBusConfig) and axis in [each.name for each in line.axis]:
             return line
     raise ConfigError(f"{config}: no smartstep line {name!r} with an axis {axis!r}")
 
 
 async def _with_drive(
-    settings: SmartStepBusConfig,
-    axis: str,
-    work: Callable[[Bus, SmartStepAxis], Awaitable[None]],
-    chain: Callable[[], Chain | None],
+    config: Path, name: str, axis: str, work: Callable[[Bus, SmartStepAxis], Awaitable[None]]
 ) -> None:
     """Open the line of a SmartStep, do something with the drive, and close it.
 
@@ -87,8 +82,9 @@ async def _with_drive(
         BusDown: the port does not open.
     """
     configure_logging(level="error")
-    line = open_smartstep_line(settings, chain=chain())
-    line.bus.resync = line.network.resync
+    rig = load_config(config)
+    settings = _line_of(rig, config, name, axis)
+    line = line_of(rig, settings)
     unit = line.network.axes[axis]
     if not isinstance(unit, SmartStepAxis):
         raise ConfigError(f"{axis} is no SmartStep")

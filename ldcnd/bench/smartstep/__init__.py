@@ -1,0 +1,1 @@
+"""SmartSteps on the bench: a line scanned, examined, its drives tried, their traces verified. Start with `family`."""

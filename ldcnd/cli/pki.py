@@ -1,0 +1,82 @@
+"""`ldcnd pki`: certificates for mutual TLS, and the access rules that go with them."""
+
+import datetime as dt
+from collections.abc import Iterable
+from pathlib import Path
+
+import click
+
+from ldcnd.cli.typed import Whole
+from ldcnd.ops.pki.access import Role
+from ldcnd.parts import require
+
+FOLDER = click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
+DAYS = 730
+
+
+@click.group()
+def command() -> None:
+    """Make certificates for mutual TLS, and the access rules that go with them.
+
+    FOLDER belongs to one site. Keep it on one machine: anyone who has ca.key can make operators.
+    """
+
+
+@command.command()
+@FOLDER
+@click.option("--name", default="ldcnd site", show_default=True, help="Common name of the authority.")
+def init(folder: Path, name: str) -> None:
+    """Make the site's authority in FOLDER."""
+    require("cryptography")
+    from ldcnd.ops.pki.site import set_up  # noqa: PLC0415 - needs an optional package
+
+    set_up(folder, name, _now())
+    click.echo(f"{folder}: authority made; next: ldcnd pki add {folder} NAME --role daemon --ip ADDRESS")
+
+
+@command.command()
+@FOLDER
+@click.argument("name")
+@click.option("--role", type=click.Choice([role.value for role in Role]), required=True, help="What it may do.")
+@click.option("--host", "hosts", multiple=True, help="Host name at which a daemon or router is found; may be repeated.")
+@click.option("--ip", "addresses", multiple=True, help="The same, an IP address.")
+@click.option("--days", type=Whole(1, 3650), default=DAYS, show_default=True, help="How long it is valid.")
+def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: tuple[str, ...], days: int) -> None:
+    """Give NAME a login: a certificate and a Zenoh configuration, in one file to hand over."""
+    require("cryptography")
+    from ldcnd.ops.pki.site import Site, new_login  # noqa: PLC0415 - needs an optional package
+
+    login = new_login(name, Role(role), (*hosts, *addresses))
+    site = Site(folder)
+    file = site.add(login, _now(), days)
+    if login.role is Role.DAEMON:
+        click.echo(f'{file}: in the rig\'s configuration, [zenoh] config_file = "{file.resolve()}"')
+    elif login.role is Role.ROUTER:
+        click.echo(f"{file}: start the router with it, `zenohd --config {file.name}`")
+    else:
+        click.echo(f"{file}: hand it over on a safe way; use it as --config {file.name}")
+    if login.role is not Role.DAEMON:
+        _say_restart(other for other in site.listener_files() if other != file)
+
+
+@command.command()
+@FOLDER
+@click.argument("name")
+def revoke(folder: Path, name: str) -> None:
+    """Take the rights of a viewer or operator back."""
+    require("cryptography")
+    from ldcnd.ops.pki.site import Site  # noqa: PLC0415 - needs an optional package
+
+    site = Site(folder)
+    site.revoke(name)
+    click.echo(f"{name}: revoked")
+    _say_restart(site.listener_files())
+
+
+def _say_restart(files: Iterable[Path]) -> None:
+    for file in files:
+        click.echo(f"restart what runs with {file}: rules are read at its start")
+
+
+def _now() -> dt.datetime:
+    return dt.datetime.now(dt.UTC)

@@ -1,0 +1,44 @@
+"""Parts that are not installed everywhere: the wings of ldcnd, and packages of others that an extra brings."""
+
+from importlib.util import find_spec
+
+from ldcnd.contract.errors import ConfigError
+
+EXTRAS = {
+    "caproto": ("caproto", "epics"),
+    "cryptography": ("cryptography", "ops"),
+    "foxglove": ("foxglove-sdk", "foxglove"),
+    "markdown_it": ("markdown-it-py", "console"),
+    "matplotlib": ("matplotlib", "plot"),
+    "mcap": ("mcap", "lab"),
+    "numpy": ("numpy", "bench"),
+    "prometheus_client": ("prometheus-client", "lab"),
+    "starlette": ("starlette", "console"),
+    "textual": ("textual", "tui"),
+    "uvicorn": ("uvicorn", "console"),
+    "websockets": ("websockets", "console"),
+}
+"""By the name of its module: a package, and the extra of ldcnd that brings it."""
+
+
+def require(*modules: str) -> None:
+    """Refuse to begin without packages that are optional.
+
+    Args:
+        modules: of `EXTRAS`.
+
+    Raises:
+        ConfigError: one is not installed; names the extra.
+    """
+    for module in modules:
+        if find_spec(module) is None:
+            package, extra = EXTRAS[module]
+            raise ConfigError(f"{package} is not installed", remedy=f"pip install 'ldcnd[{extra}]'")
+
+
+def missing_wing(error: ModuleNotFoundError) -> ConfigError | None:
+    """Return what to say when a command cannot be loaded as a wing of ldcnd is not there; None for other modules."""
+    root, _, wing = (error.name or "").partition(".")
+    if root != "ldcnd" or not wing:
+        return None
+    return ConfigError(f"this needs {error.name}, a part of ldcnd that is not installed", remedy="install all of ldcnd")
