@@ -416,8 +416,8 @@ class AxisCommands:
         await permit.load(plan.motion)
         self._moved = permit, plan.motion, self._tracker.speed_share
         await self._motion.start(permit, state, completion, plan=plan)
-        self._motion.target_counts = plan.motion.target_counts
-        self._motion.approached = state is AxisState.DISCRETE_MOTION
+        if state is AxisState.DISCRETE_MOTION:  # the end of a motion at a velocity is only there for a host that dies
+            self._motion.target_counts, self._motion.approached = plan.motion.target_counts, True
         return self._motion.reply(permit, plan)
 
     async def change_speed(self) -> bool:

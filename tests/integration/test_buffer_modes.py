@@ -7,11 +7,21 @@ from contextlib import asynccontextmanager
 import pytest
 
 from ldcnd.client.rig import Rig
-from ldcnd.contract.commands import BufferMode, CommandReply, Halt, MoveAbsolute, MoveVelocity, Power, SetPosition
+from ldcnd.contract.commands import (
+    BufferMode,
+    CommandReply,
+    Halt,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    SetPosition,
+)
 from ldcnd.contract.errors import PositionLimit, WrongState
 from ldcnd.contract.events import CommandOutcome, CommandStatus, ReadOutcome
 from ldcnd.contract.samples import AxisState, LinkState, PositionSample, TelemetryItem
 from tests.support.command_line import virtual_rig
+from tests.support.dialect_rig import AXIS, SC, dialect_rig
 from tests.support.rig import RunningRig, running_rig
 
 
@@ -258,3 +268,17 @@ def test_the_command_line_says_why_what_it_waited_for_did_not_begin(monkeypatch)
 
 async def _begun(work):
     return asyncio.create_task(work)
+
+
+async def test_a_distance_from_a_motion_at_a_velocity_is_taken_from_where_the_axis_is():
+    """A PIC-SERVO SC goes on without a halt; the end of its motion in the drive is only there for a host that dies."""
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=10.0))
+        await asyncio.sleep(0.5)
+        here = rig.position_mm
+        reply = await rig.send(MoveRelative(distance=2.0, buffer_mode=BufferMode.ABORTING))
+        assert reply.position == pytest.approx(here + 2.0, abs=1.0)
+        await rig.rig.client.wait_for_end(AXIS, reply.command_id)
+
+        assert rig.position_mm == pytest.approx(here + 2.0, abs=1.0)
