@@ -147,6 +147,18 @@ async def test_a_reset_reaches_drives_that_were_left_in_a_group():
     assert [(module.group, module.leader) for module in chain.modules] == [(0x81, False), (0x81, True)]
 
 
+async def test_a_reset_reaches_a_drive_in_a_group_behind_one_that_obeys_everybody():
+    """A Logosol drive obeys the reset of 255 in any group, and makes a PIC-SERVO behind it deaf to that of its own."""
+    chain = chain_of("ls182ap", "picservo-v4", "ls182ap")
+    spec = LineSpec(groups=(GroupSpec("all", ("a1", "a2", "a3")),))
+    for _ in range(2):
+        async with bare_network(chain, specs("ls-182ap", "pic-servo-v4", "ls-182ap"), line=spec) as line:
+            report = await line.network.bring_up()
+
+    assert report.reset
+    assert [module.address for module in chain.modules] == [1, 2, 3]
+
+
 async def test_a_configured_identity_overrides_the_table():
     odd = ModuleSpec("picservo-v4", settings=ModuleSettings(version=77))
     chain = build_chain(ChainSpec((odd,)))

@@ -352,7 +352,8 @@ class Addressing:
 
         A module that is reset makes the next one deaf, so one that is left at a rate of its own would split the chain:
         all are called to one rate first, which leaves their address outputs as they are. PIC-SERVO version 4 obeys only
-        a reset of the group it is in, so every known group address is reset.
+        a reset of the group it is in, so every known group address is reset; `EVERYBODY` last, because Logosol drives
+        obey that one in any group, and would make those behind them deaf to their own.
         """
         for baud in (*self.rate.missed_by, *self.rate.candidates):
             if baud != self.rate.at_reset and await self.rate.host_to(baud):
@@ -365,10 +366,8 @@ class Addressing:
     async def _reset_at(self, baud: int, settle_s: float) -> None:
         if not await self.rate.host_to(baud):
             return
-        packets = [
-            commands.hard_reset(commands.Group(address)).request for address in (*self._plan.addresses, WAITING_GROUP)
-        ]
-        burst = self.rate.spaced(packets)
+        groups = (*(address for address in self._plan.addresses if address != EVERYBODY), WAITING_GROUP, EVERYBODY)
+        burst = self.rate.spaced([commands.hard_reset(commands.Group(address)).request for address in groups])
         reset = unanswered(EVERYBODY, burst, settle_s, repeatable=False, effect=Effect.ARRANGES)
         for _ in range(2):
             await self._bus.execute(reset)
