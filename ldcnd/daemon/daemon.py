@@ -167,6 +167,7 @@ class Daemon:
                 if self._failure:
                     raise self._failure
             finally:
+                requests.finish()
                 for task in serving:
                     task.cancel()
                 for name in (*self.rig.axes, *self.rig.modules):

@@ -141,12 +141,16 @@ class Requests:
         self._journal = Journal(rig)
         self._pending = 0
         self._stops: dict[tuple[str, ...], list[asyncio.Future[tuple[str, ...]]]] = {}
-        self._closing = False
+        self._closing = self._over = False
         self._refusals_logged = LogLimit(now_s=asyncio.get_running_loop().time)
 
     def close(self) -> None:
         """Refuse further commands; stops are still taken."""
         self._closing = True
+
+    def finish(self) -> None:
+        """Refuse stops, too: the lines close."""
+        self._closing = self._over = True
 
     def on_command(self, query: Query) -> None:
         """Take a query on `@cmd/**`."""
@@ -160,6 +164,9 @@ class Requests:
                     remedy="wait for replies before sending more",
                 ),
             )
+            return
+        if self._over:
+            self._refuse(query, ShuttingDown("the daemon is stopping"))
             return
         self._pending += 1
         task = self._group.create_task(self._answer(query, self._command), name=f"command {query.key}")
@@ -190,6 +197,9 @@ class Requests:
 
     def on_stop(self, query: Query) -> None:
         """Take a query on `@stop` or `@stop/<axis>`."""
+        if self._over:
+            self._refuse(query, ShuttingDown("the daemon has ended: its lines are closed, no stop goes out"))
+            return
         self._group.create_task(self._answer(query, self._stop), name=f"stop {query.key}")
 
     def _done(self, _task: "asyncio.Task[None]") -> None:

@@ -8,7 +8,9 @@ import pytest
 import zenoh
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.net.hand_over import PENDING_QUERIES, Query
+from ldcnd.contract.codec import decode_error
+from ldcnd.daemon.dispatch import Requests
+from ldcnd.net.hand_over import PENDING_QUERIES, Answer, Query
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
 from tests.support.rig import running_rig
@@ -66,3 +68,17 @@ async def test_200_unanswered_stops_are_all_held_and_each_is_answered_once():
     assert [[reply.ok and reply.ok.payload.to_bytes() for reply in each] for each in replies] == [
         [b"stopped"]
     ] * CLIENTS
+
+
+@pytest.mark.parametrize("what", ["on_stop", "on_command"])
+async def test_what_comes_when_the_lines_are_closed_is_refused_in_words(what):
+    answers: list[Answer] = []
+    async with running_rig() as rig:
+        async with asyncio.TaskGroup() as group:
+            requests = Requests(rig.daemon.rig, rig.client.keys, group, rig.daemon._dispatcher)
+        requests.finish()
+        key = rig.client.keys.stop("x") if what == "on_stop" else rig.client.keys.command("x", "halt")
+        getattr(requests, what)(Query(key, {}, b"{}", "application/json", answers.extend))
+
+    (answer,) = answers
+    assert decode_error(answer.payload, answer.encoding).code == "shutting_down"
