@@ -28,6 +28,24 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """Let soak tests begin at another seed: `pytest -m soak tests/property --from 5000 --count 1000 -n 2`."""
+    parser.addoption("--from", type=int, default=1000, help="first seed of the soak tests that take `seeds`")
+    parser.addoption("--count", type=int, default=1000, help="how many seeds")
+
+
+SEEDS_OF_A_TEST = 250
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Cut the seeds of soak tests into pieces that processes share."""
+    if "seeds" in metafunc.fixturenames and metafunc.definition.get_closest_marker("soak"):
+        first = metafunc.config.getoption("--from")
+        end = first + metafunc.config.getoption("--count")
+        pieces = [range(at, min(at + SEEDS_OF_A_TEST, end)) for at in range(first, end, SEEDS_OF_A_TEST)]
+        metafunc.parametrize("seeds", pieces, ids=str)
+
+
 OF_A_MODULE = re.compile(r"^pytestmark = (?:\[\s*)?pytest\.mark\.(\w+)", re.MULTILINE)
 OF_A_FOLDER = {"browser": "system", "edges": "edges", "guest": "guest"}
 

@@ -80,6 +80,8 @@ class Witness:
     def _moves(self, packet: Packet, name: str) -> tuple[bool, bool]:
         """Tell whether a packet begins a motion of an axis, and whether it closes an open loop or prolongs a path."""
         drive = self.drive(name)
+        if packet.address not in (drive.address, drive.group):
+            return False, False  # it has lost power, and does not hear this
         command = received_command(drive.dialect, packet)
         match command:
             case LoadTrajectory(trajectory):
