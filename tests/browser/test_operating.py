@@ -176,6 +176,8 @@ async def test_the_velocity_never_contradicts_the_state(house):
         await house.sim.until("x", lambda state: state.moving == "yes")
         await house.sim.until("x", lambda state: state.moving == "no")
         await expect(desk.page.locator(".now-state .state")).to_have_text("standstill")
+        velocity = desk.page.locator(".facts div").filter(has_text="velocity").first.locator("dd")
+        await expect(velocity).to_contain_text("0.000")  # it takes two positions
         seen = await desk.page.evaluate("window.seen")
 
     values = [(state, abs(float(text.replace("\u2212", "-")))) for state, text in seen if text != "\u2013"]
