@@ -200,6 +200,33 @@ def test_no_module_ever_has_the_address_of_another_place_and_the_chain_comes_bac
     assert flaws_of(range(50)) == []
 
 
+@pytest.mark.promise("address-only-of-its-place")
+def test_modules_behind_one_without_power_get_no_address_while_the_line_is_brought_up() -> None:
+    history = History(0)
+    history.models = ("ls-182ap", "ls-182ap", "pic-servo-v4")
+    history.chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in history.models)))
+
+    async def bring_up() -> None:
+        watching = asyncio.create_task(history.watch(), name="watch")
+        config, first = config_of(history.models, 57_600), history.chain.modules[0]
+        async with rig_on(history.chain, config):
+            pass
+        first.power(on=False, at_s=asyncio.get_running_loop().time())
+        # the second one is deaf now, with its address: the third is the first that answers after a reset
+        async with rig_on(history.chain, config, up=False) as rig:
+            await asyncio.sleep(10.0)
+            assert "1 module(s) found" in rig.line.problem
+            first.power(on=True, at_s=asyncio.get_running_loop().time())
+            await asyncio.wait_for(rig.daemon.wait_up(), 60)
+        watching.cancel()
+        await asyncio.wait([watching])
+
+    with asyncio.Runner(loop_factory=JumpingLoop) as runner:
+        runner.run(bring_up())
+    assert history.flaws == []
+    assert [module.address for module in history.chain.modules] == [1, 2, 3]
+
+
 @pytest.mark.soak
 @pytest.mark.parametrize("first", range(0, 20_000, 500))
 def test_the_same_in_histories_without_end(first: int) -> None:

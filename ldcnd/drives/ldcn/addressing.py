@@ -372,7 +372,9 @@ class Addressing:
         for _ in range(2):
             await self._bus.execute(reset)
 
-    async def address_all(self, expected: int) -> dict[int, Identity]:
+    async def address_all(
+        self, expected: int, check: Callable[[Mapping[int, Identity]], object] | None = None
+    ) -> dict[int, Identity]:
         """Give the modules addresses 1, 2, ... in the order of the chain, after a reset; return who is where.
 
         Each first gets a waiting address. Only when all of these answer after the last of them was given out, each is
@@ -380,6 +382,8 @@ class Addressing:
 
         Args:
             expected: number of configured modules; they are waited for as long as they may take to restart.
+            check: raises if these are not the modules of the chain. They keep their waiting addresses then: behind one
+                without power the next one is the first that answers, and would get the address of another place.
         """
         self.had_address.clear()
         count, until_s = 0, asyncio.get_running_loop().time() + self.rate.reset_s
@@ -391,8 +395,10 @@ class Addressing:
         for number in range(1, count + 1):
             identity = await self.rate.who_is(waiting_address(number), patient=True)
             if identity is None:
-                return modules
+                break
             modules[number] = identity
+        if check:
+            check(modules)
         for number in modules:
             if not await self.move(waiting_address(number), number):
                 return {address: modules[address] for address in range(1, number)}
