@@ -19,7 +19,7 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 RECORDS = ROOT / "build" / "mutants"
-PARTS = ("bus", "daemon", "drivers", "messaging")
+PARTS = ("axis", "client", "contract", "daemon", "drives", "line", "net")
 """Where mutants are made; the rest is not recorded, which saves time."""
 IMPORTED = ""
 """The context of lines that run when a module is imported."""

@@ -200,6 +200,11 @@ def test_no_module_ever_has_the_address_of_another_place_and_the_chain_comes_bac
     assert flaws_of(range(50)) == []
 
 
+@pytest.mark.parametrize("seed", [262, 1398, 1443, 1627])
+def test_a_module_that_is_deaf_while_others_are_reset_is_found_at_its_waiting_address(seed: int) -> None:
+    assert play(seed) == ""
+
+
 @pytest.mark.promise("address-only-of-its-place")
 def test_modules_behind_one_without_power_get_no_address_while_the_line_is_brought_up() -> None:
     history = History(0)

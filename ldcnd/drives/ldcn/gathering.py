@@ -217,15 +217,19 @@ class Gathering:
         """Return a waiting address that no module has had since all had their own."""
         if self._taken == len(self._pool):
             await self._release()
+            self._taken, self._waiting = 0, []
         self._taken += 1
         return self._pool[self._taken - 1]
 
     async def _release(self) -> None:
-        """Reset all modules at waiting addresses: they have restarted, and nothing has been commanded since."""
+        """Reset all modules at waiting addresses: they have restarted, and nothing has been commanded since.
+
+        One that is deaf, behind one that restarts, keeps its waiting address: it is looked for there later.
+        """
         reset = commands.hard_reset(commands.Group(WAITING_GROUP))
         for baud in dict.fromkeys((self._bus.baud, self._rate.at_reset)):
             await self._at(baud, reset)
-        self._taken, self._waiting = 0, []
+        self._empty.update(self._waiting)
 
     # -- observations ------------------------------------------------------------------------------------------------
 
