@@ -3,11 +3,10 @@
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.axis.procedures.home import plan_search
-from ldcnd.contract.commands import Home, HomeMethod
+from ldcnd.axis.procedures.home import plan_search, runs_onto_switch
+from ldcnd.contract.commands import Home, HomeMethod, HomeStop
 from ldcnd.contract.errors import MalformedRequest, NotSupported
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import StopMode
 
 PRESET = {
     "method": "reverse_limit",
@@ -56,8 +55,8 @@ def test_what_a_request_leaves_out_comes_from_the_configuration():
     search = planned(Home(), home=PRESET)
 
     assert (search.method, search.velocity, search.position) == (HomeMethod.REVERSE_LIMIT, -5.0, 3.0)
-    assert (search.distance, search.stop, search.move_to, search.timeout_s) == (40.0, StopMode.ABRUPT, 1.0, 60.0)
-    assert search.active_high
+    assert (search.distance, search.stop, search.move_to, search.timeout_s) == (40.0, HomeStop.ABRUPT, 1.0, 60.0)
+    assert search.switch_active == "high"
 
 
 def test_what_a_request_says_goes_before_the_configuration():
@@ -66,7 +65,7 @@ def test_what_a_request_says_goes_before_the_configuration():
     search = planned(request, home=PRESET)
 
     assert (search.method, search.velocity, search.position) == (HomeMethod.INDEX, 1.0, 0.0)
-    assert (search.distance, search.stop, search.move_to, search.timeout_s) == (2.0, StopMode.SMOOTH, 0.0, 5.0)
+    assert (search.distance, search.stop, search.move_to, search.timeout_s) == (2.0, HomeStop.SMOOTH, 0.0, 5.0)
 
 
 @pytest.mark.parametrize(("request_", "missing"), [(Home(velocity=1.0), "method"), (Home(method="index"), "velocity")])
@@ -96,7 +95,7 @@ def test_limit_switches_are_those_of_the_drive_whatever_the_axis_calls_forward(m
     drive.home_methods = frozenset(HomeMethod)
     search = plan_search(axis(), drive, Home(method=method, velocity=velocity))
 
-    assert search.runs_onto_switch(-1000 if reverse else 1000) is onto
+    assert runs_onto_switch(search, -1000 if reverse else 1000) is onto
 
 
 def test_a_tracking_step_that_would_trip_the_drive_is_no_configuration():

@@ -4,7 +4,7 @@ Every leg is a trapezoid with an end in the drive, so that a search ends even if
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum
 
 from typing_extensions import override
@@ -24,7 +24,6 @@ from ldcnd.log import get_logger
 
 log = get_logger("axis")
 
-DEFAULT_TIMEOUT_S = 60.0
 STOPS = {HomeStop.SMOOTH: StopMode.SMOOTH, HomeStop.ABRUPT: StopMode.ABRUPT, HomeStop.OFF: StopMode.OFF}
 REBOUND_S = 1.0
 """Longest time for which a shaft may still turn after it has run onto its stop, seconds."""
@@ -32,44 +31,14 @@ BEYOND = 1.1
 """Length of a search without a distance, as a multiple of its time-out: the drive ends it if this host does not."""
 
 
-@dataclass(frozen=True, slots=True)
-class HomeSearch:
-    """One search.
-
-    Attributes:
-        method: what marks the reference position.
-        velocity: units a second, signed.
-        find_velocity: units a second, positive, for finding a limit switch beforehand; None without.
-        index_width: counts for which the index pulse lasts.
-        acceleration: units a second squared; None for the axis default.
-        position: what the position is called there, in axis units.
-        timeout_s: when to give up.
-        distance: how far it may go, in axis units; None for as far as the velocity goes in that time.
-        stop: how the motor stops there.
-        move_to: where to go afterwards, in axis units; None stays.
-        active_high: level of a limit switch input while the switch is actuated.
-    """
-
-    method: HomeMethod
-    velocity: float
-    find_velocity: float | None
-    index_width: int
-    acceleration: float | None
-    position: float
-    timeout_s: float
-    distance: float | None
-    stop: StopMode
-    move_to: float | None
-    active_high: bool
-
-    def runs_onto_switch(self, counts_per_unit: float) -> bool:
-        """Tell whether the search moves towards the limit switch that it looks for."""
-        forward = self.velocity * counts_per_unit > 0
-        return self.method is (HomeMethod.FORWARD_LIMIT if forward else HomeMethod.REVERSE_LIMIT)
+def runs_onto_switch(search: HomeConfig, counts_per_unit: float) -> bool:
+    """Tell whether a search moves towards the limit switch that it looks for."""
+    forward = search.velocity * counts_per_unit > 0
+    return search.method is (HomeMethod.FORWARD_LIMIT if forward else HomeMethod.REVERSE_LIMIT)
 
 
-def plan_search(config: AxisConfig, driver: QuietDrive, request: Home) -> HomeSearch:
-    """Complete a request from the axis's configuration.
+def plan_search(config: AxisConfig, driver: QuietDrive, request: Home) -> HomeConfig:
+    """Return the configuration of the axis with what a request says in its place.
 
     Raises:
         MalformedRequest: neither says how to search, or it contradicts itself.
@@ -92,28 +61,17 @@ def plan_search(config: AxisConfig, driver: QuietDrive, request: Home) -> HomeSe
             axis=config.name,
             value=method.value,
         )
-    defaults = preset or HomeConfig(method=method, velocity=velocity, timeout_s=DEFAULT_TIMEOUT_S)
-    stop = request.stop or defaults.stop
-    move_to = request.move_to if request.move_to is not None else defaults.move_to
-    if stop is HomeStop.OFF and move_to is not None:
+    asked = {name: value for name in HomeConfig.model_fields if (value := getattr(request, name, None)) is not None}
+    if preset and preset.method is not method:
+        asked.setdefault("find_velocity", None)  # what was configured is for finding another signal
+    search = (preset or HomeConfig(method=method, velocity=velocity)).model_copy(update=asked)
+    if search.stop is HomeStop.OFF and search.move_to is not None:
         raise MalformedRequest(
-            f"axis {config.name}: home cannot both open the loop and move to {move_to:g} afterwards",
+            f"axis {config.name}: home cannot both open the loop and move to {search.move_to:g} afterwards",
             axis=config.name,
             remedy="leave out move_to, or stop otherwise",
         )
-    return HomeSearch(
-        method=method,
-        velocity=velocity,
-        find_velocity=request.find_velocity or (preset.find_velocity if preset and preset.method is method else None),
-        index_width=defaults.index_width,
-        acceleration=request.acceleration,
-        position=request.position if request.position is not None else defaults.position,
-        timeout_s=request.timeout_s or defaults.timeout_s,
-        distance=request.distance or defaults.distance,
-        stop=STOPS[stop],
-        move_to=move_to,
-        active_high=defaults.switch_active == "high",
-    )
+    return search
 
 
 class Leg(Enum):
@@ -138,6 +96,7 @@ class HomeSequence(Procedure):
         self.permit = permit
         self._motion = motion
         self._search = plan_search(motion.config, motion.driver, request)
+        self._acceleration = request.acceleration
         self._leg = Leg.SEARCH
 
     @override
@@ -145,15 +104,15 @@ class HomeSequence(Procedure):
         motion, tracker = self._motion, self._motion.tracker
         guards.check_may_move(tracker)
         search = self._search
-        plan = motion.plan_at(search.velocity, search.acceleration)
+        plan = motion.plan_at(search.velocity, self._acceleration)
         if search.method is HomeMethod.INDEX:
             check_index_is_seen(motion, plan, search.index_width)
         if search.move_to is not None:
             guards.check_position(tracker, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
-        off_switch = search.runs_onto_switch(motion.counts_per_unit) and self._on_switch(await motion.read())
+        off_switch = runs_onto_switch(search, motion.counts_per_unit) and self._on_switch(await motion.read())
         await motion.reference.forget()  # before the drive captures: the kept reference has another origin
-        finds = search.find_velocity is not None and search.runs_onto_switch(motion.counts_per_unit)
+        finds = search.find_velocity is not None and runs_onto_switch(search, motion.counts_per_unit)
         await self._set_out(Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
         return motion.reply(
             self.permit, position=search.position, velocity=plan.velocity, acceleration=plan.acceleration
@@ -199,8 +158,8 @@ class HomeSequence(Procedure):
         velocity = -search.velocity if away else search.velocity
         if leg is Leg.FIND and search.find_velocity is not None:
             velocity = math.copysign(search.find_velocity, search.velocity)
-        plan = motion.plan_at(velocity, search.acceleration)
-        capture = HomeCapture(search.method, search.stop if leg is Leg.SEARCH else StopMode.SMOOTH)
+        plan = motion.plan_at(velocity, self._acceleration)
+        capture = HomeCapture(search.method, STOPS[search.stop] if leg is Leg.SEARCH else StopMode.SMOOTH)
         leg_motion = replace(
             plan.motion,
             target_counts=self._end_of_leg(plan),
@@ -209,7 +168,7 @@ class HomeSequence(Procedure):
         await self.permit.load(leg_motion, home=capture)
         self._leg = leg
         motion.tracker.referenced = False
-        opens_loop = search.stop is StopMode.OFF or search.method is HomeMethod.POSITION_ERROR
+        opens_loop = search.stop is HomeStop.OFF or search.method is HomeMethod.POSITION_ERROR
         self.deadline_s = motion.clock.now_s() + search.timeout_s
         await motion.start(
             self.permit, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH
@@ -245,11 +204,11 @@ class HomeSequence(Procedure):
         if search.method is HomeMethod.POSITION_ERROR:
             await driver.reset()  # the drive has tripped, as it was meant to
         else:
-            await driver.stop(search.stop)
+            await driver.stop(STOPS[search.stop])
         captured = await homing(driver).captured_home()
         await driver.clear_warnings()  # homing on the current sets one
         self.permit.still_wanted()
-        closed = search.stop is not StopMode.OFF
+        closed = search.stop is not HomeStop.OFF
         if search.method is HomeMethod.POSITION_ERROR and closed:
             await motion.check_does_not_coast(REBOUND_S)
             await self.permit.power_on()
@@ -278,4 +237,4 @@ class HomeSequence(Procedure):
 
     def _on_switch(self, reading: AxisReading) -> bool:
         level = reading.reverse_limit if self._search.method is HomeMethod.REVERSE_LIMIT else reading.forward_limit
-        return level is not None and level is self._search.active_high
+        return level is not None and level is (self._search.switch_active == "high")
