@@ -1,7 +1,7 @@
 """The rig's description of itself and its last values: answers to `get` on `meta/**` and `tele/**`."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Literal
 
@@ -14,7 +14,7 @@ from ldcnd.contract.errors import ErrorCode, MalformedRequest
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.contract.health import BusHealth, DaemonHealth
 from ldcnd.contract.keys import RIG_ITSELF, Keys, matches
-from ldcnd.contract.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo, ModuleInfo, RegisterInfo
+from ldcnd.contract.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.samples import Sample, TelemetryItem
 from ldcnd.daemon.contract import shipped_schemas
@@ -182,7 +182,7 @@ def bus_info(bus: BusService) -> BusInfo:
         problem=bus.problem,
         remarks=bus.report.remarks if bus.report else (),
         started_by=None if bus.report is None else "reset" if bus.report.reset else "adoption",
-        modules=tuple(ModuleInfo(**asdict(module)) for module in bus.network.modules),
+        modules=bus.network.modules,
         exchanges=statistics.exchanges,
         replies=statistics.replies,
         timeouts=statistics.timeouts,
@@ -225,10 +225,7 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         monitors=tuple(name.value for name in driver.monitors),
         trace_channels=axis.traces.channels,
         priority=config.priority,
-        registers=tuple(
-            RegisterInfo(name=register.name, value=register.value, provenance=register.provenance, why=register.why)
-            for register in driver.registers()
-        ),
+        registers=driver.registers(),
         past_faults=axis.reference.faults,
     )
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from ldcnd.contract.commands import HomeMethod, PinMode, Verb
 from ldcnd.contract.errors import BusError, NotSupported
-from ldcnd.contract.meta import Provenance
+from ldcnd.contract.meta import RegisterInfo
 from ldcnd.contract.samples import MonitorName, TelemetryItem
 from ldcnd.drives.parameter_access import MonitorValue, ParameterAccess
 from ldcnd.drives.tracer import Tracer
@@ -178,23 +178,6 @@ class HomeCapture:
 
 
 @dataclass(frozen=True, slots=True)
-class Register:
-    """What is published of a register that cannot be read back.
-
-    Attributes:
-        name: of the register.
-        value: what it holds; None when that is unknown.
-        provenance: how that is known.
-        why: the evidence, or the reason why there is none.
-    """
-
-    name: str
-    value: int | None
-    provenance: Provenance
-    why: str = ""
-
-
-@dataclass(frozen=True, slots=True)
 class Gains:
     """Registers of the position loop, as in the manuals of the drives (Set Gain).
 
@@ -334,7 +317,7 @@ class Drive(ABC):
     tracer: Tracer | None = None
     parameters: ParameterAccess | None = None
 
-    def registers(self) -> tuple[Register, ...]:
+    def registers(self) -> tuple[RegisterInfo, ...]:
         """Return what is known of registers that cannot be read back."""
         return ()
 

@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ldcnd.contract.errors import NotSupported
+from ldcnd.contract.meta import ModuleInfo
 from ldcnd.drives.driver import Drive, Motion, StopMode
 from ldcnd.line.exchange import Timing
 from ldcnd.line.poller import Poller
@@ -92,31 +93,6 @@ class LineSpec:
     proves_places: bool = False
     modules: tuple[ModuleEntry, ...] = ()
     groups: tuple[GroupSpec, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class FoundModule:
-    """Something that answers on the line, axis or not.
-
-    Attributes:
-        address: node address.
-        title: what it is, for people.
-        model: profile name; None for an unsupported device: then it is never moved.
-        device_id: as it reports.
-        version: as it reports.
-        name: under which an I/O module is served.
-        axis: the axis it is; None for a module that is only kept on the line.
-        status: its latest status byte; None for an axis, whose state is telemetry.
-    """
-
-    address: int
-    title: str
-    model: str | None
-    device_id: int
-    version: int
-    axis: str | None
-    status: int | None
-    name: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -244,7 +220,7 @@ class Network(ABC):
     io: Mapping[str, IoDriver] = MappingProxyType({})
 
     @property
-    def modules(self) -> tuple[FoundModule, ...]:
+    def modules(self) -> tuple[ModuleInfo, ...]:
         """The modules found on the line, by address; empty while they are not known."""
         return ()
 

@@ -12,6 +12,7 @@ from typing import Any
 from typing_extensions import override
 
 from ldcnd.contract.errors import BusError, NetworkMismatch
+from ldcnd.contract.meta import ModuleInfo
 from ldcnd.drives.driver import AxisSpec, Drive, Motion, StopMode
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import (
@@ -40,7 +41,6 @@ from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.drives.network import (
     AdoptFallback,
     BringUpReport,
-    FoundModule,
     Instant,
     IoDriver,
     LineSpec,
@@ -413,7 +413,7 @@ class LdcnNetwork(Network):
 
     @property
     @override
-    def modules(self) -> tuple[FoundModule, ...]:
+    def modules(self) -> tuple[ModuleInfo, ...]:
         return tuple(self._module(address, identity) for address, identity in sorted(self._identities.items()))
 
     @property
@@ -495,10 +495,10 @@ class LdcnNetwork(Network):
     async def snapshot(self, still_free: Callable[[], None]) -> Instant:
         return await self._groups.snapshot(still_free)
 
-    def _module(self, address: int, identity: Identity) -> FoundModule:
+    def _module(self, address: int, identity: Identity) -> ModuleInfo:
         profile = next((each.profile for each in self._expected if each.address == address), identity.profile)
         watch = self._watches.get(address)
-        return FoundModule(
+        return ModuleInfo(
             address=address,
             title=str(identity),
             model=profile.name if profile else None,

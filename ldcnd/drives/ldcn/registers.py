@@ -16,8 +16,8 @@ from types import MappingProxyType
 from typing_extensions import override
 
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
-from ldcnd.contract.meta import Provenance
-from ldcnd.drives.driver import Gains, Register
+from ldcnd.contract.meta import Provenance, RegisterInfo
+from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import LimitPins
 from ldcnd.drives.ldcn.packet import Field
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile
@@ -265,7 +265,7 @@ class RegisterBook:
                 return Unknown(REPLY_LOST, tuple(dict.fromkeys((*among, int(value)))))
         return Unknown(REPLY_LOST)
 
-    def published(self) -> tuple[Register, ...]:
+    def published(self) -> tuple[RegisterInfo, ...]:
         """Return every register that the module has, in the order of the manual."""
         return tuple(_published(name, holding) for name, holding in self._holdings.items())
 
@@ -274,15 +274,15 @@ class RegisterBook:
             self._holdings[name] = holdings[name]
 
 
-def _published(name: str, holding: Holding) -> Register:
+def _published(name: str, holding: Holding) -> RegisterInfo:
     match holding:
         case Known(value, _, evidence):
-            return Register(name, value, evidence, _EVIDENCE[evidence])
+            return RegisterInfo(name=name, value=value, provenance=evidence, why=_EVIDENCE[evidence])
         case Assumed(value, why):
-            return Register(name, value, Provenance.ASSUMED, why)
+            return RegisterInfo(name=name, value=value, provenance=Provenance.ASSUMED, why=why)
         case Unknown(why, among):
             either = f": it is {' or '.join(map(str, among))}" if among else ""
-            return Register(name, None, Provenance.UNKNOWN, why + either)
+            return RegisterInfo(name=name, value=None, provenance=Provenance.UNKNOWN, why=why + either)
 
 
 TRAJECTORY_NAMES = ("position", "velocity", "acceleration", "pwm_or_target")

@@ -33,6 +33,7 @@ from ldcnd.contract.errors import (
     WrongState,
     step,
 )
+from ldcnd.contract.meta import RegisterInfo
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.driver import (
     LARGEST_COUNT,
@@ -48,7 +49,6 @@ from ldcnd.drives.driver import (
     Moves,
     PathStatus,
     PwmOutput,
-    Register,
     StopMode,
 )
 from ldcnd.drives.ldcn import commands
@@ -250,7 +250,7 @@ class LdcnAxis(Moves):
         return self._book.loaded
 
     @override
-    def registers(self) -> tuple[Register, ...]:
+    def registers(self) -> tuple[RegisterInfo, ...]:
         return self._book.published()
 
     # -- reading -----------------------------------------------------------------------------------------------------
