@@ -7,7 +7,7 @@ from pydantic import AfterValidator, Field, SerializeAsAny, ValidationInfo, fiel
 from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.toml import Name, refuse_duplicates
-from ldcnd.line.line_discipline import LONGEST_RTS_DELAY_MS, Rs485
+from ldcnd.line.line_discipline import Rs485Config
 
 SIMULATED = "sim:"
 """A port of this kind names a simulated line instead of a device."""
@@ -38,21 +38,6 @@ class RecorderConfig(Frozen):
     """How far back it reaches."""
     memory_mb: int = Field(default=16, ge=1, le=4096)
     """The oldest packets go sooner when all take more; 16 MB are about 200000 exchanges."""
-
-
-class Rs485Config(Frozen):
-    """Direction control of an RS-485 transmitter by the kernel, which switches RTS around each packet."""
-
-    rts_on_send: bool = True
-    """RTS is on while sending and off otherwise; false for ports that are wired the other way round."""
-    before_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
-    """Time from switching the transmitter on to the first bit, in ms."""
-    after_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
-    """Time from the last bit to switching the transmitter off, in ms."""
-    receive_own: bool = False
-    """The receiver stays on while sending: on two wires the host then receives its own bytes, see `echo`."""
-    terminate: bool = False
-    """Switch on the terminating resistor of a port that has one."""
 
 
 class BusConfig(Frozen):
@@ -106,11 +91,6 @@ refuse, and skip where the drives' speed only shows on site."""
     def module_names(self) -> tuple[str, ...]:
         """Names of modules that are no axes."""
         return ()
-
-    @property
-    def transmitter(self) -> Rs485 | None:
-        """Return how the kernel switches the transmitter, if it does."""
-        return Rs485(**self.rs485.model_dump()) if self.rs485 else None
 
     @property
     def takes_over(self) -> bool:

@@ -10,7 +10,10 @@ import fcntl
 import struct
 import termios
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from pydantic import Field
+
+from ldcnd.contract.frozen import Frozen
 
 TCGETS2 = 0x802C542A
 """Reads `struct termios2`, whose speeds also hold rates without a constant of their own."""
@@ -56,23 +59,19 @@ def nearest(asked: int, available: Sequence[int]) -> str:
     return " and ".join(str(baud) for baud in (*below[-1:], *above[:1])) or "none"
 
 
-@dataclass(frozen=True, slots=True)
-class Rs485:
-    """Direction control of an RS-485 transmitter by the kernel, which switches RTS around each packet.
-
-    Attributes:
-        rts_on_send: RTS is on while sending, and off otherwise; False for the inverse.
-        before_ms: from switching the transmitter on to the first bit.
-        after_ms: from the last bit to switching the transmitter off.
-        receive_own: the receiver stays on while sending, so that the host receives its own bytes.
-        terminate: switch the port's own terminating resistor on.
-    """
+class Rs485Config(Frozen):
+    """Direction control of an RS-485 transmitter by the kernel, which switches RTS around each packet."""
 
     rts_on_send: bool = True
-    before_ms: int = 0
-    after_ms: int = 0
+    """RTS is on while sending and off otherwise; false for ports that are wired the other way round."""
+    before_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
+    """Time from switching the transmitter on to the first bit, in ms."""
+    after_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
+    """Time from the last bit to switching the transmitter off, in ms."""
     receive_own: bool = False
+    """The receiver stays on while sending: on two wires the host then receives its own bytes, see `echo`."""
     terminate: bool = False
+    """Switch on the terminating resistor of a port that has one."""
 
     @property
     def flags(self) -> int:
@@ -82,7 +81,7 @@ class Rs485:
         return flags | (TERMINATE_BUS if self.terminate else 0)
 
 
-def switch_direction(descriptor: int, wanted: Rs485) -> str:
+def switch_direction(descriptor: int, wanted: Rs485Config) -> str:
     """Have the kernel switch the transmitter; return why it will not as wanted, empty when it does.
 
     A driver may take less than was requested without an error, so what it took is read back.
@@ -98,7 +97,7 @@ def switch_direction(descriptor: int, wanted: Rs485) -> str:
     return _difference(wanted, flags, before_ms, after_ms)
 
 
-def _difference(wanted: Rs485, flags: int, before_ms: int, after_ms: int) -> str:
+def _difference(wanted: Rs485Config, flags: int, before_ms: int, after_ms: int) -> str:
     if not flags & ENABLED:
         return "its driver cannot switch the transmitter of an RS-485 line"
     if (flags ^ wanted.flags) & (RTS_ON_SEND | RTS_AFTER_SEND):

@@ -3,7 +3,7 @@
 from urllib.parse import urlsplit
 
 from ldcnd.contract.errors import ConfigError
-from ldcnd.line.line_discipline import Rs485
+from ldcnd.line.line_discipline import Rs485Config
 from ldcnd.line.serial_port import Framing, SerialSettings, open_serial_port
 from ldcnd.line.tcp_port import open_tcp_port
 from ldcnd.line.transport import Opener
@@ -12,7 +12,7 @@ SOCKET = "socket://"
 
 
 def port_opener(
-    port: str, baud: int, framing: Framing = "8n1", *, working_baud: int | None = None, rs485: Rs485 | None = None
+    port: str, baud: int, framing: Framing = "8n1", *, working_baud: int | None = None, rs485: Rs485Config | None = None
 ) -> Opener:
     """Return what opens the port; nothing is opened yet.
 

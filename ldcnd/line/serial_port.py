@@ -6,8 +6,8 @@ is far smaller than the driver's buffer, so one that does not fit whole means th
 0.6 needs three system calls for each read and keeps every write for the next turn of the loop; the measurement is in
 docs/explanation/timing.md. Draining and opening may block and happen in a worker.
 
-The direction of an RS-485 transmitter is the adapter's business, or the kernel's (`Rs485`); pyserial's `rs485_mode` is
-not used: after a driver has refused it, every later change of the rate fails too.
+The direction of an RS-485 transmitter is the adapter's business, or the kernel's (`Rs485Config`); pyserial's
+`rs485_mode` is not used: after a driver has refused it, every later change of the rate fails too.
 """
 
 import asyncio
@@ -29,7 +29,7 @@ from ldcnd.line.incoming import Incoming
 from ldcnd.line.line_discipline import (
     STANDARD_BAUDS,
     PortFault,
-    Rs485,
+    Rs485Config,
     actual_baud,
     makes,
     nearest,
@@ -78,7 +78,7 @@ class SerialSettings:
     low_latency: bool = True
     exclusive: bool = True
     working_baud: int | None = None
-    rs485: Rs485 | None = None
+    rs485: Rs485Config | None = None
 
 
 class _Refused(Exception):

@@ -25,7 +25,7 @@ from ldcnd.line.line_discipline import (
     RTS_ON_SEND,
     RX_DURING_TX,
     TERMINATE_BUS,
-    Rs485,
+    Rs485Config,
     actual_baud,
     makes,
 )
@@ -165,7 +165,7 @@ async def test_drives_are_not_looked_for_at_rates_that_the_port_does_not_make(te
 async def test_kernel_switches_the_transmitter_as_configured(terminal, monkeypatch):
     driver = rs485_port(monkeypatch, ENABLED | RTS_ON_SEND | RTS_AFTER_SEND | RX_DURING_TX | TERMINATE_BUS)
 
-    port = await port_opener(terminal, 9600, rs485=Rs485(rts_on_send=False, after_ms=2, terminate=True))()
+    port = await port_opener(terminal, 9600, rs485=Rs485Config(rts_on_send=False, after_ms=2, terminate=True))()
     await port.close()
 
     assert driver.taken[:3] == [ENABLED | RTS_AFTER_SEND | TERMINATE_BUS, 0, 2]
@@ -173,17 +173,17 @@ async def test_kernel_switches_the_transmitter_as_configured(terminal, monkeypat
 
 async def test_driver_without_direction_control_is_refused(terminal):
     with pytest.raises(TransportLost, match="cannot switch the transmitter of an RS-485 line; leave `rs485` out"):
-        await port_opener(terminal, 9600, rs485=Rs485())()
+        await port_opener(terminal, 9600, rs485=Rs485Config())()
 
 
 @pytest.mark.parametrize(
     ("supported", "wanted", "why"),
     [
-        (0, Rs485(), "cannot switch the transmitter"),
-        (ENABLED | RTS_AFTER_SEND, Rs485(), "cannot have RTS on while sending"),
-        (ENABLED | RTS_ON_SEND, Rs485(rts_on_send=False), "cannot have RTS off while sending"),
-        (ENABLED | RTS_ON_SEND, Rs485(receive_own=True), "cannot have the receiver on while sending"),
-        (ENABLED | RTS_ON_SEND, Rs485(terminate=True), "no terminating resistor"),
+        (0, Rs485Config(), "cannot switch the transmitter"),
+        (ENABLED | RTS_AFTER_SEND, Rs485Config(), "cannot have RTS on while sending"),
+        (ENABLED | RTS_ON_SEND, Rs485Config(rts_on_send=False), "cannot have RTS off while sending"),
+        (ENABLED | RTS_ON_SEND, Rs485Config(receive_own=True), "cannot have the receiver on while sending"),
+        (ENABLED | RTS_ON_SEND, Rs485Config(terminate=True), "no terminating resistor"),
     ],
 )
 async def test_what_a_driver_drops_silently_is_refused(terminal, monkeypatch, supported, wanted, why):
@@ -200,7 +200,7 @@ def rig_with(**bus: object) -> RigConfig:
 
 
 def test_direction_control_is_for_ports_of_this_machine():
-    assert rig_with(port="/dev/ttyS1", rs485={}).bus[0].transmitter == Rs485()
+    assert rig_with(port="/dev/ttyS1", rs485={}).bus[0].rs485 == Rs485Config()
     for port in ("socket://there:7", "sim:line0"):
         with pytest.raises(ValueError, match="rs485: only a serial port of this machine has RTS"):
             rig_with(port=port, rs485={})
@@ -210,7 +210,7 @@ def test_direction_control_of_the_page_is_valid():
     page = (SIMULATED.parents[1] / "docs" / "how-to" / "choose-an-adapter.md").read_text(encoding="utf-8")
     (line,) = tomllib.loads(re.findall(r"(?ms)^```toml\n(.*?)^```$", page)[0])["bus"]
 
-    assert rig_with(**line).bus[0].transmitter == Rs485(after_ms=1)
+    assert rig_with(**line).bus[0].rs485 == Rs485Config(after_ms=1)
 
 
 def test_place_where_nothing_can_be_written_is_refused_before_anything_is_opened(tmp_path: Path, monkeypatch):

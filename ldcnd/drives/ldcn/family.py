@@ -69,7 +69,7 @@ def open_ldcn_line(settings: LdcnBusConfig, opener: Opener | None = None) -> Lin
     baud = settings.baud if settings.port.startswith(SOCKET) else baud_at_reset(settings.clock_hz)
     bus = Bus(
         bus_settings(settings, baud, cycle=servo_cycle(settings), coalesce_s=settings.coalesce_ms / 1000),
-        opener or port_opener(settings.port, baud, working_baud=settings.baud, rs485=settings.transmitter),
+        opener or port_opener(settings.port, baud, working_baud=settings.baud, rs485=settings.rs485),
     )
     return Line(bus, LdcnNetwork(bus, tuple(axis.spec() for axis in settings.axis), settings.baud, settings.spec()))
 

@@ -110,7 +110,7 @@ def open_smartstep_line(
 
 def _port_opener(settings: SmartStepBusConfig, profile: SmartStepProfile) -> Opener:
     framing: SerialFraming = "7e1" if profile.framing is Framing.SEVEN_EVEN else "8n1"
-    return port_opener(settings.port, BAUD, framing, rs485=settings.transmitter)
+    return port_opener(settings.port, BAUD, framing, rs485=settings.rs485)
 
 
 # -- the load of a line: items are read word by word, and the words of all its units take turns -------------
