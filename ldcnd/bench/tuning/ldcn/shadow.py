@@ -12,10 +12,11 @@ An axis that does not move makes no motion to be judged. So an output that shoul
 """
 
 from collections import deque
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from ldcnd.bench.tuning.ldcn.effort import LEAST_COUNTS, Effort, EffortMeter, Seen
 from ldcnd.bench.tuning.ldcn.plant import Plant
@@ -136,21 +137,19 @@ class Alarm:
     places: tuple[int, ...] = ()
 
 
-@dataclass(slots=True)
-class Memory:
-    """What has been learnt of an axis, for as long as its plant and its gains are the same.
+class Memory(BaseModel):
+    """What has been learnt of an axis, for as long as its plant and its gains are the same; it grows."""
 
-    Attributes:
-        teaching: figures of the motions that teach, until there are enough.
-        learnt: what followed from them.
-        speeds: lowest and highest top speed of these motions, counts/s; 0, 0 before the first.
-        ways: shortest and longest way likewise, counts.
-    """
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, validate_assignment=True)
 
-    teaching: dict[FigureName, list[Shown]] = field(default_factory=dict)
-    learnt: dict[FigureName, Learnt] = field(default_factory=dict)
+    teaching: dict[FigureName, list[Shown]] = Field(default_factory=dict)
+    """Figures of the motions that teach, until there are enough."""
+    learnt: dict[FigureName, Learnt] = Field(default_factory=dict)
+    """What followed from them."""
     speeds: tuple[float, float] = (0.0, 0.0)
+    """Lowest and highest top speed of these motions, counts/s; 0, 0 before the first."""
     ways: tuple[float, float] = (0.0, 0.0)
+    """Shortest and longest way likewise, counts."""
 
 
 class Shadow:

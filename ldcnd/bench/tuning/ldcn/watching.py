@@ -12,7 +12,7 @@ from ldcnd import durable
 from ldcnd.bench.tuning.ldcn.effort import FEWEST_SAMPLES, Seen
 from ldcnd.bench.tuning.ldcn.plant import Plant
 from ldcnd.bench.tuning.ldcn.report import TuningReport
-from ldcnd.bench.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Learnt, Memory, Shadow, Shown
+from ldcnd.bench.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Memory, Shadow
 from ldcnd.client.kept_gains import file_of, gains_in
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import ReportShadow
@@ -71,8 +71,8 @@ class ShadowAlarm(Frozen):
     """What may be behind it."""
 
 
-class KeptMemory(Frozen):
-    """What was learnt of an axis, on the disk."""
+class KeptMemory(Memory):
+    """What was learnt of an axis, as it is on the disk."""
 
     rig: str
     """The rig."""
@@ -82,14 +82,6 @@ class KeptMemory(Frozen):
     """The model that it was learnt with."""
     gains: dict[str, int]
     """The gains likewise; with others it means nothing."""
-    speeds: tuple[float, float]
-    """Lowest and highest top speed of the motions that taught, counts/s."""
-    ways: tuple[float, float]
-    """Shortest and longest way of them, counts."""
-    teaching: dict[FigureName, list[Shown]]
-    """Figures of the motions so far, where there are too few."""
-    learnt: dict[FigureName, Learnt]
-    """What is usual."""
 
 
 def memory_file(rig: str, axis: str) -> Path:
@@ -166,6 +158,7 @@ class WatchedAxis:
         self._plant = _plant_of(report)
         self._gains: dict[str, int] = {}
         self._shadow: Shadow | None = None
+        self._memory: KeptMemory | None = None
         self._closed = False
         self._kept_at = 0
         self._taken, self._first_t, self._latest_t = 0, 0, 0
@@ -181,7 +174,7 @@ class WatchedAxis:
         if file_of(self._rig, self.name).exists():
             if self._shadow is not None:
                 self.keep()
-                self._gains, self._shadow = {}, None
+                self._gains, self._shadow, self._memory = {}, None, None
                 self._tell(f"{self.name}: waits until it has its own gains back")
             return
         try:
@@ -197,9 +190,10 @@ class WatchedAxis:
         self._tell(f"{self.name}: {what} with these gains ({memory_file(self._rig, self.name)})")
 
     def _begin(self) -> Shadow:
-        kept, memory = self._kept(), None
-        if kept is not None and kept.gains == self._gains and kept.plant == self._plant:
-            memory = Memory(dict(kept.teaching), dict(kept.learnt), kept.speeds, kept.ways)
+        memory = self._kept()
+        if memory is None or memory.gains != self._gains or memory.plant != self._plant:
+            memory = KeptMemory(rig=self._rig, axis=self.name, plant=self._plant, gains=self._gains)
+        self._memory = memory
         return Shadow(self._profile, self._plant, Gains(**{"cl": 0, **self._gains}), memory)
 
     def _kept(self) -> KeptMemory | None:
@@ -216,21 +210,11 @@ class WatchedAxis:
         Raises:
             ConfigError: it cannot be written.
         """
-        if self._shadow is None:
+        if self._memory is None:
             return
-        memory, path = self._shadow.memory, memory_file(self._rig, self.name)
-        kept = KeptMemory(
-            rig=self._rig,
-            axis=self.name,
-            plant=self._plant,
-            gains=self._gains,
-            speeds=memory.speeds,
-            ways=memory.ways,
-            teaching=memory.teaching,
-            learnt=memory.learnt,
-        )
+        path = memory_file(self._rig, self.name)
         try:
-            durable.replace(path, kept.model_dump_json(indent=1))
+            durable.replace(path, self._memory.model_dump_json(indent=1))
         except OSError as error:
             raise ConfigError(f"{path}: cannot be written: {error.strerror}", remedy="set XDG_STATE_HOME") from error
 
