@@ -14,7 +14,7 @@ from typing import Literal, TypeVar
 
 from ldcnd import durable
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.meta import PastFault
+from ldcnd.contract.samples import PastFault
 from ldcnd.drives.driver import StopMode
 
 FORMAT = 1
@@ -23,13 +23,9 @@ DISK_TIME_S = 2.0
 ResultT = TypeVar("ResultT")
 
 
-class KeptReference(Frozen):
-    """Position 0 on the counter of a drive, and the conditions under which it is valid."""
+class Proof(Frozen):
+    """Properties of an axis that must not have changed, besides the values of its drive."""
 
-    format: int
-    """Format of this file; another one is refused."""
-    written: int
-    """Time of writing, UTC in ns since 1970."""
     address: int
     """Address of the drive on its line."""
     identity: str
@@ -38,6 +34,29 @@ class KeptReference(Frozen):
     """Rate of the line: a drive that was reset is at another one."""
     scale: tuple[float, str, float | None]
     """Counts per unit, negative in reverse; unit; modulo."""
+
+    def differs(self, kept: "KeptReference") -> str:
+        """Return the difference in words; empty without one."""
+        if kept.format != FORMAT:
+            return f"it was kept by another version of the daemon (format {kept.format}, not {FORMAT})"
+        for name, was, now in (
+            ("address", kept.address, self.address),
+            ("identity of the drive", kept.identity, self.identity),
+            ("rate of the line", kept.baud, self.baud),
+            ("scale, unit or modulo", kept.scale, self.scale),
+        ):
+            if was != now:
+                return f"{name} was {was} and is {now}"
+        return ""
+
+
+class KeptReference(Proof):
+    """Position 0 on the counter of a drive, and the conditions under which it is valid."""
+
+    format: int
+    """Format of this file; another one is refused."""
+    written: int
+    """Time of writing, UTC in ns since 1970."""
     origin: float
     """Position 0 on the drive's own counter."""
     mark: int

@@ -11,7 +11,6 @@ from collections.abc import Callable, Mapping
 
 from ldcnd.axis.kept import KeptFiles, KeptLatch
 from ldcnd.axis.state import AxisTracker
-from ldcnd.contract.meta import PastFault
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import StopMode
 from ldcnd.durable import DamagedFile
@@ -109,7 +108,9 @@ def _latch_of(tracker: AxisTracker) -> KeptLatch | None:
     in_error, first = tracker.state is AxisState.ERROR_STOP, tracker.first_fault
     if not (tracker.stop_latched or again or in_error):
         return None
-    fault = PastFault(code=first.code, text=first.text, since=first.since, source=first.source) if first else None
     return KeptLatch(
-        stopped=tracker.stop_latched, again=again, in_error=in_error, first_fault=fault if in_error else None
+        stopped=tracker.stop_latched,
+        again=again,
+        in_error=in_error,
+        first_fault=first.past if first and in_error else None,
     )

@@ -9,15 +9,13 @@ elsewhere, and is refused as well.
 
 import asyncio
 import contextlib
-from dataclasses import dataclass
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.kept import FORMAT, KeptFiles, KeptReference
+from ldcnd.axis.kept import FORMAT, KeptFiles, KeptReference, Proof
 from ldcnd.axis.state import AxisTracker, window_counts
 from ldcnd.axis.telemetry import AxisTelemetry
 from ldcnd.contract.errors import LdcndError, WrongState
-from ldcnd.contract.meta import PastFault
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, PastFault
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive, Evidence, Moves
 from ldcnd.log import get_logger
@@ -40,37 +38,6 @@ END_TIME_S = 1.0
 STOPPING_S = 0.05
 """Longest time between two readings of an axis that comes to rest at the end of the daemon, seconds."""
 log = get_logger("axis")
-
-
-@dataclass(frozen=True, slots=True)
-class Proof:
-    """Properties of an axis that must not have changed, besides the values of its drive.
-
-    Attributes:
-        address: of the drive.
-        identity: of the drive.
-        baud: of its line.
-        scale: counts per unit, negative in reverse; unit; modulo.
-    """
-
-    address: int
-    identity: str
-    baud: int
-    scale: tuple[float, str, float | None]
-
-    def differs(self, kept: KeptReference) -> str:
-        """Return the difference in words; empty without one."""
-        if kept.format != FORMAT:
-            return f"it was kept by another version of the daemon (format {kept.format}, not {FORMAT})"
-        for name, was, now in (
-            ("address", kept.address, self.address),
-            ("identity of the drive", kept.identity, self.identity),
-            ("rate of the line", kept.baud, self.baud),
-            ("scale, unit or modulo", kept.scale, self.scale),
-        ):
-            if was != now:
-                return f"{name} was {was} and is {now}"
-        return ""
 
 
 def contradiction(kept: KeptReference, shown: Evidence, near_counts: float) -> str:
@@ -212,7 +179,7 @@ class ReferenceKeeper:
         """
         if self._files is None or self._drive is None:
             return None, ""
-        self._proof = Proof(self._config.address, identity, baud, _scale_of(self._config))
+        self._proof = Proof(address=self._config.address, identity=identity, baud=baud, scale=_scale_of(self._config))
         self._on_disk = True
         try:
             kept = await self._files.reference(self._config.name)
@@ -329,14 +296,10 @@ class ReferenceKeeper:
         kept = self._kept
         if kept and kept.low == kept.high and abs(kept.low - shown.counter) <= AS_AFTER_RESET:
             low, high = kept.low, kept.high
-        proof = self._proof
         reference = KeptReference(
             format=FORMAT,
             written=self._clock.now_ns(),
-            address=proof.address,
-            identity=proof.identity,
-            baud=proof.baud,
-            scale=proof.scale,
+            **dict(self._proof),
             origin=self._telemetry.origin_counts - (shown.counts - shown.counter),
             mark=shown.mark,
             enabled=shown.enabled,

@@ -9,8 +9,7 @@ from typing import Any
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.fault_pages import page_of
-from ldcnd.contract.meta import PastFault
-from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Quality
+from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, PastFault, Quality
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import AxisReading, Fault, StopMode
 from ldcnd.line.exchange import Timing
@@ -569,7 +568,7 @@ class AxisTracker:
 
     def _entered(self, fault: Fault, now_ns: int) -> FaultEntry:
         entry = _entry(fault, now_ns)
-        self.found(PastFault(code=entry.code, text=entry.text, since=entry.since, source=entry.source))
+        self.found(entry.past)
         return entry
 
     def _fail(self, reason: str, *, settled: bool | None = None) -> None:

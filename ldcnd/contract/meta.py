@@ -8,6 +8,7 @@ from pydantic import Field
 from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.plan import PollPriority
+from ldcnd.contract.samples import PastFault
 
 
 class DaemonInfo(Frozen):
@@ -170,19 +171,6 @@ class AxisLimits(Frozen):
     """Highest speed, in units a second."""
     acceleration: float | None = Field(default=None, gt=0)
     """Highest acceleration, in units a second squared."""
-
-
-class PastFault(Frozen):
-    """A fault that an axis has had."""
-
-    code: str
-    """Stable code of the fault."""
-    text: str
-    """Meaning and remedy."""
-    since: int
-    """Instant at which the daemon first saw the fault, UTC in ns since 1970."""
-    source: str
-    """Who said so: drive or daemon."""
 
 
 class AxisInfo(Frozen):

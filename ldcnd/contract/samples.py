@@ -160,8 +160,8 @@ class IoSample(Sample):
     """Shares of time for which the PWM outputs are on; null while they are not known."""
 
 
-class FaultEntry(Frozen):
-    """One active fault."""
+class PastFault(Frozen):
+    """A fault that an axis has had."""
 
     code: str
     """Stable code of the fault."""
@@ -170,11 +170,23 @@ class FaultEntry(Frozen):
     since: int
     """Instant at which the daemon first saw the fault, UTC in ns since 1970."""
     source: str
+    """Who said so: drive or daemon."""
+
+
+class FaultEntry(PastFault):
+    """One active fault."""
+
+    source: str
     """Who says so: drive or daemon."""
     stops: bool = True
     """The motor is off because of it; false for a warning."""
     page: str | None = None
     """Path of its page below a console or the documentation: what to check, how to clear it."""
+
+    @property
+    def past(self) -> PastFault:
+        """What is kept of it when it is over."""
+        return PastFault.model_validate(self.model_dump(include=set(PastFault.model_fields)))
 
 
 class FaultSample(Sample):
