@@ -46,7 +46,29 @@ class PollPlan(Frozen):
     """How it fares while the line cannot carry all polls; what is promised does not depend on it."""
 
 
-class BusPlan(Frozen):
+class LineLoad(Frozen):
+    """What a line carries, and how soon it stops its drives."""
+
+    load: float
+    """Share of the line that polls take when every drive takes as long as it may."""
+    mean_load: float
+    """The same on average."""
+    commands_per_s: float
+    """Evenly spaced commands a second that fit in without making a poll miss its turn."""
+    stop_wait_s: float
+    """Longest time from a stop's arrival to its first bit, while no reply is lost."""
+    stop_s: float
+    """Time from a stop's arrival to the end of the drive's reply."""
+    stop_after_loss_s: float
+    """Time from a stop's arrival to the end of the drive's reply when the exchange before it is lost."""
+
+    @property
+    def stops(self) -> bool:
+        """Whether the line can stop its drives: a stop has an exchange of its own."""
+        return self.stop_s > self.stop_wait_s
+
+
+class BusPlan(LineLoad):
     """One line."""
 
     bus: str
@@ -61,18 +83,6 @@ class BusPlan(Frozen):
     """Assumed of the host, between a reply and the next request."""
     adapter_latency_s: float
     """Assumed of the adapter, for each reply."""
-    load: float
-    """Share of the line that polls take when every drive takes as long as it may."""
-    mean_load: float
-    """The same on average."""
-    commands_per_s: float
-    """Evenly spaced commands a second that fit in without making a poll miss its turn."""
-    stop_wait_s: float
-    """Longest time from a stop's arrival to its first bit, while no reply is lost."""
-    stop_s: float
-    """Time from a stop's arrival to the end of the drive's reply."""
-    stop_after_loss_s: float
-    """Time from a stop's arrival to the end of the drive's reply when the exchange before it is lost."""
     stop_probe_hz: float
     """How often the wait of a stop is measured by a stop probe; counted in the load."""
     holds: bool
@@ -83,11 +93,6 @@ class BusPlan(Frozen):
     """The smallest changes that would make it hold; empty when it does."""
     polls: tuple[PollPlan, ...]
     """The polls of the line."""
-
-    @property
-    def stops(self) -> bool:
-        """Whether the line can stop its drives: a stop has an exchange of its own."""
-        return self.stop_s > self.stop_wait_s
 
 
 class RigBudget(Frozen):

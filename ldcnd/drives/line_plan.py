@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
+from ldcnd.contract.plan import LineLoad
 from ldcnd.drives.cost import Cost
 from ldcnd.drives.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
 from ldcnd.drives.simulated_polling import Drive, mean_lengths_s
@@ -82,21 +83,12 @@ class LinePlan:
     Attributes:
         polls: its polls.
         responses_s: for each of them, from being due to being over at the latest, without commands.
-        load: share of the line that polls take at worst, `mean_load` on average.
-        commands_per_s: highest rate of evenly spaced commands at which no poll misses its turn in the worst case.
-        stop_wait_s: from queueing a stop to its first bit at the latest, on a line that is in step.
-        stop_s: to the end of its reply.
-        stop_after_loss_s: to the end of its reply when the exchange on the wire is lost.
+        figures: what the line carries then.
     """
 
     polls: tuple[Poll, ...]
     responses_s: tuple[float, ...]
-    load: float
-    mean_load: float
-    commands_per_s: float
-    stop_wait_s: float
-    stop_s: float
-    stop_after_loss_s: float
+    figures: LineLoad
 
     @property
     def late(self) -> tuple[Poll, ...]:
@@ -131,12 +123,14 @@ def plan_line(
     return LinePlan(
         polls=tuple(polls),
         responses_s=tuple(response_times_s(tasks, urgent=probes) if by_deadline else _in_turns_s(polls, probes)),
-        load=load_of([*tasks, *probes]),
-        mean_load=_mean_load(polls, cycle) + load_of(probes),
-        commands_per_s=_most_commands_per_s(polls, probes, urgent.command_s, by_deadline=by_deadline),
-        stop_wait_s=longest_s,
-        stop_s=stop_s,
-        stop_after_loss_s=max(longest_s, urgent.search_s) + urgent.margin_s + urgent.recovery_s + urgent.stop_s,
+        figures=LineLoad(
+            load=load_of([*tasks, *probes]),
+            mean_load=_mean_load(polls, cycle) + load_of(probes),
+            commands_per_s=_most_commands_per_s(polls, probes, urgent.command_s, by_deadline=by_deadline),
+            stop_wait_s=longest_s,
+            stop_s=stop_s,
+            stop_after_loss_s=max(longest_s, urgent.search_s) + urgent.margin_s + urgent.recovery_s + urgent.stop_s,
+        ),
     )
 
 

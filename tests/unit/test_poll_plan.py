@@ -212,20 +212,20 @@ def test_a_plan_counts_the_room_that_is_left_for_commands():
     plan = plan_line([poll("x", 50.0, 4 * MS), poll("y", 50.0, 4 * MS)], URGENT)
 
     assert plan.holds
-    assert plan.load == pytest.approx(0.4)
-    assert plan.mean_load == pytest.approx(0.2)
-    interval_s = 1 / plan.commands_per_s
+    assert plan.figures.load == pytest.approx(0.4)
+    assert plan.figures.mean_load == pytest.approx(0.2)
+    interval_s = 1 / plan.figures.commands_per_s
     tasks = [each.task for each in plan.polls]
     assert meets_deadlines(tasks, PeriodicTask(interval_s * 1.0001, URGENT.command_s))
-    assert plan.commands_per_s <= (0.98 - plan.load) / URGENT.command_s
+    assert plan.figures.commands_per_s <= (0.98 - plan.figures.load) / URGENT.command_s
 
 
 def test_a_stop_waits_for_the_longest_exchange_and_no_more():
     plan = plan_line([poll("x", 10.0, 7 * MS), poll("y", 10.0, 4 * MS)], URGENT)
 
-    assert plan.stop_wait_s == pytest.approx(7 * MS)
-    assert plan.stop_s == pytest.approx(8 * MS)
-    assert plan.stop_after_loss_s == pytest.approx(16 * MS)
+    assert plan.figures.stop_wait_s == pytest.approx(7 * MS)
+    assert plan.figures.stop_s == pytest.approx(8 * MS)
+    assert plan.figures.stop_after_loss_s == pytest.approx(16 * MS)
 
 
 def test_a_plan_names_the_polls_that_can_come_too_late():
@@ -236,7 +236,7 @@ def test_a_plan_names_the_polls_that_can_come_too_late():
 
 
 def test_a_full_line_has_no_room_for_commands():
-    assert plan_line([poll("x", 500.0, 2 * MS)], URGENT).commands_per_s == 0.0
+    assert plan_line([poll("x", 500.0, 2 * MS)], URGENT).figures.commands_per_s == 0.0
 
 
 @pytest.mark.parametrize(("limit", "expected"), [(3.7, 3.7), (20.0, 10.0), (0.5, None)])
