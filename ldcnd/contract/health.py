@@ -1,7 +1,7 @@
 """How well a rig is doing, once a second: what a monitoring system watches."""
 
 from enum import StrEnum
-from typing import Literal
+from typing import Annotated, Generic, Literal, TypeVar
 
 from pydantic import Field
 
@@ -76,7 +76,31 @@ class AxisHealth(Frozen):
     """How often its drive's EEPROM was written, ever; null for drives without one and where no ledger is kept."""
 
 
-class BusHealth(Frozen):
+CountT = TypeVar("CountT", bound=int)
+
+
+class LineCounters(Frozen, Generic[CountT]):
+    """Counters of one line since the daemon started."""
+
+    exchanges: CountT
+    """Requests sent since the daemon started, the other counters likewise."""
+    timeouts: CountT
+    """Exchanges without a complete reply."""
+    corrupt_replies: CountT
+    """Replies that could not be trusted."""
+    rejected_packets: CountT
+    """Packets that a node received damaged and did not execute."""
+    resent: CountT
+    """Exchanges sent again."""
+    resynchronisations: CountT
+    """How often the line was resynchronised."""
+    stray_bytes: CountT
+    """Bytes that belong to no request."""
+    losses: CountT
+    """How often the port was lost."""
+
+
+class BusHealth(LineCounters[Annotated[int, Field(ge=0)]]):
     """One line and its axes: published each second on `meta/health/<bus>`."""
 
     t: int
@@ -89,22 +113,6 @@ class BusHealth(Frozen):
     """Its drives are polled."""
     utilisation: float = Field(ge=0)
     """Share of the last period for which bytes were on the wire, 0 to 1; waiting for drives is not counted."""
-    exchanges: int = Field(ge=0)
-    """Requests sent since the daemon started, the other counters likewise."""
-    timeouts: int = Field(ge=0)
-    """Exchanges without a complete reply."""
-    corrupt_replies: int = Field(ge=0)
-    """Replies that could not be trusted."""
-    rejected_packets: int = Field(ge=0)
-    """Packets that a node received damaged and did not execute."""
-    resent: int = Field(ge=0)
-    """Exchanges sent again."""
-    resynchronisations: int = Field(ge=0)
-    """How often the line was resynchronised."""
-    stray_bytes: int = Field(ge=0)
-    """Bytes that belong to no request."""
-    losses: int = Field(ge=0)
-    """How often the port was lost."""
     lanes: tuple[LaneHealth, ...]
     """The most urgent first."""
     stop_wait: StopWaitHealth

@@ -7,6 +7,7 @@ from pydantic import Field
 
 from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.health import LineCounters
 from ldcnd.contract.plan import PollPriority
 from ldcnd.contract.samples import PastFault
 
@@ -81,7 +82,7 @@ class ModuleInfo(Frozen):
     """Latest status byte of a module that is no axis; null while it does not answer, and for axes."""
 
 
-class BusInfo(Frozen):
+class BusInfo(LineCounters[int]):
     """One line: `meta/buses/<bus>`."""
 
     bus: str
@@ -100,24 +101,8 @@ class BusInfo(Frozen):
     """Whether the drives were reset, so that positions count from 0, or taken over as they were; null while down."""
     modules: tuple[ModuleInfo, ...] = ()
     """Modules found on the line, by address; empty while that is not known."""
-    exchanges: int
-    """Requests sent since the daemon started, the other counters likewise."""
     replies: int
     """Intact replies."""
-    timeouts: int
-    """Exchanges without a complete reply."""
-    corrupt_replies: int
-    """Replies that could not be trusted."""
-    rejected_packets: int
-    """Packets that a node received damaged and did not execute."""
-    resent: int
-    """Exchanges sent again."""
-    resynchronisations: int
-    """How often the line was resynchronised."""
-    stray_bytes: int
-    """Bytes that belong to no request."""
-    losses: int
-    """How often the port was lost."""
     wire_busy_s: float
     """Seconds for which bytes were on the wire."""
     poll_p99_s: float

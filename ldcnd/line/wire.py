@@ -8,6 +8,7 @@ from itertools import accumulate
 from typing import Any
 
 from ldcnd.contract.errors import TransportLost
+from ldcnd.contract.health import LineCounters
 from ldcnd.line.exchange import Exchange, Timing
 from ldcnd.line.flight_recorder import WireEvent, WireLog
 from ldcnd.line.settings import BusSettings
@@ -75,6 +76,10 @@ class BusStatistics:
         default_factory=lambda: {lane: LatencyHistogram() for lane in range(4)}
     )
     """By lane: from queueing (polls: from their due time) to the last reply byte."""
+
+    def counters(self) -> dict[str, int]:
+        """Return what is published of the line; slotted here, because every exchange counts."""
+        return {name: getattr(self, name) for name in LineCounters.model_fields}
 
 
 class Echo:
