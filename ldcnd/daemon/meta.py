@@ -1,9 +1,8 @@
 """The rig's description of itself and its last values: answers to `get` on `meta/**` and `tele/**`."""
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
 from functools import lru_cache, partial
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
@@ -23,7 +22,7 @@ from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import Rig
 from ldcnd.drives.driver import Drive
 from ldcnd.line.queue import Lane
-from ldcnd.net.hand_over import Query
+from ldcnd.net.hand_over import Answer, Query
 from ldcnd.net.publisher import Publisher
 
 WORK_PER_STEP = 16
@@ -33,18 +32,9 @@ COUNTERS_HZ = 10
 """Maximum update rate of the counters in a line's description, Hz."""
 REMEMBERED = 1024
 """Encoded samples and reports that are kept at most; more keys than a rig has."""
+_Part: TypeAlias = tuple[Answer, int]
+"""One key of an answer, and the work that it took."""
 LEVELS: Mapping[bool | None, Literal["high", "low"] | None] = {True: "high", False: "low", None: None}
-
-
-@dataclass(frozen=True, slots=True)
-class _Part:
-    """One key of an answer, and the work that it took."""
-
-    key: str
-    payload: bytes
-    encoding: str
-    measured_at_ns: int | None = None
-    work: int = 1
 
 
 class _Encoded:
@@ -62,10 +52,10 @@ class _Encoded:
         source = self._source()
         known = self._payloads.get(encoding)
         if known and known[0] == source:
-            return _Part(key, known[1], known[2])
+            return Answer(key, known[1], known[2]), 1
         payload, name = encode(self._model(), encoding)
         self._payloads[encoding] = source, payload, name
-        return _Part(key, payload, name, work=DESCRIPTION_WORK)
+        return Answer(key, payload, name), DESCRIPTION_WORK
 
 
 class Describing:
@@ -122,7 +112,7 @@ class Describing:
             yield self._described[key].part(key, encoding)
         yield from self._newest(query, self._health.latest)
         for key in _covered(query.key, tuple(self._schemas)):
-            yield _Part(key, self._schemas[key], Encoding.JSON.value)
+            yield Answer(key, self._schemas[key], Encoding.JSON.value), 1
 
     def _newest(self, query: Query, newest: Mapping[str, Sample | DaemonHealth | BusHealth]) -> Iterator[_Part]:
         """Yield what was published last on every key that the query covers."""
@@ -133,13 +123,13 @@ class Describing:
                 continue  # withdrawn since the query came
             known = self._latest.get((key, encoding))
             if known and known[0] is published:
-                yield _Part(key, known[1], known[2], published.t)
+                yield Answer(key, known[1], known[2], published.t), 1
                 continue
             if len(self._latest) >= REMEMBERED:
                 self._latest.clear()
             payload, name = encode(published, encoding)
             self._latest[key, encoding] = published, payload, name
-            yield _Part(key, payload, name, published.t, SAMPLE_WORK)
+            yield Answer(key, payload, name, published.t), SAMPLE_WORK
 
     def _bus_source(self, bus: BusService) -> object:
         """Return what the description of a line is made of; its counters never stand still."""
@@ -149,9 +139,9 @@ class Describing:
 def _in_steps(query: Query, parts: Iterator[_Part]) -> Iterator[None]:
     """Answer with all parts; each step does a bounded amount of work."""
     work = 0
-    for part in parts:
-        query.reply(part.payload, part.encoding, key=part.key, measured_at_ns=part.measured_at_ns)
-        work += part.work
+    for answer, took in parts:
+        query.reply(answer.payload, answer.encoding, key=answer.key, measured_at_ns=answer.measured_at_ns)
+        work += took
         if work >= WORK_PER_STEP:
             work = 0
             yield
