@@ -8,7 +8,6 @@ from ldcnd.contract.parameters import (
     CounterReply,
     EepromCount,
     ListParameters,
-    MonitorReading,
     MonitorReport,
     ParameterDump,
     ParameterList,
@@ -55,17 +54,7 @@ class Parameters:
                 return ParameterPlan(command_id=command_id, axis=axis, verb=verb, plan=await access.plan(command))
             case ReadMonitors(monitors=names):
                 read = await access.monitors(names)
-                readings = tuple(
-                    MonitorReading(
-                        monitor=each.name,
-                        title=each.title,
-                        value=each.value,
-                        unit=each.unit,
-                        high=each.high,
-                        active=each.active,
-                    )
-                    for each in read
-                )
+                readings = tuple(each.reading for each in read)
                 return MonitorReport(command_id=command_id, axis=axis, verb=verb, readings=readings)
             case WriteParameter():
                 done = await access.write(command)

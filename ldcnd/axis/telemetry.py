@@ -182,17 +182,13 @@ class AxisTelemetry:
         quality = self._tracker.quality
         if value.resolved and quality is Quality.GOOD:
             quality = Quality.UNCERTAIN
-        self._publisher.monitor(self._tracker.name, value.name).publish(
+        self._publisher.monitor(self._tracker.name, value.reading.monitor).publish(
             {
                 "t": t,
                 "t_error_ns": t_error_ns,
                 "seq": 0,
                 "quality": quality,
-                "value": value.value,
-                "unit": value.unit,
-                "title": value.title,
-                "high": value.high,
-                "active": value.active,
+                **value.reading.model_dump(exclude={"monitor"}),
             }
         )
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from ldcnd.contract.commands import AxisCommand, Capability, Command, CommandReply, Effect, ReplyT_co, Verb
 from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
-from ldcnd.contract.samples import MonitorName
+from ldcnd.contract.samples import MonitorContent, MonitorName
 
 SLOW_S = 60.0
 """Longest wait for what takes many words with a slow drive, in seconds."""
@@ -211,21 +211,13 @@ class AlarmReport(CommandReply):
     """Ten entries, the newest first as far as is known."""
 
 
-class MonitorReading(Frozen):
+class MonitorReading(MonitorContent):
     """One monitor of a drive, read once."""
 
     monitor: MonitorName
     """Name of the counter."""
-    title: str
-    """The manual's words."""
-    value: int
-    """The value with its sign; for signals and switches their word."""
-    unit: str
-    """Unit of the value; empty for signals and switches."""
     high: tuple[str, ...] = ()
     """Signals whose level is high, switches that are on."""
-    active: tuple[str, ...] | None = None
-    """Signals that are on, by the active levels of the configuration; null for what has no active level."""
 
 
 class MonitorReport(CommandReply):

@@ -143,8 +143,8 @@ class LatchSample(Sample):
     """Id of the probe command that latched this position."""
 
 
-class IoSample(Sample):
-    """The lines of an I/O module, and its outputs; published under the name of the module."""
+class IoReading(Frozen):
+    """The lines of an I/O module, and its outputs."""
 
     levels: tuple[bool, ...]
     """Levels of the lines, the first is line 1; true is high. Outputs show their pins, too."""
@@ -152,12 +152,17 @@ class IoSample(Sample):
     """Lines that are outputs; null while that is not known, such as after a take-over."""
     adc: tuple[int, ...]
     """The analog inputs, 0 to 255."""
-    volts: tuple[float, ...]
-    """The same in volts, 5 V at full scale."""
     counter: int
     """Counter or timer: 32 bits that wrap silently; only differences mean something."""
     pwm: tuple[float, ...] | None
     """Shares of time for which the PWM outputs are on; null while they are not known."""
+
+
+class IoSample(Sample, IoReading):
+    """The lines of an I/O module, and its outputs; published under the name of the module."""
+
+    volts: tuple[float, ...]
+    """The same in volts, 5 V at full scale."""
 
 
 class PastFault(Frozen):
@@ -308,8 +313,8 @@ class MonitorName(StrEnum):
     AUTO_TUNING_RESULT = "auto_tuning_result"
 
 
-class MonitorSample(Sample):
-    """One monitor of a drive, in the drive's own unit."""
+class MonitorContent(Frozen):
+    """What one monitor of a drive says, in the drive's own unit."""
 
     value: int
     """The value with its sign; for signals and switches their word."""
@@ -321,6 +326,10 @@ class MonitorSample(Sample):
     """Signals whose level is high, whatever that means; of switches, those that are on."""
     active: tuple[str, ...] | None = None
     """Signals that are on, by the active levels of the configuration; null for what has no active level."""
+
+
+class MonitorSample(Sample, MonitorContent):
+    """One monitor of a drive, in the drive's own unit."""
 
 
 SAMPLE_MODELS: dict[TelemetryItem, type[Sample]] = {

@@ -7,10 +7,10 @@ from typing import TypeVar
 from ldcnd.axis.clock import Clock
 from ldcnd.contract.errors import LdcndError, MalformedRequest, UnknownAxis, ValueOutOfRange
 from ldcnd.contract.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer
-from ldcnd.contract.samples import Quality, TelemetryItem
+from ldcnd.contract.samples import IoReading, Quality, TelemetryItem
 from ldcnd.daemon.line import BusService
 from ldcnd.drives.driver import StopMode
-from ldcnd.drives.network import IoDriver, IoReading
+from ldcnd.drives.network import IoDriver
 from ldcnd.line.exchange import Timing
 from ldcnd.line.transaction import Condition, only_while, until_begun
 from ldcnd.log import get_logger
@@ -163,12 +163,8 @@ class ModuleService:
                 "t_error_ns": t_error_ns,
                 "seq": 0,
                 "quality": Quality.GOOD,
-                "levels": reading.levels,
-                "outputs": reading.outputs,
-                "adc": reading.adc,
+                **dict(reading),
                 "volts": tuple(value / FULL_SCALE_COUNTS * FULL_SCALE_V for value in reading.adc),
-                "counter": reading.counter,
-                "pwm": reading.pwm,
             }
         )
 

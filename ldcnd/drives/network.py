@@ -9,6 +9,7 @@ from typing import Any
 
 from ldcnd.contract.errors import NotSupported
 from ldcnd.contract.meta import ModuleInfo
+from ldcnd.contract.samples import IoReading
 from ldcnd.drives.driver import Drive, Motion, StopMode
 from ldcnd.line.exchange import Timing
 from ldcnd.line.poller import Poller
@@ -151,25 +152,6 @@ class Instant:
     from_s: float
     until_s: float
     io: tuple[CapturedIo, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class IoReading:
-    """The values of one poll of an I/O module, and its outputs.
-
-    Attributes:
-        levels: of its lines, the first is line 1; true is high.
-        outputs: lines that are outputs; None while that is not known.
-        adc: of its analog inputs, 0 to 255 for 0 to 5 V.
-        counter: counter or timer, 32 bits that wrap silently.
-        pwm: shares of time for which its PWM outputs are on; None while they are not known.
-    """
-
-    levels: tuple[bool, ...]
-    outputs: tuple[int, ...] | None
-    adc: tuple[int, ...]
-    counter: int
-    pwm: tuple[float, float] | None
 
 
 class IoDriver(ABC):

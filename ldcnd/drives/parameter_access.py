@@ -7,6 +7,7 @@ from ldcnd.contract.parameters import (
     AlarmEntry,
     CounterName,
     DriveFacts,
+    MonitorReading,
     ParameterInfo,
     ParameterValue,
     PlannedParameters,
@@ -21,20 +22,11 @@ class MonitorValue:
     """One monitor, read.
 
     Attributes:
-        name: which.
-        value: in `unit`, with its sign; for signals and switches their documented bits.
-        title: the manual's words.
-        high: signals at high level, switches that are on.
-        active: signals that are on, whatever their level; None for what has no active level.
+        reading: which, and what it says.
         resolved: a counter that was off by 65536 and was corrected by what it said before.
     """
 
-    name: MonitorName
-    value: int
-    unit: str
-    title: str
-    high: tuple[str, ...] = ()
-    active: tuple[str, ...] | None = None
+    reading: MonitorReading
     resolved: bool = False
 
 

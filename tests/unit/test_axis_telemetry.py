@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.contract.commands import MoveAbsolute
+from ldcnd.contract.parameters import MonitorReading
 from ldcnd.contract.samples import AxisState, MonitorName, Quality, TelemetryItem
 from ldcnd.contract.traces import TraceChunk
 from ldcnd.drives.driver import Fault
@@ -107,7 +108,9 @@ async def test_what_a_drive_that_is_gone_has_shown_is_published_once_more_as_bad
     [(False, False, Quality.GOOD), (True, False, Quality.UNCERTAIN), (True, True, Quality.BAD)],
 )
 async def test_a_counter_that_had_to_be_corrected_is_uncertain_and_one_of_a_lost_drive_is_bad(resolved, away, quality):
-    value = MonitorValue(MonitorName.SPEED_FEEDBACK, 100, "rpm", "speed", resolved=resolved)
+    value = MonitorValue(
+        MonitorReading(monitor=MonitorName.SPEED_FEEDBACK, value=100, unit="rpm", title="speed"), resolved=resolved
+    )
     async with axis_bench() as bench:
         if away:
             bench.axis.disconnected()

@@ -29,21 +29,21 @@ async def test_any_monitor_is_read_once_the_auto_tuning_result_too():
     drive.drive.set_run(0.0, on=True)
     async with smartstep_line([drive]) as line:
         access = line.axis("u1").parameters
-        everything = {value.name: value for value in await access.monitors(())}
+        everything = {value.reading.monitor: value.reading for value in await access.monitors(())}
         one = await access.monitors((MonitorName.AUTO_TUNING_RESULT,))
 
     assert set(everything) == set(MonitorName)
-    assert [(value.value, value.unit, value.title) for value in one] == [(100, "%", "Auto-tuning result")]
+    (read,) = (value.reading for value in one)
+    assert (read.value, read.unit, read.title) == (100, "%", "Auto-tuning result")
 
 
 async def test_a_signal_is_active_by_the_level_of_the_profile_and_not_by_being_high():
     drive = simulated(1)
     drive.drive.set_run(0.0, on=True)
     async with smartstep_line([drive]) as line:
-        inputs, outputs = await line.axis("u1").parameters.monitors(
-            (MonitorName.INPUT_SIGNALS, MonitorName.OUTPUT_SIGNALS)
-        )
+        signals = await line.axis("u1").parameters.monitors((MonitorName.INPUT_SIGNALS, MonitorName.OUTPUT_SIGNALS))
 
+    inputs, outputs = (value.reading for value in signals)
     assert (inputs.high, inputs.active) == (("RESET",), ("RUN",))
     assert "ALM" not in outputs.active
     assert "BKIR" in outputs.active

@@ -256,10 +256,12 @@ async def test_monitors_come_at_their_rates():
         line.bus.add_poller(UnitPoller(line.bus, 1, axis.profile, rates, 0.0, listeners))
         await asyncio.sleep(20.0)
 
-    counts = {name: sum(value.name is name for value in told) for name in MonitorName}
+    counts = {name: sum(value.reading.monitor is name for value in told) for name in MonitorName}
     assert counts[MonitorName.TORQUE_REFERENCE] in range(39, 42)
     assert counts[MonitorName.INPUT_COUNTER] in range(10, 12)
-    assert {value.high for value in told if value.name is MonitorName.INPUT_SIGNALS} == {("RUN", "RESET")}
+    assert {value.reading.high for value in told if value.reading.monitor is MonitorName.INPUT_SIGNALS} == {
+        ("RUN", "RESET")
+    }
 
 
 async def test_polling_for_long_leaves_nothing_behind_in_the_queue():

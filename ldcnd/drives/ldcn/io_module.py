@@ -15,6 +15,7 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import BusError, RegisterUnknown, ValueOutOfRange
 from ldcnd.contract.meta import Provenance
+from ldcnd.contract.samples import IoReading
 from ldcnd.drives.ldcn.pic_io import (
     ALL_LINES,
     LINES,
@@ -33,7 +34,7 @@ from ldcnd.drives.ldcn.pic_io import (
     timer_control,
 )
 from ldcnd.drives.ldcn.registers import TAKEN_OVER, RegisterBook
-from ldcnd.drives.network import IoDriver, IoReading, ModuleEntry
+from ldcnd.drives.network import IoDriver, ModuleEntry
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, Timing
 from ldcnd.line.poller import Poller, next_on_grid

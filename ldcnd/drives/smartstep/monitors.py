@@ -17,6 +17,7 @@ from enum import Enum, IntEnum, IntFlag, StrEnum
 from types import MappingProxyType
 from typing import ClassVar
 
+from ldcnd.contract.parameters import MonitorReading
 from ldcnd.contract.samples import MonitorName
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.drives.smartstep.addresses import OperatingMode, Register
@@ -443,12 +444,16 @@ def word_value(name: MonitorName, word: int, profile: SmartStepProfile) -> Monit
         case _:
             pass
     if bits is None:
-        return MonitorValue(name, monitor.value_of(word), monitor.unit, monitor.title)
-    return MonitorValue(name, int(bits), "", monitor.title, tuple(bit.name or "" for bit in bits), active)
+        value = monitor.value_of(word)
+        return MonitorValue(MonitorReading(monitor=name, value=value, unit=monitor.unit, title=monitor.title))
+    high = tuple(bit.name or "" for bit in bits)
+    return MonitorValue(
+        MonitorReading(monitor=name, value=int(bits), unit="", title=monitor.title, high=high, active=active)
+    )
 
 
 def counter_value(name: MonitorName, signed: int, *, resolved: bool) -> MonitorValue:
     """Return what a counter says."""
     low = COUNTERS[name].low
     title = low.title.removesuffix(" (rightmost 16 bits)")
-    return MonitorValue(name, signed, low.unit, title, resolved=resolved)
+    return MonitorValue(MonitorReading(monitor=name, value=signed, unit=low.unit, title=title), resolved=resolved)
