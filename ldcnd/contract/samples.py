@@ -207,11 +207,9 @@ MOST_SHADOW_FIGURES = 8
 """One observer tells no more of an axis."""
 
 
-class ShadowFigure(Frozen):
-    """One figure of an axis, as an observer finds it in its motions."""
+class FigureRange(Frozen):
+    """The mean of a figure of some motions, and what it was learnt to be."""
 
-    figure: str = Field(pattern="^[a-z_]{1,20}$")
-    """Name of the figure: friction, inertia or misfit of `ldcnd shadow`."""
     value: float
     """Mean of the last motions."""
     usual: float
@@ -222,6 +220,13 @@ class ShadowFigure(Frozen):
     """Above this mean likewise."""
     unit: str
     """Unit of these values."""
+
+
+class ShadowFigure(FigureRange):
+    """One figure of an axis, as an observer finds it in its motions."""
+
+    figure: str = Field(pattern="^[a-z_]{1,20}$")
+    """Name of the figure: friction, inertia or misfit of `ldcnd shadow`."""
     motions: int = Field(ge=1, le=LARGEST_INTEGER)
     """Number of motions in the mean."""
     alarm: bool

@@ -12,7 +12,7 @@ An axis that does not move makes no motion to be judged. So an output that shoul
 """
 
 from collections import deque
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from ldcnd.bench.tuning.ldcn.effort import LEAST_COUNTS, Effort, EffortMeter, Seen
 from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.contract.samples import FigureRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import Profile
 
@@ -104,37 +105,26 @@ class Learnt:
         return self.value + self.per_speed * speed_counts_per_s
 
 
-@dataclass(frozen=True, slots=True)
-class Alarm:
-    """A figure has left what was learnt, or is back.
-
-    Attributes:
-        figure: which one.
-        over: it is back.
-        t_s: when the last motion ended, on the clock of the positions.
-        value: mean of the last motions, the healthy ones among them.
-        latest: median of the last five.
-        usual: what these motions should have shown.
-        low: below this value there is an alarm.
-        high: above it likewise.
-        unit: of the four.
-        motions: so many motions are in the mean.
-        sigma: learnt for single motions.
-        places: where the axis stood with an output that it cannot need, counts; no two close together.
-    """
+class Alarm(FigureRange):
+    """A figure has left what was learnt, or is back."""
 
     figure: FigureName
-    over: bool
-    t_s: float
-    value: float
+    """What has left its range."""
+    over: bool = False
+    """It is back."""
     latest: float
-    usual: float
-    low: float
-    high: float
-    unit: str
+    """Median of the last five."""
     motions: int
+    """Number of motions in the mean."""
     sigma: float
+    """Standard deviation of single motions while the axis taught."""
     places: tuple[int, ...] = ()
+    """Where the axis stood with an output that it cannot need, counts; no two close together."""
+
+    @property
+    def is_outside(self) -> bool:
+        """Whether the mean is beyond a limit."""
+        return self.value > self.high or (self.low is not None and self.value < self.low)
 
 
 class Memory(BaseModel):
@@ -213,12 +203,10 @@ class Shadow:
             return ()
         alarm = Alarm(
             figure=name,
-            over=False,
-            t_s=seen.t_s,
             value=pwm,
             latest=pwm,
             usual=self._needed_pwm,
-            low=-np.inf,
+            low=None,
             high=self._stalls_pwm,
             unit="PWM steps",
             motions=1,
@@ -228,14 +216,14 @@ class Shadow:
         self.standing[name] = self.trend[name] = alarm
         return (alarm,)
 
-    def _moved(self, t_s: float) -> tuple[Alarm, ...]:
+    def _moved(self) -> tuple[Alarm, ...]:
         """Return the end of such an alarm after enough motions without one."""
         self._since_stall += 1
         if FigureName.OUTPUT_AT_REST not in self.standing or self._since_stall < WINDOWS[0]:
             return ()
         del self.trend[FigureName.OUTPUT_AT_REST]
         alarm = self.standing.pop(FigureName.OUTPUT_AT_REST)
-        return (replace(alarm, over=True, t_s=t_s),)
+        return (alarm.model_copy(update={"over": True}),)
 
     def _judged(self, effort: Effort) -> tuple[Alarm, ...]:
         shown = {FigureName.INERTIA: effort.inertia, FigureName.MISFIT: effort.left_pwm}
@@ -254,10 +242,10 @@ class Shadow:
         if self.is_learning:
             memory.speeds = _widened(memory.speeds, effort.top_counts_per_s)
             memory.ways = _widened(memory.ways, way)
-        alarms = [self._take(name, Shown(value, effort.top_counts_per_s), effort.t_s) for name, value in shown.items()]
-        return (*self._moved(effort.t_s), *(alarm for alarm in alarms if alarm))
+        alarms = [self._take(name, Shown(value, effort.top_counts_per_s)) for name, value in shown.items()]
+        return (*self._moved(), *(alarm for alarm in alarms if alarm))
 
-    def _take(self, name: FigureName, shown: Shown, t_s: float) -> Alarm | None:
+    def _take(self, name: FigureName, shown: Shown) -> Alarm | None:
         learnt = self.memory.learnt.get(name)
         if learnt is None:
             teaching = self.memory.teaching.setdefault(name, [])
@@ -270,12 +258,12 @@ class Shadow:
         self._off[name].append(min(max(shown.value - usual, -most), most))
         self._usual[name].append(usual)
         self._latest[name].append(shown.value)
-        found = [self._mean(name, learnt, window, t_s) for window in WINDOWS if len(self._off[name]) >= window]
+        found = [self._mean(name, learnt, window) for window in WINDOWS if len(self._off[name]) >= window]
         if not found:
             return None
         self.trend[name] = found[0]
         standing = self.standing.get(name)
-        outside = [alarm for alarm in found if not alarm.low <= alarm.value <= alarm.high]
+        outside = [alarm for alarm in found if alarm.is_outside]
         if standing is None and outside:
             self.standing[name] = outside[0]
             return outside[0]
@@ -283,7 +271,7 @@ class Shadow:
         half = (short.high - short.usual) * FALLEN_SHARE
         if standing is not None and not outside and abs(short.value - short.usual) <= half:
             del self.standing[name]
-            return replace(short, over=True)
+            return short.model_copy(update={"over": True})
         return None
 
     def _least(self, name: FigureName) -> float:
@@ -296,17 +284,15 @@ class Shadow:
             case _:
                 return LEAST_MISFIT_PWM
 
-    def _mean(self, name: FigureName, learnt: Learnt, window: int, t_s: float) -> Alarm:
+    def _mean(self, name: FigureName, learnt: Learnt, window: int) -> Alarm:
         """Return the mean of the last motions with its limits."""
         off, usual = (float(np.mean(list(each)[-window:])) for each in (self._off[name], self._usual[name]))
         # what was learnt has an error of its own
         error = learnt.sigma * float(np.sqrt(NEIGHBOURS * (1 / window + 1 / LEARNT_MOTIONS)))
         limit = max(STANDARD_ERRORS * error, self._least(name))
-        low = usual - limit if name is not FigureName.MISFIT else -np.inf
+        low = usual - limit if name is not FigureName.MISFIT else None
         return Alarm(
             figure=name,
-            over=False,
-            t_s=t_s,
             value=usual + off,
             latest=float(np.median(self._latest[name])),
             usual=usual,

@@ -1,9 +1,7 @@
 """Following axes of a running rig by what it publishes: no lease, no command; what was learnt stays on this host."""
 
 import asyncio
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import pydantic
@@ -17,9 +15,8 @@ from ldcnd.client.kept_gains import file_of, gains_in
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import ReportShadow
 from ldcnd.contract.errors import ConfigError, LdcndError, NotSupported, WrongState
-from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import PositionSample, Quality, ShadowFigure, StateSample
+from ldcnd.contract.samples import FigureRange, PositionSample, Quality, ShadowFigure, StateSample
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import PROFILES, Profile
 from ldcnd.log import get_logger
@@ -38,35 +35,13 @@ Show = Callable[["ShadowAlarm"], None]
 Tell = Callable[[str], None]
 
 
-class ShadowAlarm(Frozen):
+class ShadowAlarm(Alarm):
     """What `ldcnd shadow` says when an axis takes more or less than it has learnt, and when that is over."""
 
     axis: str
     """The axis."""
-    figure: FigureName
-    """What has left its range."""
-    over: bool
-    """It is back."""
     t: int
     """When the last motion had ended, UTC in ns since 1970."""
-    value: float
-    """Mean of the last motions; after a change some of them were before it."""
-    latest: float
-    """Median of the last five."""
-    usual: float
-    """What the axis had taught for motions of this speed."""
-    low: float | None
-    """Below this mean there is an alarm; null without a lower limit."""
-    high: float
-    """Above this mean likewise."""
-    unit: str
-    """Unit of these values."""
-    motions: int
-    """Number of motions in the mean."""
-    sigma: float
-    """Standard deviation of single motions while the axis taught."""
-    places: tuple[int, ...] = ()
-    """Where the axis stood with an output that it cannot need, counts."""
     meaning: str
     """What may be behind it."""
 
@@ -267,11 +242,7 @@ class WatchedAxis:
             figures.append(
                 ShadowFigure(
                     figure=name.value,
-                    value=mean.value,
-                    usual=mean.usual,
-                    low=mean.low if math.isfinite(mean.low) else None,
-                    high=mean.high,
-                    unit=mean.unit,
+                    **mean.model_dump(include=set(FigureRange.model_fields)),
                     motions=mean.motions,
                     alarm=standing is not None,
                     meaning=meaning(name, more=more, places=standing.places) if standing else None,
@@ -282,11 +253,10 @@ class WatchedAxis:
         )
 
     def _reported(self, alarm: Alarm, t: int) -> ShadowAlarm:
-        values = asdict(alarm)
-        del values["t_s"]
-        values["low"] = alarm.low if math.isfinite(alarm.low) else None
         more = alarm.latest >= alarm.usual
-        return ShadowAlarm(axis=self.name, t=t, meaning=meaning(alarm.figure, more=more, places=alarm.places), **values)
+        return ShadowAlarm(
+            axis=self.name, t=t, meaning=meaning(alarm.figure, more=more, places=alarm.places), **dict(alarm)
+        )
 
 
 def _profile_of(info: AxisInfo) -> Profile:
