@@ -14,11 +14,11 @@ from ldcnd.cli.quantities import decimals, sample_text
 from ldcnd.cli.typed import Finite, Whole, axis_of
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.fleet import AxisReport, RigReport, survey
-from ldcnd.client.overview import AxisNow, overview
+from ldcnd.client.overview import AxisNow, AxisSeen, overview, seen_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
 from ldcnd.contract.commands import Why, WhyReply
-from ldcnd.contract.condition import Place, assess
+from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.events import ALARM_HISTORY, DRIVE_CHANGED, REFERENCE, UNSETTLED, CommandEvent
 from ldcnd.contract.fault_pages import codes, page_text
@@ -32,14 +32,10 @@ from ldcnd.contract.parameters import (
     ReadMonitors,
 )
 from ldcnd.contract.samples import (
-    AxisState,
     FaultSample,
-    LinkState,
     MonitorName,
     MonitorSample,
-    Moving,
     PositionSample,
-    Quality,
     Sample,
     StateSample,
     TelemetryItem,
@@ -50,27 +46,11 @@ SILENT_S = 3.0
 """Time without a sample after which `axis watch` says why, seconds."""
 
 
-class AxisRow(AxisInfo):
+class AxisRow(AxisSeen, AxisInfo):
     """An axis as `axis list --json` has it: its description, and how it is now."""
 
-    position: float | None
-    """Where it is, as far as `place` says so; null before the first position."""
-    quality: Quality | None
-    """How much the position is worth."""
-    age_s: float | None
-    """Age of the position, seconds."""
-    place: Place
-    """Whether the position says where the axis is."""
-    state: AxisState | None
-    """PLCopen state."""
     referenced: bool
     """The position is valid."""
-    link: LinkState | None
-    """Whether the drive answers."""
-    moving: Moving
-    """Whether it moves; unknown is an answer of its own and never means no."""
-    condition: tuple[str, ...]
-    """Everything that is to be said of it, in a few words each, the worst first."""
 
 
 @click.command("list")
@@ -110,18 +90,11 @@ def _digits(now: AxisNow) -> str | None:
 
 def row(now: AxisNow) -> AxisRow:
     """Return an axis as `--json` has it."""
-    state, position = now.state, now.position
+    state = now.state
     return AxisRow(
         **now.info.model_dump(),
-        position=position.value if position else None,
-        quality=position.quality if position else None,
-        age_s=now.age_s,
-        place=now.condition.place,
-        state=state.state if state else None,
+        **dict(seen_of(state, now.position, now.age_s, now.condition)),
         referenced=state is not None and state.referenced and now.condition.live,
-        link=state.link if state else None,
-        moving=state.moving if state and now.condition.live else Moving.UNKNOWN,
-        condition=now.condition.notes,
     )
 
 

@@ -4,12 +4,50 @@ from dataclasses import dataclass
 
 from ldcnd.client.health import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.condition import UNKNOWN_HOLDER, Condition, assess
+from ldcnd.contract.condition import UNKNOWN_HOLDER, Condition, Place, assess
 from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth
 from ldcnd.contract.leases import ListHolders
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import FaultSample, PositionSample, StateSample
+from ldcnd.contract.samples import AxisState, FaultSample, LinkState, Moving, PositionSample, Quality, StateSample
+
+
+class AxisSeen(Frozen):
+    """How an axis is now, as far as that is known; null where it is not."""
+
+    position: float | None
+    """Where it is, as far as `place` says so; null before the first position."""
+    quality: Quality | None
+    """How much the position is worth."""
+    age_s: float | None
+    """Age of the position, seconds."""
+    place: Place
+    """Whether the position says where the axis is."""
+    state: AxisState | None
+    """PLCopen state."""
+    link: LinkState | None
+    """Whether the drive answers."""
+    moving: Moving
+    """Whether it moves; unknown is an answer of its own and never means no."""
+    condition: tuple[str, ...]
+    """Everything that is to be said of it, in a few words each, the worst first."""
+
+
+def seen_of(
+    state: StateSample | None, position: PositionSample | None, age_s: float | None, condition: Condition
+) -> AxisSeen:
+    """Return how an axis is by its last samples, the age of its position in seconds, and its condition."""
+    return AxisSeen(
+        position=position.value if position else None,
+        quality=position.quality if position else None,
+        age_s=age_s,
+        place=condition.place,
+        state=state.state if state else None,
+        link=state.link if state else None,
+        moving=state.moving if state and condition.live else Moving.UNKNOWN,
+        condition=condition.notes,
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """A rig at one moment, as `ldcnd top` shows it and prints it with `--json`."""
 
-from ldcnd.contract.condition import Place, Severity
+from ldcnd.client.overview import AxisSeen
+from ldcnd.contract.condition import Severity
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality
 
 
 class Glance(Frozen):
@@ -14,7 +14,7 @@ class Glance(Frozen):
     """The worst trouble, in words; empty when there is none."""
 
 
-class AxisGlance(Glance):
+class AxisGlance(Glance, AxisSeen):
     """One axis; what is not known is null."""
 
     axis: str
@@ -23,16 +23,6 @@ class AxisGlance(Glance):
     """The line it is on."""
     unit: str
     """Unit of position and target; velocity is a second of it."""
-    state: AxisState | None
-    """PLCopen state."""
-    moving: Moving
-    """Whether it moves."""
-    position: float | None
-    """Where it is, as far as `place` says so."""
-    place: Place
-    """Whether the position says where it is."""
-    condition: tuple[str, ...]
-    """Everything that is to be said of it, in a few words each, the worst first."""
     cause: str
     """What several axes have in common that is wrong, such as their line; empty where the trouble is its own."""
     shown_position: str
@@ -45,16 +35,10 @@ class AxisGlance(Glance):
     """Where its command ends."""
     adc_volts: float | None
     """Its analog input."""
-    quality: Quality | None
-    """How much the position is worth."""
-    age_s: float | None
-    """Age of the position, seconds."""
     rate_hz: float | None
     """How often the position came in the last second."""
     rate_wanted_hz: float | None
     """The configured rate."""
-    link: LinkState | None
-    """Whether the drive answers."""
     control: str | None
     """Who controls or moves it, in words; null where that is not known."""
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from ldcnd.client.network import Sample, SampleKind
+from ldcnd.client.overview import seen_of
 from ldcnd.contract.codec import decode_received
 from ldcnd.contract.condition import SHARED, UNKNOWN_HOLDER, Kind, Severity, Trouble, assess, line_troubles
 from ldcnd.contract.frozen import Frozen
@@ -18,7 +19,6 @@ from ldcnd.contract.meta import AxisInfo, DaemonInfo
 from ldcnd.contract.samples import (
     AdcSample,
     FaultSample,
-    Moving,
     PositionSample,
     StateSample,
     TelemetryItem,
@@ -135,22 +135,15 @@ class RigView:
             axis=info.axis,
             bus=info.bus,
             unit=info.unit,
-            state=state.state if state else None,
-            moving=state.moving if state and condition.live else Moving.UNKNOWN,
-            position=position.value if position else None,
-            place=condition.place,
-            condition=condition.notes,
+            **dict(seen_of(state, position, age_s, condition)),
             cause=cause_of(worst, info.bus),
             shown_position=condition.position(f"{position.value:.3f}" if position else None, info.unit, age_s),
             shown_state=condition.summary,
             velocity=velocity.value if velocity else None,
             target=state.command.target if state and state.command else None,
             adc_volts=adc.volts if adc else None,
-            quality=position.quality if position else None,
-            age_s=age_s,
             rate_hz=health.rate_hz if health else None,
             rate_wanted_hz=health.rate_wanted_hz if health else None,
-            link=state.link if state else None,
             control=control,
             severity=worst.severity if worst else Severity.NOTICE if news else Severity.FINE,
             trouble=worst.text if worst else news,
