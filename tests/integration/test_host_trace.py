@@ -137,6 +137,17 @@ async def test_trigger_that_does_not_come_ends_the_trace_in_its_time_and_frees_t
     assert polled < 120
 
 
+async def test_trigger_without_its_level_is_refused_and_nothing_is_armed():
+    async with running_rig() as rig:
+        await ready(rig)
+
+        with pytest.raises(ValueOutOfRange, match="needs a level"):
+            await arm_trace(rig.client, "x", TakeTrace(channels=("velocity",), trigger=rising(None)))
+
+        with pytest.raises(WrongState, match="no trace is under way"):
+            await rig.client.command("x", AbortTrace())
+
+
 async def test_second_trace_is_refused_until_the_first_is_aborted():
     async with running_rig() as rig:
         await ready(rig)

@@ -10,8 +10,22 @@ import pytest
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
-from ldcnd.contract.catalogue import RENAMED
-from ldcnd.contract.commands import BufferMode, Halt, MoveAbsolute, MoveVelocity, Power, Preview, SetGains, Stop, Why
+from ldcnd.contract.catalogue import BY_VERB, RENAMED
+from ldcnd.contract.commands import (
+    About,
+    AxisCommand,
+    BufferMode,
+    Effect,
+    Halt,
+    Jog,
+    MoveAbsolute,
+    MoveVelocity,
+    Power,
+    Preview,
+    SetGains,
+    Stop,
+    Why,
+)
 from ldcnd.contract.errors import (
     CommandExpired,
     CommandIdReused,
@@ -101,6 +115,27 @@ async def commanded(*, required: bool = False, **axis: object) -> AsyncIterator[
         yield Commanded(x, y, group, required=required)
 
 
+FIELDS: dict[str, dict[str, object]] = {
+    "power": {"on": True},
+    "move_absolute": {"position": 1.0},
+    "move_relative": {"distance": 1.0},
+    "move_velocity": {"velocity": 1.0},
+    "jog": {"velocity": 1.0},
+    "home": {"method": "index"},
+    "probe": {"sources": ["index"], "position": 1.0},
+    "set_position": {"position": 1.0},
+    "set_gains": {"kp": 1},
+    "move_analog": {"target": 1},
+    "set_pwm": {"duty": 0.1, "duration_s": 1.0},
+    "track": {"position": 1.0},
+    "set_outputs": {},
+    "clear_counter": {"counter": "command"},
+    "write_parameter": {"parameter": "Pn102", "value": 1},
+    "trace": {"channels": ["position"]},
+}
+"""The least that a command needs, by its verb."""
+
+
 # -- at most once ------------------------------------------------------------------------------------------------------
 
 
@@ -126,19 +161,27 @@ async def test_a_repeated_command_moves_once_and_is_answered_alike_also_while_it
             await rig.send(command, "y")
 
 
-async def test_what_gets_its_turn_after_its_sender_has_given_up_does_not_begin():
+def waiting_commands() -> list[type[AxisCommand]]:
+    """Return what waits for its turn: all but questions, and what takes energy out."""
+    known = BY_VERB[About.AXIS].values()
+    return [kind for kind in known if issubclass(kind, AxisCommand) and kind.effect in (Effect.CHANGE, Effect.MOTION)]
+
+
+@pytest.mark.parametrize("kind", waiting_commands(), ids=lambda kind: kind.verb.value)
+async def test_what_gets_its_turn_after_its_sender_has_given_up_does_not_begin(kind):
+    command = kind.model_validate(FIELDS.get(kind.verb, {}))
     async with commanded() as rig:
         released = asyncio.Event()
         rig.x.drive.during["set_gains"] = released.wait
         async with asyncio.TaskGroup() as group:
             group.create_task(rig.send(SetGains(kp=100)), name="takes long")
             await asyncio.sleep(0.1)
-            behind = [rig.send(each) for each in (MoveVelocity(velocity=1.0), THERE, Power(on=True))]
-            waiting = [group.create_task(refused(each), name="behind") for each in behind]
-            await asyncio.sleep(6.0)
+            waiting = group.create_task(refused(rig.send(command)), name="behind")
+            await asyncio.sleep(command.answer_s)
             released.set()
 
-        assert [type(each.result()) for each in waiting] == [CommandExpired] * 3
+        # a jog is over with its hold, which is shorter
+        assert isinstance(waiting.result(), LeaseExpired if kind is Jog else CommandExpired)
         assert rig.x.drive.calls == ["set_gains"]
 
 
