@@ -29,8 +29,12 @@ def read(path: Path, parse: Callable[[str], KeptT]) -> KeptT | None:
         DamagedFile: it cannot be read, or makes no sense, as one that is cut short or that a newer version has written.
     """
     try:
+        if not stat.S_ISREG(path.stat().st_mode):  # to open a pipe would wait for its other end
+            raise DamagedFile(f"{path}: is no file")
         text = path.read_text(encoding="utf-8")
     except (FileNotFoundError, NotADirectoryError):
+        if path.is_symlink():
+            raise DamagedFile(f"{path}: is a link to what is not there") from None
         return None
     except OSError as error:
         raise DamagedFile(f"{path}: cannot be read: {error.strerror}") from error

@@ -103,23 +103,31 @@ def understand(model: type[CommandT], payload: bytes, encoding: str) -> tuple[Co
     try:
         return decode(model, payload, encoding), None
     except LdcndError as error:
-        fields = {"on": False} if issubclass(model, Power) and _says_off(payload, encoding) else {}
+        fields = {"on": False} if issubclass(model, Power) and _says_off(payload) else {}
         if not (fields or model.effect is Effect.REST):
             raise
         return model.model_validate(fields), error
 
 
-def _says_off(payload: bytes, encoding: str) -> bool:
-    """Tell whether a payload, as far as it can be read, says that a loop is to be opened."""
-    try:
-        value = pydantic_core.from_json(as_json(payload, encoding), allow_partial=True)
-        return isinstance(value, dict) and not _BOOLEAN.validate_python(value.get("on"))
-    except (LdcndError, ValueError):
-        return False
+def _says_off(payload: bytes) -> bool:
+    """Tell whether a payload says that a loop is to be opened, whatever is wrong with the rest of it.
+
+    Nothing is decoded: no damage elsewhere, no other encoding than the one that is declared hides the field.
+    """
+    said = [match.lastgroup == "off" for match in _ON_FIELD.finditer(payload)]
+    return bool(said) and all(said)
 
 
-_BOOLEAN = pydantic.TypeAdapter(bool)
-"""Reads 0, "off" and "false" as well, as people and stock clients write them."""
+_ON_FIELD = re.compile(
+    rb"""
+    (?: "on" \s* : \s* (?= (?: false | 0 (?:\.0+)? | "(?: 0|f|n|no|off|false )" ) \s* (?: [,}] | \Z ) )  # JSON
+      | (?: \xa2 | \xc4\x02 | \xd9\x02 ) on (?= \xc2 | \x00 | \xa1[0fn] | \xa2no | \xa3off | \xa5false )  # msgpack
+    ) (?P<off>)
+    | (?: "on" \s* : | (?: \xa2 | \xc4\x02 | \xd9\x02 ) on )
+    """,
+    re.VERBOSE | re.IGNORECASE,
+)
+"""The field `on` of a request, as JSON or as msgpack; `off` where its value means false, as people write that too."""
 
 
 def decode_received(model: type[ModelT], payload: bytes, encoding: str) -> ModelT:

@@ -24,6 +24,7 @@ from ldcnd.contract.codec import (
     rebuild_error,
     reply_encoding,
     to_json,
+    understand,
 )
 from ldcnd.contract.commands import ErrorReply, Home, MoveAbsolute, Power, Reset
 from ldcnd.contract.errors import ErrorCode, LdcndError, MalformedRequest, PayloadTooLarge, PositionLimit
@@ -329,3 +330,41 @@ def test_json_of_a_model_that_was_never_validated_is_that_of_pydantic():
     made = _NotBuiltYet.model_construct(name="x", count=3)
 
     assert to_json(made, exclude_defaults=True) == b'{"name":"x"}'
+
+
+OFF = {
+    "a character that is none": b'{"on":false,"client":"\\ud800"}',
+    "a number of 5000 digits": b'{"on":false,"sequence":' + b"9" * 5000 + b"}",
+    "2000 lists": b'{"on":false,"x":' + b"[" * 2000 + b"]" * 2000 + b"}",
+    "no UTF-8": b'{"on":false,"client":"\xff"}',
+    "a byte order mark": b'\xef\xbb\xbf{"on": false}',
+    "what follows": b'{"on": 0} and more',
+    "cut short": b'{"client": "ann", "on": false',
+    "msgpack": b"\x81\xa2on\xc2",
+    "msgpack with a key that is a number": b"\x82\xa2on\xc2\x01\x02",
+    "msgpack and one byte": b"\x81\xa2on\xc2\xc0",
+    "msgpack with a time": b"\x82\xa2on\xc2\xa1x\xd6\xff\x00\x00\x00\x00",
+    "a word": b'{"on": "OFF"}',
+}
+NOT_OFF = (
+    b'{"on": true, "x": 1}', b'{"on": 0.5}', b'{"on": 01}', b'{"on": null}', b"{}", b'{"on": false, "on": true}',
+    b'{"client": "\\"on\\": false"}', b"\x81\xa2on\xc3", b"\x81\xa2on\x01", b"", b'{"on": falsehood}',
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("payload", OFF.values(), ids=OFF)
+@pytest.mark.parametrize("encoding", ["application/json", "application/msgpack", ""])
+def test_what_says_off_is_understood_whatever_else_is_wrong(payload: bytes, encoding: str) -> None:
+    command, _complaint = understand(Power, payload, encoding)
+
+    assert command.on is False
+
+
+@pytest.mark.parametrize("payload", NOT_OFF)
+@pytest.mark.parametrize("encoding", ["application/json", "application/msgpack", ""])
+def test_what_does_not_say_off_switches_nothing_off(payload: bytes, encoding: str) -> None:
+    try:
+        command, _complaint = understand(Power, payload, encoding)
+    except MalformedRequest:
+        return
+    assert command.on is True
