@@ -35,11 +35,13 @@ from ldcnd.axis.state import (
 )
 from ldcnd.axis.telemetry import Arrivals, AxisTelemetry, Note, OnEnded
 from ldcnd.contract import events
+from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
     Capability,
     CommandReply,
+    Effect,
     Halt,
     Jog,
     Move,
@@ -80,6 +82,7 @@ from ldcnd.net.publisher import Publisher
 
 log = get_logger("axis")
 
+NO_COMMAND_HELPS = "the drive takes no command for that: use its own inputs and its own tool"
 QUEUED_COMMANDS = 8
 HALTS_WITHIN_S = 1.0
 """Longest time that an aborting move is left without an answer while the axis comes to rest, seconds."""
@@ -546,12 +549,7 @@ class AxisService:
         permit = permit or self.permit(self._next_command_id(), command.verb)
         if self.stoppable and (mode := takes_energy_out(command)):
             return await self._take_energy_out(permit, command, mode)
-        if command.verb not in self.driver.capabilities:
-            raise NotSupported(
-                f"axis {self.config.name}: {self.config.model} cannot {command.verb}",
-                axis=self.config.name,
-                value=command.verb.value,
-            )
+        self._check_takes(command.verb)
         if not self._queue.free:
             permit.ask()
             return await self._queue.wait(permit, command)
@@ -561,6 +559,40 @@ class AxisService:
         finally:
             if self._commands.procedure is not None:
                 self._queue.wake()  # for the steps of what has begun
+
+    def _check_takes(self, verb: Verb) -> None:
+        if verb not in self.driver.capabilities:
+            raise NotSupported(
+                f"axis {self.config.name}: {self.config.model} cannot {verb}", axis=self.config.name, value=verb.value
+            )
+
+    def obstacles(self, verb: Verb) -> list[tuple[LdcndError, bool]]:
+        """Return all that a command would be refused with now, the first first; and whether that ends with a motion."""
+        try:
+            self._check_takes(verb)
+        except NotSupported as error:
+            return [(error, False)]
+        found = guards.obstacles(guards.needs(verb), self.tracker, self._moves)
+        if guards.goes_on(verb, self.tracker):
+            return [(error, False) for error, guard in found if guard is not guards.check_stands]
+        return [(error, guard is guards.check_stands) for error, guard in found]
+
+    def obstacles_to_motion(self, *, absolute: bool) -> list[tuple[LdcndError, bool]]:
+        """Return all that keeps the axis from a motion, the faults of its drive one by one."""
+        able = self.driver.capabilities
+        moves = any(command.effect is Effect.MOTION and verb in able for verb, command in AXIS_COMMANDS.items())
+        absolute = absolute and Verb.MOVE_ABSOLUTE in able
+        row = guards.needs(Verb.MOVE_ABSOLUTE if absolute else Verb.MOVE_RELATIVE) if moves else guards.AT_ALL
+        found = list(guards.obstacles(row, self.tracker, self._moves))
+        name = self.config.name
+        first = [error for error, guard in found if guard in (guards.check_reachable, guards.check_not_latched)]
+        faults = [guards.fault(name, each) for each in self.tracker.active_faults if each.source == "drive"]
+        causes = [(error, False) for error in (*first, *faults)]
+        causes += [(error, guard is guards.check_stands) for error, guard in found if error not in first]
+        if not moves:
+            text = f"axis {name}: its drive takes no motion over the line"
+            causes.append((NotSupported(text, axis=name, remedy=NO_COMMAND_HELPS), False))
+        return causes
 
     async def _take_energy_out(
         self, permit: Permit, command: AxisCommand[CommandReply], mode: StopMode

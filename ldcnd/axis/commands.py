@@ -16,7 +16,7 @@ from ldcnd.axis.procedures.path import PathMember, PathShareRequest
 from ldcnd.axis.procedures.probe import ProbeMove
 from ldcnd.axis.procedures.pwm import PwmRun
 from ldcnd.axis.procedures.track import SetPoint
-from ldcnd.axis.procedures.velocity import COUNTER_SHARE, VelocityChange, runs
+from ldcnd.axis.procedures.velocity import COUNTER_SHARE, VelocityChange
 from ldcnd.axis.state import Completion
 from ldcnd.contract.commands import (
     AxisCommand,
@@ -52,7 +52,7 @@ from ldcnd.contract.errors import (
     WrongState,
     step,
 )
-from ldcnd.contract.samples import AxisState, LinkState, Moving
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Gains, Motion, StopMode
 from ldcnd.line.exchange import Timing
 
@@ -135,7 +135,7 @@ class AxisCommands:
                 hold = self.holds.get(permit.command_id)
                 now_s = self._motion.clock.now_s()
                 return HeldJog(self._motion, permit, hold or self.holds.begin(permit.command_id, request, now_s))
-            case MoveVelocity() if runs(self._tracker) and not self._driver.retargets:
+            case MoveVelocity() if guards.goes_on(request.verb, self._tracker) and not self._driver.retargets:
                 return VelocityChange(self._motion, permit, request)
             case Track():
                 return SetPoint(self._motion, permit, request, self.procedure)
@@ -264,16 +264,9 @@ class AxisCommands:
     # -- power -------------------------------------------------------------------------------------------------------
 
     async def _power_on(self, permit: Permit) -> CommandReply:
-        tracker = self._tracker
-        guards.check_may_power_on(tracker)
-        guards.check_stands(tracker)
+        permit.check_state()
         await self._motion.check_does_not_coast()
-        if Verb.SET_GAINS in self._driver.capabilities and self._driver.gains is None:
-            raise WrongState(
-                f"axis {tracker.name} has no gains: its loop cannot close",
-                axis=tracker.name,
-                remedy=Remedy("configure gains or {}", step("set_gains")),
-            )
+        guards.check_has_gains(self._driver)
         await permit.power_on()
         self._drop_procedure()
         self._motion.target_counts = None
@@ -288,16 +281,10 @@ class AxisCommands:
         its power driver is off, and a host that took it over has not seen what came before.
         """
         tracker = self._tracker
-        guards.check_reachable(tracker)
-        (guards.check_not_latched if faults_only else guards.check_stop_confirmed)(tracker)
-        guards.check_stands(tracker)  # a stop that is under way keeps its latch
-        if tracker.state is AxisState.ERROR_STOP and self._moves_by_force():
-            raise WrongState(
-                f"axis {tracker.name} still moves, or may: a reset would switch its motor off at speed",
-                axis=tracker.name,
-                value=tracker.moving.value,
-                remedy=Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
-            )
+        if faults_only:
+            guards.check_reachable(tracker)
+            guards.check_not_latched(tracker)
+        permit.check_state()  # a stop that is under way keeps its latch
         stopped = tracker.state is AxisState.ERROR_STOP or any(fault.stops for fault in tracker.active_faults)
         if stopped or not tracker.energised:
             await self._driver.reset()
@@ -309,10 +296,6 @@ class AxisCommands:
         tracker.cleared(self._motion.clock.now_s())
         self._motion.publish_state()
         return self._motion.reply(permit)
-
-    def _moves_by_force(self) -> bool:
-        """Tell whether the motor has voltage and turns, or may, whatever the state says."""
-        return self._tracker.energised and self._tracker.moving is not Moving.NO
 
     # -- motion ------------------------------------------------------------------------------------------------------
 
@@ -332,9 +315,8 @@ class AxisCommands:
             and tracker.state in (AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION)
         )
 
-    def _check_may_start(self, request: Move) -> None:
-        if not (self.retargets(request) or (isinstance(request, MoveVelocity) and runs(self._tracker))):
-            guards.check_may_move(self._tracker)
+    def _check_may_start(self, permit: Permit, request: Move) -> None:
+        permit.check_state(follows=self.retargets(request))
 
     def check(self, request: Move) -> None:
         """Refuse a move that could not follow what the axis is doing now; nothing is halted for it.
@@ -342,7 +324,7 @@ class AxisCommands:
         Raises:
             RequestRefused: as the move itself would be, once the axis stands.
         """
-        guards.check_may_follow(self._tracker)
+        guards.check(request.verb, self._tracker, follows=True)
         match request:
             case MoveAbsolute():
                 goal = self._plan_absolute(request)
@@ -356,15 +338,15 @@ class AxisCommands:
                 self._motion.plan_at(request.velocity, request.acceleration)
 
     async def _move_absolute(self, permit: Permit, request: MoveAbsolute) -> CommandReply:
-        self._check_may_start(request)
+        self._check_may_start(permit, request)
         return await self._move_to(permit, request, self._plan_absolute(request))
 
     async def _move_relative(self, permit: Permit, request: MoveRelative) -> CommandReply:
-        self._check_may_start(request)
+        self._check_may_start(permit, request)
         if self._motion.target_counts is None:
             here = (await self._motion.read()).position_counts  # one reading alone may be wrong
             permit.still_wanted()
-            self._check_may_start(request)
+            self._check_may_start(permit, request)
             return await self._move_to(permit, request, self._plan_relative(request, here))
         return await self._move_to(permit, request, self._plan_relative(request))
 
@@ -377,13 +359,12 @@ class AxisCommands:
         return await self._move(permit, goal, AxisState.DISCRETE_MOTION)
 
     async def _move_velocity(self, permit: Permit, request: MoveVelocity) -> CommandReply:
-        self._check_may_start(request)
+        self._check_may_start(permit, request)
         velocity, bounded = self._plan_velocity(request)
         reply = await self._move(permit, bounded, AxisState.CONTINUOUS_MOTION)
         return reply.model_copy(update={"velocity": velocity})
 
     def _plan_absolute(self, request: MoveAbsolute) -> MotionPlan:
-        guards.check_referenced(self._tracker)
         position = self._motion.unwrapped(request.position, request.direction)
         return self._motion.plan_to(position, request.velocity, request.acceleration)
 
@@ -461,10 +442,7 @@ class AxisCommands:
 
     async def _set_position(self, permit: Permit, position: float) -> CommandReply:
         motion = self._motion
-        tracker = self._tracker
-        guards.check_reachable(tracker)
-        guards.check_stands(tracker)
-        guards.check_position_kept(tracker)
+        permit.check_state()
         here = await motion.read()  # one reading alone may be wrong
         await motion.reference.forget()
         permit.still_wanted()
@@ -476,7 +454,7 @@ class AxisCommands:
 
     async def _set_gains(self, permit: Permit, request: SetGains) -> CommandReply:
         tracker = self._tracker
-        guards.check_reachable(tracker)
+        permit.check_state()
         asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name, None)) is not None}
         held = self._driver.gains
         if held is None and not {"kp", "el"} <= asked.keys():
@@ -538,6 +516,6 @@ class AxisCommands:
             )
 
     async def _set_outputs(self, permit: Permit, request: SetOutputs) -> CommandReply:
-        guards.check_reachable(self._tracker)
+        permit.check_state()
         await permit.set_outputs(request.limit1, request.limit2)
         return self._motion.reply(permit)

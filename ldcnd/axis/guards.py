@@ -9,18 +9,21 @@ judged by the state at its start, not by the state at its arrival.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NoReturn, Protocol
 
 from typing_extensions import override
 
 from ldcnd.axis.state import MOTION_STATES, AxisTracker
-from ldcnd.contract.commands import HomeMethod, PinMode, Verb
+from ldcnd.contract.catalogue import AXIS_COMMANDS
+from ldcnd.contract.commands import Effect, HomeMethod, PinMode, Verb
 from ldcnd.contract.errors import (
     AccelerationLimit,
     AxisUnreachable,
     CommandAborted,
+    DriveFault,
+    LdcndError,
     NotReferenced,
     NotSupported,
     PositionLimit,
@@ -33,7 +36,7 @@ from ldcnd.contract.errors import (
     step,
 )
 from ldcnd.contract.meta import AxisLimits
-from ldcnd.contract.samples import AxisState, LinkState, TelemetryItem
+from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, TelemetryItem
 from ldcnd.drives.driver import (
     NO_CEILING,
     AnalogMotion,
@@ -53,6 +56,34 @@ from ldcnd.drives.driver import (
 from ldcnd.drives.network import Network
 from ldcnd.line.exchange import Exchange
 from ldcnd.line.transaction import Condition, only_while
+
+
+class QuietDrive(Protocol):
+    """Calls to a drive that need no permission: none of them can make it move."""
+
+    spec: AxisSpec
+    capabilities: frozenset[Verb]
+    adc_full_scale: int | None
+    retargets: bool
+    gains: Gains | None
+    holds_gains: bool
+    home_methods: frozenset[HomeMethod]
+    capture_s: float
+    path_period_s: float
+    path_packet: int
+    path_most_counts: int
+
+    def quantise(self, motion: Motion, most: Ceiling = ...) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
+    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
+    def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
+    async def stop(self, mode: StopMode) -> StopMode: ...  # noqa: D102
+    async def reset(self) -> None: ...  # noqa: D102
+    async def clear_warnings(self) -> None: ...  # noqa: D102
+    async def captured_home(self) -> int: ...  # noqa: D102
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool: ...  # noqa: D102
+    def check_path(self) -> None: ...  # noqa: D102
+    def path_exchanges(self) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
+    async def path_status(self) -> PathStatus: ...  # noqa: D102
 
 
 def check_reachable(axis: AxisTracker) -> None:
@@ -97,25 +128,6 @@ def check_enabled(axis: AxisTracker) -> None:
             value=axis.state,
             remedy=Remedy("{}", step("power", 'send power {"on": true}', on=True)),
         )
-
-
-def check_may_power_on(axis: AxisTracker) -> None:
-    """Refuse to close the loop of an axis that is unreachable, latched or faulted."""
-    check_reachable(axis)
-    check_not_latched(axis)
-    check_not_in_error(axis)
-
-
-def check_may_follow(axis: AxisTracker) -> None:
-    """Refuse a motion unless the axis is powered; it may still move."""
-    check_may_power_on(axis)
-    check_enabled(axis)
-
-
-def check_may_move(axis: AxisTracker) -> None:
-    """Refuse a motion unless the axis is powered and stands still."""
-    check_may_follow(axis)
-    check_stands(axis)
 
 
 def check_stands(axis: AxisTracker) -> None:
@@ -207,13 +219,45 @@ def check_acceleration(axis: AxisTracker, limits: AxisLimits, acceleration: floa
         )
 
 
-def no_speed(axis: str) -> WrongState:
-    """Return the refusal of a motion while the speed override of the rig is 0."""
-    return WrongState(
-        f"axis {axis}: the speed override of the rig is 0 %",
+def check_speed(axis: AxisTracker) -> None:
+    """Refuse a motion while the speed override of the rig is 0."""
+    if axis.speed_share <= 0:
+        raise WrongState(
+            f"axis {axis.name}: the speed override of the rig is 0 %",
+            axis=axis.name,
+            value=0.0,
+            remedy=Remedy("{} above 0 %", step("set_speed_override", "set the speed override")),
+        )
+
+
+def check_not_forced(axis: AxisTracker) -> None:
+    """Refuse to reset a faulted axis whose motor has voltage and turns, or may, whatever the state says."""
+    if axis.state is AxisState.ERROR_STOP and axis.energised and axis.moving is not Moving.NO:
+        raise WrongState(
+            f"axis {axis.name} still moves, or may: a reset would switch its motor off at speed",
+            axis=axis.name,
+            value=axis.moving.value,
+            remedy=Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
+        )
+
+
+def check_has_gains(drive: QuietDrive) -> None:
+    """Refuse to close the loop of a drive that takes gains and has none."""
+    if Verb.SET_GAINS in drive.capabilities and drive.gains is None:
+        raise WrongState(
+            f"axis {drive.spec.name} has no gains: its loop cannot close",
+            axis=drive.spec.name,
+            remedy=Remedy("configure gains or {}", step("set_gains")),
+        )
+
+
+def fault(axis: str, entry: FaultEntry) -> DriveFault:
+    """Return a fault of a drive as what keeps its axis from moving."""
+    return DriveFault(
+        f"axis {axis}: {entry.text}",
         axis=axis,
-        value=0.0,
-        remedy=Remedy("{} above 0 %", step("set_speed_override", "set the speed override")),
+        value=entry.code,
+        remedy=Remedy("remove the cause, then {}", step("reset")),
     )
 
 
@@ -230,6 +274,94 @@ def _faulted(axis: AxisTracker) -> WrongState:
 def _said(axis: AxisTracker) -> str:
     first = (axis.first_fault,) if axis.first_fault else ()
     return "; ".join(fault.text for fault in axis.active_faults or first)
+
+
+# -- what each command needs -----------------------------------------------------------------------------------------
+
+
+Guard = Callable[[AxisTracker], None]
+"""Raises what a command is refused with while the axis does not hold what it needs."""
+ENERGY: tuple[Guard, ...] = (check_reachable, check_not_latched, check_not_in_error)
+"""Needed for as long as the motor gets voltage."""
+STILL: tuple[Guard, ...] = (*ENERGY, check_enabled, check_stands)
+TO_MOVE: tuple[Guard, ...] = (*ENERGY, check_speed)
+"""Asked directly before each packet that can move."""
+TO_POWER: tuple[Guard, ...] = (*ENERGY, check_does_not_coast)
+"""Asked directly before each packet that closes the loop."""
+
+
+@dataclass(frozen=True, slots=True)
+class Needs:
+    """What a command needs of the state of its axis, whatever its values.
+
+    Attributes:
+        to_begin: asked in this order when its turn has come, before its values.
+        at_packet: asked after its values, directly before its packets.
+        of_drive: asked of the drive before its first packet.
+    """
+
+    to_begin: tuple[Guard, ...] = ()
+    at_packet: tuple[Guard, ...] = ()
+    of_drive: tuple[Callable[[QuietDrive], None], ...] = ()
+
+
+BY_VERB: Mapping[Verb, Needs] = {
+    Verb.POWER: Needs((*ENERGY, check_stands), TO_POWER, (check_has_gains,)),
+    Verb.MOVE_ABSOLUTE: Needs((*STILL, check_referenced), TO_MOVE),
+    Verb.TRACK: Needs((*STILL, check_referenced), TO_MOVE),
+    Verb.RESET: Needs((check_reachable, check_stop_confirmed, check_stands, check_not_forced)),
+    Verb.SET_POSITION: Needs((check_reachable, check_stands, check_position_kept)),
+    Verb.SET_GAINS: Needs((check_reachable,)),
+    Verb.SET_OUTPUTS: Needs((check_reachable,)),
+    Verb.TRACE: Needs(at_packet=(check_reachable,)),
+}
+"""`power` is to close the loop: to open it needs nothing."""
+BY_EFFECT: Mapping[Effect, Needs] = {Effect.MOTION: Needs(STILL, TO_MOVE)}
+"""What a command needs that has no entry of its own; nothing where its effect has none either."""
+
+
+AT_ALL = Needs(ENERGY)
+"""What a motion needs that a drive takes over its own inputs."""
+
+
+def needs(verb: Verb) -> Needs:
+    """Return what a command needs."""
+    return BY_VERB.get(verb) or BY_EFFECT.get(AXIS_COMMANDS[verb].effect, Needs())
+
+
+GOES_ON: Mapping[Verb, frozenset[AxisState]] = {
+    Verb.MOVE_VELOCITY: frozenset({AxisState.CONTINUOUS_MOTION}),
+    Verb.SET_PWM: MOTION_STATES,
+    Verb.TRACK: MOTION_STATES,
+}
+"""Commands that one of their own takes over without a standstill, while the axis is in one of these states."""
+
+
+def goes_on(verb: Verb, axis: AxisTracker) -> bool:
+    """Tell whether a command takes over one of its own that is under way."""
+    return axis.command is not None and axis.command.verb is verb and axis.state in GOES_ON.get(verb, ())
+
+
+def check(verb: Verb, axis: AxisTracker, *, follows: bool = False) -> None:
+    """Refuse to begin a command; with `follows` one that need not wait until the axis stands."""
+    follows = follows or goes_on(verb, axis)
+    for guard in needs(verb).to_begin:
+        if not (follows and guard is check_stands):
+            guard(axis)
+
+
+def obstacles(row: Needs, axis: AxisTracker, drive: QuietDrive) -> Iterator[tuple[LdcndError, Guard | None]]:
+    """Yield all that a command with these needs would be refused with now, the first first; and which guard says so."""
+    for guard in dict.fromkeys(row.to_begin + row.at_packet):
+        try:
+            guard(axis)
+        except LdcndError as error:
+            yield error, guard
+    for of_drive in row.of_drive:
+        try:
+            of_drive(drive)
+        except LdcndError as error:
+            yield error, None
 
 
 def always() -> None:
@@ -260,34 +392,6 @@ class Right:
 
 UNCONDITIONAL = Right()
 """Right of commands that bring an axis to rest, and of callers inside the daemon."""
-
-
-class QuietDrive(Protocol):
-    """Calls to a drive that need no permission: none of them can make it move."""
-
-    spec: AxisSpec
-    capabilities: frozenset[Verb]
-    adc_full_scale: int | None
-    retargets: bool
-    gains: Gains | None
-    holds_gains: bool
-    home_methods: frozenset[HomeMethod]
-    capture_s: float
-    path_period_s: float
-    path_packet: int
-    path_most_counts: int
-
-    def quantise(self, motion: Motion, most: Ceiling = ...) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
-    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
-    def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
-    async def stop(self, mode: StopMode) -> StopMode: ...  # noqa: D102
-    async def reset(self) -> None: ...  # noqa: D102
-    async def clear_warnings(self) -> None: ...  # noqa: D102
-    async def captured_home(self) -> int: ...  # noqa: D102
-    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool: ...  # noqa: D102
-    def check_path(self) -> None: ...  # noqa: D102
-    def path_exchanges(self) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
-    async def path_status(self) -> PathStatus: ...  # noqa: D102
 
 
 def homing(drive: QuietDrive) -> QuietDrive:
@@ -407,34 +511,36 @@ class Permit:
         if not begun:
             self._right.in_time()
 
+    def check_state(self, *, follows: bool = False) -> None:
+        """Raise when the state of the axis forbids to begin this command; see `Needs.to_begin`.
+
+        Args:
+            follows: it may follow what the axis does, without a standstill in between.
+        """
+        check(self.verb, self._gate.tracker, follows=follows)
+
     def ask_to_move(self) -> None:
         """Raise when nothing of this command may move the axis now.
 
         Raises:
             CommandAborted,
-        LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop, and a
+        DriveFault,
+            LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop, and a
                 speed override of 0.
         """
         self.to_move()()
 
     def to_move(self) -> Condition:
         """Return the condition that `ask_to_move` checks, to be checked again when a packet's turn comes."""
-        energise, tracker = self._to_energise(), self._gate.tracker
+        return self._condition(TO_MOVE)
 
-        def condition() -> None:
-            energise()
-            if tracker.speed_share <= 0:
-                raise no_speed(tracker.name)
-
-        return condition
-
-    def _to_energise(self) -> Condition:
-        """Return the condition that is checked before the loop is closed."""
+    def _condition(self, guards: tuple[Guard, ...]) -> Condition:
         begun, tracker = self._begun, self._gate.tracker
 
         def condition() -> None:
             self._ask(begun=begun)
-            check_may_power_on(tracker)
+            for guard in guards:
+                guard(tracker)
 
         return condition
 
@@ -478,14 +584,9 @@ class Permit:
 
     async def power_on(self) -> None:
         """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
-        energise, tracker = self._to_energise(), self._gate.tracker
-
-        def condition() -> None:
-            energise()
-            check_does_not_coast(tracker)
-
+        condition = self._condition(TO_POWER)
         condition()
-        was_on = tracker.enabled
+        was_on = self._gate.tracker.enabled
         try:
             self.begin()
             with only_while(condition):

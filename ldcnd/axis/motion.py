@@ -16,8 +16,8 @@ from ldcnd.axis.guards import (
     check_acceleration,
     check_does_not_coast,
     check_position,
+    check_speed,
     check_velocity,
-    no_speed,
 )
 from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.state import ActiveCommand, AxisTracker, Completion, Settling, window_counts
@@ -317,10 +317,8 @@ class AxisMotion:
         rate = self.config.acceleration if acceleration is None else acceleration
         check_velocity(self.tracker, self.config.limits, speed)
         check_acceleration(self.tracker, self.config.limits, rate)
-        share = self.tracker.speed_share
-        if share <= 0:
-            raise no_speed(self.tracker.name)
-        return speed * share, rate
+        check_speed(self.tracker)
+        return speed * self.tracker.speed_share, rate
 
     def before_approach(
         self, goal: MotionPlan, velocity: float | None, acceleration: float | None

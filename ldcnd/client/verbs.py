@@ -461,13 +461,14 @@ class AxisVerbs(ABC):
         """End the trace that is under way, or one that was left armed in the drive; its samples are lost."""
         return await self._send(AbortTrace)
 
-    async def why(self, *, absolute: bool = True) -> WhyReply:
+    async def why(self, *, absolute: bool = True, each_command: bool = False) -> WhyReply:
         """Report why an axis cannot move.
 
         Args:
             absolute: Whether the motion would name a position, which needs a referenced axis.
+            each_command: Whether to say of each command of the axis as well what forbids it.
         """
-        return await self._ask(lambda: Why(absolute=absolute))
+        return await self._ask(lambda: Why(absolute=absolute, each_command=each_command))
 
     async def preview(
         self,

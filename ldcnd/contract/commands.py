@@ -645,6 +645,17 @@ class Cause(Frozen):
     """The commands that the remedy names, in their order."""
     page: str | None = None
     """Path of its page below a console or the documentation."""
+    passes: bool = False
+    """It ends with the motion under way: a move with another `buffer_mode` than refuse is not refused for it."""
+
+
+class Hindered(Frozen):
+    """Commands of an axis that the same obstacles forbid, or none."""
+
+    verbs: tuple[str, ...]
+    """The commands; `power` is to close the loop, as to open it is never refused."""
+    causes: tuple[Cause, ...]
+    """The obstacles; the first is what they would be refused with, if their values are right."""
 
 
 class WhyReply(Frozen):
@@ -658,6 +669,8 @@ class WhyReply(Frozen):
     """The obstacles, in the order in which they have to be cleared."""
     first_fault: str | None
     """The first fault since the last reset; null when there was none."""
+    commands: tuple[Hindered, ...] = ()
+    """What forbids each command of the axis, if that was asked."""
 
 
 class Why(Command[WhyReply]):
@@ -671,6 +684,8 @@ class Why(Command[WhyReply]):
     """The lease under which the motion would be sent."""
     absolute: bool = True
     """Whether the motion would name a position, which needs a referenced axis."""
+    each_command: bool = False
+    """Whether to say of each command of the axis as well what forbids it."""
 
 
 class PreviewReply(Frozen):

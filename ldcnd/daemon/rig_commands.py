@@ -1,36 +1,35 @@
 """Commands of several axes, of a module or of the rig as a whole, and questions: what is not for one axis alone."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import replace
 
 from ldcnd.axis import guards
-from ldcnd.axis.axis import AxisService
+from ldcnd.axis.axis import NO_COMMAND_HELPS, AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.procedures.group import GroupMoveRequest, Meeting, Rendezvous, plans_on_line
 from ldcnd.axis.procedures.path import PathShareRequest, SharedPath
-from ldcnd.axis.state import AxisTracker
+from ldcnd.contract.catalogue import AXIS_COMMANDS, verbs_for
 from ldcnd.contract.codec import remedy_steps
 from ldcnd.contract.commands import (
     AxisCommand,
+    Capability,
     Cause,
     Command,
     CommandReply,
+    Effect,
+    Hindered,
     MoveAbsolute,
     Preview,
     ReportShadow,
-    Verb,
     Why,
     WhyReply,
 )
 from ldcnd.contract.errors import (
-    DriveFault,
     InternalError,
     LdcndError,
     MalformedRequest,
     NotSupported,
-    Remedy,
-    step,
 )
 from ldcnd.contract.events import CommandOutcome, ReadEvents, ReadOutcome
 from ldcnd.contract.frozen import Frozen
@@ -56,7 +55,6 @@ from ldcnd.contract.rig_commands import (
     WalkPath,
     WireLogReply,
 )
-from ldcnd.contract.samples import FaultEntry
 from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy
 from ldcnd.daemon.ledger import EventLog, Ledger
 from ldcnd.daemon.line import BusService
@@ -174,12 +172,7 @@ class RigCommands:
 
     def _why(self, axis: AxisService, request: Why) -> WhyReply:
         """Tell why a motion of this axis would be refused now, and what would clear that."""
-        return explain(
-            axis.tracker,
-            lambda: self._admit(axis.config.name, request.lease),
-            axis.driver.capabilities,
-            absolute=request.absolute,
-        )
+        return explain(axis, request, lambda: self._admit(axis.config.name, request.lease))
 
     def _own(self, axis: str, leases: tuple[str, ...]) -> str | None:
         """Return which of these leases is the one on an axis; None when another one is, or none."""
@@ -427,76 +420,49 @@ def _bus_of(rig: Rig, name: str) -> BusService:
     return next(bus for bus in rig.buses if any(axis.config.name == name for axis in bus.axes))
 
 
-MOTIONS = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY, Verb.JOG, Verb.SET_PWM})
-"""Commands of which a drive that can be moved at all takes one at least."""
-OF_DRIVES = frozenset({*MOTIONS, Verb.POWER, Verb.HALT, Verb.HOME, Verb.SET_POSITION, Verb.RESET, Verb.SET_GAINS})
-"""Commands that only some drives take."""
-NO_COMMAND_HELPS = "the drive takes no command for that: use its own inputs and its own tool"
-
-
-def explain(
-    tracker: AxisTracker, admit: Callable[[], None], capabilities: Collection[Verb], *, absolute: bool
-) -> WhyReply:
-    """Evaluate every guard for a motion.
-
-    Args:
-        tracker: what is known of the axis.
-        admit: raises what the authority would refuse the sender with.
-        capabilities: the commands that its drive takes: no remedy names another one.
-        absolute: whether the motion would name a position.
-    """
-    checks: list[Callable[[], None]] = [
-        admit,
-        lambda: guards.check_reachable(tracker),
-        lambda: guards.check_not_latched(tracker),
-        *(_fault(tracker.name, fault) for fault in tracker.active_faults if fault.source == "drive"),
-        lambda: guards.check_not_in_error(tracker),
-    ]
-    if MOTIONS.isdisjoint(capabilities):
-        checks.append(lambda: _refuse_motion(tracker.name))
-    else:
-        checks += [lambda: guards.check_enabled(tracker), lambda: guards.check_stands(tracker)]
-    if absolute and Verb.MOVE_ABSOLUTE in capabilities:
-        checks.append(lambda: guards.check_referenced(tracker))
-    causes = []
-    for check in checks:
-        try:
-            check()
-        except LdcndError as error:
-            steps = remedy_steps(error)
-            possible = all(each.verb in capabilities or each.verb not in OF_DRIVES for each in steps)
-            causes.append(
-                Cause(
-                    code=error.code.value,
-                    text=error.message,
-                    remedy=error.remedy if possible else NO_COMMAND_HELPS,
-                    steps=steps if possible else (),
-                    page=error.page,
-                )
-            )
-    first = tracker.first_fault
+def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyReply:
+    """Say what forbids a motion of an axis, and each of its commands; `admit` raises what its sender may not."""
+    not_admitted = []
+    try:
+        admit()
+    except LdcndError as error:
+        not_admitted.append((error, False))
+    alike: dict[tuple[str, ...], Hindered] = {}
+    for verb, command in AXIS_COMMANDS.items() if request.each_command else ():
+        asks_right = [] if command.effect is Effect.QUESTION else not_admitted
+        causes = () if command.effect is Effect.REST else _causes(axis, asks_right + axis.obstacles(verb))
+        texts = tuple(cause.text for cause in causes)
+        others = alike[texts].verbs if texts in alike else ()
+        alike[texts] = Hindered(verbs=(*others, verb.value), causes=causes)
+    causes = _causes(axis, not_admitted + axis.obstacles_to_motion(absolute=request.absolute))
+    first = axis.tracker.first_fault
     return WhyReply(
-        axis=tracker.name,
+        axis=axis.config.name,
         can_move=not causes,
-        causes=tuple(causes),
+        causes=causes,
         first_fault=f"{first.code}: {first.text}" if first else None,
+        commands=tuple(alike.values()),
     )
 
 
-def _refuse_motion(axis: str) -> None:
-    raise NotSupported(f"axis {axis}: its drive takes no motion over the line", axis=axis, remedy=NO_COMMAND_HELPS)
-
-
-def _fault(axis: str, fault: FaultEntry) -> Callable[[], None]:
-    def check() -> None:
-        raise DriveFault(
-            f"axis {axis}: {fault.text}",
-            axis=axis,
-            value=fault.code,
-            remedy=Remedy("remove the cause, then {}", step("reset")),
+def _causes(axis: AxisService, obstacles: Iterable[tuple[LdcndError, bool]]) -> tuple[Cause, ...]:
+    """Return obstacles as a client gets them; no remedy names a command that the drive does not take."""
+    impossible = verbs_for(Capability.MOTION) - axis.driver.capabilities
+    causes = []
+    for error, passes in obstacles:
+        steps = remedy_steps(error)
+        possible = not any(each.verb in impossible for each in steps)
+        causes.append(
+            Cause(
+                code=error.code.value,
+                text=error.message,
+                remedy=error.remedy if possible else NO_COMMAND_HELPS,
+                steps=steps if possible else (),
+                page=error.page,
+                passes=passes,
+            )
         )
-
-    return check
+    return tuple(causes)
 
 
 def wire_page(rig: Rig, request: ReadWireLog, clock: Clock) -> WireLogReply:

@@ -4,6 +4,7 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from functools import partial
 from types import SimpleNamespace
 
 import pytest
@@ -17,13 +18,25 @@ from ldcnd.contract.commands import (
     BufferMode,
     Effect,
     Halt,
+    Home,
+    HomeMethod,
     Jog,
     MoveAbsolute,
+    MoveAnalog,
+    MoveRelative,
     MoveVelocity,
     Power,
     Preview,
+    Probe,
+    QuickStop,
+    Reset,
     SetGains,
+    SetOutputs,
+    SetPosition,
+    SetPwm,
     Stop,
+    Track,
+    Verb,
     Why,
 )
 from ldcnd.contract.errors import (
@@ -44,12 +57,12 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.leases import Acquire, LeaseReply, ListHolders, Release, Renew
 from ldcnd.contract.rig_commands import AxisMove, MoveTogether, Rehearsal, Rehearse
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.dispatch import PENDING_REQUESTS, Dispatcher, Requests
 from ldcnd.daemon.leases import Authority
 from ldcnd.daemon.ledger import EventLog, Ledger
 from ldcnd.daemon.rig import Rig
-from ldcnd.drives.driver import StopMode
+from ldcnd.drives.driver import Fault, StopMode
 from ldcnd.net.hand_over import Query
 from tests.support.axis_bench import KEYS, RUNNING, STANDING, AxisBench, axis_bench, raising
 
@@ -361,6 +374,123 @@ async def test_why_and_preview_tell_what_the_sender_would_be_refused_with_and_do
 
     assert rig.x.drive.calls == []
     assert rig.page() == []
+
+
+FIT = {
+    "power": Power(on=True),
+    "move_absolute": THERE,
+    "move_relative": MoveRelative(distance=1.0),
+    "move_velocity": MoveVelocity(velocity=1.0),
+    "jog": Jog(velocity=1.0),
+    "halt": Halt(),
+    "quick_stop": QuickStop(),
+    "stop": Stop(),
+    "home": Home(method=HomeMethod.INDEX, velocity=1.0),
+    "probe": Probe(sources=("forward_limit",), distance=1.0),
+    "reset": Reset(),
+    "set_position": SetPosition(position=0.0),
+    "set_gains": SetGains(kp=300, el=4000),
+    "move_analog": MoveAnalog(target=500),
+    "set_pwm": SetPwm(duty=0.1, duration_s=1.0),
+    "track": Track(position=0.1),
+    "set_outputs": SetOutputs(),
+}
+"""Commands whose values are right, by verb: only the state of the axis, or the right of the sender, refuses them."""
+
+
+async def _latched(rig: Commanded) -> None:
+    await rig.x.stop()
+    await rig.x.settled()
+
+
+async def _moving(rig: Commanded) -> None:
+    await rig.send(MoveVelocity(velocity=1.0))
+    await rig.x.pass_s(0.1, **RUNNING)
+
+
+async def _disabled(rig: Commanded) -> None:
+    await rig.send(Power(on=False))
+    await rig.x.settled(enabled=False)
+
+
+async def _turning(rig: Commanded) -> None:
+    await _disabled(rig)
+    await rig.x.pass_s(0.1, enabled=False, **RUNNING)
+
+
+async def _without_gains(rig: Commanded) -> None:
+    await _disabled(rig)
+    rig.x.drive.gains = None
+
+
+async def _faulted(rig: Commanded) -> None:
+    await rig.x.settled(faults=(Fault("overheat", "too hot", stops=True),))
+
+
+async def _foreign(rig: Commanded) -> None:
+    await rig.acquired("x", client="bob")
+
+
+async def _two_daemons(rig: Commanded) -> None:
+    rig.dispatcher.rivals.add("another")
+
+
+async def _put(rig: Commanded, **fields: object) -> None:
+    for name, value in fields.items():
+        setattr(rig.x.tracker, name, value)
+
+
+STATES = {
+    "standstill": _put,
+    "disabled": _disabled,
+    "turning, disabled": _turning,
+    "gains unknown": _without_gains,
+    "faulted": _faulted,
+    "latched": _latched,
+    "moving": _moving,
+    "not homed": partial(_put, referenced=False),
+    "position lost": partial(_put, referenced=False, position_lost=True),
+    "link down": partial(_put, link=LinkState.DOWN),
+    "link down, latched, not homed": partial(_put, link=LinkState.DOWN, stop_latched=True, referenced=False),
+    "override 0 %": partial(_put, speed_share=0.0),
+    "foreign control": _foreign,
+    "two daemons": _two_daemons,
+}
+
+
+@pytest.mark.parametrize("state", STATES)
+async def test_why_says_of_each_command_what_it_is_refused_with(state):
+    pwm, tracking = {"duty": 0.5, "duration_s": 5.0}, {"step": 3.0, "rate": 50.0}
+    said, found = {}, {}
+    for verb, command in FIT.items():
+        async with commanded(pwm=pwm, tracking=tracking) as rig:
+            await STATES[state](rig)
+            groups = (await rig.send(Why(each_command=True))).commands
+            (causes,) = [group.causes for group in groups if verb in group.verbs]
+            said[verb] = (causes[0].code, causes[0].text, causes[0].remedy) if causes else None
+            error = await refused(rig.send(command))
+            found[verb] = (error.code.value, error.message, error.remedy) if error else None
+
+    assert said == found
+
+
+async def test_why_names_every_command_of_the_axis_once_and_a_stop_is_never_forbidden():
+    async with commanded(required=True) as rig:
+        await _latched(rig)
+        await _put(rig, link=LinkState.DOWN, speed_share=0.0)
+        groups = (await rig.send(Why(each_command=True))).commands
+
+    assert sorted(verb for group in groups for verb in group.verbs) == sorted(Verb)
+    assert {"halt", "stop", "quick_stop"} <= {verb for group in groups for verb in group.verbs if not group.causes}
+
+
+async def test_why_marks_what_a_move_may_wait_for():
+    async with commanded() as rig:
+        await _moving(rig)
+        reply = await rig.send(Why(each_command=True))
+        assert [cause.passes for cause in reply.causes] == [True]
+        reply = await rig.send(Why())
+        assert reply.commands == ()
 
 
 @pytest.mark.parametrize("kind", Rehearsal)

@@ -2,6 +2,7 @@ import pytest
 
 from ldcnd.axis import guards
 from ldcnd.axis.state import AxisTracker
+from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import (
     AccelerationLimit,
     AxisUnreachable,
@@ -30,7 +31,7 @@ LIMITS = AxisLimits(position_min=-10, position_max=10, velocity=5, acceleration=
 
 
 def test_an_axis_that_stands_and_is_powered_may_move():
-    guards.check_may_move(READY)
+    guards.check(Verb.MOVE_RELATIVE, READY)
 
 
 @pytest.mark.parametrize(
@@ -49,7 +50,7 @@ def test_an_axis_that_stands_and_is_powered_may_move():
 )
 def test_a_refusal_names_the_axis_and_the_way_out(change, error, remedy):
     with pytest.raises(error) as refusal:
-        guards.check_may_move(ready(**change))
+        guards.check(Verb.MOVE_RELATIVE, ready(**change))
 
     assert "axis x" in refusal.value.message
     assert refusal.value.axis == "x"
@@ -58,7 +59,7 @@ def test_a_refusal_names_the_axis_and_the_way_out(change, error, remedy):
 
 def test_a_faulted_axis_says_what_its_fault_is():
     with pytest.raises(WrongState, match="overheat"):
-        guards.check_may_move(ready("overheat", state=AxisState.ERROR_STOP))
+        guards.check(Verb.MOVE_RELATIVE, ready("overheat", state=AxisState.ERROR_STOP))
 
 
 def test_an_unreferenced_axis_takes_no_absolute_target():

@@ -7,7 +7,6 @@ limit switches stop it in the drive, where they are armed.
 
 from typing_extensions import override
 
-from ldcnd.axis import guards
 from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
@@ -39,8 +38,7 @@ class AnalogMove(EndlessMotion):
             DriveFault: the sensor reads like a broken one.
         """
         motion, request = self._motion, self._request
-        tracker = motion.tracker
-        guards.check_may_move(tracker)
+        self.permit.check_state()
         self._check_target()
         speed = motion.config.velocity if request.velocity is None else request.velocity
         plan = motion.plan_at(speed, request.acceleration)

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 
 from typing_extensions import override
 
-from ldcnd.axis import guards
 from ldcnd.axis.guards import Permit, start_together
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.procedure import Procedure
@@ -213,9 +212,7 @@ class GroupMember(Procedure):
         """
         meeting, motion = self._request.rendezvous, self.motion
         try:
-            tracker = motion.tracker
-            guards.check_may_move(tracker)
-            guards.check_referenced(tracker)
+            self.permit.check_state()
             position = motion.unwrapped(self._request.position, self._request.direction)
             self.plan = motion.plan_to(position, self._request.velocity, self._request.acceleration)
             await meeting.join(motion.config.name, self)

@@ -102,7 +102,7 @@ class HomeSequence(Procedure):
     @override
     async def begin(self) -> CommandReply:
         motion, tracker = self._motion, self._motion.tracker
-        guards.check_may_move(tracker)
+        self.permit.check_state()
         search = self._search
         plan = motion.plan_at(search.velocity, self._acceleration)
         if search.method is HomeMethod.INDEX:

@@ -12,7 +12,6 @@ from enum import Enum
 
 from typing_extensions import override
 
-from ldcnd.axis import guards
 from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.procedure import Procedure
@@ -138,7 +137,7 @@ class HeldJog(Procedure):
             PositionLimit: the axis stands at the software limit ahead.
             LeaseExpired: no renewal came while the command waited.
         """
-        guards.check_may_move(self._motion.tracker)
+        self.permit.check_state()
         try:
             return await self._run()
         finally:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 from typing_extensions import override
 
-from ldcnd.axis import guards
 from ldcnd.axis.guards import Permit, start_path, walking
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.polyline import PathAxis, Walk, walk
@@ -281,9 +280,7 @@ class PathMember(Procedure):
         """
         path, motion = self._path, self.motion
         try:
-            tracker = motion.tracker
-            guards.check_may_move(tracker)
-            guards.check_referenced(tracker)
+            self.permit.check_state()
             walking(motion.driver).check_path()
             status = await walking(motion.driver).path_status()
             if status.points or status.running or not status.enabled:

@@ -42,11 +42,11 @@ class ProbeMove(Procedure):
             VelocityLimit: the index could be missed at this velocity.
         """
         motion = self._motion
-        guards.check_may_move(motion.tracker)
+        self.permit.check_state()
         self._check_sources()
         here = (await motion.read()).position_counts  # one reading alone may be wrong
         self.permit.still_wanted()
-        guards.check_may_move(motion.tracker)
+        self.permit.check_state()
         plan = self._plan(here)
         if HomeMethod.INDEX in self._methods:
             width = motion.config.home.index_width if motion.config.home else 1

@@ -6,12 +6,11 @@ the axis must be configured for it.
 
 from typing_extensions import override
 
-from ldcnd.axis import guards
 from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
 from ldcnd.axis.state import AxisTracker, Completion
-from ldcnd.contract.commands import CommandReply, SetPwm, Verb
+from ldcnd.contract.commands import CommandReply, SetPwm
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import AxisReading, Motion, PwmOutput, StopMode
@@ -32,11 +31,7 @@ class PwmRun(EndlessMotion):
     async def begin(self) -> CommandReply:
         """See `Procedure`. A duty under way may be replaced by another."""
         motion, request = self._motion, self._request
-        tracker, active = motion.tracker, motion.tracker.command
-        if active is None or active.verb is not Verb.SET_PWM:
-            guards.check_may_move(tracker)
-        else:
-            guards.check_may_power_on(tracker)
+        self.permit.check_state()
         self._check_bounds()
         speed, rate = motion.config.velocity, motion.config.acceleration
         counts_per_unit = abs(motion.counts_per_unit)

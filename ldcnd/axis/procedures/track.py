@@ -47,11 +47,7 @@ class SetPoint(Procedure):
         motion, tracker, position = self._motion, self._motion.tracker, self._request.position
         bounds = self._bounds()
         before, self._before = self._before, None  # a stream keeps only its last set-point
-        if before:
-            guards.check_may_power_on(tracker)
-        else:
-            guards.check_may_move(tracker)
-        guards.check_referenced(tracker)
+        self.permit.check_state()
         guards.check_position(tracker, motion.config.limits, position)
         self._check_rate(before, bounds)
         target = motion.counts_of(position)

@@ -8,22 +8,15 @@ that are armed do so without it. PIC-SERVO SC takes a new trapezoid at any time:
 
 from typing_extensions import override
 
-from ldcnd.axis import guards
 from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.procedures.endless import EndlessMotion
-from ldcnd.axis.state import AxisTracker, Completion
-from ldcnd.contract.commands import CommandReply, MoveVelocity, Verb
+from ldcnd.axis.state import Completion
+from ldcnd.contract.commands import CommandReply, MoveVelocity
 from ldcnd.contract.samples import AxisState
 
 COUNTER_SHARE = 0.99
 """Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
-
-
-def runs(tracker: AxisTracker) -> bool:
-    """Tell whether the axis carries out a motion whose velocity may be changed."""
-    command = tracker.command
-    return command is not None and command.verb is Verb.MOVE_VELOCITY and tracker.state is AxisState.CONTINUOUS_MOTION
 
 
 class VelocityChange(EndlessMotion):
@@ -41,7 +34,7 @@ class VelocityChange(EndlessMotion):
             PositionLimit: the software limit ahead is too near to stop before it.
         """
         motion, request = self._motion, self._request
-        guards.check_may_follow(motion.tracker)
+        self.permit.check_state()
         plan = motion.plan_at(request.velocity, request.acceleration)
         self._velocity, self.acceleration = plan.velocity, plan.acceleration
         self.check_room(plan.velocity)
