@@ -306,6 +306,11 @@ class Pages:
         self._rigs = rigs
         self._open: dict[str, tuple[Visitor, PageControl]] = {}
         self._count = 0
+        rigs.lease_of = self.lease
+
+    def lease(self, rig: str, axis: str) -> str | None:
+        """Return the lease under which one of the pages controls an axis."""
+        return next((lease for _, page in self._open.values() if (lease := page.lease(rig, axis))), None)
 
     @asynccontextmanager
     async def open(self, visitor: Visitor, tell: Callable[[ToPage], None]) -> AsyncIterator[PageControl]:

@@ -1,24 +1,35 @@
 """One rig: whether its daemon is there, what it says about itself, and its values as they come."""
 
 import asyncio
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 
-from ldcnd.client.network import Sample
+import msgpack
+
+from ldcnd.client.network import Sample, SampleKind
 from ldcnd.client.overview import holders_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import RigReply
+from ldcnd.contract.codec import Encoding
+from ldcnd.contract.commands import Why
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.meta import CommandList
 from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.samples import TelemetryItem
 from ldcnd.log import get_logger
 
 log = get_logger("console")
 
 ASK_AGAIN_S = 0.5
 """Pause before the next query of a daemon that did not answer, seconds; behind a router it may be late at first."""
+OBSTACLES_TOPIC = "obstacles"
+"""The last chunk of the key under which a page gets what forbids the commands of an axis; no daemon publishes it."""
+ASK_WHY_EACH_S = 0.2
+"""Shortest time between two rounds of questions for what forbids the commands of axes, seconds."""
+ASK_ALL_WHY_S = 2.0
+"""Longest time between them: what is not in the state of an axis, as another daemon, forbids commands too."""
 HOLDERS_EACH_S = 1.0
 """Period of queries for who controls what, seconds; the daemon publishes everything else by itself."""
 LINGER_S = 0.016
@@ -36,10 +47,19 @@ class RigWatch:
         endpoint: through which it is reached, in words.
     """
 
-    def __init__(self, client: RigClient, endpoint: str, values: LatestValues) -> None:
+    def __init__(
+        self,
+        client: RigClient,
+        endpoint: str,
+        values: LatestValues,
+        lease_of: Callable[[str], str | None] = lambda _axis: None,
+    ) -> None:
         self.client = client
         self.endpoint = endpoint
         self._values = values
+        self._lease_of = lease_of
+        self._why_due: set[str] = set()
+        self._why_wanted = asyncio.Event()
         self._conditions = Conditions(client.rig, values.take, asyncio.get_running_loop().time)
         self._instances: set[str] = set()
         self._stirred = asyncio.Event()
@@ -77,11 +97,13 @@ class RigWatch:
         async with asyncio.TaskGroup() as group:
             group.create_task(self._conditions.run(), name=f"conditions of {self.client.rig}")
             group.create_task(self._follow_holders(), name=f"holders of {self.client.rig}")
+            group.create_task(self._follow_obstacles(), name=f"obstacles of {self.client.rig}")
             await self._watch()
 
     def control_changed(self) -> None:
         """Query at once who controls what: a page has taken control, given it up or lost it."""
         self._control_changed.set()
+        self._want_why(*self.axes)
 
     async def _follow_holders(self) -> None:
         """Query who controls what, for all pages at once."""
@@ -93,7 +115,40 @@ class RigWatch:
                 async with asyncio.timeout(HOLDERS_EACH_S):
                     await self._control_changed.wait()
 
+    def _want_why(self, *axes: str) -> None:
+        self._why_due.update(axes)
+        self._why_wanted.set()
+
+    async def _follow_obstacles(self) -> None:
+        """Ask what forbids the commands of each axis, for all open pages at once, whenever its state has changed."""
+        while True:
+            try:
+                async with asyncio.timeout(ASK_ALL_WHY_S):
+                    await self._why_wanted.wait()
+            except TimeoutError:
+                self._why_due.update(self.axes)
+            self._why_wanted.clear()
+            due, self._why_due = self._why_due & self.axes, set()
+            for axis in due if self._values.watchers and self.connected else ():
+                await self._ask_why(axis)
+            await asyncio.sleep(ASK_WHY_EACH_S)
+
+    async def _ask_why(self, axis: str) -> None:
+        """Put what forbids the commands of an axis, to the page that controls it, among the values of pages."""
+        key, payload = self.client.keys.telemetry(axis, TelemetryItem.STATE), b""
+        key = f"{key.removesuffix(TelemetryItem.STATE)}{OBSTACLES_TOPIC}"
+        with suppress(LdcndError):
+            reply = await self.client.ask(Why(lease=self._lease_of(axis), each_command=True), axis)
+            said = {
+                verb: [each.model_dump() for each in group.causes] for group in reply.commands for verb in group.verbs
+            }
+            payload = msgpack.packb(said)
+        kind = SampleKind.PUT if payload else SampleKind.DELETE
+        self._values.take(Sample(key, payload, Encoding.MSGPACK, kind, measured_at_ns=None))
+
     def _take(self, sample: Sample) -> None:
+        if sample.key.endswith((f"/{TelemetryItem.STATE}", f"/{TelemetryItem.FAULT}")):
+            self._want_why(sample.key.split("/")[-2])
         self._values.take(sample)
         self._conditions.take(sample)
 

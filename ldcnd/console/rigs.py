@@ -1,8 +1,9 @@
 """All rigs that the console shows, over one session for each endpoint."""
 
 import asyncio
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
+from functools import partial
 
 from ldcnd.client.network import Session, ZenohSettings, open_session
 from ldcnd.client.rig_client import RigClient, daemons
@@ -38,11 +39,15 @@ class Rigs:
     Args:
         values: takes what they publish.
         wanted: these only; none means all.
+
+    Attributes:
+        lease_of: gives the lease under which a page controls an axis of a rig, or None.
     """
 
     def __init__(self, values: LatestValues, wanted: Collection[str] = ()) -> None:
         self._values = values
         self._wanted = frozenset(wanted)
+        self.lease_of: Callable[[str, str], str | None] = lambda _rig, _axis: None
         self._watches: dict[str, RigWatch] = {}
         self._endpoints: dict[str, EndpointReply] = {}
 
@@ -110,7 +115,9 @@ class Rigs:
                     if len(self._watches) >= MOST_RIGS:
                         self._note(endpoint, problem=f"rig {rig} is left out: there are {MOST_RIGS} already")
                         return
-                    watch = self._watches[rig] = RigWatch(RigClient(session, rig), endpoint.name, self._values)
+                    watch = self._watches[rig] = RigWatch(
+                        RigClient(session, rig), endpoint.name, self._values, partial(self._lease, rig)
+                    )
                     group.create_task(watch.run(), name=f"rig {rig}")
                 if watch.endpoint != endpoint.name:
                     self._note(endpoint, problem=f"rig {rig} is shown as {watch.endpoint} has it; its namesake is not")
@@ -124,6 +131,9 @@ class Rigs:
                 except SessionError as error:
                     self._note(endpoint, problem=error.message)
                     await asyncio.sleep(OPEN_AGAIN_S)
+
+    def _lease(self, rig: str, axis: str) -> str | None:
+        return self.lease_of(rig, axis)
 
     def _watch(self, rig: str) -> RigWatch:
         if rig not in self._watches:

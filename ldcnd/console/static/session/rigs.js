@@ -179,8 +179,6 @@ export class Rig {
   endpoint = "";
   daemon = null;
   plan = null;
-  /** What each command may do to the rig, by verb, as the daemon publishes it. */
-  effects = {};
   health = null;
   axes = new Map();
   buses = new Map();
@@ -217,7 +215,6 @@ export class Rig {
     this.problem = told.problem;
     this.daemon = told.daemon ?? this.daemon;
     this.plan = told.plan ?? this.plan;
-    if (told.commands) this.effects = Object.fromEntries(told.commands.commands.map(({ verb, effect }) => [verb, effect]));
     const described = Boolean(told.daemon);
     if (described) for (const axis of this.axes.values()) axis.info = null; // those that it has not any more keep none
     for (const bus of this.buses.keys()) if (described && !told.buses.some((each) => each.bus === bus)) this.buses.delete(bus);
