@@ -4,7 +4,8 @@ import re
 
 import pytest
 
-from ldcnd.contract.commands import MoveVelocity, Power
+from ldcnd.contract.commands import MoveRelative, MoveVelocity, Power
+from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.parameters import ReadParameter
 from ldcnd.contract.rig_commands import SetSpeedOverride
@@ -62,6 +63,20 @@ async def test_what_would_be_refused_is_said_before_it_is_asked(house):
         await expect(desk.panel("Move")).to_contain_text("above the limit 100 mm")
         await desk.button("Use 100.000").click()
         await expect(desk.panel("Move")).to_contain_text("Ends at 100.000 mm")
+
+
+async def test_a_button_says_what_the_daemon_refuses_the_command_with(house):
+    await house.sim.quiet("x")
+    await house.sim.rig.command("x", Power(on=False))
+    with pytest.raises(LdcndError) as refusal:
+        await house.sim.rig.command("x", MoveRelative(distance=1.0))
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.panel("Move").get_by_label("Move", exact=True).select_option("by a distance")
+        await expect(desk.panel("Move")).to_contain_text(f"{refusal.value.message}: press Enable.")
+        await desk.button("Enable").click()
+        await expect(desk.panel("Move")).not_to_contain_text(refusal.value.message)
 
 
 async def test_the_button_stops_every_axis_of_every_rig(house):
