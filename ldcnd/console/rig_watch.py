@@ -139,10 +139,8 @@ class RigWatch:
         key = f"{key.removesuffix(TelemetryItem.STATE)}{OBSTACLES_TOPIC}"
         with suppress(LdcndError):
             reply = await self.client.ask(Why(lease=self._lease_of(axis), each_command=True), axis)
-            said = {
-                verb: [each.model_dump() for each in group.causes] for group in reply.commands for verb in group.verbs
-            }
-            payload = msgpack.packb(said)
+            groups = [(verb, group.causes) for group in reply.commands for verb in group.verbs]
+            payload = msgpack.packb({verb: [each.model_dump() for each in causes] for verb, causes in groups})
         kind = SampleKind.PUT if payload else SampleKind.DELETE
         self._values.take(Sample(key, payload, Encoding.MSGPACK, kind, measured_at_ns=None))
 
