@@ -1,16 +1,20 @@
 """What is held of the words of the published contract: `python -m tests.words`, a part of `make check`.
 
-Every description in `schemas/` is a whole sentence that begins with the thing described and ends with a full stop.
+Every description in `schemas/` is a whole sentence that begins with the thing described and ends with a full stop. The
+name of a class stands once in the package.
 """
 
 import argparse
+import ast
 import json
 import re
 import sys
+from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-SCHEMAS = Path(__file__).parents[1] / "schemas"
+ROOT = Path(__file__).parents[1]
+SCHEMAS = ROOT / "schemas"
 NO_THING = frozenset({
     "After", "Also", "And", "As", "At", "Because", "Before", "Beside", "Besides", "But", "By", "Else", "For", "From",
     "If", "In", "Likewise", "None", "Not", "Of", "On", "Only", "Or", "Otherwise", "Over", "Per", "Same", "Since", "So",
@@ -43,17 +47,31 @@ def fault_of(text: str) -> str | None:
     return None if text.rstrip().endswith(".") else "does not end with a full stop"
 
 
+def names_twice(package: Path) -> Iterator[str]:
+    """Yield the names of classes that several modules define, with these."""
+    modules: dict[str, list[str]] = defaultdict(list)
+    for file in sorted(package.rglob("*.py")):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.ClassDef):
+                modules[node.name].append(str(file.relative_to(package)))
+    for name, found in modules.items():
+        if len(found) > 1:
+            yield f"class {name} stands in {', '.join(found)}"
+
+
 def main() -> int:
-    """Print the descriptions that are no sentences; the exit status is 1 if there are any."""
+    """Print descriptions that are no sentences and names that stand twice; the exit status is 1 if there are any."""
     argparse.ArgumentParser(description=__doc__).parse_args()
-    found = {
+    texts = {
         f"{path}: {text!r} {fault}"
         for file in sorted(SCHEMAS.glob("*.json"))
         for path, text in descriptions(json.loads(file.read_text(encoding="utf-8")), file.stem)
         if (fault := fault_of(text))
     }
-    print(*sorted(found), f"{len(found)} descriptions are no whole sentences", sep="\n")
-    return bool(found)
+    names = list(names_twice(ROOT / "ldcnd"))
+    print(*sorted(texts), *names, sep="\n", end="\n" if texts or names else "")
+    print(f"{len(texts)} descriptions are no whole sentences, {len(names)} names of classes stand twice")
+    return bool(texts or names)
 
 
 if __name__ == "__main__":

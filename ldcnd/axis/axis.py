@@ -21,7 +21,7 @@ from ldcnd.axis.kept import KeptFiles
 from ldcnd.axis.latches import LatchKeeper
 from ldcnd.axis.motion import AxisMotion, MotionPlan, preview
 from ldcnd.axis.parameters import Parameters
-from ldcnd.axis.plausibility import ROUNDS, PlausibilityGate, Step, Verdict, agree
+from ldcnd.axis.plausibility import ROUNDS, CounterStep, PlausibilityGate, ReadingVerdict, agree
 from ldcnd.axis.procedures.jog import Hold
 from ldcnd.axis.recorder import TraceRecorder
 from ldcnd.axis.reference import ReferenceKeeper
@@ -373,7 +373,7 @@ class AxisService:
         # a command that waits has sent nothing yet
         standing = tracker.command is None and tracker.at_rest and not self._queue.at_work.locked()
         judged = self._plausibility.judge(reading, timing, standing=standing)
-        if judged.verdict is Verdict.BELIEVED:
+        if judged.verdict is ReadingVerdict.BELIEVED:
             if judged.confirmed:
                 if judged.step:
                     self._stepped(judged.step, reading)
@@ -382,7 +382,7 @@ class AxisService:
                 self._observe(first, first.asked - asked, first_timing)
             self._observe(reading, asked, timing)
             return False
-        if judged.verdict is Verdict.CONTRADICTS:
+        if judged.verdict is ReadingVerdict.CONTRADICTS:
             now_ns = self._clock.now_ns()
             if tracker.contradicted(now_ns):
                 log.error("readings contradict each other", axis=self.config.name, counts=reading.position_counts)
@@ -391,11 +391,11 @@ class AxisService:
             self.telemetry.stale(now_ns)
         if judged.foreign:
             self._bus.distrust()  # another drive's reply that came late would be followed by others
-        return judged.verdict is Verdict.ASK_AGAIN
+        return judged.verdict is ReadingVerdict.ASK_AGAIN
 
-    def _stepped(self, step: Step, reading: AxisReading) -> None:
+    def _stepped(self, step: CounterStep, reading: AxisReading) -> None:
         """No motion has led to where the drive is: its counter was set, or the encoder slips."""
-        if step is Step.ZEROED:
+        if step is CounterStep.ZEROED:
             self._changed_by_another(DRIVE_RESET, "its position counter has restarted at 0")
         else:
             log.error("position jumped", axis=self.config.name, counts=reading.position_counts)

@@ -53,7 +53,7 @@ from ldcnd.contract.errors import (
     step,
 )
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Gains, Motion, StopMode
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, CountsMotion, Gains, StopMode
 from ldcnd.line.exchange import Timing
 
 STEP_RETRY_S = 0.2
@@ -83,7 +83,9 @@ class AxisCommands:
         self.procedure: Procedure | None = None
         self.holds = Holds(motion.config.name)
         self.own_gains: Gains | None = None
-        self._moved: tuple[Permit, Motion, float] | None = None  # the last trapezoid, and the speed share of its plan
+        self._moved: tuple[Permit, CountsMotion, float] | None = (
+            None  # the last trapezoid, and the speed share of its plan
+        )
         self._retry_s: float | None = None  # when the step that was not taken is taken again
 
     async def carry_out(self, permit: Permit, request: AxisCommand[CommandReply]) -> CommandReply:

@@ -43,10 +43,10 @@ from ldcnd.drives.driver import (
     AxisReading,
     AxisSpec,
     Ceiling,
+    CountsMotion,
     Drive,
     Gains,
     HomeCapture,
-    Motion,
     Moves,
     PathStatus,
     PwmOutput,
@@ -73,8 +73,8 @@ class QuietDrive(Protocol):
     path_packet: int
     path_most_counts: int
 
-    def quantise(self, motion: Motion, most: Ceiling = ...) -> Motion: ...  # noqa: D102 - of `Moves`, as all of these
-    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
+    def quantise(self, motion: CountsMotion, most: Ceiling = ...) -> CountsMotion: ...  # noqa: D102 - of `Moves`, as all of these
+    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
     def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
     async def stop(self, mode: StopMode) -> StopMode: ...  # noqa: D102
     async def reset(self) -> None: ...  # noqa: D102
@@ -429,11 +429,11 @@ class Unmoved(Moves):
         self._refuse(f"read {', '.join(sorted(items))} at once")
 
     @override
-    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
         self._refuse("move")
 
     @override
-    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         return ()
 
     @override
@@ -441,7 +441,7 @@ class Unmoved(Moves):
         self._refuse("be enabled" if on else "be disabled")
 
     @override
-    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         self._refuse("move")
 
     @override
@@ -546,7 +546,7 @@ class Permit:
 
     # -- what can move -----------------------------------------------------------------------------------------------
 
-    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator."""
         self.ask_to_move()
         self._gate.expect(motion)
@@ -572,7 +572,7 @@ class Permit:
             raise cannot(drive.spec, "track")
         condition = self.to_move()
         self.begin()
-        self._gate.expect(Motion(position_counts, math.inf, math.inf))
+        self._gate.expect(CountsMotion(position_counts, math.inf, math.inf))
         with only_while(condition):
             await drive.track(position_counts)
 
@@ -608,7 +608,7 @@ class Permit:
         with only_while(self.ask):
             await self._gate.driver.set_outputs(limit1, limit2)
 
-    def announce(self, motion: Motion, *, anywhere: bool = False) -> None:
+    def announce(self, motion: CountsMotion, *, anywhere: bool = False) -> None:
         """Have readings judged by a motion that the network is about to start; see `PlausibilityGate.expect`."""
         self._gate.expect(motion, anywhere=anywhere)
 
@@ -620,7 +620,7 @@ class Permit:
 class Expect(Protocol):
     """See `PlausibilityGate.expect`."""
 
-    def __call__(self, motion: Motion | AnalogMotion | PwmOutput, *, anywhere: bool = False) -> None:
+    def __call__(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, anywhere: bool = False) -> None:
         """Take a motion that is about to be loaded."""
 
 
@@ -699,7 +699,7 @@ async def start_path(network: Network, names: frozenset[str], permits: Sequence[
 
 
 async def start_together(
-    network: Network, motions: Mapping[str, Motion], permits: Sequence[Permit], announce: Callable[[], None]
+    network: Network, motions: Mapping[str, CountsMotion], permits: Sequence[Permit], announce: Callable[[], None]
 ) -> None:
     """Start axes in the same servo cycle; every member's permission is checked directly before the packet that starts.
 

@@ -23,7 +23,7 @@ DISK_TIME_S = 2.0
 ResultT = TypeVar("ResultT")
 
 
-class Proof(Frozen):
+class ReferenceEvidence(Frozen):
     """Properties of an axis that must not have changed, besides the values of its drive."""
 
     address: int
@@ -50,7 +50,7 @@ class Proof(Frozen):
         return ""
 
 
-class KeptReference(Proof):
+class KeptReference(ReferenceEvidence):
     """Position 0 on the counter of a drive, and the conditions under which it is valid."""
 
     format: int

@@ -38,7 +38,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, Motion, StopMode
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, StopMode
 from ldcnd.line.bus import Bus
 
 LOOK_AGAIN_S = 0.02
@@ -57,7 +57,7 @@ class MotionPlan:
         duration_s: of the profile, without settling; None for a motion without an end.
     """
 
-    motion: Motion
+    motion: CountsMotion
     position: float | None
     velocity: float
     acceleration: float
@@ -253,7 +253,7 @@ class AxisMotion:
                 remedy="move there in parts",
             )
         counts_per_unit = abs(self.counts_per_unit)
-        motion = self.quantise(Motion(target, speed * counts_per_unit, rate * counts_per_unit))
+        motion = self.quantise(CountsMotion(target, speed * counts_per_unit, rate * counts_per_unit))
         duration_s = profile_duration_s(
             abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
         )
@@ -281,7 +281,7 @@ class AxisMotion:
             )
         speed, rate = self._checked(velocity, acceleration)
         counts_per_unit = self.counts_per_unit
-        motion = self.quantise(Motion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
+        motion = self.quantise(CountsMotion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
         return MotionPlan(
             motion,
             None,
@@ -290,7 +290,7 @@ class AxisMotion:
             None,
         )
 
-    def quantise(self, motion: Motion) -> Motion:
+    def quantise(self, motion: CountsMotion) -> CountsMotion:
         """Return a motion as the drive's registers will hold it, within the limits of the axis also after rounding.
 
         Raises:
@@ -358,7 +358,7 @@ class AxisMotion:
             cycle_s=self.driver.capture_s,
         )
 
-    def replanned(self, plan: MotionPlan, motion: Motion) -> MotionPlan:
+    def replanned(self, plan: MotionPlan, motion: CountsMotion) -> MotionPlan:
         """Return a plan with another velocity and acceleration, to the same target."""
         share = self.on_line(replace(plan, motion=motion))
         counts_per_unit = abs(self.counts_per_unit)

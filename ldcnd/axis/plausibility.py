@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import AnalogMotion, AxisReading, Motion, PwmOutput
+from ldcnd.drives.driver import AnalogMotion, AxisReading, CountsMotion, PwmOutput
 from ldcnd.line.exchange import Timing
 
 NOISE_COUNTS = 16
@@ -33,7 +33,7 @@ ROUNDS = 4
 _COUNTER, _HALF = 1 << 32, 1 << 31
 
 
-class Verdict(Enum):
+class ReadingVerdict(Enum):
     """Result of judging a reading."""
 
     BELIEVED = "believed"
@@ -43,7 +43,7 @@ class Verdict(Enum):
     understood what it does."""
 
 
-class Step(Enum):
+class CounterStep(Enum):
     """What has happened to the counter of the drive, where no motion leads to a reading that others have confirmed."""
 
     JUMPED = "jumped"
@@ -67,13 +67,13 @@ class Judgement:
             reach and shows another place.
     """
 
-    verdict: Verdict
+    verdict: ReadingVerdict
     confirmed: _Seen | None = None
-    step: Step | None = None
+    step: CounterStep | None = None
     foreign: bool = False
 
 
-_BELIEVED, _STILL_CONTRADICTS = Judgement(Verdict.BELIEVED), Judgement(Verdict.CONTRADICTS)
+_BELIEVED, _STILL_CONTRADICTS = Judgement(ReadingVerdict.BELIEVED), Judgement(ReadingVerdict.CONTRADICTS)
 
 
 class _Fit(IntEnum):
@@ -151,7 +151,7 @@ class PlausibilityGate:
         self._turned_by_hand = OPEN_LOOP_SPEEDS / SPEEDS * self._speed
         self._step_counts = STEP_OF_EL * config.gains.el if config.gains else 0.0
 
-    def expect(self, motion: Motion | AnalogMotion | PwmOutput, *, anywhere: bool = False) -> None:
+    def expect(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, anywhere: bool = False) -> None:
         """Take a motion that is about to be loaded: from now on it explains what the axis does.
 
         Args:
@@ -161,9 +161,9 @@ class PlausibilityGate:
         match motion:
             case PwmOutput():
                 return  # with the loop open the speed is any
-            case Motion(target_counts=int()) if not anywhere:
+            case CountsMotion(target_counts=int()) if not anywhere:
                 low, high, target = -motion.velocity_counts_per_s, motion.velocity_counts_per_s, motion.target_counts
-            case Motion() if not anywhere:
+            case CountsMotion() if not anywhere:
                 low, high, target = motion.velocity_counts_per_s, motion.velocity_counts_per_s, None
             case _:
                 high = abs(motion.velocity_counts_per_s)
@@ -232,19 +232,19 @@ class PlausibilityGate:
             if record is _SURE:
                 # a shaft that happens to come to rest at its 0 was led there
                 zeroed = reading.begun_anew and not known[0].begun_anew and fit >= _Fit.BEYOND
-                step = Step.ZEROED if zeroed else Step.JUMPED if self._far else None
+                step = CounterStep.ZEROED if zeroed else CounterStep.JUMPED if self._far else None
             return self._believe(reading, timing, unconfirmed, step)
         self._unconfirmed = reading, timing
         self._rounds += 1
         way, *_ = _shown_way(known, reading, timing.true_until_s)
         foreign = self._far or (record is _AWAY and abs(way) > NOISE_COUNTS)
         if self._rounds < ROUNDS:
-            return Judgement(Verdict.ASK_AGAIN, foreign=foreign)
+            return Judgement(ReadingVerdict.ASK_AGAIN, foreign=foreign)
         self.withheld += self._rounds
         # what follows is compared with the latest: what was believed before may never be true again
         self._known, self._unconfirmed, self._rounds, self._agreeing = (reading, timing), None, 0, 0
         self._record = _CONTRADICTED
-        return Judgement(Verdict.CONTRADICTS, foreign=foreign)
+        return Judgement(ReadingVerdict.CONTRADICTS, foreign=foreign)
 
     def _contradict(self, reading: AxisReading, timing: Timing, fit: _Fit) -> Judgement:
         """Go on until as many polls in a row make sense as have not; a loop that hunts takes no more of the line."""
@@ -260,12 +260,12 @@ class PlausibilityGate:
         reading: AxisReading,
         timing: Timing,
         confirmed: _Seen | None = None,
-        step: Step | None = None,
+        step: CounterStep | None = None,
         record: _Record = _SURE,
     ) -> Judgement:
         self._known, self._expected, self._record = (reading, timing), self._expected[-1:], record
         self._unconfirmed, self._rounds = None, 0
-        return Judgement(Verdict.BELIEVED, confirmed, step)
+        return Judgement(ReadingVerdict.BELIEVED, confirmed, step)
 
     def _is_too_fast(self, before: AxisReading, reading: AxisReading, *, still: bool) -> bool:
         """Tell whether an axis that did not turn as fast before cannot do so by now."""

@@ -40,7 +40,7 @@ class PathAxis:
 
 
 @dataclass(frozen=True, slots=True)
-class Walk:
+class PathWalk:
     """A path as the drives will walk it.
 
     Attributes:
@@ -78,7 +78,7 @@ class _Leg:
         return tuple((b - a) / self.length for a, b in zip(self.begin, self.end, strict=True))
 
 
-def walk(axes: Mapping[str, PathAxis], period_s: float, cycle_s: float, speed: float | None = None) -> Walk:
+def walk(axes: Mapping[str, PathAxis], period_s: float, cycle_s: float, speed: float | None = None) -> PathWalk:
     """Plan a path.
 
     Args:
@@ -106,7 +106,7 @@ def walk(axes: Mapping[str, PathAxis], period_s: float, cycle_s: float, speed: f
     )
 
 
-def _excess(planned: Walk, most_steps: Sequence[float]) -> float:
+def _excess(planned: PathWalk, most_steps: Sequence[float]) -> float:
     """Return the highest acceleration of any axis over what it may have; what rounding makes is left out."""
     changes = [
         max(abs(b - a) for a, b in pairwise([0, *steps, 0])) - ROUNDING_COUNTS for steps in planned.steps.values()
@@ -121,12 +121,12 @@ def _walk(
     period_s: float,
     cycle_s: float,
     speed: float | None,
-) -> tuple[Walk, float]:
+) -> tuple[PathWalk, float]:
     """Plan at a speed along the path; return the highest that comes of it, too."""
     units = [axis.counts_per_unit for axis in axes.values()]
     legs = [_leg(begin, end, limits, speed) for begin, end in pairwise(corners) if math.dist(begin, end) > 0]
     if not legs:
-        return Walk(dict.fromkeys(axes, (0,)), period_s, 0.0), 0.0
+        return PathWalk(dict.fromkeys(axes, (0,)), period_s, 0.0), 0.0
     turns = _turning_speeds(legs, [acceleration for _, acceleration in limits], period_s)
     points, cut, fastest = _sampled(legs, turns, period_s)
     rounded = [[round(value * unit) for value, unit in zip(point, units, strict=True)] for point in points]
@@ -136,7 +136,7 @@ def _walk(
         for at, name in enumerate(axes)
     }
     rounding = math.hypot(*(0.5 / unit for unit in units))
-    return Walk(steps, period_s, cut + rounding + fastest * cycle_s), fastest
+    return PathWalk(steps, period_s, cut + rounding + fastest * cycle_s), fastest
 
 
 def _leg(

@@ -11,7 +11,7 @@ import asyncio
 import contextlib
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.kept import FORMAT, KeptFiles, KeptReference, Proof
+from ldcnd.axis.kept import FORMAT, KeptFiles, KeptReference, ReferenceEvidence
 from ldcnd.axis.state import AxisTracker, window_counts
 from ldcnd.axis.telemetry import AxisTelemetry
 from ldcnd.contract.errors import LdcndError, WrongState
@@ -102,7 +102,7 @@ class ReferenceKeeper:
         self._files = files
         self._kept: KeptReference | None = None  # as it is on the disk
         self._on_disk = False  # something may be there
-        self._proof: Proof | None = None
+        self._proof: ReferenceEvidence | None = None
         self._generation = 0  # of origins: what was read under an earlier one is not written
         self._faults_kept = 0
         self.woken = asyncio.Event()
@@ -179,7 +179,9 @@ class ReferenceKeeper:
         """
         if self._files is None or self._drive is None:
             return None, ""
-        self._proof = Proof(address=self._config.address, identity=identity, baud=baud, scale=_scale_of(self._config))
+        self._proof = ReferenceEvidence(
+            address=self._config.address, identity=identity, baud=baud, scale=_scale_of(self._config)
+        )
         self._on_disk = True
         try:
             kept = await self._files.reference(self._config.name)

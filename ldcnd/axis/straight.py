@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from ldcnd.contract.errors import ValueOutOfRange
-from ldcnd.drives.driver import Motion
+from ldcnd.drives.driver import CountsMotion
 
 SHARES = (1.0, 0.995, 0.98, 0.96, 0.93, 0.9, 0.8, 0.7, 0.6, 0.5)
 """Of an acceleration, tried one after another until the register that is nearest to it keeps the limit."""
@@ -39,7 +39,7 @@ class LineAxis:
     counts_per_unit: float
     most_velocity: float
     most_acceleration: float
-    quantise: Callable[[Motion], Motion]
+    quantise: Callable[[CountsMotion], CountsMotion]
     cycle_s: float
 
     @property
@@ -49,7 +49,7 @@ class LineAxis:
 
 
 @dataclass(frozen=True, slots=True)
-class Profile:
+class Trapezoid:
     """A trapezoid of one axis, from 0 to `way`; any consistent units."""
 
     way: float
@@ -83,7 +83,7 @@ class Profile:
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class StraightLine:
     """A line as the drives will draw it.
 
     Attributes:
@@ -93,12 +93,12 @@ class Line:
             cycles. What the servos lag behind comes on top.
     """
 
-    motions: Mapping[str, Motion]
+    motions: Mapping[str, CountsMotion]
     duration_s: float
     deviation: float
 
 
-def straight_line(axes: Mapping[str, LineAxis]) -> Line:
+def straight_line(axes: Mapping[str, LineAxis]) -> StraightLine:
     """Plan a line.
 
     Raises:
@@ -106,23 +106,24 @@ def straight_line(axes: Mapping[str, LineAxis]) -> Line:
     """
     moved = {name: axis for name, axis in axes.items() if axis.way}
     if not moved:
-        return Line({name: _standing(axis) for name, axis in axes.items()}, 0.0, 0.0)
+        return StraightLine({name: _standing(axis) for name, axis in axes.items()}, 0.0, 0.0)
     share_a = min(axis.most_acceleration / axis.way for axis in moved.values())
     share_v = min(*(axis.most_velocity / axis.way for axis in moved.values()), math.sqrt(share_a))
     accelerations = {name: _acceleration(axis, share_a * axis.way) for name, axis in moved.items()}
     duration_s = max(
-        Profile(axis.way, share_v * axis.way, accelerations[name]).duration_s for name, axis in moved.items()
+        Trapezoid(axis.way, share_v * axis.way, accelerations[name]).duration_s for name, axis in moved.items()
     )
     motions = {
         name: _at_least(
-            axis, Motion(axis.target_counts, _velocity(axis.way, accelerations[name], duration_s), accelerations[name])
+            axis,
+            CountsMotion(axis.target_counts, _velocity(axis.way, accelerations[name], duration_s), accelerations[name]),
         )
         if name in moved
         else _standing(axis)
         for name, axis in axes.items()
     }
     profiles = {
-        name: Profile(
+        name: Trapezoid(
             axis.way / axis.counts_per_unit,
             motions[name].velocity_counts_per_s / axis.counts_per_unit,
             motions[name].acceleration_counts_per_s2 / axis.counts_per_unit,
@@ -132,10 +133,10 @@ def straight_line(axes: Mapping[str, LineAxis]) -> Line:
     longest_s = max(profile.duration_s for profile in profiles.values())
     cycle_s = max(axis.cycle_s for axis in axes.values())
     count = math.hypot(*(1.0 / axis.counts_per_unit for axis in moved.values()))
-    return Line(motions, longest_s, deviation_of(list(profiles.values()), cycle_s) + count)
+    return StraightLine(motions, longest_s, deviation_of(list(profiles.values()), cycle_s) + count)
 
 
-def deviation_of(profiles: Sequence[Profile], skew_s: float = 0.0) -> float:
+def deviation_of(profiles: Sequence[Trapezoid], skew_s: float = 0.0) -> float:
     """Return how far profiles that start together leave the straight line between their ends.
 
     Args:
@@ -164,7 +165,7 @@ def _off_line(point: Sequence[float], along: Sequence[float]) -> float:
     return math.hypot(*(value - share * part for value, part in zip(point, along, strict=True)))
 
 
-def _at_least(axis: LineAxis, motion: Motion) -> Motion:
+def _at_least(axis: LineAxis, motion: CountsMotion) -> CountsMotion:
     """Return a motion as the registers hold it, the slowest that they do if it is slower than that."""
     try:
         return axis.quantise(motion)
@@ -174,20 +175,20 @@ def _at_least(axis: LineAxis, motion: Motion) -> Motion:
         return axis.quantise(replace(motion, velocity_counts_per_s=float(error.nearest)))
 
 
-def _standing(axis: LineAxis) -> Motion:
+def _standing(axis: LineAxis) -> CountsMotion:
     acceleration = _acceleration(axis, axis.most_acceleration)
-    return axis.quantise(Motion(axis.target_counts, axis.most_velocity, acceleration))
+    return axis.quantise(CountsMotion(axis.target_counts, axis.most_velocity, acceleration))
 
 
 def _acceleration(axis: LineAxis, wanted: float) -> float:
     """Return the acceleration nearest to the wanted one that a register holds and that is not above the limit."""
     for share in SHARES:
         try:
-            held = axis.quantise(Motion(axis.target_counts, axis.most_velocity, wanted * share))
+            held = axis.quantise(CountsMotion(axis.target_counts, axis.most_velocity, wanted * share))
         except ValueOutOfRange as error:
             if error.nearest is None:
                 raise
-            held = axis.quantise(Motion(axis.target_counts, axis.most_velocity, float(error.nearest)))
+            held = axis.quantise(CountsMotion(axis.target_counts, axis.most_velocity, float(error.nearest)))
         if held.acceleration_counts_per_s2 <= axis.most_acceleration:
             break
     return held.acceleration_counts_per_s2

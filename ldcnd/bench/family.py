@@ -12,7 +12,7 @@ import click
 
 from ldcnd.contract.health import Finding
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.family import Line
+from ldcnd.drives.family import UnopenedLine
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.line.bus import Bus
 from ldcnd.line.transport import Opener
@@ -40,7 +40,7 @@ class TrialMove:
 
 
 @dataclass(frozen=True, slots=True)
-class Trial:
+class LineTrial:
     """A line on which drives are tried, what that finds, and its configuration if it needs one."""
 
     bus: Bus
@@ -94,7 +94,7 @@ class BenchFamily(ABC, Generic[BusT]):
     is_tuned_by_host: bool = False
 
     @abstractmethod
-    def examine(self, line: Line, settings: BusT) -> AsyncIterator[Finding]:
+    def examine(self, line: UnopenedLine, settings: BusT) -> AsyncIterator[Finding]:
         """Examine an open line by reading only."""
 
     def commands(self) -> Sequence[click.Command]:
@@ -113,7 +113,7 @@ class BenchFamily(ABC, Generic[BusT]):
         move: TrialMove | None,
         held: Callable[[], bool],
         opener: Opener | None = None,
-    ) -> Trial:
+    ) -> LineTrial:
         """Return the trial of the drives on a port.
 
         Args:

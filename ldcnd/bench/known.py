@@ -6,7 +6,7 @@ from typing import Any
 from ldcnd.bench.family import BenchFamily
 from ldcnd.config.rig import RigConfig
 from ldcnd.config.simulated import simulator
-from ldcnd.drives.family import Line
+from ldcnd.drives.family import UnopenedLine
 from ldcnd.drives.known import FAMILIES, ByName
 from ldcnd.drives.line_config import BusConfig
 
@@ -15,7 +15,7 @@ HOMES = {"ldcn": "ldcnd.bench.ldcn.family:LDCN_BENCH", "smartstep": "ldcnd.bench
 BENCHES: Mapping[str, BenchFamily[Any]] = ByName(HOMES)
 
 
-def line_of(rig: RigConfig, settings: BusConfig) -> Line:
+def line_of(rig: RigConfig, settings: BusConfig) -> UnopenedLine:
     """Return a line of a configuration that is not open yet, also a simulated one.
 
     Raises:

@@ -14,7 +14,7 @@ from ldcnd.bench.commissioning.checklist import STEPS, Checklist
 from ldcnd.bench.commissioning.checklist import axis_of as configured_axis
 from ldcnd.bench.commissioning.record import StepRecord
 from ldcnd.bench.commissioning.report import html_of
-from ldcnd.bench.commissioning.walk import Walk
+from ldcnd.bench.commissioning.walk import ChecklistWalk
 from ldcnd.bench.known import BENCHES
 from ldcnd.bench.person import Left, Person
 from ldcnd.cli.connection import AXIS, AxisName, Target, with_target
@@ -119,7 +119,7 @@ class _Session:
         self._target = target
         self._person = person
         self._checklist = checklist
-        self.walk = Walk(checklist, person, str(config), self._show)
+        self.walk = ChecklistWalk(checklist, person, str(config), self._show)
 
     async def show_list(self) -> bool:
         """Show every step with what is known of it."""

@@ -15,7 +15,7 @@ from ldcnd.bench.begun import begun_with, scan_port, write
 from ldcnd.bench.family import BenchFamily, TrialMove
 from ldcnd.bench.known import BENCHES, line_of
 from ldcnd.bench.opened import show_findings
-from ldcnd.cli.typed import Finite, Whole
+from ldcnd.cli.typed import Finite, WholeNumber
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError, NotSupported
 from ldcnd.contract.health import Finding, Verdict
@@ -154,9 +154,9 @@ GAINS = "kp,kd,ki,il,ol,el"
 @click.option("--family", type=click.Choice(list(BENCHES)), default=DEFAULT, show_default=True)
 @click.option("--units", default="1", show_default=True, help="Unit numbers, as 1,2, of drives that have some.")
 @click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=Path("acceptance"), show_default=True)
-@click.option("--move", "address", type=Whole(1, 127), help="Let the drive at this address move, too.")
+@click.option("--move", "address", type=WholeNumber(1, 127), help="Let the drive at this address move, too.")
 @click.option("--gains", help=f"For the move: {GAINS}.")
-@click.option("--counts", type=Whole(), default=2000, show_default=True, help="How far, there and back.")
+@click.option("--counts", type=WholeNumber(), default=2000, show_default=True, help="How far, there and back.")
 @click.option("--velocity", type=Finite(1), default=1000.0, show_default=True, help="Counts per second.")
 @click.option("--acceleration", type=Finite(1), default=10_000.0, show_default=True, help="Counts per s^2.")
 @click.option("--list", "list_only", is_flag=True, help="Print the assumptions and what would confirm them, and end.")

@@ -11,7 +11,7 @@ from click.shell_completion import CompletionItem
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.output import typed
 from ldcnd.cli.quantities import decimals, sample_text
-from ldcnd.cli.typed import Finite, Whole, axis_of
+from ldcnd.cli.typed import Finite, WholeNumber, axis_of
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.client.overview import AxisNow, AxisSeen, overview, seen_of
@@ -101,7 +101,7 @@ def row(now: AxisNow) -> AxisRow:
 @click.command()
 @click.argument("axis", type=AXIS, default="*")
 @click.option("--item", type=click.Choice([item.value for item in TelemetryItem]), help="Only this item.")
-@click.option("--count", type=Whole(min=1), help="End after this many samples.")
+@click.option("--count", type=WholeNumber(min=1), help="End after this many samples.")
 @with_target
 def watch(target: Target, axis: str, item: str | None, count: int | None) -> None:
     """Show the telemetry of AXIS, an axis or an I/O module (or of all), as it comes."""
@@ -267,7 +267,7 @@ def why(target: Target, axis: str) -> None:
 
 @click.command()
 @click.option("--axis", type=AXIS, help="Only this axis.")
-@click.option("--count", type=Whole(1, 1000), default=50, show_default=True, help="Maximum number of events.")
+@click.option("--count", type=WholeNumber(1, 1000), default=50, show_default=True, help="Maximum number of events.")
 @click.option("--follow", is_flag=True, help="Go on with those that come, until Ctrl-C; none is lost silently.")
 @with_target
 def events(target: Target, axis: str | None, count: int, *, follow: bool) -> None:

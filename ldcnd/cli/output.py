@@ -11,7 +11,7 @@ from contextlib import suppress
 
 import click
 
-from ldcnd.contract.errors import ConfigError, LdcndError, SessionError, Step
+from ldcnd.contract.errors import ConfigError, LdcndError, RemedyCommand, SessionError
 from ldcnd.parts import missing_wing
 from ldcnd.printable import printable
 
@@ -33,7 +33,7 @@ TYPED = {
 """How a command that a remedy names is typed; what is missing is `axis VERB AXIS`."""
 
 
-def typed(step: Step, axis: str | None) -> str:
+def typed(step: RemedyCommand, axis: str | None) -> str:
     """Return a step of a remedy as it is typed.
 
     Args:

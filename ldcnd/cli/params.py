@@ -10,7 +10,7 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
-from ldcnd.cli.typed import NewFile, Whole, force_option
+from ldcnd.cli.typed import NewFile, WholeNumber, force_option
 from ldcnd.client.parameters import Transfer, carry_out, plan_transfer, read_dump
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import ConfigError
@@ -26,11 +26,11 @@ from ldcnd.contract.parameters import (
     RestartEepromCount,
     WriteParameter,
 )
-from ldcnd.drives.family import HasParameters
+from ldcnd.drives.family import HasParameterFiles
 from ldcnd.drives.known import FAMILIES
 
 LARGEST = 0xFFFF
-FAMILY = next(family for family in FAMILIES.values() if isinstance(family, HasParameters))
+FAMILY = next(family for family in FAMILIES.values() if isinstance(family, HasParameterFiles))
 """Whose drives files are about: there is one such family, so that files need not name it."""
 
 
@@ -159,7 +159,7 @@ def get(target: Target, axis: str, parameter: str, *, unlisted: bool) -> None:
 @click.argument("value", callback=_word)
 @click.option("--eeprom", is_flag=True, help="Write permanently; the memory endures 10,000 writes.")
 @click.option("--unlisted", is_flag=True, help="Allow a number that the manual does not list.")
-@click.option("--confirm-unit", type=Whole(0, 15), help="The unit number that writing Pn000 leads to.")
+@click.option("--confirm-unit", type=WholeNumber(0, 15), help="The unit number that writing Pn000 leads to.")
 @with_target
 def set_parameter(
     target: Target, axis: str, parameter: str, value: int, confirm_unit: int | None, *, eeprom: bool, unlisted: bool
@@ -267,7 +267,7 @@ def save(target: Target, axis: str, *, dry_run: bool, yes: bool) -> None:
 
 @command.command("restart-count")
 @click.argument("axis", type=AXIS)
-@click.option("--writes", type=Whole(0, 10_000), default=0, help="Writes that the new drive has taken already.")
+@click.option("--writes", type=WholeNumber(0, 10_000), default=0, help="Writes that the new drive has taken already.")
 @click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
 @with_target
 def restart_count(target: Target, axis: str, writes: int, *, yes: bool) -> None:

@@ -12,7 +12,7 @@ import click
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.output import on_end
 from ldcnd.cli.quantities import save_figure, stacked_rows
-from ldcnd.cli.typed import NewFile, Whole, force_option
+from ldcnd.cli.typed import NewFile, WholeNumber, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title
 from ldcnd.contract.errors import ConfigError
@@ -49,7 +49,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
     type=FILE,
     help="The file to write, NAME.mcap; strftime codes stand for the start in UTC: run-%Y%m%d-%H%M%S.mcap, %% for %.",
 )
-@click.option("--rotate-mb", type=Whole(1), default=250, show_default=True, help="Begin a new file then.")
+@click.option("--rotate-mb", type=WholeNumber(1), default=250, show_default=True, help="Begin a new file then.")
 @with_target
 def record(target: Target, out: Path | None, rotate_mb: int) -> None:
     """Record everything that a rig publishes until SIGTERM or SIGINT; a killed recorder loses one second at most."""

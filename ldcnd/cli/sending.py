@@ -14,7 +14,7 @@ import click
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines, show_passing
 from ldcnd.cli.quantities import number, outcome, values_of
-from ldcnd.cli.typed import Finite, Whole, axis_of
+from ldcnd.cli.typed import Finite, WholeNumber, axis_of
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Verb
@@ -264,4 +264,4 @@ def _kind(annotation: object) -> click.ParamType[Any]:
     kind = kinds[0]
     if isinstance(kind, type) and issubclass(kind, Enum):
         return click.Choice([each.value for each in kind])
-    return Whole() if kind is int else Finite()
+    return WholeNumber() if kind is int else Finite()

@@ -10,7 +10,7 @@ import click
 
 from ldcnd.cli.connection import DEFAULT_ENDPOINT, Target, with_target
 from ldcnd.cli.output import on_end
-from ldcnd.cli.typed import CONSOLE_ADDRESS, Whole, address_option
+from ldcnd.cli.typed import CONSOLE_ADDRESS, WholeNumber, address_option
 from ldcnd.client.health import health_reports
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient, Samples
@@ -215,7 +215,7 @@ HIGHEST_DOMAIN = 232
 @click.command()
 @click.argument("axes", nargs=-1)
 @click.option("--router", required=True, help="Zenoh endpoint of the ROS graph's router, such as tcp/127.0.0.1:7447.")
-@click.option("--domain", type=Whole(0, HIGHEST_DOMAIN), default=0, show_default=True, envvar="ROS_DOMAIN_ID")
+@click.option("--domain", type=WholeNumber(0, HIGHEST_DOMAIN), default=0, show_default=True, envvar="ROS_DOMAIN_ID")
 @with_target
 def ros2(target: Target, axes: tuple[str, ...], router: str, domain: int) -> None:
     """Publish AXES (all of them by default) on /joint_states and /diagnostics until SIGTERM or SIGINT; read-only."""

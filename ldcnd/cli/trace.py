@@ -9,7 +9,7 @@ import click
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.output import end_as_interrupted, show_passing
 from ldcnd.cli.quantities import save_figure, stacked_rows
-from ldcnd.cli.typed import Finite, NewFile, Whole, axis_of, force_option
+from ldcnd.cli.typed import Finite, NewFile, WholeNumber, axis_of, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
 from ldcnd.client.traces import ENDING_S, Trace, armed_trace, fetch_trace, wait_for_trace
@@ -84,8 +84,8 @@ def command() -> None:
 @click.argument("axis", type=AXIS)
 @click.option("--channel", "-c", "channels", multiple=True, required=True, help="What to record; may be repeated.")
 @click.option("--interval", callback=_interval, default=FASTEST, help=f"Seconds between samples [{FASTEST}].")
-@click.option("--samples", type=Whole(2, MOST_SAMPLES), default=500, help="How many samples [500].")
-@click.option("--pre", type=Whole(0), default=0, help="Number of them before the trigger [0].")
+@click.option("--samples", type=WholeNumber(2, MOST_SAMPLES), default=500, help="How many samples [500].")
+@click.option("--pre", type=WholeNumber(0), default=0, help="Number of them before the trigger [0].")
 @click.option("--trigger", callback=_trigger, help=f"CHANNEL:KIND:LEVEL; kinds: {', '.join(TriggerKind)}.")
 @click.option("--full-scale", multiple=True, callback=_full_scale, help="CHANNEL:LARGEST, to resolve it finer.")
 @click.option("--timeout", type=Finite(0, LONGEST_WAIT_S, min_open=True), default=30.0, help="Seconds [30].")

@@ -73,7 +73,7 @@ class Finite(click.FloatRange):
         return "" if self.min is None and self.max is None else super()._describe_range()
 
 
-class Whole(click.IntRange):
+class WholeNumber(click.IntRange):
     """A whole number, within limits if there are any."""
 
     def convert(self, value: int | str, param: click.Parameter | None, ctx: click.Context | None) -> int:

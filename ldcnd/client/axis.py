@@ -23,7 +23,7 @@ from ldcnd.contract.events import CommandOutcome, ReadOutcome
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
 from ldcnd.contract.traces import TakeTrace, TraceTrigger
-from ldcnd.net.session import Sample, SampleKind
+from ldcnd.net.session import Publication, SampleKind
 
 LINGER_S = 0.03
 """Time that a position may wait for others, seconds: waking a program for each one costs more than all else."""
@@ -46,9 +46,9 @@ class Positions:
     def __init__(self, axis: "Axis") -> None:
         self.dropped = 0
         self._axis = axis
-        self._kept: deque[Sample] = deque()
+        self._kept: deque[Publication] = deque()
 
-    def take(self, sample: Sample) -> None:
+    def take(self, sample: Publication) -> None:
         """Take a sample from the axis."""
         if len(self._kept) == KEPT_SAMPLES:
             self._kept.popleft()
@@ -83,7 +83,7 @@ class Axis(AxisVerbs):
         self._client = client
         self._loop = loop
         self._state: tuple[StateSample, float] | None = None
-        self._position: tuple[Sample | PositionSample, float] | None = None
+        self._position: tuple[Publication | PositionSample, float] | None = None
         self._sent: Sent | None = None
         self._changed = asyncio.Event()
         self._readers: weakref.WeakSet[Positions] = weakref.WeakSet()
@@ -113,7 +113,7 @@ class Axis(AxisVerbs):
         if self._position is None:
             raise self._silent()
         sample, at_s = self._position
-        if isinstance(sample, Sample):
+        if isinstance(sample, Publication):
             sample = decode_received(PositionSample, sample.payload, sample.encoding)
             self._position = sample, at_s
         return Position(sample, self._loop.time() - at_s, self._state[0] if self._state else None)
@@ -279,12 +279,12 @@ class Axis(AxisVerbs):
         """Wake up those who wait: control was lost."""
         self._changed.set()
 
-    def _take_state(self, sample: Sample) -> None:
+    def _take_state(self, sample: Publication) -> None:
         if sample.kind is SampleKind.PUT:
             self._state = decode_received(StateSample, sample.payload, sample.encoding), self._loop.time()
             self._changed.set()
 
-    def _take_position(self, sample: Sample) -> None:
+    def _take_position(self, sample: Publication) -> None:
         if sample.kind is SampleKind.PUT:
             self._position = sample, self._loop.time()
             for reader in self._readers:

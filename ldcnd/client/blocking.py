@@ -52,17 +52,17 @@ def _waiting(
 
 def _moving(
     method: Callable[Concatenate[WrappedT, P], Coroutine[Any, Any, motion.Motion]],
-) -> Callable[Concatenate[Facade[WrappedT], P], "Motion"]:
+) -> Callable[Concatenate[Facade[WrappedT], P], "BlockingMotion"]:
     """Return a method that waits until the drive has acknowledged a motion."""
 
     @wraps(method)
-    def call(facade: Facade[WrappedT], /, *args: P.args, **kwargs: P.kwargs) -> Motion:
-        return Motion(facade._loop, facade._loop.run(method(facade._wrapped, *args, **kwargs)))  # noqa: SLF001
+    def call(facade: Facade[WrappedT], /, *args: P.args, **kwargs: P.kwargs) -> BlockingMotion:
+        return BlockingMotion(facade._loop, facade._loop.run(method(facade._wrapped, *args, **kwargs)))  # noqa: SLF001
 
     return call
 
 
-class Motion(Facade[motion.Motion]):
+class BlockingMotion(Facade[motion.Motion]):
     """A command that the drive has acknowledged and that ends later."""
 
     done = _waiting(motion.Motion.done)
@@ -72,14 +72,14 @@ class Motion(Facade[motion.Motion]):
         return self._loop.each(aiter(self._wrapped))
 
 
-class Jogging(Facade[jog.Jogging]):
-    """A jog under way; made by `Axis.jogging`."""
+class BlockingJogging(Facade[jog.Jogging]):
+    """A jog under way; made by `BlockingAxis.jogging`."""
 
     held = _waiting(jog.Jogging.held)
     renew = _waiting(jog.Jogging.renew)
 
 
-class Axis(Facade[asynchronous.Axis]):
+class BlockingAxis(Facade[asynchronous.Axis]):
     """An axis that a program controls or watches; a method for each verb, as `ldcnd.Axis` has."""
 
     # made by `python -m tools client`: begin
@@ -119,11 +119,13 @@ class Axis(Facade[asynchronous.Axis]):
     take_trace = _waiting(asynchronous.Axis.take_trace)
 
     @contextmanager
-    def jogging(self, velocity: float, *, acceleration: float | None = None, hold_s: float = 0.4) -> Iterator[Jogging]:
-        """Jog for as long as `Jogging.held` is called; the end of the context halts the axis, whatever ends it."""
+    def jogging(
+        self, velocity: float, *, acceleration: float | None = None, hold_s: float = 0.4
+    ) -> Iterator[BlockingJogging]:
+        """Jog while `BlockingJogging.held` is called; the end of the context halts the axis, whatever ends it."""
         jogging = self._wrapped.jogging(velocity, acceleration=acceleration, hold_s=hold_s)
         with self._loop.inside(jogging) as begun:
-            yield Jogging(self._loop, begun)
+            yield BlockingJogging(self._loop, begun)
 
     @property
     def name(self) -> str:
@@ -154,7 +156,7 @@ class Axis(Facade[asynchronous.Axis]):
         return self._wrapped._repr_html_()
 
 
-class Rig(Facade[rig.Rig]):
+class BlockingRig(Facade[rig.Rig]):
     """A rig that a program uses; made by `connect`."""
 
     stop = _waiting(rig.Rig.stop)
@@ -195,12 +197,12 @@ class Rig(Facade[rig.Rig]):
         acceleration: float | None = None,
         path: LinePath = LinePath.INDEPENDENT,
         max_deviation: float | None = None,
-    ) -> tuple[Motion, ...]:
+    ) -> tuple[BlockingMotion, ...]:
         """Start absolute moves of the members of one group in the same servo cycle; see `ldcnd.Rig.move_together`."""
         moves = self._wrapped.move_together(
             targets, velocity=velocity, acceleration=acceleration, path=path, max_deviation=max_deviation
         )
-        return tuple(Motion(self._loop, move) for move in self._loop.run(moves))
+        return tuple(BlockingMotion(self._loop, move) for move in self._loop.run(moves))
 
     def path(
         self,
@@ -210,37 +212,39 @@ class Rig(Facade[rig.Rig]):
         velocity: float | None = None,
         acceleration: float | None = None,
         max_deviation: float | None = None,
-    ) -> tuple[Motion, ...]:
+    ) -> tuple[BlockingMotion, ...]:
         """Walk the members of one group along a polyline; see `ldcnd.Rig.path`."""
         motions = self._wrapped.path(
             corners, speed=speed, velocity=velocity, acceleration=acceleration, max_deviation=max_deviation
         )
-        return tuple(Motion(self._loop, motion) for motion in self._loop.run(motions))
+        return tuple(BlockingMotion(self._loop, motion) for motion in self._loop.run(motions))
 
     @overload
     def control(
         self, axis: str, /, *, client: str, lease_s: float = 1.0, force: bool = False
-    ) -> AbstractContextManager[Axis]: ...
+    ) -> AbstractContextManager[BlockingAxis]: ...
 
     @overload
     def control(
         self, first: str, second: str, /, *more: str, client: str, lease_s: float = 1.0, force: bool = False
-    ) -> AbstractContextManager[tuple[Axis, ...]]: ...
+    ) -> AbstractContextManager[tuple[BlockingAxis, ...]]: ...
 
     def control(
         self, *axes: str, client: str, lease_s: float = 1.0, force: bool = False
-    ) -> AbstractContextManager[Axis] | AbstractContextManager[tuple[Axis, ...]]:
+    ) -> AbstractContextManager[BlockingAxis] | AbstractContextManager[tuple[BlockingAxis, ...]]:
         """Control axes until the context ends; see `ldcnd.Rig.control`."""
         held = self._axes(self._wrapped.controlled(axes, client, lease_s, force=force))
         return _only(held) if len(axes) == 1 else held
 
     @overload
-    def watch(self, axis: str, /) -> AbstractContextManager[Axis]: ...
+    def watch(self, axis: str, /) -> AbstractContextManager[BlockingAxis]: ...
 
     @overload
-    def watch(self, first: str, second: str, /, *more: str) -> AbstractContextManager[tuple[Axis, ...]]: ...
+    def watch(self, first: str, second: str, /, *more: str) -> AbstractContextManager[tuple[BlockingAxis, ...]]: ...
 
-    def watch(self, *axes: str) -> AbstractContextManager[Axis] | AbstractContextManager[tuple[Axis, ...]]:
+    def watch(
+        self, *axes: str
+    ) -> AbstractContextManager[BlockingAxis] | AbstractContextManager[tuple[BlockingAxis, ...]]:
         """Watch axes until the context ends; see `ldcnd.Rig.watch`."""
         watched = self._axes(self._wrapped.watched(axes))
         return _only(watched) if len(axes) == 1 else watched
@@ -258,9 +262,11 @@ class Rig(Facade[rig.Rig]):
             yield self._loop.each(samples)
 
     @contextmanager
-    def _axes(self, context: AbstractAsyncContextManager[tuple[asynchronous.Axis, ...]]) -> Iterator[tuple[Axis, ...]]:
+    def _axes(
+        self, context: AbstractAsyncContextManager[tuple[asynchronous.Axis, ...]]
+    ) -> Iterator[tuple[BlockingAxis, ...]]:
         with self._loop.inside(context) as axes:
-            yield tuple(Axis(self._loop, axis) for axis in axes)
+            yield tuple(BlockingAxis(self._loop, axis) for axis in axes)
 
     def _repr_html_(self) -> str:
         """Return the axes as a table, for notebooks."""
@@ -269,10 +275,12 @@ class Rig(Facade[rig.Rig]):
 
 
 @contextmanager
-def connect(endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None) -> Iterator[Rig]:
+def connect(
+    endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None
+) -> Iterator[BlockingRig]:
     """Use one rig for as long as the context lasts; see `ldcnd.connect`."""
     with loop_thread() as loop, loop.inside(_connect(endpoint, rig=rig, config=config)) as found:
-        yield Rig(loop, found)
+        yield BlockingRig(loop, found)
 
 
 def fleet(settings: ZenohSettings, rig: str | None = None) -> tuple[RigReport, ...]:
@@ -285,6 +293,6 @@ _connect = rig.connect
 
 
 @contextmanager
-def _only(axes: AbstractContextManager[tuple[Axis, ...]]) -> Iterator[Axis]:
+def _only(axes: AbstractContextManager[tuple[BlockingAxis, ...]]) -> Iterator[BlockingAxis]:
     with axes as found:
         yield found[0]

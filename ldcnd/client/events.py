@@ -13,7 +13,7 @@ from ldcnd.contract.codec import decode_received
 from ldcnd.contract.errors import OutcomeUnknown, SessionError
 from ldcnd.contract.events import CommandEvent, EventList, ReadEvents
 from ldcnd.contract.keys import EVENT
-from ldcnd.net.session import Sample, SampleKind
+from ldcnd.net.session import Publication, SampleKind
 
 CHECK_PERIOD_S = 2.0
 """Period of queries for a missed last event, while none comes, seconds."""
@@ -119,7 +119,7 @@ async def follow_events(client: RigClient, axis: str | None = None, *, history: 
     at = page if history else page.model_copy(update={"first_number": page.end_number})
     events = Events(client, axis, at)
 
-    def take(sample: Sample) -> None:
+    def take(sample: Publication) -> None:
         if sample.kind is SampleKind.PUT:
             events.take(decode_received(CommandEvent, sample.payload, sample.encoding))
 

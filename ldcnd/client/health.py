@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import decode_received
 from ldcnd.contract.health import BusHealth, DaemonHealth
-from ldcnd.net.session import Sample, SampleKind
+from ldcnd.net.session import Publication, SampleKind
 
 
 async def last_health(client: RigClient) -> DaemonHealth | None:
@@ -24,7 +24,7 @@ async def last_bus_health(client: RigClient) -> list[BusHealth]:
 async def health_reports(client: RigClient, take: Callable[[DaemonHealth | BusHealth], None]) -> AsyncIterator[None]:
     """Hand every health report to `take` for the time of the context."""
 
-    def decode(sample: Sample) -> None:
+    def decode(sample: Publication) -> None:
         if sample.kind is SampleKind.DELETE:
             return
         if sample.key == client.keys.health:

@@ -4,7 +4,7 @@ A recorder, a page or a bridge passes on samples that it does not read, and what
 command to a rig, so it needs more than `rig_client`. This is all of the session that it may use.
 """
 
-from ldcnd.net.session import Declaration, Qos, Sample, SampleKind, Session
+from ldcnd.net.session import Declaration, Publication, Qos, SampleKind, Session
 from ldcnd.net.zenoh_config import zenoh_config as check_settings
 from ldcnd.net.zenoh_session import open_zenoh_session as open_session
 from ldcnd.net.zenoh_settings import LEASE_MS, RETRY_MS, ZenohSettings
@@ -13,8 +13,8 @@ __all__ = [
     "LEASE_MS",
     "RETRY_MS",
     "Declaration",
+    "Publication",
     "Qos",
-    "Sample",
     "SampleKind",
     "Session",
     "ZenohSettings",

@@ -9,7 +9,7 @@ from collections import Counter, deque
 from collections.abc import Awaitable, Callable
 
 from ldcnd.contract.errors import LdcndError
-from ldcnd.net.session import OnSample, Sample
+from ldcnd.net.session import OnSample, Publication
 
 HELD_SAMPLES = 4096
 """Maximum number of samples of an unknown session that wait until the daemon is found; the oldest are dropped."""
@@ -40,7 +40,7 @@ class Origin:
         self._find = find
         self._gates: list[OwnSamples] = []
 
-    def drop(self, sample: Sample) -> None:
+    def drop(self, sample: Publication) -> None:
         """Count a sample that is not the daemon's."""
         is_first = not self.rivals[sample.source]
         self.rivals[sample.source] += 1
@@ -63,7 +63,7 @@ class Origin:
         """Leave out a gate that was closed."""
         self._gates.remove(gate)
 
-    def owns(self, sample: Sample) -> bool:
+    def owns(self, sample: Publication) -> bool:
         """Tell whether the daemon has published a sample; every session may have where the network does not say."""
         return self.source in (sample.source, "")
 
@@ -75,11 +75,11 @@ class OwnSamples:
         self._origin = origin
         self._find = find
         self._take = take
-        self._held: deque[Sample] = deque(maxlen=HELD_SAMPLES)
+        self._held: deque[Publication] = deque(maxlen=HELD_SAMPLES)
         self._search: asyncio.Task[None] | None = None
         self._until_s: dict[str, float] = {}  # by session that was not the daemon's, when to ask again
 
-    def admit(self, sample: Sample) -> None:
+    def admit(self, sample: Publication) -> None:
         """Take a sample of any session."""
         if self._origin.owns(sample):
             self._take(sample)

@@ -30,7 +30,7 @@ from ldcnd.net.session import (
     UNDELIVERED_SAMPLES,
     Declaration,
     OnSample,
-    Sample,
+    Publication,
     SampleKind,
     Session,
 )
@@ -68,7 +68,7 @@ class Samples:
         self._kept: deque[tuple[str, Measurement]] = deque(maxlen=KEPT_SAMPLES)
         self._ready = asyncio.Event()
 
-    def take(self, sample: Sample) -> None:
+    def take(self, sample: Publication) -> None:
         """Take a sample from the session."""
         if sample.kind is SampleKind.DELETE:
             return
@@ -283,7 +283,7 @@ class RigClient:
 
     @asynccontextmanager
     async def values(
-        self, axis: str, item: str, take: Callable[[Sample], None], linger_s: float = 0.0
+        self, axis: str, item: str, take: Callable[[Publication], None], linger_s: float = 0.0
     ) -> AsyncIterator[None]:
         """Hand one item of an axis to `take`, encoded as it came, for the time of the context."""
         key = self.keys.telemetry_pattern(axis, item)
@@ -305,7 +305,7 @@ class RigClient:
 
     @asynccontextmanager
     async def published(
-        self, take: Callable[[Sample], None], kept: int = KEPT_PUBLISHED, linger_s: float = 0.0
+        self, take: Callable[[Publication], None], kept: int = KEPT_PUBLISHED, linger_s: float = 0.0
     ) -> AsyncIterator[Callable[[], int]]:
         """Hand all telemetry, events and health reports to `take`, as they come, for the time of the context.
 
@@ -322,7 +322,7 @@ class RigClient:
                 declarations.append(declaration)
             yield lambda: sum(declaration.load.lost for declaration in declarations)
 
-    async def last_published(self) -> list[Sample]:
+    async def last_published(self) -> list[Publication]:
         """Return the last value of every telemetry and health key, in msgpack; no samples of traces."""
         keys = (
             self.keys.telemetry_pattern("*", "*"),
@@ -331,7 +331,9 @@ class RigClient:
         )
         answers = [a for key in keys for a in await self._values(key, {"enc": "msgpack"})]
         return [
-            Sample(answer.key, answer.payload, answer.encoding, SampleKind.PUT, answer.measured_at_ns, answer.source)
+            Publication(
+                answer.key, answer.payload, answer.encoding, SampleKind.PUT, answer.measured_at_ns, answer.source
+            )
             for answer in answers
             if not answer.is_error
         ]

@@ -11,9 +11,9 @@ from typing import TypeVar
 
 import msgpack
 
-from ldcnd.client.network import Sample, SampleKind
+from ldcnd.client.network import Publication, SampleKind
 from ldcnd.contract.codec import Encoding, decode_received
-from ldcnd.contract.condition import UNKNOWN_HOLDER, Condition, Kind, Place, Severity, Trouble, assess
+from ldcnd.contract.condition import UNKNOWN_HOLDER, Condition, Place, Severity, Trouble, TroubleKind, assess
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.health import BusHealth
 from ldcnd.contract.keys import Keys
@@ -39,9 +39,9 @@ _MODELS: dict[str, type[Measured]] = {
 class _Axis:
     """What came of one axis, decoded when it is needed."""
 
-    state: Sample | None = None
-    fault: Sample | None = None
-    position: Sample | None = None
+    state: Publication | None = None
+    fault: Publication | None = None
+    position: Publication | None = None
     shown: bytes = b""
 
 
@@ -58,7 +58,7 @@ class Conditions:
         holders: who controls each axis; None where no client does. An axis of which that is not known is missing.
     """
 
-    def __init__(self, rig: str, put: Callable[[Sample], None], now_s: Callable[[], float]) -> None:
+    def __init__(self, rig: str, put: Callable[[Publication], None], now_s: Callable[[], float]) -> None:
         self.silence = ""
         self.holders: Mapping[str, str | None] = {}
         self._keys = Keys(rig)
@@ -70,7 +70,7 @@ class Conditions:
         self._newest: tuple[int, float] = (0, 0.0)  # the daemon's clock, and when it was that late here
         self._heard_at_s = now_s()
 
-    def take(self, sample: Sample) -> None:
+    def take(self, sample: Publication) -> None:
         """Take a published sample."""
         self._heard_at_s = self._now_s()
         if sample.key.startswith(self._telemetry):
@@ -112,7 +112,7 @@ class Conditions:
         if payload != axis.shown:
             axis.shown = payload
             key = f"{self._telemetry}{name}/{TOPIC}"
-            self._put(Sample(key, payload, Encoding.MSGPACK, SampleKind.PUT, measured_at_ns=None))
+            self._put(Publication(key, payload, Encoding.MSGPACK, SampleKind.PUT, measured_at_ns=None))
 
     async def run(self) -> None:
         """Decide until cancelled."""
@@ -165,7 +165,7 @@ def as_payload(condition: Condition) -> dict[str, object]:
 
 def _trouble(trouble: Trouble) -> dict[str, str]:
     text = trouble.text
-    if trouble.kind in (Kind.FAULT, Kind.WARNING):
+    if trouble.kind in (TroubleKind.FAULT, TroubleKind.WARNING):
         text = f"{trouble.short}: {text.partition(': ')[2]}"
     text = f"{text[:1].upper()}{text[1:]}"
     return {
@@ -176,7 +176,7 @@ def _trouble(trouble: Trouble) -> dict[str, str]:
     }
 
 
-def _decoded(sample: Sample | None, model: type[MeasuredT]) -> MeasuredT | None:
+def _decoded(sample: Publication | None, model: type[MeasuredT]) -> MeasuredT | None:
     if sample is None:
         return None
     try:

@@ -149,7 +149,7 @@ class Page:
             yield frame(self._now_ns(), self.dropped, batch.body(self._entry))
 
 
-class Channel:
+class FrameChannel:
     """Sends the frames to all pages with one subscription."""
 
     def __init__(self, values: LatestValues, subscription: Subscription) -> None:
@@ -209,7 +209,7 @@ class Feed:
     def __init__(self, values: LatestValues, now_ns: Callable[[], int]) -> None:
         self._now_ns = now_ns
         self._values = values
-        self._channels: dict[Subscription, tuple[Channel, asyncio.Task[None]]] = {}
+        self._channels: dict[Subscription, tuple[FrameChannel, asyncio.Task[None]]] = {}
         self._group = asyncio.TaskGroup()
 
     async def __aenter__(self) -> Self:
@@ -242,8 +242,8 @@ class Feed:
                 self._values.watchers.remove(channel)
                 task.cancel()
 
-    def _new_channel(self, subscription: Subscription) -> tuple[Channel, asyncio.Task[None]]:
-        channel = Channel(self._values, subscription)
+    def _new_channel(self, subscription: Subscription) -> tuple[FrameChannel, asyncio.Task[None]]:
+        channel = FrameChannel(self._values, subscription)
         task = self._group.create_task(channel.run(), name=f"channel at {subscription.rate_hz:g} Hz")
         self._values.watchers.append(channel)
         self._channels[subscription] = (channel, task)

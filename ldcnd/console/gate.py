@@ -45,7 +45,7 @@ signal USR1: it then prints one.</p>
 """
 
 
-class Gate:
+class RequestGate:
     """Wraps the application.
 
     Args:

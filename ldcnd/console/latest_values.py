@@ -12,7 +12,7 @@ from typing import Protocol
 
 import msgpack
 
-from ldcnd.client.network import Sample, SampleKind
+from ldcnd.client.network import Publication, SampleKind
 from ldcnd.contract.codec import Encoding
 from ldcnd.contract.keys import ROOT
 
@@ -74,7 +74,7 @@ class LatestValues:
         self._paths: dict[str, _Path] = {}
         self._newer: dict[str, set[str]] = {}
 
-    def take(self, sample: Sample) -> None:
+    def take(self, sample: Publication) -> None:
         """Take a published sample; samples of traces are left out, pages fetch them."""
         path = self._paths.get(sample.key) or self._new_path(sample.key)
         if path.kind is _Kind.LEFT_OUT:
@@ -100,7 +100,7 @@ class LatestValues:
         """Note which values of a rig come from now on; see `settle`."""
         self._newer[rig] = set()
 
-    def settle(self, rig: str, answers: Sequence[Sample]) -> None:
+    def settle(self, rig: str, answers: Sequence[Publication]) -> None:
         """Put a rig's values in order after it has come back, given the values that it answered.
 
         What has come since `begin_again` is newer than an answer; what has neither come nor was answered is no more.

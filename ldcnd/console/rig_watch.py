@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import msgpack
 
-from ldcnd.client.network import Sample, SampleKind
+from ldcnd.client.network import Publication, SampleKind
 from ldcnd.client.overview import holders_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
@@ -142,9 +142,9 @@ class RigWatch:
             groups = [(verb, group.causes) for group in reply.commands for verb in group.verbs]
             payload = msgpack.packb({verb: [each.model_dump() for each in causes] for verb, causes in groups})
         kind = SampleKind.PUT if payload else SampleKind.DELETE
-        self._values.take(Sample(key, payload, Encoding.MSGPACK, kind, measured_at_ns=None))
+        self._values.take(Publication(key, payload, Encoding.MSGPACK, kind, measured_at_ns=None))
 
-    def _take(self, sample: Sample) -> None:
+    def _take(self, sample: Publication) -> None:
         if sample.key.endswith((f"/{TelemetryItem.STATE}", f"/{TelemetryItem.FAULT}")):
             self._want_why(sample.key.split("/")[-2])
         self._values.take(sample)

@@ -22,7 +22,7 @@ from ldcnd.console.commands import command_routes
 from ldcnd.console.connections import HANDSHAKE_TIME_S, BoundedH11
 from ldcnd.console.control import control_routes
 from ldcnd.console.feed import Feed
-from ldcnd.console.gate import Gate
+from ldcnd.console.gate import RequestGate
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.pages import Pages
 from ldcnd.console.reading import STATIC, reading_routes
@@ -74,7 +74,7 @@ def build_app(
         *(commissioning(rigs) if commissioning else ()),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]
-    return Gate(Starlette(routes=routes), visitors, settings.scheme, settings.known_hosts)
+    return RequestGate(Starlette(routes=routes), visitors, settings.scheme, settings.known_hosts)
 
 
 async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = None) -> None:

@@ -18,7 +18,7 @@ import pydantic
 import pydantic_core
 
 from ldcnd.contract.commands import Cause, Command, Effect, ErrorReply, Power, ReceivedError, RemedyStep
-from ldcnd.contract.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge, Remedy, Step
+from ldcnd.contract.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge, Remedy, RemedyCommand
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.printable import is_printable, printable
 
@@ -210,7 +210,7 @@ def remedy_steps(error: LdcndError) -> tuple[RemedyStep, ...]:
 
 def remedy_of(reply: ReceivedError | Cause) -> Remedy | None:
     """Return the remedy that a reply tells of."""
-    steps = tuple(Step(each.verb, each.said, each.arguments) for each in reply.steps)
+    steps = tuple(RemedyCommand(each.verb, each.said, each.arguments) for each in reply.steps)
     return None if reply.remedy is None else Remedy.of(reply.remedy, steps)
 
 

@@ -36,7 +36,7 @@ class Severity(IntEnum):
     """It does not work: a fault, a drive or a line that does not answer."""
 
 
-class Kind(Enum):
+class TroubleKind(Enum):
     """The kind of a trouble."""
 
     UNKNOWN = auto()
@@ -71,7 +71,7 @@ class Trouble:
         short: the same in a few words, for a cell of a table.
     """
 
-    kind: Kind
+    kind: TroubleKind
     severity: Severity
     text: str
     short: str
@@ -160,7 +160,7 @@ STATE_WORDS = {
 }
 
 
-class State(Protocol):
+class KnownState(Protocol):
     """The known state of an axis: a state sample, or the daemon's own knowledge."""
 
     @property
@@ -226,36 +226,38 @@ class Faults(Protocol):
 
 _WRONG, _NOTICE, _FINE = Severity.WRONG, Severity.NOTICE, Severity.FINE
 _NOT_CONFIRMED = Trouble(
-    Kind.STOP_PENDING,
+    TroubleKind.STOP_PENDING,
     _WRONG,
     "a stop is NOT confirmed by the drive: use the machine's emergency stop",
     "stop NOT CONFIRMED by the drive",
 )
-_NO_ANSWER = Trouble(Kind.NO_ANSWER, _WRONG, "the drive does not answer", "no answer")
-_ON_DEAD_LINE = Trouble(Kind.LINE_DOWN, _WRONG, "the line is not up", "line down")
+_NO_ANSWER = Trouble(TroubleKind.NO_ANSWER, _WRONG, "the drive does not answer", "no answer")
+_ON_DEAD_LINE = Trouble(TroubleKind.LINE_DOWN, _WRONG, "the line is not up", "line down")
 _NOT_IDENTIFIED = Trouble(
-    Kind.NOT_IDENTIFIED,
+    TroubleKind.NOT_IDENTIFIED,
     _WRONG,
     "what answers is not known to be its drive: only what stops it is sent",
     "not identified",
 )
-_NEVER_SEEN = Trouble(Kind.UNKNOWN, _NOTICE, "nothing was received from it yet", "nothing received")
-_OLD = Trouble(Kind.OLD, _WRONG, "its position is old: nothing newer came", "old")
+_NEVER_SEEN = Trouble(TroubleKind.UNKNOWN, _NOTICE, "nothing was received from it yet", "nothing received")
+_OLD = Trouble(TroubleKind.OLD, _WRONG, "its position is old: nothing newer came", "old")
 _REFERENCE_LOST = Trouble(
-    Kind.REFERENCE_LOST,
+    TroubleKind.REFERENCE_LOST,
     _WRONG,
     "has lost its reference: its position is not known before it is homed",
     "reference lost",
 )
-_NOT_HOMED = Trouble(Kind.NOT_HOMED, _NOTICE, "not homed: its position is not known", "not homed")
-_HOMING = Trouble(Kind.NOT_HOMED, _NOTICE, "it is being homed: its position is not known yet", "homing")
-_LATCHED = Trouble(Kind.STOP_LATCHED, _NOTICE, "a stop is latched: nothing moves before reset", "stop latched")
-_UNCOMMANDED = Trouble(Kind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command")
-_OVERRIDE_ZERO = Trouble(
-    Kind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: nothing moves", "speed override 0 %"
+_NOT_HOMED = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "not homed: its position is not known", "not homed")
+_HOMING = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "it is being homed: its position is not known yet", "homing")
+_LATCHED = Trouble(TroubleKind.STOP_LATCHED, _NOTICE, "a stop is latched: nothing moves before reset", "stop latched")
+_UNCOMMANDED = Trouble(
+    TroubleKind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command"
 )
-_MISSED_POLLS = Trouble(Kind.MISSED_POLLS, _NOTICE, "the drive missed its latest polls", "missed polls")
-SHARED = frozenset({Kind.SILENCE, Kind.NOT_HOMED, Kind.STANDS_BY_OVERRIDE})
+_OVERRIDE_ZERO = Trouble(
+    TroubleKind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: nothing moves", "speed override 0 %"
+)
+_MISSED_POLLS = Trouble(TroubleKind.MISSED_POLLS, _NOTICE, "the drive missed its latest polls", "missed polls")
+SHARED = frozenset({TroubleKind.SILENCE, TroubleKind.NOT_HOMED, TroubleKind.STANDS_BY_OVERRIDE})
 """Troubles of which several axes have one cause, or which are said once for all; so is a line that is down."""
 _MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
 """Faults whose name says best why the position is lost."""
@@ -270,11 +272,11 @@ def line_troubles(*, up: bool, problem: str = "") -> tuple[Trouble, ...]:
         problem: why it is not up; empty when that is not known.
     """
     text = f"{_ON_DEAD_LINE.text}: {problem}" if problem else _ON_DEAD_LINE.text
-    return () if up else (Trouble(Kind.LINE_DOWN, _WRONG, text, _ON_DEAD_LINE.short),)
+    return () if up else (Trouble(TroubleKind.LINE_DOWN, _WRONG, text, _ON_DEAD_LINE.short),)
 
 
 def assess(
-    state: State | None,
+    state: KnownState | None,
     faults: Faults | None = None,
     health: AxisHealth | None = None,
     *,
@@ -322,10 +324,10 @@ def _unanswered(state: str, troubles: tuple[Trouble, ...], mark: str) -> Conditi
 
 
 def _silent(why: str) -> Trouble:
-    return Trouble(Kind.SILENCE, _WRONG, why, "daemon silent")
+    return Trouble(TroubleKind.SILENCE, _WRONG, why, "daemon silent")
 
 
-def _unreachable(state: State, faults: Faults | None, *, silence: str, line_up: bool) -> Trouble | None:
+def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line_up: bool) -> Trouble | None:
     """Return why nothing is known of an axis; None when it answers."""
     if silence:
         return _silent(silence)
@@ -341,7 +343,7 @@ def _is_old(age_s: float | None, health: AxisHealth | None) -> bool:
     return age_s is not None and age_s > OLD_S + OLD_PERIODS / rate_hz
 
 
-def _place(state: State, faults: Faults | None, *, is_old: bool) -> tuple[Place, str]:
+def _place(state: KnownState, faults: Faults | None, *, is_old: bool) -> tuple[Place, str]:
     """Return whether the position of an axis that answers says where it is, and its mark."""
     if state.link is LinkState.UP and state.quality is Quality.UNCERTAIN:
         codes = [fault.code for fault in faults.active if fault.code in _MARKING_FAULTS] if faults else []
@@ -355,13 +357,13 @@ def _place(state: State, faults: Faults | None, *, is_old: bool) -> tuple[Place,
     return Place.NOT_HOMED, _REFERENCE_LOST.short if state.reference_lost else _NOT_HOMED.short
 
 
-def _found(state: State, faults: Faults | None, health: AxisHealth | None, place: Place) -> tuple[Trouble, ...]:
+def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, place: Place) -> tuple[Trouble, ...]:
     """Return what deserves attention on an axis that answers."""
     entries = _first_cause_first(faults) if faults else []
-    found = [_of_fault(entry, Kind.FAULT, _WRONG) for entry in entries if entry.stops]
+    found = [_of_fault(entry, TroubleKind.FAULT, _WRONG) for entry in entries if entry.stops]
     if state.state is AxisState.ERROR_STOP and not found:
         text = f"in error stop: {state.last_error or 'reset it to go on'}"
-        found.append(Trouble(Kind.ERROR_STOP, _WRONG, text, "error stop"))
+        found.append(Trouble(TroubleKind.ERROR_STOP, _WRONG, text, "error stop"))
     if place is Place.OLD:
         found.append(_OLD)
     if state.has_reference and not state.referenced and place is not Place.CONTRADICTED:  # that is its cause
@@ -373,7 +375,7 @@ def _found(state: State, faults: Faults | None, health: AxisHealth | None, place
         found.append(_UNCOMMANDED)
     if not state.speed_override:
         found.append(_OVERRIDE_ZERO)
-    found += [_of_fault(entry, Kind.WARNING, _NOTICE) for entry in entries if not entry.stops]
+    found += [_of_fault(entry, TroubleKind.WARNING, _NOTICE) for entry in entries if not entry.stops]
     if state.link is LinkState.DEGRADED:
         found.append(_MISSED_POLLS)
     elif health:
@@ -381,17 +383,17 @@ def _found(state: State, faults: Faults | None, health: AxisHealth | None, place
     return tuple(sorted(found, key=lambda trouble: -trouble.severity))
 
 
-def _beside(state: State, holder: str | None) -> tuple[Trouble, ...]:
+def _beside(state: KnownState, holder: str | None) -> tuple[Trouble, ...]:
     """Return what is to be known and is not wrong."""
     said = []
     if 0 < state.speed_override < FULL_SPEED:
         short = f"speed override {state.speed_override:g} %"
-        said.append(Trouble(Kind.SLOWED, _FINE, f"{short} of every velocity", short))
+        said.append(Trouble(TroubleKind.SLOWED, _FINE, f"{short} of every velocity", short))
     if holder is None:
-        said.append(Trouble(Kind.CONTROL, _FINE, "no client controls it", "not controlled"))
+        said.append(Trouble(TroubleKind.CONTROL, _FINE, "no client controls it", "not controlled"))
     elif holder:
         moves = "moved" if state.moving is Moving.YES else "controlled"
-        said.append(Trouble(Kind.CONTROL, _FINE, f"{moves} by {holder}", f"{moves} by {holder}"))
+        said.append(Trouble(TroubleKind.CONTROL, _FINE, f"{moves} by {holder}", f"{moves} by {holder}"))
     return tuple(said)
 
 
@@ -400,7 +402,7 @@ def _first_cause_first(faults: Faults) -> list[FaultEntry]:
     return sorted(faults.active, key=lambda entry: entry.code != first)
 
 
-def _of_fault(entry: FaultEntry, kind: Kind, severity: Severity) -> Trouble:
+def _of_fault(entry: FaultEntry, kind: TroubleKind, severity: Severity) -> Trouble:
     return Trouble(kind, severity, f"{entry.code}: {entry.text}", _words(entry.code))
 
 
@@ -415,4 +417,4 @@ def _slowness(health: AxisHealth) -> list[Trouble]:
     if health.rate_hz + EDGE_HZ >= ENOUGH * wanted_hz:
         return []
     text = f"fewer samples a second than asked for: {health.rate_hz:.1f} of {wanted_hz:.1f}"
-    return [Trouble(Kind.SLOW, _NOTICE, text, "slow")]
+    return [Trouble(TroubleKind.SLOW, _NOTICE, text, "slow")]

@@ -74,7 +74,7 @@ Argument = bool | float | str
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class RemedyCommand:
     """A command that a remedy names; every face says it in its own way: to be typed, or to be pressed.
 
     Attributes:
@@ -88,9 +88,9 @@ class Step:
     arguments: Mapping[str, Argument] = field(default_factory=dict)
 
 
-def step(verb: str, said: str | None = None, **arguments: Argument) -> Step:
+def step(verb: str, said: str | None = None, **arguments: Argument) -> RemedyCommand:
     """Return a step; without words of its own a remedy says "send" and the verb."""
-    return Step(verb, said or f"send {verb}", arguments)
+    return RemedyCommand(verb, said or f"send {verb}", arguments)
 
 
 class Remedy(str):
@@ -102,9 +102,9 @@ class Remedy(str):
     """
 
     __slots__ = ("steps",)
-    steps: tuple[Step, ...]
+    steps: tuple[RemedyCommand, ...]
 
-    def __new__(cls, text: str, *steps: Step) -> Self:
+    def __new__(cls, text: str, *steps: RemedyCommand) -> Self:
         """Return the text with what the steps are called."""
         said = []
         for each in steps:  # a stop makes a remedy: no generator, no call more
@@ -114,13 +114,13 @@ class Remedy(str):
         return made
 
     @classmethod
-    def of(cls, text: str, steps: tuple[Step, ...]) -> Self:
+    def of(cls, text: str, steps: tuple[RemedyCommand, ...]) -> Self:
         """Return a text that names the steps already."""
         made = super().__new__(cls, text)
         made.steps = steps
         return made
 
-    def phrased(self, words: Callable[[Step], str]) -> str:
+    def phrased(self, words: Callable[[RemedyCommand], str]) -> str:
         """Return the text with other words for its steps."""
         text = str(self)
         for each in self.steps:

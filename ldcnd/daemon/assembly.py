@@ -23,7 +23,7 @@ from ldcnd.daemon.heartbeat import Heartbeat
 from ldcnd.daemon.leases import Authority, random_token
 from ldcnd.daemon.ledger import EventLog, Ledger
 from ldcnd.daemon.line import BusService
-from ldcnd.daemon.rig import ModuleService, Rig
+from ldcnd.daemon.rig import ModuleService, OwnedRig
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.family import OpenLine
@@ -114,7 +114,7 @@ def build_daemon(
         for bus in buses
         for driver in bus.network.io.values()
     )
-    rig = Rig(config.rig, buses, groups, modules)
+    rig = OwnedRig(config.rig, buses, groups, modules)
     latches = LatchKeeper(kept, {name: axis.tracker for name, axis in rig.axes.items() if axis.stoppable}, clock.now_ns)
     for each in rig.axes.values():
         each.latches = latches

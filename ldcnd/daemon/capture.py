@@ -22,7 +22,7 @@ from ldcnd.axis.clock import Clock
 from ldcnd.config.rig import CapturesConfig, RigConfig, ZenohConfig
 from ldcnd.contract.errors import ConfigError
 from ldcnd.daemon.line import BusService
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.known import FAMILIES
 from ldcnd.line.capture import Capture, CaptureHeader, capture_lines
 from ldcnd.line.flight_recorder import WireEntries, WireRecord
@@ -111,7 +111,7 @@ class Run:
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class RecorderSnapshot:
     """The contents of a line's flight recorder at one instant; quick to take, and then independent of the line."""
 
     bus: str
@@ -124,10 +124,10 @@ class Snapshot:
     entries: WireEntries
 
 
-def snapshot_of(line: BusService, clock: Clock) -> Snapshot:
+def snapshot_of(line: BusService, clock: Clock) -> RecorderSnapshot:
     """Take what a line's flight recorder holds: less than a millisecond for a full one."""
     log = line.bus.wire_log
-    return Snapshot(
+    return RecorderSnapshot(
         bus=line.bus.settings.name,
         family=line.family,
         port=line.port,
@@ -139,7 +139,7 @@ def snapshot_of(line: BusService, clock: Clock) -> Snapshot:
     )
 
 
-def capture_of(snapshot: Snapshot, config: RigConfig, run: Run, cause: str) -> Capture:
+def capture_of(snapshot: RecorderSnapshot, config: RigConfig, run: Run, cause: str) -> Capture:
     """Return a snapshot as a capture; needs no event loop, and takes its time."""
     header = CaptureHeader(
         version=version(),
@@ -207,7 +207,7 @@ class CaptureWatch:
         store: where captures go.
     """
 
-    def __init__(self, rig: Rig, config: Callable[[], RigConfig], run: Run, store: CaptureStore) -> None:
+    def __init__(self, rig: OwnedRig, config: Callable[[], RigConfig], run: Run, store: CaptureStore) -> None:
         self._rig = rig
         self._config = config
         self._run = run
@@ -238,7 +238,7 @@ class CaptureWatch:
         for line in self._rig.buses:
             self._write(snapshot_of(line, self._run.clock), cause)
 
-    def _write(self, snapshot: Snapshot, cause: str) -> None:
+    def _write(self, snapshot: RecorderSnapshot, cause: str) -> None:
         self._store.write(capture_of(snapshot, self._config(), self._run, cause))
 
 

@@ -21,7 +21,7 @@ from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.heartbeat import Heartbeat
 from ldcnd.daemon.leases import apply_policy
 from ldcnd.daemon.meta import Describing
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.line.capture import Capture
 from ldcnd.log import get_logger
 from ldcnd.net.hand_over import Load
@@ -52,7 +52,7 @@ class Daemon:
         self,
         config: RigConfig,
         session: Session,
-        rig: Rig,
+        rig: OwnedRig,
         dispatcher: Dispatcher,
         publisher: Publisher,
         clock: Clock,

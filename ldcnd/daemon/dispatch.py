@@ -46,8 +46,8 @@ from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF, CommandAddress, Keys
 from ldcnd.contract.leases import Acquire
 from ldcnd.daemon.leases import Authority, LeaseWatch
-from ldcnd.daemon.ledger import Entry, EventLog, Ledger
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.ledger import EventLog, Ledger, LedgerEntry
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.rig_commands import RigCommands
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.log import LogLimit, get_logger
@@ -74,7 +74,7 @@ class Journal:
     with what it contains.
     """
 
-    def __init__(self, rig: Rig) -> None:
+    def __init__(self, rig: OwnedRig) -> None:
         logs = [(line.bus.wire_log, [axis.config.name for axis in line.axes]) for line in rig.buses]
         self._logs = {name: [log] for log, names in logs for name in names}
         self._logs[RIG_ITSELF] = [log for log, _ in logs]
@@ -133,7 +133,7 @@ class EarlyStops:
 class Requests:
     """Answers the command and stop queries of one rig, each exactly once."""
 
-    def __init__(self, rig: Rig, keys: Keys, group: asyncio.TaskGroup, dispatcher: "Dispatcher") -> None:
+    def __init__(self, rig: OwnedRig, keys: Keys, group: asyncio.TaskGroup, dispatcher: "Dispatcher") -> None:
         self._rig = rig
         self._dispatcher = dispatcher
         self._keys = keys
@@ -330,7 +330,7 @@ class Dispatcher:
 
     def __init__(
         self,
-        rig: Rig,
+        rig: OwnedRig,
         authority: Authority,
         ledger: Ledger,
         events: EventLog,
@@ -418,7 +418,7 @@ class Dispatcher:
         if hold:
             right = right.also(lambda: hold.check(self._clock.now_s()))
         permit = axis.permit(command_id, command.verb, right)
-        self._ledger.open(Entry(command_id, axis_name, command, client, login))
+        self._ledger.open(LedgerEntry(command_id, axis_name, command, client, login))
         over = self._under_way[command_id] = asyncio.Event()
         try:
             if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
@@ -468,9 +468,9 @@ class Dispatcher:
                     "the drive did not confirm it yet; the axis is latched",
                 )
             command_id = self.events.next_command_id()
-            self._ledger.open(Entry(command_id, name, command, command.client, login, status, reason))
+            self._ledger.open(LedgerEntry(command_id, name, command, command.client, login, status, reason))
 
-    async def _answer_again(self, entry: Entry) -> CommandReply:
+    async def _answer_again(self, entry: LedgerEntry) -> CommandReply:
         """Answer a repeated id as the first time, once there is an answer."""
         under_way = self._under_way.get(entry.command_id)
         if under_way and entry.answer is None:

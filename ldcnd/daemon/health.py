@@ -17,7 +17,7 @@ from ldcnd.contract.health import (
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.daemon.line import BusService
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.line.queue import Lane
 from ldcnd.net.hand_over import Load
 from ldcnd.net.publisher import Publisher, Topic
@@ -87,7 +87,7 @@ class HealthWatch:
 
     def __init__(
         self,
-        rig: Rig,
+        rig: OwnedRig,
         keys: Keys,
         publisher: Publisher,
         clock: Clock,

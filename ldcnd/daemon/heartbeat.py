@@ -13,17 +13,17 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ldcnd.config.rig import HeartbeatConfig
-from ldcnd.contract.condition import Kind, assess, line_troubles
+from ldcnd.contract.condition import TroubleKind, assess, line_troubles
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import HeartbeatHealth
 from ldcnd.daemon.line import BusService
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.line.level import GpioLine, LevelFile, ModemLine, Output
 from ldcnd.log import get_logger
 
 log = get_logger("heartbeat")
 
-HOLDING = frozenset({Kind.NO_ANSWER, Kind.STOP_PENDING})
+HOLDING = frozenset({TroubleKind.NO_ANSWER, TroubleKind.STOP_PENDING})
 """Troubles of an axis that hold the level; faults and latched stops are the drive's own and the machine's business."""
 REOPEN_S = 1.0
 """Pause between two attempts to open an output that is gone."""
@@ -56,7 +56,7 @@ class Heartbeat:
     """
 
     def __init__(
-        self, config: HeartbeatConfig, rig: Rig, open_wire: Callable[[HeartbeatConfig], Output] = open_output
+        self, config: HeartbeatConfig, rig: OwnedRig, open_wire: Callable[[HeartbeatConfig], Output] = open_output
     ) -> None:
         self._config = config
         self._open_wire = open_wire

@@ -30,7 +30,7 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.leases import SHORTEST_LEASE_S, Acquire, LeaseReply
 from ldcnd.contract.samples import Moving
 from ldcnd.daemon.ledger import EventLog
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.axis_config import LossPolicy
 from ldcnd.drives.driver import StopMode
 from ldcnd.log import LogLimit, get_logger
@@ -260,7 +260,7 @@ class LeaseWatch:
         group: where policies run; None until the daemon runs, and until then no client has control.
     """
 
-    def __init__(self, rig: Rig, authority: Authority, events: EventLog, clock: Clock) -> None:
+    def __init__(self, rig: OwnedRig, authority: Authority, events: EventLog, clock: Clock) -> None:
         self.group: asyncio.TaskGroup | None = None
         self._rig = rig
         self._authority = authority

@@ -43,7 +43,7 @@ RESTING = "\0rest"
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
+class LedgerEntry:
     """One command.
 
     Attributes:
@@ -75,14 +75,14 @@ class Entry:
 class Ledger:
     """The commands of one rig, latest last."""
 
-    def __init__(self, changed: Callable[[Entry, LdcndError | None], None], now_s: Callable[[], float]) -> None:
+    def __init__(self, changed: Callable[[LedgerEntry, LdcndError | None], None], now_s: Callable[[], float]) -> None:
         """Begin empty.
 
         Args:
             changed: called with every entry and every change of status, and the error that goes with it.
             now_s: returns the time, in seconds.
         """
-        self._entries: dict[str, Entry] = {}
+        self._entries: dict[str, LedgerEntry] = {}
         self._of_senders: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
         self._until_s: dict[int, float] = {}  # by fingerprint, in the order of expiry
         self._changed = changed
@@ -92,7 +92,7 @@ class Ledger:
         """Tell whether an id names another command already, or has."""
         return command_id in self._entries or self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s()
 
-    def repeated(self, command_id: str, axis: str, command: AxisCommand[CommandReply]) -> Entry | None:
+    def repeated(self, command_id: str, axis: str, command: AxisCommand[CommandReply]) -> LedgerEntry | None:
         """Return the entry that this id has already, or None when it is new.
 
         Raises:
@@ -115,7 +115,7 @@ class Ledger:
             )
         return entry
 
-    def get(self, command_id: str) -> Entry:
+    def get(self, command_id: str) -> LedgerEntry:
         """Return an entry.
 
         Raises:
@@ -130,7 +130,7 @@ class Ledger:
             )
         return entry
 
-    def open(self, entry: Entry) -> None:
+    def open(self, entry: LedgerEntry) -> None:
         """Enter a new command.
 
         Raises:
@@ -170,7 +170,7 @@ class Ledger:
 
     def _reached(
         self,
-        entry: Entry,
+        entry: LedgerEntry,
         answer: CommandReply | LdcndError | None,
         status: CommandStatus,
         reason: str | None,
@@ -181,7 +181,7 @@ class Ledger:
         if not news:
             status, reason, arrival = entry.status, entry.reason, entry.arrival
         # spelled out, because `replace` takes 2.0 us instead of 1.3 where the answer waits
-        entry = self._entries[entry.command_id] = Entry(
+        entry = self._entries[entry.command_id] = LedgerEntry(
             command_id=entry.command_id,
             axis=entry.axis,
             command=entry.command,
@@ -195,7 +195,7 @@ class Ledger:
         if news:
             self._changed(entry, error)
 
-    def _remember(self, entry: Entry) -> None:
+    def _remember(self, entry: LedgerEntry) -> None:
         command = entry.command
         if command.command_id is None or command.takes_energy_out:
             return
@@ -258,7 +258,7 @@ class _News:
     t: int
     seq: int
     number: int
-    entry: Entry
+    entry: LedgerEntry
     error: LdcndError | None
 
 
@@ -285,7 +285,7 @@ class EventLog:
         """Return an id for a command that came without one."""
         return f"{self._run}-{next(self._serial)}"
 
-    def changed(self, entry: Entry, error: LdcndError | None) -> None:
+    def changed(self, entry: LedgerEntry, error: LdcndError | None) -> None:
         """Take a change of the ledger; what is refused at once was never accepted."""
         if entry.status is CommandStatus.REFUSED and self._news and _is_acceptance(self._news[-1].entry, entry):
             self._news.pop()
@@ -400,7 +400,7 @@ class EventLog:
         )
 
 
-def _is_acceptance(latest: Entry, refused: Entry) -> bool:
+def _is_acceptance(latest: LedgerEntry, refused: LedgerEntry) -> bool:
     return latest.command_id == refused.command_id and latest.status is CommandStatus.ACCEPTED
 
 

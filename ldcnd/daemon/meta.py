@@ -19,7 +19,7 @@ from ldcnd.contract.samples import Sample, TelemetryItem
 from ldcnd.daemon.contract import shipped_schemas
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.line import BusService
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.driver import Drive
 from ldcnd.line.queue import Lane
 from ldcnd.net.hand_over import Answer, Query
@@ -63,7 +63,7 @@ class Describing:
 
     def __init__(
         self,
-        rig: Rig,
+        rig: OwnedRig,
         keys: Keys,
         publisher: Publisher,
         daemon: Callable[[], DaemonInfo],

@@ -41,7 +41,7 @@ class Named(dict[str, PartT]):
         raise self._unknown(name, ", ".join(self) or "none")
 
 
-class Rig:
+class OwnedRig:
     """All lines and axes of one daemon.
 
     Attributes:

@@ -58,7 +58,7 @@ from ldcnd.contract.rig_commands import (
 from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy
 from ldcnd.daemon.ledger import EventLog, Ledger
 from ldcnd.daemon.line import BusService
-from ldcnd.daemon.rig import ModuleService, Rig
+from ldcnd.daemon.rig import ModuleService, OwnedRig
 from ldcnd.line.flight_recorder import WireRecord
 from ldcnd.log import get_logger
 
@@ -87,7 +87,7 @@ class RigCommands:
 
     def __init__(
         self,
-        rig: Rig,
+        rig: OwnedRig,
         authority: Authority,
         leases: LeaseWatch,
         ledger: Ledger,
@@ -258,7 +258,7 @@ class RigCommands:
 
 
 async def move_together(
-    rig: Rig,
+    rig: OwnedRig,
     moves: Mapping[str, MoveAbsolute],
     execute: Execute,
     *,
@@ -287,7 +287,7 @@ async def move_together(
     return meeting.reply(await _all_of(requests, meeting, execute))
 
 
-async def walk_path(rig: Rig, command: WalkPath, execute: Execute) -> PathReply:
+async def walk_path(rig: OwnedRig, command: WalkPath, execute: Execute) -> PathReply:
     """Walk axes along a polyline; returns once every drive walks.
 
     Raises:
@@ -331,7 +331,7 @@ async def _all_of(
     return tuple(replies)
 
 
-def preview_together(rig: Rig, request: PreviewTogether) -> PreviewTogetherReply:
+def preview_together(rig: OwnedRig, request: PreviewTogether) -> PreviewTogetherReply:
     """Plan moves of a group without sending anything.
 
     Raises:
@@ -364,7 +364,7 @@ def _shares(command: GroupMoves) -> dict[str, MoveAbsolute]:
     return moves
 
 
-def _line_of(rig: Rig, names: Iterable[str]) -> BusService:
+def _line_of(rig: OwnedRig, names: Iterable[str]) -> BusService:
     """Return the line that all these axes are on.
 
     Raises:
@@ -378,7 +378,7 @@ def _line_of(rig: Rig, names: Iterable[str]) -> BusService:
     return line
 
 
-def concerned(rig: Rig, request: Rehearse) -> tuple[str, ...]:
+def concerned(rig: OwnedRig, request: Rehearse) -> tuple[str, ...]:
     """Return the axes that a rehearsed loss concerns: a lost line is lost for all on it.
 
     Raises:
@@ -390,7 +390,7 @@ def concerned(rig: Rig, request: Rehearse) -> tuple[str, ...]:
     return (axis.config.name,)
 
 
-async def rehearse(rig: Rig, request: Rehearse) -> RehearsalReply:
+async def rehearse(rig: OwnedRig, request: Rehearse) -> RehearsalReply:
     """Play a loss; returns once it was played, the axis may still be coming to rest.
 
     Raises:
@@ -416,7 +416,7 @@ async def rehearse(rig: Rig, request: Rehearse) -> RehearsalReply:
     return RehearsalReply(kind=request.kind, axis=request.axis, policy=policy.value)
 
 
-def _bus_of(rig: Rig, name: str) -> BusService:
+def _bus_of(rig: OwnedRig, name: str) -> BusService:
     return next(bus for bus in rig.buses if any(axis.config.name == name for axis in bus.axes))
 
 
@@ -465,7 +465,7 @@ def _causes(axis: AxisService, obstacles: Iterable[tuple[LdcndError, bool]]) -> 
     return tuple(causes)
 
 
-def wire_page(rig: Rig, request: ReadWireLog, clock: Clock) -> WireLogReply:
+def wire_page(rig: OwnedRig, request: ReadWireLog, clock: Clock) -> WireLogReply:
     """Return the requested records of one line, the oldest first, as many as one reply takes.
 
     Raises:

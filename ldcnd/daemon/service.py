@@ -24,13 +24,13 @@ from pydantic import BaseModel, ValidationError
 
 from ldcnd.config.plan import require_plan
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.condition import Kind, assess, line_troubles
+from ldcnd.contract.condition import TroubleKind, assess, line_troubles
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.samples import FaultEntry, LinkState
 from ldcnd.daemon import systemd
 from ldcnd.daemon.daemon import Daemon
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.systemd import Notifier
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.line_config import BusConfig
@@ -275,7 +275,7 @@ class Service:
         return reload, require_plan(reload.config)
 
 
-def describe(rig: Rig) -> str:
+def describe(rig: OwnedRig) -> str:
     """Return in one line what of a rig works and what does not; what is true of several axes is said once.
 
     Polls that a drive missed are left out: a status is for what lasts.
@@ -289,7 +289,7 @@ def describe(rig: Rig) -> str:
         for axis in bus.axes if up else ():
             tracker = axis.tracker
             troubles = assess(tracker, _Faults(tracker.active_faults, tracker.first_fault)).wrong
-            for trouble in [each for each in troubles if each.kind is not Kind.MISSED_POLLS][:1]:
+            for trouble in [each for each in troubles if each.kind is not TroubleKind.MISSED_POLLS][:1]:
                 wrong.setdefault(trouble.text, []).append(axis.config.name)
     buses_up = sum(bus.report is not None for bus in rig.buses)
     axes_up = sum(axis.tracker.link is not LinkState.DOWN for axis in rig.axes.values())

@@ -100,7 +100,7 @@ class AxisReading:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class CountsMotion:
     """A motion in counts: a target for a trapezoid, None for a constant velocity.
 
     Attributes:
@@ -371,7 +371,7 @@ class Moves(Readable):
     about_to_renumber: Callable[[], Awaitable[None]] = staticmethod(nothing)
 
     @abstractmethod
-    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
         """Return the motion as the drive's registers will hold it: the nearest values that are not above these.
 
         Raises:
@@ -379,7 +379,7 @@ class Moves(Readable):
         """
 
     @abstractmethod
-    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         """Return what `load` and `start` would send for a motion; nothing is sent."""
 
     def room_counts(self, *, forward: bool) -> int:  # noqa: ARG002 - part of the contract
@@ -391,7 +391,7 @@ class Moves(Readable):
         """Close the loop at the present position, or open it and disable the amplifier; nothing moves."""
 
     @abstractmethod
-    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         """Prepare a motion, and the capture of a home position on the way; nothing moves.
 
         Raises:

@@ -22,7 +22,7 @@ BusT = TypeVar("BusT", bound=BusConfig)
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class UnopenedLine:
     """A line that is not open yet: who owns it, and the drives on it."""
 
     bus: Bus
@@ -64,7 +64,7 @@ class Demand:
         return 1.0 / self.urgent.probe.period_s if self.urgent.probe else 0.0
 
 
-OpenLine = Callable[[BusT, Opener | None], Line]
+OpenLine = Callable[[BusT, Opener | None], UnopenedLine]
 """Makes a line: its configuration, and what opens it instead of its port."""
 
 
@@ -108,7 +108,7 @@ class Family(ABC, Generic[BusT]):
 # -- what only some families can: a family that can inherits it ------------------------------------------------------
 
 
-class HasParameters(ABC):
+class HasParameterFiles(ABC):
     """A family whose drives have parameters that files hold."""
 
     @abstractmethod

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from ldcnd.contract.plan import LineLoad
 from ldcnd.drives.cost import Cost
 from ldcnd.drives.response_times import FULL, PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
-from ldcnd.drives.simulated_polling import Drive, mean_lengths_s
+from ldcnd.drives.simulated_polling import PolledDrive, mean_lengths_s
 from ldcnd.line.settings import ServoCycle
 
 STEPS = 16
@@ -137,7 +137,7 @@ def plan_line(
 def _mean_load(polls: Sequence[Poll], cycle: ServoCycle | None) -> float:
     lengths_s: Sequence[float] = [poll.mean_s for poll in polls]
     if cycle and len(polls) > 1:
-        lengths_s = mean_lengths_s(tuple(Drive(poll.rate_hz, poll.mean_cost) for poll in polls), cycle)
+        lengths_s = mean_lengths_s(tuple(PolledDrive(poll.rate_hz, poll.mean_cost) for poll in polls), cycle)
     return math.fsum(poll.rate_hz * length_s for poll, length_s in zip(polls, lengths_s, strict=True))
 
 

@@ -10,7 +10,7 @@ from typing import Any
 from ldcnd.contract.errors import NotSupported
 from ldcnd.contract.meta import ModuleInfo
 from ldcnd.contract.samples import IoReading
-from ldcnd.drives.driver import Drive, Motion, StopMode
+from ldcnd.drives.driver import CountsMotion, Drive, StopMode
 from ldcnd.line.exchange import Timing
 from ldcnd.line.poller import Poller
 from ldcnd.line.proof import Proof
@@ -250,7 +250,7 @@ class Network(ABC):
             BusError: the line failed; each axis must be stopped by itself in any case.
         """
 
-    async def start_group(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:  # noqa: ARG002
+    async def start_group(self, motions: Mapping[str, CountsMotion], still_wanted: Callable[[], None]) -> None:  # noqa: ARG002
         """Load motions, and start them all in the same servo cycle; if one cannot be loaded nothing starts.
 
         Args:

@@ -29,7 +29,7 @@ _NOTHING: Exchange[None] = Exchange(0, b"", 0, lambda _: ReplyVerdict.INTACT, la
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class PolledDrive:
     """One drive, with its poll.
 
     Attributes:
@@ -42,7 +42,7 @@ class Drive:
 
 
 @lru_cache(maxsize=64)
-def mean_lengths_s(drives: tuple[Drive, ...], cycle: ServoCycle, seed: int = 1) -> Sequence[float]:
+def mean_lengths_s(drives: tuple[PolledDrive, ...], cycle: ServoCycle, seed: int = 1) -> Sequence[float]:
     """Return how long the polls of each drive occupy the line on average, in seconds, in the order of the drives.
 
     Some fifty milliseconds of work for 31 drives; an overloaded line polls without a pause.
@@ -58,7 +58,7 @@ def mean_lengths_s(drives: tuple[Drive, ...], cycle: ServoCycle, seed: int = 1) 
 
 
 def _rehearse(
-    drives: tuple[Drive, ...], cycle: ServoCycle, dice: random.Random, lengths_s: Sequence[list[float]]
+    drives: tuple[PolledDrive, ...], cycle: ServoCycle, dice: random.Random, lengths_s: Sequence[list[float]]
 ) -> None:
     """Poll once with cycles of their own; append how long each poll took to the list of its drive."""
     order = PhaseOrder(cycle)
@@ -86,7 +86,7 @@ def _rehearse(
 class _Poller(Poller[None]):
     """A drive that answers at the end of its cycle, and its turns."""
 
-    def __init__(self, node: int, drive: Drive, cycle: ServoCycle, dice: random.Random) -> None:
+    def __init__(self, node: int, drive: PolledDrive, cycle: ServoCycle, dice: random.Random) -> None:
         self.node = node
         self.drive = drive
         self.due_at_s = 0.0

@@ -7,7 +7,7 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, BusDown, BusError, LdcndError, NotSupported, PacketRejected, TransportLost
 from ldcnd.line.adapter import LineErrors
-from ldcnd.line.exchange import Effect, Exchange, Timing
+from ldcnd.line.exchange import Exchange, PacketEffect, Timing
 from ldcnd.line.flight_recorder import WireEvent, WireLog
 from ldcnd.line.line import Line, Phase, Users
 from ldcnd.line.poller import Poller
@@ -121,7 +121,7 @@ LONGEST_OPENING_S = 10.0
 """Upper bound of closing a lost port and opening it again, seconds; both are bounded by themselves."""
 
 
-READS = Effect.READS  # looked up slowly in its class
+READS = PacketEffect.READS  # looked up slowly in its class
 
 
 class Bus(Users):

@@ -25,7 +25,7 @@ class ReplyVerdict(Enum):
     """An intact reply by which the node says it did not execute our damaged packet; resending is always safe."""
 
 
-class Effect(Enum):
+class PacketEffect(Enum):
     """What a packet does to the one who takes it."""
 
     READS = "reads"
@@ -66,7 +66,7 @@ class Exchange(Generic[ReplyT]):
     response_s: float
     repeatable: bool
     total_bytes: Callable[[bytes], int | None] | None = None
-    effect: Effect = Effect.CHANGES
+    effect: PacketEffect = PacketEffect.CHANGES
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,11 +20,11 @@ from ldcnd.contract.errors import BadReply, BusError, ReplyTimeout, TransportLos
 from ldcnd.line.exchange import ReplyVerdict, Timing
 from ldcnd.line.flight_recorder import WireEvent, WireLog
 from ldcnd.line.queue import POLL
-from ldcnd.line.resync import Probe, Quarantine, Resync
+from ldcnd.line.resync import Quarantine, Resync, ResyncExchange
 from ldcnd.line.settings import LINGER_S, BusSettings
 from ldcnd.line.transaction import AT_ONCE, LANES, Transaction
 from ldcnd.line.transport import Receiver, Transport
-from ldcnd.line.wire import CLOCK_TOLERANCE, NEVER_S, BusStatistics, Pieces, Watchdog, Whole, Wire
+from ldcnd.line.wire import CLOCK_TOLERANCE, NEVER_S, BusStatistics, CompleteReply, Pieces, Watchdog, Wire
 
 
 class Phase(Enum):
@@ -239,7 +239,7 @@ class Line(Receiver):
             data = whole.surplus
 
     def _judge(
-        self, transaction: Transaction, whole: Whole, verdict: ReplyVerdict, arrived: bytes, now_s: float
+        self, transaction: Transaction, whole: CompleteReply, verdict: ReplyVerdict, arrived: bytes, now_s: float
     ) -> None:
         """Accept a reply, wait for a better one, or reject it."""
         flaw = "came too early" if whole.early else _FLAWS.get(verdict, "")
@@ -309,7 +309,7 @@ class Line(Receiver):
     def _complete(self, transaction: Transaction, reply: bytes, now_s: float) -> None:
         """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
         timing = self.wire.replied(transaction, reply, self._sent_at_s, now_s)
-        if isinstance(transaction, Probe):
+        if isinstance(transaction, ResyncExchange):
             self._probed(transaction, reply, timing, now_s)
             return
         self._release(transaction, transaction.then_baud)
@@ -347,7 +347,7 @@ class Line(Receiver):
         """Settle the transaction whose reply cannot be valid any more, and resynchronise the line."""
         self.deliver()
         self._users.missed(transaction, now_s)
-        if not isinstance(transaction, Probe):
+        if not isinstance(transaction, ResyncExchange):
             self._quarantine.require()
         # before the resynchronisation, which a stop that is sent again cuts short
         if transaction.lost(error):
@@ -409,7 +409,7 @@ class Line(Receiver):
         else:
             self._next()
 
-    def _probed(self, probe: Probe, reply: bytes, timing: Timing, now_s: float) -> None:
+    def _probed(self, probe: ResyncExchange, reply: bytes, timing: Timing, now_s: float) -> None:
         probe.completed(reply, timing)
         if not probe.passed:
             why = "is not the known one"

@@ -11,13 +11,13 @@ from contextvars import ContextVar
 from typing import Any
 
 from ldcnd.contract.errors import AxisUnreachable, LdcndError, NotIdentified
-from ldcnd.line.exchange import Effect, Exchange
+from ldcnd.line.exchange import Exchange, PacketEffect
 from ldcnd.line.queue import Lane
 from ldcnd.line.transaction import Condition, condition_in_force
 
 MISSES_UNTIL_LOST = 3
 """Exchanges in a row without a reply after which another module may be at the address."""
-ALWAYS_SENT = frozenset({Effect.READS, Effect.RELIEVES})
+ALWAYS_SENT = frozenset({PacketEffect.READS, PacketEffect.RELIEVES})
 
 
 class bringing_up:  # noqa: N801 - read as a statement
@@ -160,7 +160,7 @@ class Proofs:
         That is its proof, and the permission of a command (`only_while`), which a stop does not need.
         """
         permission = condition_in_force() if lane is not Lane.STOP else None
-        passes = _pass.get() if exchange.effect is Effect.ARRANGES else None
+        passes = _pass.get() if exchange.effect is PacketEffect.ARRANGES else None
 
         def condition() -> None:
             if not (passes and passes.holds):

@@ -37,7 +37,7 @@ class Resync:
     probe: Callable[[AbstractSet[int]], Exchange[Any] | None] = _no_probe
 
 
-class Probe(Transaction):
+class ResyncExchange(Transaction):
     """The line's own exchange at the end of a resynchronisation."""
 
     __slots__ = ("passed",)
@@ -100,11 +100,11 @@ class Quarantine:
         quiet_s = self._resync.quiet_s
         return min(now_s + quiet_s, self._since_s + LONGEST_QUARANTINE * quiet_s)
 
-    def probe(self, avoid: AbstractSet[int], now_s: float) -> Probe | None:
+    def probe(self, avoid: AbstractSet[int], now_s: float) -> ResyncExchange | None:
         """Return the next proof to attempt; None when none is needed, or when there is no node to probe."""
         if self.in_step:
             return None
         exchange = self._resync.probe(avoid)
         self._rounds_left = self._rounds_left - 1 if exchange else 0
         self.in_step = self._rounds_left == 0
-        return Probe(exchange, now_s) if exchange else None
+        return ResyncExchange(exchange, now_s) if exchange else None

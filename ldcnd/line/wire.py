@@ -82,7 +82,7 @@ class BusStatistics:
         return {name: getattr(self, name) for name in LineCounters.model_fields}
 
 
-class Echo:
+class PendingEcho:
     """Bytes that were sent and whose echo has not arrived yet."""
 
     __slots__ = ("_due",)
@@ -121,7 +121,7 @@ CLOCK_TOLERANCE = 0.9
 
 
 @dataclass(frozen=True, slots=True)
-class Whole:
+class CompleteReply:
     """As many bytes as make a reply.
 
     Attributes:
@@ -164,7 +164,7 @@ class Pieces:
         """Return the earliest instant at which so many bytes can have come behind the request."""
         return self._over_s + count * self._byte_s
 
-    def add(self, exchange: Exchange[Any], data: bytes, now_s: float) -> Whole | None:
+    def add(self, exchange: Exchange[Any], data: bytes, now_s: float) -> CompleteReply | None:
         """Add bytes that have just arrived; return the reply once it is whole."""
         data = self.held + data
         self.early = self.early or now_s < self.earliest_s(len(data))
@@ -172,7 +172,7 @@ class Pieces:
         if total is None or len(data) < total:
             self.held = data
             return None
-        whole = Whole(data[:total], data[total:], self.early)
+        whole = CompleteReply(data[:total], data[total:], self.early)
         self.held, self.early = b"", False
         return whole
 
@@ -248,7 +248,7 @@ class Wire:
         self._statistics = statistics
         self.log = wire_log
         self._loop = asyncio.get_running_loop()
-        self.echo = Echo() if settings.echo else None
+        self.echo = PendingEcho() if settings.echo else None
 
     def longest_s(self, exchange: Exchange[Any]) -> float:
         """Return how long an exchange can take at the present rate, first bit to last, in seconds."""

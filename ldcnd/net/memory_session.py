@@ -33,9 +33,9 @@ from ldcnd.net.session import (
     UNDELIVERED_SAMPLES,
     Declaration,
     OnSample,
+    Publication,
     PublishValue,
     Qos,
-    Sample,
     SampleKind,
     Session,
 )
@@ -52,7 +52,7 @@ class _Queryable:
 @dataclass(eq=False, slots=True)
 class _Subscription:
     key: str
-    samples: HandOver[Sample]
+    samples: HandOver[Publication]
 
 
 @dataclass(eq=False, slots=True)
@@ -154,7 +154,7 @@ class MemorySession(Session):
         """Offer the sample to every subscription that matches; quality of service makes no difference here."""
         del qos, attachment
         if self._closed or self._broker.subscriptions or self._overhear:
-            self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns, self._name))
+            self._offer(Publication(key, payload, encoding, SampleKind.PUT, measured_at_ns, self._name))
 
     def publisher(self, key: str, *, encoding: str, qos: Qos) -> PublishValue:
         """Return what publishes the values of one key."""
@@ -163,13 +163,13 @@ class MemorySession(Session):
 
         def publish(payload: bytes, measured_at_ns: int) -> None:
             if self._closed or broker.subscriptions or self._overhear:
-                self._offer(Sample(key, payload, encoding, SampleKind.PUT, measured_at_ns, self._name))
+                self._offer(Publication(key, payload, encoding, SampleKind.PUT, measured_at_ns, self._name))
 
         return publish
 
     def delete(self, key: str) -> None:
         """Offer the deletion to every subscription that matches."""
-        self._offer(Sample(key, b"", "", SampleKind.DELETE, None, self._name))
+        self._offer(Publication(key, b"", "", SampleKind.DELETE, None, self._name))
 
     async def serve(
         self,
@@ -276,7 +276,7 @@ class MemorySession(Session):
         for declaration in tuple(self._declarations):
             await declaration.close()
 
-    def _offer(self, sample: Sample) -> None:
+    def _offer(self, sample: Publication) -> None:
         if self._closed:
             raise SessionError("the session is closed")
         if self._overhear and sample.kind is SampleKind.PUT:

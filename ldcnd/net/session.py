@@ -39,7 +39,7 @@ class SampleKind(StrEnum):
     DELETE = "delete"
 
 
-class Sample(NamedTuple):
+class Publication(NamedTuple):
     """A value that was published, or the deletion of a key; a tuple, as recorders take 50,000 a second."""
 
     key: str
@@ -52,7 +52,7 @@ class Sample(NamedTuple):
     """The session that has published it, as in the `source` of an `Answer`; empty when it does not say."""
 
 
-OnSample = Callable[[Sample], None]
+OnSample = Callable[[Publication], None]
 PublishValue = Callable[[bytes, int], None]
 """Publishes a payload, true at that instant, UTC in ns since 1970."""
 

@@ -6,11 +6,11 @@ from typing import TypedDict
 import zenoh
 
 from ldcnd.net.hand_over import Answer
-from ldcnd.net.session import Qos, Sample, SampleKind
+from ldcnd.net.session import Publication, Qos, SampleKind
 from ldcnd.net.zenoh_failures import no_answer
 
 
-class Travel(TypedDict):
+class ZenohQos(TypedDict):
     """Zenoh's quality of service for a message."""
 
     congestion_control: zenoh.CongestionControl
@@ -19,7 +19,7 @@ class Travel(TypedDict):
 
 
 _DROP = zenoh.CongestionControl.DROP
-TRAVEL: Mapping[Qos, Travel] = {
+TRAVEL: Mapping[Qos, ZenohQos] = {
     Qos.TELEMETRY: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA, "express": False},
     # not express: each sample would take a batch for itself, and of a burst all but two would be dropped
     Qos.EVENT: {"congestion_control": _DROP, "priority": zenoh.Priority.INTERACTIVE_HIGH, "express": False},
@@ -31,15 +31,15 @@ _PUT, _PUT_OF_OURS = zenoh.SampleKind.PUT, SampleKind.PUT
 """Looked up once: a recorder takes 50,000 samples a second."""
 
 
-def to_sample(sample: zenoh.Sample) -> Sample:
+def to_sample(sample: zenoh.Sample) -> Publication:
     """Return a sample as the session's users expect it."""
     key, payload, at_ns = str(sample.key_expr), sample.payload.to_bytes(), _stamped_ns(sample.timestamp)
     # not the id in the time stamp: who passes on a sample without one puts in its own
     info = sample.source_info
     source = "" if info is None else str(info.source_id.zid)
     if sample.kind == _PUT:
-        return Sample(key, payload, str(sample.encoding), _PUT_OF_OURS, at_ns, source)
-    return Sample(key, payload, "", SampleKind.DELETE, at_ns, source)
+        return Publication(key, payload, str(sample.encoding), _PUT_OF_OURS, at_ns, source)
+    return Publication(key, payload, "", SampleKind.DELETE, at_ns, source)
 
 
 def to_answers(key: str, replies: Sequence[zenoh.Reply], timeout_s: float) -> list[Answer]:

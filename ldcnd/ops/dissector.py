@@ -10,7 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 
 from ldcnd.drives.ldcn.controls import HomingControl, StopControl
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag, StatusItem
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag, StatusItem
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC, PROFILES, Profile
 from ldcnd.drives.ldcn.registers import gain_fields
 from ldcnd.drives.ldcn.trajectory import TrajectoryControl
@@ -27,7 +27,7 @@ FILE = "ldcnd.lua"
 def dissector() -> str:
     """Return the whole plugin."""
     tables = (
-        _table("COMMANDS", _names(Command)),
+        _table("COMMANDS", _names(CommandCode)),
         _flags("STATUS_ITEMS", StatusItem),
         _flags("STATUS_FLAGS", StatusFlag),
         _flags("AUX_FLAGS", AuxFlag),

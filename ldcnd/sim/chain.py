@@ -39,7 +39,7 @@ class Delivery(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class ModuleReply:
     """A transmission that a module begins.
 
     Attributes:
@@ -121,7 +121,7 @@ class Module(ABC):
         """Do work now that would otherwise be done at the host's next request; changes nothing visible."""
 
     @abstractmethod
-    def advance(self, to_s: float) -> Reply | None:
+    def advance(self, to_s: float) -> ModuleReply | None:
         """Do what is due up to that instant, and return the reply that begins with it, if any."""
 
 
@@ -361,7 +361,7 @@ class Chain:
                 transmission.data = transmission.data[: transmission.complete(at_s)]
         self._sweep()
 
-    def _begin(self, reply: Reply, module: Module) -> None:
+    def _begin(self, reply: ModuleReply, module: Module) -> None:
         self.wire_busy_s += len(reply.data) * reply.byte_s
         slowest, fastest = self._understood_bauds()
         data, byte_s = reply.data, reply.byte_s

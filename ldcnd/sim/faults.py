@@ -26,7 +26,7 @@ class FaultKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class LineFault:
     """One thing that may go wrong.
 
     Attributes:
@@ -47,7 +47,7 @@ class Fault:
 class FaultPlan:
     """Everything that may go wrong on one line, and the seed of the dice."""
 
-    faults: tuple[Fault, ...] = ()
+    faults: tuple[LineFault, ...] = ()
     seed: int = 1
 
 
@@ -115,7 +115,7 @@ class FaultInjector:
         delay_s = self._dice.uniform(0.0, delayed.longest_s) if delayed else 0.0
         return FaultyReply(data, delay_s, copies=2 if FaultKind.REPLY_DUPLICATED in struck else 1)
 
-    def _strike(self, at_s: float) -> dict[FaultKind, Fault]:
+    def _strike(self, at_s: float) -> dict[FaultKind, LineFault]:
         return {
             fault.kind: fault
             for fault in self._faults

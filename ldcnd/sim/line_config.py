@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from ldcnd.config.simulated import SimulatedLineConfig
 from ldcnd.contract.frozen import Frozen
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 
 
 class SimulatedFaultConfig(Frozen):
@@ -32,9 +32,9 @@ class SimulatedFaultConfig(Frozen):
             raise ValueError(f"until_s {self.until_s:g} is not after from_s {self.from_s:g}")
         return self
 
-    def spec(self, starts_at_s: float) -> Fault:
+    def spec(self, starts_at_s: float) -> LineFault:
         """Return what the simulator plays."""
-        fault = Fault(self.kind, self.probability, starts_at_s + self.from_s, longest_s=self.longest_s)
+        fault = LineFault(self.kind, self.probability, starts_at_s + self.from_s, longest_s=self.longest_s)
         return fault if self.until_s is None else replace(fault, until_s=starts_at_s + self.until_s)
 
 

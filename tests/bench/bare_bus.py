@@ -11,7 +11,7 @@ from typing_extensions import override
 from ldcnd.contract.errors import BusError
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.packet import Status, StatusItem
+from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, Timing
@@ -23,7 +23,7 @@ BAUD = 115_200
 ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 
 
-class Asker(Poller[Status]):
+class Asker(Poller[StatusPacket]):
     """Asks one drive for nine bytes, again and again."""
 
     def __init__(self, address: int) -> None:
@@ -33,12 +33,12 @@ class Asker(Poller[Status]):
         self._exchange = replace(commands.read_status(Node(address, PROFILES["ls-182ap"]), ITEMS), total_bytes=None)
 
     @override
-    def next_exchange(self, now_s: float) -> Exchange[Status]:
+    def next_exchange(self, now_s: float) -> Exchange[StatusPacket]:
         self.due_at_s = self.deadline_at_s = now_s
         return self._exchange
 
     @override
-    def deliver(self, reply: Status, timing: Timing) -> None:
+    def deliver(self, reply: StatusPacket, timing: Timing) -> None:
         pass
 
     @override

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 
-from ldcnd.drives.driver import AxisSpec, Gains, Motion, Moves
+from ldcnd.drives.driver import AxisSpec, CountsMotion, Gains, Moves
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.network import LdcnNetwork
@@ -103,7 +103,7 @@ async def _virtual(modules: int) -> tuple[float, float, float]:
         for drive in network.axes.values():
             assert isinstance(drive, Moves)
             await drive.power(on=True)
-            await drive.load(Motion(FAR, 20_000.0, 200_000.0))
+            await drive.load(CountsMotion(FAR, 20_000.0, 200_000.0))
             await drive.start()
         loop = asyncio.get_running_loop()
 

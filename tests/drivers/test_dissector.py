@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from ldcnd.cli import bus
 from ldcnd.config.rig import load_config
 from ldcnd.daemon.capture import config_of
-from ldcnd.drives.ldcn.packet import Command, PacketReader, Status, StatusItem, decode_status, status_bytes
+from ldcnd.drives.ldcn.packet import CommandCode, PacketReader, StatusItem, StatusPacket, decode_status, status_bytes
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.smartstep.packet import PACKET_CHARACTERS, decode_command, decode_reply
 from ldcnd.line.capture import Capture, parse_capture
@@ -56,17 +56,17 @@ def kept(name: str) -> Capture:
     return parse_capture((FOLDER / f"{name}.capture").read_text(encoding="utf-8"))
 
 
-def statuses(capture: Capture) -> dict[int, tuple[int, Status]]:
+def statuses(capture: Capture) -> dict[int, tuple[int, StatusPacket]]:
     """Return address and status of each reply to a Read Status that came whole, by the number of its record."""
     models = {axis.address: axis.model for axis in config_of(capture.header).bus[0].axis}
-    found: dict[int, tuple[int, Status]] = {}
+    found: dict[int, tuple[int, StatusPacket]] = {}
     asked: tuple[int, StatusItem] | None = None
     for number, record in enumerate(capture.records, 1):
         if record.event is WireEvent.SENT:
             reader = PacketReader()
             packets = [read.packet for byte in record.data if (read := reader.feed(byte))]
             last = packets[-1] if packets else None
-            reads = last and last.command is Command.READ_STATUS and last.address in models
+            reads = last and last.command is CommandCode.READ_STATUS and last.address in models
             asked = (last.address, StatusItem(last.data[0])) if last and reads else None
         elif record.event is WireEvent.RECEIVED and asked:
             profile = PROFILES[models[asked[0]]]
@@ -164,6 +164,6 @@ def test_command_installs_it_without_a_line_or_a_daemon(tmp_path: Path, monkeypa
     assert (done.exit_code, done.output) == (0, f"{tmp_path / PERSONAL_PLUGINS / FILE}\n")
 
 
-@pytest.mark.parametrize("name", [command.name for command in Command])
+@pytest.mark.parametrize("name", [command.name for command in CommandCode])
 def test_every_command_of_the_manuals_has_its_name(name: str):
     assert f'] = "{name}"' in dissector()

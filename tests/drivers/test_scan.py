@@ -12,11 +12,11 @@ from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import Verdict
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.addressing import NULLS
-from ldcnd.drives.ldcn.packet import Command, PacketReader
+from ldcnd.drives.ldcn.packet import CommandCode, PacketReader
 from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.chain import Chain, Delivery
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import Trip
@@ -25,8 +25,8 @@ from ldcnd.sim.plant import MotorPlant
 
 SERVOS = ("ls-182ap", "ls-173ap", "pic-servo-v4", "pic-servo-sc")
 OTHERS = ("pic-io", "pic-step")
-HARMLESS = {Command.READ_STATUS, Command.NO_OPERATION}
-ADDRESSING = {Command.SET_BAUD_RATE, Command.HARD_RESET, Command.SET_ADDRESS}
+HARMLESS = {CommandCode.READ_STATUS, CommandCode.NO_OPERATION}
+ADDRESSING = {CommandCode.SET_BAUD_RATE, CommandCode.HARD_RESET, CommandCode.SET_ADDRESS}
 PORT = "socket://127.0.0.1:4001"
 LONG = MotorPlant(reverse_limit_counts=-(10**7), forward_limit_counts=10**7)
 GAINS = Gains(kp=100, kd=1000, ki=50, il=200, ol=255, cl=0, el=4000, sr=1, deadband=0)
@@ -72,7 +72,7 @@ def random_chain(dice: random.Random) -> tuple[Chain, dict[int, tuple[str, int, 
     """Return a line in some state; what of it can be found, and whether a module without an address can."""
     names = [dice.choice((*SERVOS, *SERVOS, *OTHERS)) for _ in range(dice.randint(1, 6))]
     noise = dice.choice((0.0, 0.0, 0.01))
-    faults = FaultPlan((Fault(FaultKind.REPLY_BIT_FLIPPED, noise),) if noise else (), dice.randrange(1000))
+    faults = FaultPlan((LineFault(FaultKind.REPLY_BIT_FLIPPED, noise),) if noise else (), dice.randrange(1000))
     spec = ChainSpec(
         tuple(ModuleSpec(name, plant=LONG) for name in names),
         baud_check=True,
@@ -118,7 +118,7 @@ async def test_a_chain_in_any_state_is_told_as_it_is_and_left_as_it_was(seed):
     assert any(finding.what == "addresses" for finding in findings) == waiting, seed
     rates = {baud for _, baud, _ in expected.values()}
     assert any(finding.what == "rates" for finding in findings) == (len(rates) > 1), seed
-    assert {Command(packet.command) for packet in packets(sent)} <= HARMLESS
+    assert {CommandCode(packet.command) for packet in packets(sent)} <= HARMLESS
     assert [(module.address, module.baud, module.items) for module in chain.modules] == before
     assert [module.loop.servo_on for module in chain.modules if isinstance(module, SimulatedDrive)] == closed
 
@@ -145,7 +145,7 @@ async def test_a_fresh_line_gets_addresses_when_asked():
     drives, _, sent = await scanned(chain, give_addresses=True)
 
     assert [(drive.address, drive.model) for drive in drives] == [(1, "ls-182ap"), (2, "pic-io"), (3, "pic-servo-sc")]
-    assert {Command(packet.command) for packet in packets(sent)} == HARMLESS | ADDRESSING
+    assert {CommandCode(packet.command) for packet in packets(sent)} == HARMLESS | ADDRESSING
 
 
 @pytest.mark.parametrize(
@@ -180,7 +180,7 @@ async def test_nothing_is_reset_while_a_drive_moves_or_may(addressed):
     _, findings, sent = await scanned(chain, give_addresses=True)
 
     assert any(finding.verdict is Verdict.WRONG and "no addresses given" in finding.text for finding in findings)
-    assert {Command(packet.command) for packet in packets(sent)} <= HARMLESS
+    assert {CommandCode(packet.command) for packet in packets(sent)} <= HARMLESS
 
 
 async def test_a_silent_line_is_not_reset():
@@ -191,7 +191,7 @@ async def test_a_silent_line_is_not_reset():
     _, findings, sent = await scanned(chain, give_addresses=True)
 
     assert any(finding.verdict is Verdict.WRONG for finding in findings)
-    assert {Command(packet.command) for packet in packets(sent)} <= HARMLESS
+    assert {CommandCode(packet.command) for packet in packets(sent)} <= HARMLESS
     assert chain.modules[0].loop.servo_on
 
 

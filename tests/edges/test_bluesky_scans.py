@@ -16,7 +16,7 @@ from bluesky.utils import FailedStatus
 
 import ldcnd.lab.bluesky
 from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, TelemetryItem
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.bluesky_engine import Documents, Laboratory, laboratory
 from tests.support.process import ROOT, START_TIME_S, answering, client, daemon, free_port, process, simulated_terminal
 
@@ -97,7 +97,7 @@ def test_a_move_that_is_refused_fails_the_run_with_the_axis_at_rest():
 def test_a_drive_fault_in_the_middle_fails_the_run_with_the_axis_at_rest():
     async def short():
         module = lab.module("x")
-        module.set_condition(Condition.MOTOR_SHORT, present=True, at_s=asyncio.get_running_loop().time())
+        module.set_condition(FaultCondition.MOTOR_SHORT, present=True, at_s=asyncio.get_running_loop().time())
 
     with laboratory() as lab, lab.powered("x") as (x,):
         truth = scan_until(lab, x, short)

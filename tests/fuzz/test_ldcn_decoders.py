@@ -11,11 +11,11 @@ from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.faults import Knowledge, diagnose
 from ldcnd.drives.ldcn.packet import (
     HEADER,
-    Command,
+    CommandCode,
     Packet,
     PacketReader,
-    Status,
     StatusItem,
+    StatusPacket,
     check_status,
     decode_packet,
     decode_status,
@@ -52,7 +52,7 @@ def test_any_bytes_are_a_command_or_a_bad_reply(profile, data):
         assert decode_packet(data).data == data[3:-1]
 
 
-@given(profiles, st.builds(Packet, st.integers(0, 255), st.sampled_from(Command), st.binary(max_size=15)))
+@given(profiles, st.builds(Packet, st.integers(0, 255), st.sampled_from(CommandCode), st.binary(max_size=15)))
 def test_any_packet_has_an_interpretation(profile, packet):
     interpretation = interpret(profile, packet)
 
@@ -85,7 +85,7 @@ def test_an_exchange_decodes_or_refuses(data):
     exchange = commands.read_status(Node(1, profile), StatusItem(0xFF))
 
     with suppress(BadReply):
-        assert isinstance(exchange.decode(data), Status)
+        assert isinstance(exchange.decode(data), StatusPacket)
 
 
 @given(st.binary(max_size=200))

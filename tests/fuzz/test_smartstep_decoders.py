@@ -18,7 +18,14 @@ from ldcnd.drives.smartstep.commands import (
     write_eeprom,
 )
 from ldcnd.drives.smartstep.monitors import SPEED_FEEDBACK
-from ldcnd.drives.smartstep.packet import Command, Reply, checksum, decode_command, decode_reply, piece_bytes
+from ldcnd.drives.smartstep.packet import (
+    CommandPacket,
+    ReplyPacket,
+    checksum,
+    decode_command,
+    decode_reply,
+    piece_bytes,
+)
 from ldcnd.drives.smartstep.parameters import PN100
 from ldcnd.drives.smartstep.profiles import ByteOrder, SmartStepProfile, StringChecksum
 from ldcnd.drives.smartstep.trace_data import split_words
@@ -73,9 +80,9 @@ def test_exchanges_take_any_bytes(exchange):
 @given(any_bytes)
 def test_decoders_give_a_value_or_a_bad_reply(data):
     command = decode_command(data)
-    assert command is None or isinstance(command, Command)
+    assert command is None or isinstance(command, CommandPacket)
     with contextlib.suppress(BadReply):
-        assert isinstance(decode_reply(data), Reply)
+        assert isinstance(decode_reply(data), ReplyPacket)
     with contextlib.suppress(BadReply):
         assert len(split_words(data, ByteOrder.BIG)) * 2 == len(data)
     assert is_self_hearing(0, data) in (True, False)

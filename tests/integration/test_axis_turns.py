@@ -15,7 +15,7 @@ from ldcnd.contract.keys import EVENT, Keys
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.net.memory_session import MemoryBroker
-from ldcnd.net.session import Sample
+from ldcnd.net.session import Publication
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 
@@ -76,7 +76,7 @@ async def test_an_event_can_be_asked_for_at_once_and_is_published_a_moment_later
 
 
 async def test_what_has_just_happened_is_told_by_a_daemon_that_is_cut_short():
-    told: list[Sample] = []
+    told: list[Publication] = []
     loop = asyncio.get_running_loop()
     broker = MemoryBroker()
     async with broker.session() as session, broker.session() as client_session:

@@ -7,19 +7,19 @@ import pytest
 
 from ldcnd.contract.codec import MAX_PAYLOAD_BYTES
 from ldcnd.contract.commands import Power
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.line.flight_recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig
 
 X = "ldcn/sim/@cmd/x"
-LOOKING = {Command.READ_STATUS}
+LOOKING = {CommandCode.READ_STATUS}
 
 
-def sent_commands(rig: RunningRig) -> list[Command]:
+def sent_commands(rig: RunningRig) -> list[CommandCode]:
     """Return everything but polls that has gone over the wire since the line came up."""
     records = rig.daemon.rig.buses[0].bus.wire_log.records()
     packets = [record.data for record in records if record.event is WireEvent.SENT and record.data[:1] == b"\xaa"]
-    return [command for command in (Command(packet[2] & 0x0F) for packet in packets) if command not in LOOKING]
+    return [command for command in (CommandCode(packet[2] & 0x0F) for packet in packets) if command not in LOOKING]
 
 
 async def ask(rig: RunningRig, key: str, payload: bytes, encoding: str) -> dict[str, object]:

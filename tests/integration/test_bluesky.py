@@ -27,7 +27,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import AxisState, Moving
-from ldcnd.lab.bluesky import Axis, Fly, ReadableAxis, Signal, Status, Trace
+from ldcnd.lab.bluesky import Fly, PlanAxis, ReadableAxis, Signal, Status, TraceDetector
 from tests.support.bluesky_engine import Laboratory, laboratory
 from tests.support.rig import two_axes
 
@@ -71,13 +71,13 @@ def configured(lab: Laboratory, **changes: dict[str, float]):
 def test_devices_satisfy_the_protocols_without_a_base_class(lab: Laboratory):
     wanted = {
         ReadableAxis: ("Readable", "Triggerable", "Configurable", "Subscribable", "HasHints", "HasName", "HasParent"),
-        Axis: ("Movable", "Locatable", "Stoppable", "Checkable", "Preparable", "Flyable", "EventPageCollectable"),
+        PlanAxis: ("Movable", "Locatable", "Stoppable", "Checkable", "Preparable", "Flyable", "EventPageCollectable"),
         Signal: ("Readable", "Triggerable", "Subscribable", "HasHints"),
-        Trace: ("Readable", "Triggerable", "HasHints"),
+        TraceDetector: ("Readable", "Triggerable", "HasHints"),
     }
     with lab.powered("x") as (x,), lab.devices.watch("y") as y:
         trace = x.trace("position")
-        made = {ReadableAxis: y, Axis: x, Signal: lab.devices.signal("x", "velocity"), Trace: trace}
+        made = {ReadableAxis: y, PlanAxis: x, Signal: lab.devices.signal("x", "velocity"), TraceDetector: trace}
         lacking = [
             (kind.__name__, name)
             for kind, names in wanted.items()

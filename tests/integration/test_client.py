@@ -49,7 +49,7 @@ def test_every_command_of_an_axis_is_a_method_of_both_clients():
     names = {method_name(command) for command in COMMANDS if command.about is About.AXIS}
 
     assert names <= set(dir(Axis))
-    assert names <= set(dir(blocking.Axis))
+    assert names <= set(dir(blocking.BlockingAxis))
 
 
 def test_the_methods_are_those_that_the_commands_make():
@@ -65,7 +65,7 @@ def _class_of(module: str) -> str:
 
 
 def test_no_call_of_the_asyncio_client_is_missing_from_the_blocking_one():
-    for theirs, ours in ((Axis, blocking.Axis), (Rig, blocking.Rig)):
+    for theirs, ours in ((Axis, blocking.BlockingAxis), (Rig, blocking.BlockingRig)):
         public = {name for name, _ in inspect.getmembers(theirs) if not name.startswith("_")}
         inner = {
             "watched",

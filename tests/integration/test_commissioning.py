@@ -16,7 +16,7 @@ from ldcnd.bench.commissioning.limit_switches import _judged
 from ldcnd.bench.commissioning.motor import CAUGHT, MOST_EL_COUNTS, OUTPUTS
 from ldcnd.bench.commissioning.record import Result, StepState
 from ldcnd.bench.commissioning.report import html_of
-from ldcnd.bench.commissioning.walk import Walk
+from ldcnd.bench.commissioning.walk import ChecklistWalk
 from ldcnd.bench.person import Left
 from ldcnd.bench.tuning.ldcn.plant import Plant
 from ldcnd.client.axis import Axis
@@ -676,7 +676,7 @@ async def test_what_a_person_has_agreed_to_is_what_is_run(tmp_path):
     async with commissioning_rig(tmp_path, STANDS) as rig:
         rig.person.script["run it"] = agree
         checklist = await rig.checklist()
-        await Walk(checklist, rig.person, "rig.toml", lambda _: None).one("motor")
+        await ChecklistWalk(checklist, rig.person, "rig.toml", lambda _: None).one("motor")
 
         assert "what it will do has changed meanwhile:" in rig.person.told
         assert any("by about 200 counts" in line for line in rig.person.told)
@@ -697,7 +697,7 @@ async def test_a_configuration_that_was_changed_while_a_change_was_looked_at_kee
             return "y"
 
         rig.person.script["write this"] = lambda: approve("", "")
-        assert await Walk(checklist, rig.person, "rig.toml", lambda _: None).offer("scale")
+        assert await ChecklistWalk(checklist, rig.person, "rig.toml", lambda _: None).offer("scale")
         with pytest.raises(ConfigError, match="changed meanwhile"):
             checklist.write(late)
 

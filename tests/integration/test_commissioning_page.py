@@ -10,9 +10,9 @@ import pytest
 import serial
 
 from ldcnd import parts
-from ldcnd.bench.commissioning.record import Record, StepState
+from ldcnd.bench.commissioning.record import CommissioningRecord, StepState
 from ldcnd.config.rig import load_config
-from ldcnd.console.commissioning.messages import Answer, FromPage
+from ldcnd.console.commissioning.messages import FromCommissioningPage, PersonAnswer
 from ldcnd.console.commissioning.page_person import HELD_S
 from ldcnd.console.commissioning.scan_conversation import ScanConversation
 from ldcnd.contract.errors import ErrorCode
@@ -42,7 +42,11 @@ async def console(rig):
 
 def record(rig):
     path = rig.config.with_name("commissioning-bench-x.json")
-    return Record.model_validate_json(path.read_text()) if path.exists() else Record(rig="bench", axis=AXIS)
+    return (
+        CommissioningRecord.model_validate_json(path.read_text())
+        if path.exists()
+        else CommissioningRecord(rig="bench", axis=AXIS)
+    )
 
 
 async def holder(rig):
@@ -329,13 +333,13 @@ async def test_a_port_that_another_program_has_is_not_scanned(tmp_path):
         search = ScanConversation(tmp_path / "rig.toml")
         async with asyncio.TaskGroup() as group:
             running = group.create_task(search.run())
-            search.heard(FromPage(begin="scan"))
+            search.heard(FromCommissioningPage(begin="scan"))
             for text in (port, "ldcn"):
                 view = await search.view()
                 while view.question is None or view.question.number in said:
                     view = await search.view()
                 said.append(view.question.number)
-                search.heard(FromPage(answer=Answer(number=view.question.number, text=text)))
+                search.heard(FromCommissioningPage(answer=PersonAnswer(number=view.question.number, text=text)))
             while (view := await search.view()).problem is None:
                 pass
             running.cancel()

@@ -113,7 +113,7 @@ def test_what_programs_keep_is_one_clear_error_when_it_is_damaged(monkeypatch, t
     gains, steps = file_of("sim", "x"), tmp_path / "commissioning-sim-x.json"
     gains.parent.mkdir(parents=True)
     gains.write_text(KeptGains(rig="sim", axis="x", gains={"kp": 1}).model_dump_json())
-    steps.write_text(record.Record(rig="sim", axis="x").model_dump_json())
+    steps.write_text(record.CommissioningRecord(rig="sim", axis="x").model_dump_json())
     for path, read in ((gains, lambda: kept_for("sim", "x")), (steps, lambda: record.read(steps, "sim", "x"))):
         damage(path)
         with pytest.raises(ConfigError, match=path.name) as refused:

@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.contract.commands import Home, MoveAbsolute, MoveVelocity, Power, Reset
 from ldcnd.contract.samples import AdcSample, AxisState, PositionSample, TelemetryItem, VelocitySample
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.dialect_rig import (
     AXIS,
     CMC,
@@ -74,10 +74,12 @@ async def a_working_day(dialect: Dialect) -> None:
 
         # a fault, its recovery, and on with the work
         await rig.send(MoveAbsolute(position=0.0, velocity=2.0))
-        condition = Condition.OVERHEAT if dialect in (LS_173AP, LS_182AP, LS_182AP_22) else Condition.MOTOR_POWER_OFF
+        condition = (
+            FaultCondition.OVERHEAT if dialect in (LS_173AP, LS_182AP, LS_182AP_22) else FaultCondition.MOTOR_POWER_OFF
+        )
         rig.condition(condition)
         faults = await rig.until_fault(lambda sample: sample.active)
-        assert faults.first.code == ("overheat" if condition is Condition.OVERHEAT else "power_lost")
+        assert faults.first.code == ("overheat" if condition is FaultCondition.OVERHEAT else "power_lost")
         await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
         rig.condition(condition, present=False)
         await rig.send(Reset())

@@ -9,7 +9,7 @@ from ldcnd.contract.errors import LdcndError, RegisterUnknown, ReplyTimeout, Val
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.samples import LinkState, Quality, TelemetryItem
 from ldcnd.drives.ldcn.controls import LimitPins
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
 from tests.support.dialect_rig import (
     AXIS,
@@ -114,7 +114,7 @@ SR_10 = {"gains": GAINS | {"sr": 10, "kp": 40, "kd": 200, "ki": 0}, "limits": {"
 class Swallowed(FaultInjector):
     """Loses the replies to one command, which the module executes, or the requests."""
 
-    def __init__(self, command: Command, *, executed: bool) -> None:
+    def __init__(self, command: CommandCode, *, executed: bool) -> None:
         super().__init__(FaultPlan())
         self._command, self._executed, self._on = command, executed, False
 
@@ -127,7 +127,7 @@ class Swallowed(FaultInjector):
         return FaultyReply(b"" if self._on else data)
 
 
-async def send_unanswered(rig: DialectRig, command, written: Command, *, executed: bool = True) -> None:
+async def send_unanswered(rig: DialectRig, command, written: CommandCode, *, executed: bool = True) -> None:
     """Send a command that writes a register, with no reply to that packet."""
     rig.chain._injector = Swallowed(written, executed=executed)
     try:
@@ -154,7 +154,7 @@ async def fastest_mm_per_s(rig: DialectRig, seconds: float) -> float:
 async def test_a_move_after_a_lost_set_gain_keeps_its_limit(executed):
     async with dialect_rig(LS_182AP, **SR_10) as rig:
         await rig.power_on()
-        await send_unanswered(rig, SetGains(sr=1, kp=350, kd=3000), Command.SET_GAIN, executed=executed)
+        await send_unanswered(rig, SetGains(sr=1, kp=350, kd=3000), CommandCode.SET_GAIN, executed=executed)
         velocity = await rig.rig.client.last("x", TelemetryItem.VELOCITY)
         (unknown,) = await rig.rig.client.axes()
 
@@ -175,7 +175,7 @@ async def test_gains_that_may_have_changed_in_a_motion_are_loaded_again_at_rest(
     async with dialect_rig(V4) as rig:
         await rig.power_on()
         await rig.send(MoveRelative(distance=5.0, velocity=2.0))
-        await send_unanswered(rig, SetGains(kp=300), Command.SET_GAIN)
+        await send_unanswered(rig, SetGains(kp=300), CommandCode.SET_GAIN)
         assert rig.drive.loop.gains.kp == 300
         await rig.send(Halt())
         await rig.until(lambda state: state.command is None)
@@ -207,10 +207,10 @@ async def test_a_drive_that_was_taken_over_is_given_the_configured_gains_before_
 async def test_a_set_gain_that_stays_unanswered_keeps_the_axis_from_moving():
     async with dialect_rig(LS_182AP, **SR_10) as rig:
         await rig.power_on()
-        await send_unanswered(rig, SetGains(sr=1), Command.SET_GAIN)
+        await send_unanswered(rig, SetGains(sr=1), CommandCode.SET_GAIN)
         at = rig.position_mm
 
-        await send_unanswered(rig, MoveRelative(distance=5.0), Command.SET_GAIN)
+        await send_unanswered(rig, MoveRelative(distance=5.0), CommandCode.SET_GAIN)
 
         assert await fastest_mm_per_s(rig, 1.0) < 0.1
         assert rig.position_mm == pytest.approx(at, abs=0.02)
@@ -222,11 +222,11 @@ async def test_a_pin_that_is_not_named_stays_what_it_is(executed):
         await rig.until(lambda state: state.link == "up")
         await rig.send(SetOutputs(limit1="high"))
 
-        await send_unanswered(rig, SetOutputs(limit2="high"), Command.IO_CONTROL, executed=executed)
+        await send_unanswered(rig, SetOutputs(limit2="high"), CommandCode.IO_CONTROL, executed=executed)
         await rig.send(SetOutputs(limit2="high"))
         assert rig.drive._pins == LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_HIGH
 
-        await send_unanswered(rig, SetOutputs(limit2="low"), Command.IO_CONTROL, executed=executed)
+        await send_unanswered(rig, SetOutputs(limit2="low"), CommandCode.IO_CONTROL, executed=executed)
         held = rig.drive._pins
         with pytest.raises(RegisterUnknown, match="limit2_pin") as refusal:
             await rig.send(SetOutputs(limit1="low"))

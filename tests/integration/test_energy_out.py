@@ -15,7 +15,7 @@ from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.dispatch import PENDING_REQUESTS
 from ldcnd.sim.chain import Chain
-from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from tests.integration.test_kept_references import chain_of
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
 
@@ -160,7 +160,7 @@ async def test_what_comes_while_the_daemon_ends_is_sent_as_long_as_it_serves(ver
     async with leased_rig(loss={"daemon": "halt"}) as (rig, chain, lease):
         await run(rig, lease)
         now_s = asyncio.get_running_loop().time()
-        lost = Fault(FaultKind.REQUEST_LOST, 1.0, now_s, until_s=now_s + 1.0)
+        lost = LineFault(FaultKind.REQUEST_LOST, 1.0, now_s, until_s=now_s + 1.0)
         chain._injector = FaultInjector(FaultPlan((lost,)))
         rig.daemon.end()
         await asyncio.sleep(0.2)

@@ -10,7 +10,7 @@ from ldcnd.contract.commands import MoveRelative, Power
 from ldcnd.contract.samples import AxisState, FaultSample, PositionSample, TelemetryItem
 from ldcnd.drives.driver import AxisReading
 from ldcnd.line.exchange import Timing
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import Chain, ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import SIMULATED, running_rig
 
@@ -24,7 +24,7 @@ def rig_config() -> RigConfig:
 
 def chain(seed: int) -> Chain:
     models = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
-    falsified = Fault(FaultKind.REPLY_FALSIFIED, SHARE, from_s=FALSE_FROM_S)
+    falsified = LineFault(FaultKind.REPLY_FALSIFIED, SHARE, from_s=FALSE_FROM_S)
     return build_chain(
         ChainSpec(tuple(ModuleSpec(model) for model in models), faults=FaultPlan((falsified,), seed), seed=seed)
     )

@@ -8,7 +8,7 @@ from ldcnd.contract.commands import MoveAbsolute, Power, Reset, SetPosition, Sto
 from ldcnd.contract.errors import DriveFault, NotReferenced, WrongState
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.ldcn.faults import FaultCode
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.dialect_rig import (
     AXIS,
     DIALECTS,
@@ -24,17 +24,17 @@ from tests.support.dialect_rig import (
 
 FAR = MoveAbsolute(position=18.0, velocity=10.0)
 LATCHED = {
-    Condition.STOP_INPUT: FaultCode.STOP_INPUT,
-    Condition.MOTOR_SHORT: FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE,
-    Condition.OVERHEAT: FaultCode.OVERHEAT,
-    Condition.OVERCURRENT: FaultCode.OVERCURRENT,
-    Condition.ENCODER_LOSS: FaultCode.ENCODER_OR_HALL,
+    FaultCondition.STOP_INPUT: FaultCode.STOP_INPUT,
+    FaultCondition.MOTOR_SHORT: FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE,
+    FaultCondition.OVERHEAT: FaultCode.OVERHEAT,
+    FaultCondition.OVERCURRENT: FaultCode.OVERCURRENT,
+    FaultCondition.ENCODER_LOSS: FaultCode.ENCODER_OR_HALL,
 }
 latched = pytest.mark.parametrize("condition", LATCHED, ids=lambda condition: condition.value)
 logosol = pytest.mark.parametrize("dialect", [LS_173AP, LS_182AP], ids=lambda dialect: dialect.name)
 
 
-async def trip(rig: DialectRig, condition: Condition) -> None:
+async def trip(rig: DialectRig, condition: FaultCondition) -> None:
     """Let something switch the moving motor off; it is over again when the drive has noticed."""
     await rig.power_on()
     await rig.send(FAR)
@@ -75,7 +75,7 @@ async def test_power_off_of_a_tripped_drive_leaves_the_fault_its_name(condition)
 @pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
 async def test_a_stop_after_a_position_error_leaves_the_fault_its_name(dialect):
     async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
-        await trip(rig, Condition.STALLED)
+        await trip(rig, FaultCondition.STALLED)
 
         await rig.send(Stop())
 
@@ -86,7 +86,7 @@ async def test_a_stop_after_a_position_error_leaves_the_fault_its_name(dialect):
 
 async def test_a_position_that_was_lost_stays_lost_after_a_stop():
     async with dialect_rig(LS_182AP) as rig:
-        await trip(rig, Condition.ENCODER_LOSS)
+        await trip(rig, FaultCondition.ENCODER_LOSS)
         await rig.send(Stop())
         await asyncio.sleep(0.5)
 
@@ -113,7 +113,7 @@ async def test_a_second_without_the_cable_leaves_the_fault_its_name(condition):
         assert await codes_later(rig) == [LATCHED[condition]]
 
 
-@pytest.mark.parametrize("condition", [*LATCHED, Condition.STALLED], ids=lambda condition: condition.value)
+@pytest.mark.parametrize("condition", [*LATCHED, FaultCondition.STALLED], ids=lambda condition: condition.value)
 async def test_a_tripped_drive_that_is_taken_over_has_a_fault_without_a_cause(condition):
     async with dialect_rig(LS_182AP, gains=GAINS | {"el": 500}) as rig:
         await trip(rig, condition)
@@ -130,7 +130,7 @@ async def test_a_tripped_drive_that_is_taken_over_has_a_fault_without_a_cause(co
         assert await codes_later(later) == []
 
 
-async def stopped_after(rig: DialectRig, condition: Condition) -> None:
+async def stopped_after(rig: DialectRig, condition: FaultCondition) -> None:
     """Trip a drive and stop it: with its power driver off it hides a cause that is over, and holds it all the same."""
     await trip(rig, condition)
     await rig.until(lambda state: state.moving is Moving.NO)
@@ -139,7 +139,7 @@ async def stopped_after(rig: DialectRig, condition: Condition) -> None:
 
 @pytest.mark.parametrize(
     ("dialect", "condition"),
-    [(LS_182AP, condition) for condition in LATCHED] + [(each, Condition.STALLED) for each in DIALECTS],
+    [(LS_182AP, condition) for condition in LATCHED] + [(each, FaultCondition.STALLED) for each in DIALECTS],
     ids=lambda each: each.name.lower(),
 )
 async def test_one_reset_is_enough_for_a_tripped_drive_that_was_stopped_and_taken_over(dialect, condition):
@@ -159,7 +159,7 @@ async def test_one_reset_is_enough_for_a_tripped_drive_that_was_stopped_and_take
 @pytest.mark.parametrize("dialect", [LS_173AP, LS_182AP], ids=lambda dialect: dialect.name)
 async def test_power_clears_no_fault_that_a_drive_hides_when_it_is_taken_over(dialect):
     async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
-        await stopped_after(rig, Condition.STALLED)
+        await stopped_after(rig, FaultCondition.STALLED)
 
     async with adopting_rig(dialect, rig) as later:
         await later.until(lambda state: state.state is AxisState.DISABLED)
@@ -184,7 +184,7 @@ async def test_nothing_is_said_of_a_drive_that_is_taken_over_switched_off():
 @pytest.mark.parametrize("dialect", [V4, SC], ids=lambda dialect: dialect.name)
 async def test_lost_motor_power_keeps_its_name_when_the_power_is_back(dialect):
     async with dialect_rig(dialect) as rig:
-        await trip(rig, Condition.MOTOR_POWER_OFF)
+        await trip(rig, FaultCondition.MOTOR_POWER_OFF)
 
         assert await codes_later(rig) == ["power_lost"]
 
@@ -193,12 +193,12 @@ async def test_lost_motor_power_keeps_its_name_when_the_power_is_back(dialect):
 async def test_motor_power_that_is_off_while_the_axis_is_disabled_stops_nothing(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.until(lambda state: state.state is AxisState.DISABLED)
-        rig.condition(Condition.MOTOR_POWER_OFF)
+        rig.condition(FaultCondition.MOTOR_POWER_OFF)
         sample = await rig.until_fault(lambda faults: faults.active)
 
         assert [(fault.code, fault.stops) for fault in sample.active] == [("power_lost", False)]
         await rig.send(Reset())
         assert (await rig.rig.client.state(AXIS)).state is AxisState.DISABLED
-        rig.condition(Condition.MOTOR_POWER_OFF, present=False)
+        rig.condition(FaultCondition.MOTOR_POWER_OFF, present=False)
         await rig.send(Power(on=True))
         assert (await rig.done(FAR)).last_error is None

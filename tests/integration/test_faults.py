@@ -22,7 +22,7 @@ from ldcnd.contract.commands import (
 from ldcnd.contract.errors import DriveFault, NotReferenced, WrongState
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.ldcn.faults import FaultCode
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.dialect_rig import (
     AXIS,
     DIALECTS,
@@ -57,12 +57,12 @@ def codes(sample):
 @pytest.mark.parametrize(
     ("condition", "code"),
     [
-        (Condition.STOP_INPUT, FaultCode.STOP_INPUT),
-        (Condition.MOTOR_SHORT, FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
-        (Condition.OVERVOLTAGE, FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
-        (Condition.OVERHEAT, FaultCode.OVERHEAT),
-        (Condition.OVERCURRENT, FaultCode.OVERCURRENT),
-        (Condition.ENCODER_LOSS, FaultCode.ENCODER_OR_HALL),
+        (FaultCondition.STOP_INPUT, FaultCode.STOP_INPUT),
+        (FaultCondition.MOTOR_SHORT, FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
+        (FaultCondition.OVERVOLTAGE, FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
+        (FaultCondition.OVERHEAT, FaultCode.OVERHEAT),
+        (FaultCondition.OVERCURRENT, FaultCode.OVERCURRENT),
+        (FaultCondition.ENCODER_LOSS, FaultCode.ENCODER_OR_HALL),
     ],
 )
 async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(dialect, condition, code):
@@ -106,9 +106,9 @@ async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(di
 @pytest.mark.parametrize(
     ("condition", "code"),
     [
-        (Condition.STOP_INPUT, FaultCode.STOP_INPUT),
-        (Condition.OVERVOLTAGE, FaultCode.OVERVOLTAGE),
-        (Condition.OVERHEAT, FaultCode.OVERHEAT),
+        (FaultCondition.STOP_INPUT, FaultCode.STOP_INPUT),
+        (FaultCondition.OVERVOLTAGE, FaultCode.OVERVOLTAGE),
+        (FaultCondition.OVERHEAT, FaultCode.OVERHEAT),
     ],
 )
 async def test_what_is_wrong_with_the_power_driver_off_is_named(dialect, condition, code):
@@ -137,14 +137,14 @@ async def test_a_jam_ends_in_a_position_error(dialect):
         await rig.send(FAR)
         await asyncio.sleep(0.5)
 
-        rig.condition(Condition.STALLED)
+        rig.condition(FaultCondition.STALLED)
         sample = await rig.until_fault(lambda faults: faults.active)
 
         assert (codes(sample), sample.first.text) == (["position_error"], FaultCode.POSITION_ERROR.remedy)
         why = await rig.rig.client.ask(Why(), AXIS)
         assert (why.causes[0].code, why.causes[0].remedy) == ("drive_fault", "remove the cause, then send reset")
         assert (await rig.until(lambda state: state.state is AxisState.ERROR_STOP)).enabled is False
-        rig.condition(Condition.STALLED, present=False)
+        rig.condition(FaultCondition.STALLED, present=False)
         await rig.send(Reset())
         await rig.send(Power(on=True))
         assert (await rig.done(FAR)).state is AxisState.STANDSTILL
@@ -157,12 +157,12 @@ async def test_a_sensor_lost_in_an_analog_move_is_named(dialect):
         await rig.send(MoveAnalog(target=200, velocity=2.0))
         await asyncio.sleep(0.5)
 
-        rig.condition(Condition.SENSOR_LOST)
+        rig.condition(FaultCondition.SENSOR_LOST)
         sample = await rig.until_fault(lambda faults: faults.active)
 
         assert (codes(sample), sample.first.text) == (["sensor_fault"], FaultCode.SENSOR_FAULT.remedy)
         await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
-        rig.condition(Condition.SENSOR_LOST, present=False)
+        rig.condition(FaultCondition.SENSOR_LOST, present=False)
         await rig.send(Reset())
         await rig.send(Power(on=True))
         assert (await rig.done(FAR)).state is AxisState.STANDSTILL
@@ -172,7 +172,7 @@ async def test_a_sensor_lost_in_an_analog_move_is_named(dialect):
 async def test_a_sensor_lost_in_any_other_move_disturbs_nothing(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
-        rig.condition(Condition.SENSOR_LOST)
+        rig.condition(FaultCondition.SENSOR_LOST)
 
         state = await rig.done(FAR)
 
@@ -190,11 +190,11 @@ async def test_an_encoder_that_was_lost_takes_the_reference_with_it_until_the_ax
         await rig.send(FAR)
         await asyncio.sleep(0.5)
 
-        rig.condition(Condition.ENCODER_LOSS)
+        rig.condition(FaultCondition.ENCODER_LOSS)
         state = await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
         with pytest.raises(WrongState, match="its position is lost") as refusal:
             await rig.send(SetPosition(position=3.0))
-        rig.condition(Condition.ENCODER_LOSS, present=False)
+        rig.condition(FaultCondition.ENCODER_LOSS, present=False)
         await rig.send(Reset())
         await rig.until(lambda state: state.moving is Moving.NO)
         await rig.send(Power(on=True))
@@ -267,12 +267,12 @@ async def test_motor_power_lost_is_named_and_nothing_lurches_when_it_returns(dia
         await rig.send(FAR)
         await asyncio.sleep(0.5)
 
-        rig.condition(Condition.MOTOR_POWER_OFF)
+        rig.condition(FaultCondition.MOTOR_POWER_OFF)
         sample = await rig.until_fault(lambda faults: faults.active)
         assert (codes(sample), sample.first.text) == (["power_lost"], FaultCode.POWER_LOST.remedy)
         await asyncio.sleep(2.0)
         where = rig.position_mm
-        rig.condition(Condition.MOTOR_POWER_OFF, present=False)
+        rig.condition(FaultCondition.MOTOR_POWER_OFF, present=False)
         await asyncio.sleep(1.0)
 
         assert rig.position_mm == pytest.approx(where, abs=0.01)
@@ -323,8 +323,8 @@ async def test_a_late_servo_cycle_is_a_warning_that_reset_clears(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
 
-        rig.condition(Condition.SLOW_PROCESSOR)
-        rig.condition(Condition.SLOW_PROCESSOR, present=False)
+        rig.condition(FaultCondition.SLOW_PROCESSOR)
+        rig.condition(FaultCondition.SLOW_PROCESSOR, present=False)
         sample = await rig.until_fault(lambda faults: faults.active)
 
         assert (codes(sample), sample.first.stops) == (["servo_overrun"], False)
@@ -337,13 +337,13 @@ async def test_a_late_servo_cycle_is_a_warning_that_reset_clears(dialect):
 async def test_the_first_cause_is_kept_while_others_come_and_go():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
-        rig.condition(Condition.OVERHEAT)
+        rig.condition(FaultCondition.OVERHEAT)
         await rig.until_fault(lambda faults: faults.active)
 
         with pytest.raises(DriveFault):
             await rig.send(Reset())
-        rig.condition(Condition.STOP_INPUT)
-        rig.condition(Condition.OVERHEAT, present=False)
+        rig.condition(FaultCondition.STOP_INPUT)
+        rig.condition(FaultCondition.OVERHEAT, present=False)
         sample = await rig.until_fault(lambda faults: codes(faults) == ["stop_input"])
 
         assert sample.first.code == "overheat"
@@ -352,10 +352,10 @@ async def test_the_first_cause_is_kept_while_others_come_and_go():
 async def test_a_latched_cause_outlives_its_condition_until_reset():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
-        rig.condition(Condition.STOP_INPUT)
+        rig.condition(FaultCondition.STOP_INPUT)
         await rig.until_fault(lambda faults: faults.active)
 
-        rig.condition(Condition.STOP_INPUT, present=False)
+        rig.condition(FaultCondition.STOP_INPUT, present=False)
         await asyncio.sleep(1.0)
 
         sample = await rig.until_fault(lambda _: True)
@@ -365,9 +365,9 @@ async def test_a_latched_cause_outlives_its_condition_until_reset():
 async def test_reset_follows_the_printed_order_and_closes_nothing():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
-        rig.condition(Condition.OVERCURRENT)
+        rig.condition(FaultCondition.OVERCURRENT)
         await rig.until_fault(lambda faults: faults.active)
-        rig.condition(Condition.OVERCURRENT, present=False)
+        rig.condition(FaultCondition.OVERCURRENT, present=False)
 
         await rig.send(Reset())
 
@@ -377,7 +377,7 @@ async def test_reset_follows_the_printed_order_and_closes_nothing():
 async def test_closing_the_loop_over_a_standing_cause_is_refused_with_its_name():
     async with dialect_rig(LS_182AP) as rig:
         await rig.until(lambda state: state.state is AxisState.DISABLED)
-        rig.condition(Condition.ENCODER_LOSS)  # not shown while the power driver is off
+        rig.condition(FaultCondition.ENCODER_LOSS)  # not shown while the power driver is off
 
         with pytest.raises(DriveFault, match="encoder or Hall signals are lost"):
             await rig.send(Power(on=True))

@@ -32,7 +32,7 @@ from ldcnd.contract.samples import AxisState, PositionSample, StateSample
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
-from ldcnd.ops.pki.access import Role
+from ldcnd.ops.pki.access import CertificateRole
 from ldcnd.ops.pki.site import Site, new_login, set_up
 from tests.support.network import Network, NoNamespaces, router_config, router_words
 from tests.support.process import LDCND
@@ -123,11 +123,16 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SiteNetwork]:
 
 
 def make_logins(site: Site, network: Network) -> None:
-    for host, role in (("mill", Role.DAEMON), ("lathe", Role.DAEMON), ("gate1", Role.ROUTER), ("gate2", Role.ROUTER)):
+    for host, role in (
+        ("mill", CertificateRole.DAEMON),
+        ("lathe", CertificateRole.DAEMON),
+        ("gate1", CertificateRole.ROUTER),
+        ("gate2", CertificateRole.ROUTER),
+    ):
         addresses = tuple(address for (here, _), address in network.address.items() if here == host)
         site.add(new_login(host, role, (*addresses, "127.0.0.1")), NOW, 10)
-    site.add(new_login("vic", Role.VIEWER, ()), NOW, 10)
-    site.add(new_login("ada", Role.OPERATOR, ()), NOW, 10)
+    site.add(new_login("vic", CertificateRole.VIEWER, ()), NOW, 10)
+    site.add(new_login("ada", CertificateRole.OPERATOR, ()), NOW, 10)
 
 
 @asynccontextmanager

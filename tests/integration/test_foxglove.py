@@ -12,7 +12,7 @@ from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.events import CommandEvent, CommandStatus
 from ldcnd.contract.samples import PositionSample
 from ldcnd.lab.recording.live_view import LiveView
-from ldcnd.net.session import Sample, SampleKind
+from ldcnd.net.session import Publication, SampleKind
 from tests.support.process import LDCND, ROOT, daemon
 from tests.support.websocket import foxglove_client
 
@@ -36,7 +36,7 @@ EVENT = CommandEvent(
 
 
 def published(item, model):
-    return Sample(f"ldcn/sim/tele/x/{item}", *encode(model, Encoding.JSON), SampleKind.PUT, model.t)
+    return Publication(f"ldcn/sim/tele/x/{item}", *encode(model, Encoding.JSON), SampleKind.PUT, model.t)
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.rig_commands import AxisMove, LinePath, MoveTogether, PreviewTogether
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.rig_commands import move_together
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
@@ -47,7 +47,7 @@ async def together(rig, **targets):
 
 
 def starts(rig):
-    return [packet for packet in rig.sent if packet.command is Command.START_MOTION]
+    return [packet for packet in rig.sent if packet.command is CommandCode.START_MOTION]
 
 
 async def test_axes_start_together_and_end_like_any_move():

@@ -18,12 +18,12 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.drives.driver import HomeCapture, Motion, StopMode
+from ldcnd.drives.driver import CountsMotion, HomeCapture, StopMode
 from ldcnd.drives.ldcn.commands import spaced
 from ldcnd.drives.ldcn.controls import StopControl
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.network import GroupSpec, LineSpec, StartPolicy
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.bare_network import bare_network, specs
 from tests.support.chain_rig import drive, rig_on, simulated_config
@@ -33,8 +33,8 @@ MODULES = ("ls182ap", "picservo-v4", "picservo-v4", "ls182ap")
 AXES = specs("ls-182ap", "pic-servo-v4", "pic-servo-v4", "ls-182ap")
 PAIR = LineSpec(groups=(GroupSpec("pair", ("a2", "a3")),))
 LED_PAIR = LineSpec(groups=(GroupSpec("pair", ("a2", "a3"), leader="a3"),))
-THERE = Motion(20_000, 20_000.0, 100_000.0)
-BACK = Motion(-20_000, 20_000.0, 100_000.0)
+THERE = CountsMotion(20_000, 20_000.0, 100_000.0)
+BACK = CountsMotion(-20_000, 20_000.0, 100_000.0)
 
 
 def chain_of(*modules, faults=None):
@@ -61,7 +61,7 @@ async def test_members_start_with_one_packet_and_nobody_else_does(line_spec):
         before = len(line.sent())
 
         await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
-        started = [packet for packet in line.sent(before) if packet.command is Command.START_MOTION]
+        started = [packet for packet in line.sent(before) if packet.command is CommandCode.START_MOTION]
         await asyncio.sleep(3)
 
     assert [packet.address for packet in started] == [0x81]
@@ -71,7 +71,7 @@ async def test_members_start_with_one_packet_and_nobody_else_does(line_spec):
 
 
 def is_leader(packet):
-    return packet.command is Command.SET_ADDRESS and not packet.data[1] & 0x80
+    return packet.command is CommandCode.SET_ADDRESS and not packet.data[1] & 0x80
 
 
 async def test_set_baud_goes_to_groups_while_they_have_no_leader():
@@ -79,7 +79,7 @@ async def test_set_baud_goes_to_groups_while_they_have_no_leader():
         await up(line, power=False)
         sent = line.sent()
 
-    rate_changes = [at for at, packet in enumerate(sent) if packet.command is Command.SET_BAUD_RATE]
+    rate_changes = [at for at, packet in enumerate(sent) if packet.command is CommandCode.SET_BAUD_RATE]
     leaders = [at for at, packet in enumerate(sent) if is_leader(packet)]
     assert len(rate_changes) >= 2
     assert leaders
@@ -102,7 +102,7 @@ async def test_a_leader_keeps_leading_while_another_drive_is_brought_back():
 
     assert [module.address for module in chain.modules] == [1, 2, 3, 4]
     assert chain.modules[2].leader
-    assert not [packet for packet in sent if packet.command is Command.SET_ADDRESS and packet.address == 3]
+    assert not [packet for packet in sent if packet.command is CommandCode.SET_ADDRESS and packet.address == 3]
 
 
 @pytest.mark.parametrize("baud", [9600, 19_200, 115_200, 230_400])
@@ -135,10 +135,10 @@ async def test_nothing_starts_when_one_load_fails():
         await up(line)
 
         with pytest.raises(ValueOutOfRange):
-            await line.network.start_group({"a2": THERE, "a3": Motion(1 << 40, 1.0, 1.0)}, wanted)
+            await line.network.start_group({"a2": THERE, "a3": CountsMotion(1 << 40, 1.0, 1.0)}, wanted)
         await asyncio.sleep(1)
 
-        assert Command.START_MOTION not in {packet.command for packet in line.sent()}
+        assert CommandCode.START_MOTION not in {packet.command for packet in line.sent()}
     assert drive(chain, 2).loop.position == 0
 
 
@@ -151,7 +151,7 @@ async def test_nothing_starts_when_a_loop_is_open():
         with pytest.raises(DriveFault, match="a3"):
             await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
 
-        assert Command.START_MOTION not in {packet.command for packet in line.sent()}
+        assert CommandCode.START_MOTION not in {packet.command for packet in line.sent()}
 
 
 async def test_a_stop_between_load_and_start_keeps_the_group_at_rest():
@@ -166,7 +166,7 @@ async def test_a_stop_between_load_and_start_keeps_the_group_at_rest():
         with pytest.raises(StopLatched):
             await line.network.start_group({"a2": THERE, "a3": BACK}, overtaken)
 
-        assert Command.START_MOTION not in {packet.command for packet in line.sent()}
+        assert CommandCode.START_MOTION not in {packet.command for packet in line.sent()}
 
 
 async def test_axes_that_are_no_group_are_refused():
@@ -182,7 +182,7 @@ async def test_axes_that_are_no_group_are_refused():
 
 
 async def test_a_group_that_did_not_hear_its_start_is_stopped_and_reported():
-    chain = chain_of(faults=FaultPlan((Fault(FaultKind.REQUEST_LOST, 1.0, from_s=20.0, until_s=20.5),), 1))
+    chain = chain_of(faults=FaultPlan((LineFault(FaultKind.REQUEST_LOST, 1.0, from_s=20.0, until_s=20.5),), 1))
     loop = asyncio.get_running_loop()
     async with bare_network(chain, AXES, line=PAIR) as line:
         await up(line)
@@ -198,8 +198,8 @@ async def test_a_group_that_did_not_hear_its_start_is_stopped_and_reported():
             await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
         commands = [packet.command for packet in line.sent()]
 
-    assert commands.count(Command.START_MOTION) == 1
-    assert commands.index(Command.STOP_MOTOR, commands.index(Command.START_MOTION)) > 0
+    assert commands.count(CommandCode.START_MOTION) == 1
+    assert commands.index(CommandCode.STOP_MOTOR, commands.index(CommandCode.START_MOTION)) > 0
     assert [drive(chain, address).loop.position for address in (2, 3)] == [0, 0]
 
 
@@ -265,12 +265,12 @@ async def test_no_snapshot_while_a_homing_runs():
     chain = chain_of()
     async with bare_network(chain, AXES, line=LineSpec(snapshot=True)) as line:
         await up(line)
-        await line.network.axes["a2"].load(Motion(None, 100.0, 1000.0), home=HomeCapture(HomeMethod.INDEX))
+        await line.network.axes["a2"].load(CountsMotion(None, 100.0, 1000.0), home=HomeCapture(HomeMethod.INDEX))
 
         with pytest.raises(WrongState, match="a2 is homing"):
             await line.network.snapshot(wanted)
 
-        assert Command.SAVE_CURRENT_POSITION_AS_HOME not in {packet.command for packet in line.sent()}
+        assert CommandCode.SAVE_CURRENT_POSITION_AS_HOME not in {packet.command for packet in line.sent()}
 
 
 async def test_the_stop_of_a_rig_begins_with_one_packet_for_all_its_drives():
@@ -285,7 +285,7 @@ async def test_the_stop_of_a_rig_begins_with_one_packet_for_all_its_drives():
         before = len(rig.sent)
 
         reply = await rig.client.stop()
-        stops = [packet.address for packet in rig.sent[before:] if packet.command is Command.STOP_MOTOR]
+        stops = [packet.address for packet in rig.sent[before:] if packet.command is CommandCode.STOP_MOTOR]
         states = [await rig.until(name, lambda state: state.state is AxisState.STANDSTILL) for name in ("x", "c")]
 
     assert set(reply.confirmed) == {"x", "y", "z", "c"}
@@ -303,7 +303,7 @@ async def test_the_stop_of_a_rig_closes_no_open_loop():
 
         before = len(rig.sent)
         await rig.client.stop()
-        stops = [packet for packet in rig.sent[before:] if packet.command is Command.STOP_MOTOR]
+        stops = [packet for packet in rig.sent[before:] if packet.command is CommandCode.STOP_MOTOR]
 
     assert {packet.address for packet in stops} == {1, 2, 3, 4}
     assert [packet.data for packet in stops if packet.address in (2, 4)] == [bytes([StopControl.MOTOR_OFF])] * 2

@@ -19,7 +19,7 @@ from ldcnd.contract.codec import decode
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import DaemonHealth, HeartbeatHealth
 from ldcnd.daemon.heartbeat import Heartbeat
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.line.level import LevelFile, Output
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import rig_on, simulated_config
@@ -183,7 +183,7 @@ async def test_work_that_fills_the_threads_of_the_loop_does_not_hold_it():
         def close(self):
             pass
 
-    heartbeat = Heartbeat(HeartbeatConfig(file=Path("level")), Rig("sim", (), {}), lambda _config: Wire())
+    heartbeat = Heartbeat(HeartbeatConfig(file=Path("level")), OwnedRig("sim", (), {}), lambda _config: Wire())
     beating = asyncio.create_task(heartbeat.run(), name="heartbeat")
     try:
         async with asyncio.timeout(10.0):

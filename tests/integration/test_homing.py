@@ -10,7 +10,7 @@ from ldcnd.contract.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolu
 from ldcnd.contract.errors import BusError, MalformedRequest, NotSupported, PositionLimit, VelocityLimit
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from ldcnd.drives.ldcn.controls import HomingControl
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from tests.support.dialect_rig import (
     AXIS,
     DIALECTS,
@@ -322,7 +322,7 @@ async def test_polls_between_the_packets_of_a_command_do_not_disturb_it(rate):
 @pytest.mark.parametrize("seed", range(1, 6))
 async def test_on_a_bad_line_a_search_ends_with_the_right_reference_or_with_a_reason(dialect, seed):
     print("seed", seed)
-    bad_line = FaultPlan((Fault(FaultKind.REPLY_LOST, 0.1, from_s=5.0),), seed=seed)
+    bad_line = FaultPlan((LineFault(FaultKind.REPLY_LOST, 0.1, from_s=5.0),), seed=seed)
     async with dialect_rig(dialect, faults=bad_line, start_counts=-20_500.0) as rig:
         await rig.power_on()
         await asyncio.sleep(5.0 - asyncio.get_running_loop().time())

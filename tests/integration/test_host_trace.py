@@ -12,7 +12,7 @@ from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.errors import BusyTracing, DriveFault, ValueOutOfRange, WrongState
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.contract.traces import AbortTrace, TakeTrace, TracePhase, TraceTrigger, TriggerKind
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import build_chain
 from tests.support.rig import SIMULATED, running_rig
 
@@ -232,7 +232,7 @@ async def test_every_ldcn_and_nmc_drive_of_the_rig_is_traced_faster_than_it_is_p
 async def test_a_lost_line_ends_the_trace_at_once_and_the_next_one_works():
     config = load_config(SIMULATED)
     line = config.sim[0]
-    unplugged = Fault(FaultKind.UNPLUGGED, from_s=5.0, until_s=5.1, longest_s=0.5)
+    unplugged = LineFault(FaultKind.UNPLUGGED, from_s=5.0, until_s=5.1, longest_s=0.5)
     chain = build_chain(replace(line.spec(), faults=FaultPlan((unplugged,))))
     async with running_rig(config, {line.name: chain}) as rig:
         await rig.until("x", lambda state: state.link == "up")

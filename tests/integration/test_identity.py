@@ -14,7 +14,7 @@ from ldcnd.contract.errors import AxisUnreachable, LeaseHeld, NotIdentified, Out
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import SetIo, SetIoTimer
 from ldcnd.contract.samples import AxisState, LinkState, Moving
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
@@ -30,8 +30,9 @@ COASTING = MotorPlant(
     forward_limit_counts=10_000_000,
 )
 CHANGING = {
-    Command.RESET_POSITION, Command.LOAD_TRAJECTORY, Command.START_MOTION, Command.SET_GAIN, Command.IO_CONTROL,
-    Command.SET_HOMING_MODE, Command.CLEAR_STICKY_BITS, Command.SAVE_CURRENT_POSITION_AS_HOME,
+    CommandCode.RESET_POSITION, CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION, CommandCode.SET_GAIN,
+    CommandCode.IO_CONTROL,
+    CommandCode.SET_HOMING_MODE, CommandCode.CLEAR_STICKY_BITS, CommandCode.SAVE_CURRENT_POSITION_AS_HOME,
 }  # fmt: skip
 
 
@@ -111,7 +112,7 @@ async def test_a_stop_a_halt_and_power_off_reach_a_line_that_is_not_taken_over()
             with pytest.raises(OutcomeUnknown, match="sent again"):
                 await rig.client.command("x", command)
             await asyncio.sleep(1.0)
-            assert Command.STOP_MOTOR in {packet.command for packet in rig.sent[before:]}, command.verb
+            assert CommandCode.STOP_MOTOR in {packet.command for packet in rig.sent[before:]}, command.verb
 
 
 async def test_the_outputs_of_a_line_that_another_host_left_are_not_touched():

@@ -8,7 +8,7 @@ import pytest
 
 from ldcnd.contract.commands import MoveAbsolute, Stop
 from ldcnd.contract.samples import InputsSample, TelemetryItem
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.dialect_rig import AXIS, LS_182AP, PLANT, SC, V4, DialectRig, dialect_rig
 
 dialects = pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
@@ -40,7 +40,7 @@ async def test_a_limit_switch_shows_in_the_poll_that_carries_it(dialect):
 async def test_the_stop_input_shows_while_the_power_driver_is_off_and_limits_while_it_is_on():
     async with dialect_rig(LS_182AP) as rig:
         off = await inputs(rig, lambda sample: sample.amplifier_enable is False)
-        rig.drive.set_condition(Condition.STOP_INPUT, present=True, at_s=asyncio.get_running_loop().time())
+        rig.drive.set_condition(FaultCondition.STOP_INPUT, present=True, at_s=asyncio.get_running_loop().time())
         open_circuit = await inputs(rig, lambda sample: sample.stop_input is True)
 
         assert (off.stop_input, off.forward_limit) == (False, None)

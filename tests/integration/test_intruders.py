@@ -10,7 +10,7 @@ from ldcnd.contract.events import DRIVE_CHANGED, CommandEvent, ReadEvents
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import HomingControl, StopControl
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import LoadTrajectory, ResetPosition, SetGain, SetHomingMode, StopMotor
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -106,7 +106,12 @@ async def test_what_another_program_does_to_a_drive_is_found_at_the_next_polls(a
     assert state is not None
     assert state.referenced is (code in ("drive_changed", "position_error"))
     assert [event.code for event in events] == ([code] if code in ("drive_reset", "drive_changed") else [])
-    assert not sent & {Command.SET_GAIN, Command.LOAD_TRAJECTORY, Command.START_MOTION, Command.RESET_POSITION}
+    assert not sent & {
+        CommandCode.SET_GAIN,
+        CommandCode.LOAD_TRAJECTORY,
+        CommandCode.START_MOTION,
+        CommandCode.RESET_POSITION,
+    }
 
 
 @pytest.mark.promise("contradiction-stops")

@@ -12,8 +12,8 @@ from ldcnd.axis import kept as kept_files
 from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, QuickStop, Reset
 from ldcnd.contract.errors import OutcomeUnknown, RequestRefused, WrongState
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.integration.test_kept_references import chain_of, keeping
 from tests.support.chain_rig import ChainRig, drive, rig_on
 
@@ -99,7 +99,7 @@ async def test_a_daemon_killed_before_the_drive_was_sent_the_stop_is_followed_by
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
         await jogging(rig)
-        chain._injector = FaultInjector(FaultPlan((Fault(FaultKind.REQUEST_LOST, 1.0),)))
+        chain._injector = FaultInjector(FaultPlan((LineFault(FaultKind.REQUEST_LOST, 1.0),)))
         reply = await rig.client.stop("x")
         assert (reply.confirmed, reply.kept) == ((), ("x",))
         await rig.kill()
@@ -119,7 +119,7 @@ async def test_a_halt_that_no_drive_has_confirmed_is_sent_by_the_next_daemon(tmp
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
         await jogging(rig)
-        chain._injector = FaultInjector(FaultPlan((Fault(FaultKind.REQUEST_LOST, 1.0),)))
+        chain._injector = FaultInjector(FaultPlan((LineFault(FaultKind.REQUEST_LOST, 1.0),)))
         with pytest.raises(OutcomeUnknown):
             await rig.client.command("x", Halt())
         await asyncio.sleep(0.2)
@@ -143,12 +143,12 @@ async def test_an_axis_in_error_stop_is_in_error_stop_in_the_next_daemon_with_it
     async with rig_on(chain, config) as rig:
         await jogging(rig)
         now_s = asyncio.get_running_loop().time()
-        drive(chain, 1).set_condition(Condition.STALLED, present=True, at_s=now_s)
+        drive(chain, 1).set_condition(FaultCondition.STALLED, present=True, at_s=now_s)
         await rig.until("x", lambda state: state.state is AxisState.ERROR_STOP)
         first = rig.daemon.rig.axes["x"].tracker.first_fault
         await asyncio.sleep(0.2)
         await end(rig, how)
-    drive(chain, 1).set_condition(Condition.STALLED, present=False, at_s=asyncio.get_running_loop().time())
+    drive(chain, 1).set_condition(FaultCondition.STALLED, present=False, at_s=asyncio.get_running_loop().time())
     async with rig_on(chain, config) as rig:
         await up(rig)
         state, fault = await rig.client.state("x"), await rig.client.last("x", "fault")

@@ -20,7 +20,7 @@ from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveRelative, Powe
 from ldcnd.contract.errors import LdcndError, NotReferenced, ReplyTimeout, RequestRefused, WrongState
 from ldcnd.contract.events import CommandStatus, ReadEvents
 from ldcnd.contract.samples import FaultSample, LinkState, PositionSample, StateSample, TelemetryItem
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import PlainCommand, ResetPosition
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.sim.chain import Chain
@@ -131,7 +131,7 @@ async def test_a_homed_axis_has_its_mark_from_its_homing(tmp_path):
         await rig.client.command("z", Power(on=True))
         await ended(rig, "z", Home(method="index", velocity=0.5, position=2.0, move_to=20.0))
         await asyncio.sleep(2.0)
-        marks = [packet for packet in rig.sent if packet.command is Command.SAVE_CURRENT_POSITION_AS_HOME]
+        marks = [packet for packet in rig.sent if packet.command is CommandCode.SAVE_CURRENT_POSITION_AS_HOME]
         before = await position_of(rig, "z")
 
     async with rig_on(chain, config) as rig:
@@ -289,7 +289,7 @@ async def test_a_drive_that_was_reset_and_addressed_by_another_program_has_no_re
     ("tamper", "why"),
     [
         (lambda module: module.execute(ResetPosition()), "its counter reads 0, as after a reset"),
-        (lambda module: module.execute(PlainCommand(Command.SAVE_CURRENT_POSITION_AS_HOME)), "another program"),
+        (lambda module: module.execute(PlainCommand(CommandCode.SAVE_CURRENT_POSITION_AS_HOME)), "another program"),
         (lambda module: module.loop.open(), "its loop is open and was closed"),
         (lambda module: module.loop.renumber(module.loop.position + 500), "it is 500 counts from where it was left"),
     ],

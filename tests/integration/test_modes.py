@@ -15,7 +15,7 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.dialect_rig import (
     AXIS,
     CMC,
@@ -95,7 +95,7 @@ async def test_an_analog_target_where_the_sensor_counts_as_broken_is_refused(dia
 async def test_an_analog_move_is_refused_while_the_sensor_is_disconnected():
     async with dialect_rig(LS_182AP) as rig:
         await rig.power_on()
-        rig.condition(Condition.SENSOR_LOST)
+        rig.condition(FaultCondition.SENSOR_LOST)
 
         with pytest.raises(DriveFault, match="the analog sensor reads 0"):
             await rig.send(MoveAnalog(target=500))
@@ -170,7 +170,7 @@ async def test_a_plain_move_after_an_analog_one_ignores_the_sensor():
         await rig.power_on()
         await rig.done(MoveAnalog(target=600, velocity=5.0))
         await rig.done(MoveAbsolute(position=0.5))
-        rig.condition(Condition.SENSOR_LOST)
+        rig.condition(FaultCondition.SENSOR_LOST)
 
         state = await rig.done(MoveAbsolute(position=1.0))
 

@@ -6,7 +6,7 @@ import pytest
 
 from ldcnd.contract.commands import MoveAbsolute, MoveRelative, MoveVelocity
 from ldcnd.contract.errors import WrongState
-from ldcnd.drives.ldcn.packet import Command, PacketReader
+from ldcnd.drives.ldcn.packet import CommandCode, PacketReader
 from ldcnd.line.flight_recorder import WireEvent
 from tests.support.dialect_rig import SC, V4, DialectRig, dialect_rig
 
@@ -16,7 +16,7 @@ def stops(rig: DialectRig) -> int:
     records = rig.rig.daemon.rig.buses[0].bus.wire_log.records()
     data = b"".join(record.data for record in records if record.event is WireEvent.SENT and record.data)
     received = [reader.feed(byte) for byte in data]
-    return sum(each is not None and each.packet.command is Command.STOP_MOTOR for each in received)
+    return sum(each is not None and each.packet.command is CommandCode.STOP_MOTOR for each in received)
 
 
 @pytest.mark.parametrize(

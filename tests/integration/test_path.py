@@ -20,7 +20,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.rig_commands import AxisPath, PathReply, WalkPath
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -246,7 +246,7 @@ async def test_a_path_whose_sender_has_lost_one_axis_is_fed_no_further(by_force)
 
     assert still
     assert math.dist(places(chain)[1], (0.0, 0.0)) < 20.0
-    assert Command.ADD_PATH_POINTS not in later
+    assert CommandCode.ADD_PATH_POINTS not in later
 
 
 @pytest.mark.promise("path-checked-whole")

@@ -15,7 +15,7 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.drives.axis_config import LossConfig, LossPolicy
-from ldcnd.drives.ldcn.packet import Command, PacketReader
+from ldcnd.drives.ldcn.packet import CommandCode, PacketReader
 from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
@@ -113,7 +113,7 @@ async def test_a_stop_is_the_first_packet_to_a_drive_whose_line_is_back_at_its_r
 
     reader = PacketReader()
     first = next(received.packet for value in b"".join(sent) if (received := reader.feed(value)))
-    assert (first.address, first.command) == (1, Command.STOP_MOTOR)
+    assert (first.address, first.command) == (1, CommandCode.STOP_MOTOR)
 
 
 async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():

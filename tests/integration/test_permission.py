@@ -32,7 +32,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import LossConfig, LossPolicy
-from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
@@ -383,7 +383,7 @@ async def test_a_stop_at_the_end_of_the_daemon_is_sent_for_as_long_as_there_is_t
         await rig.client.command("x", MoveVelocity(velocity=5.0))
         await asyncio.sleep(0.5)
         now_s = asyncio.get_running_loop().time()
-        lost = Fault(FaultKind.REQUEST_LOST, 1.0, now_s, until_s=now_s + 1.2)
+        lost = LineFault(FaultKind.REQUEST_LOST, 1.0, now_s, until_s=now_s + 1.2)
         chain._injector = FaultInjector(FaultPlan((lost,)))
         rig.daemon.end()
         await asyncio.wait([rig.running])

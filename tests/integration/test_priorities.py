@@ -17,7 +17,7 @@ from ldcnd.contract.traces import TakeTrace
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.profiles import PROFILES
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.priority_rig import Asked, granted, ranked_config
 from tests.support.rig import SIMULATED, running_rig
@@ -29,7 +29,7 @@ ALIVE_HZ = 0.2
 orders = pytest.mark.parametrize("order", ["deadline", "phase"])
 
 
-def chain_of(drives: int, *faults: Fault):
+def chain_of(drives: int, *faults: LineFault):
     return build_chain(ChainSpec((ModuleSpec("ls182ap"),) * drives, faults=FaultPlan(faults)))
 
 
@@ -60,7 +60,7 @@ async def test_low_axes_are_polled_now_and_then_even_where_high_ones_want_all_of
 @orders
 async def test_a_mute_drive_and_commands_that_are_sent_again_cost_high_axes_nothing(order):
     asked = {"high": Asked(2, 50.0), "normal": Asked(10, 36.0), "low": Asked(2, 36.0)}
-    chain, node = chain_of(14, Fault(FaultKind.REPLY_LOST, 0.005)), Node(5, PROFILES["ls-182ap"])
+    chain, node = chain_of(14, LineFault(FaultKind.REPLY_LOST, 0.005)), Node(5, PROFILES["ls-182ap"])
 
     async def command(bus):
         while True:

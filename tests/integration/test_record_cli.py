@@ -17,13 +17,13 @@ from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.samples import PositionSample
 from ldcnd.lab.recording.reading import Recording
 from ldcnd.lab.recording.recorder import Recorder
-from ldcnd.net.session import Sample, SampleKind
+from ldcnd.net.session import Publication, SampleKind
 from tests.support.process import LDCND, ROOT, daemon
 
 VALUE = PositionSample(
     t=1, t_error_ns=0, seq=0, quality="good", value=1.5, unit="mm", counts=1500, following_error=None
 )
-POSITION = Sample("ldcn/sim/tele/x/position", *encode(VALUE, Encoding.JSON), SampleKind.PUT, VALUE.t)
+POSITION = Publication("ldcn/sim/tele/x/position", *encode(VALUE, Encoding.JSON), SampleKind.PUT, VALUE.t)
 
 
 def is_on_the_disk(part, topic):

@@ -21,7 +21,7 @@ from ldcnd.contract.samples import AxisState
 from ldcnd.lab.recording.mcap_file import FACTS
 from ldcnd.lab.recording.recorder import FLUSH_PERIOD_S, Recorder
 from ldcnd.lab.recording.recovery import recover
-from ldcnd.net.session import Sample, SampleKind
+from ldcnd.net.session import Publication, SampleKind
 from tests.support.process import ROOT
 from tests.support.recordings import LARGE, checked_topics, recorded_rig, thirty_one_axes
 from tests.support.rig import EPOCH_NS
@@ -236,7 +236,7 @@ async def test_a_full_disk_ends_the_recording_and_what_was_written_is_recovered(
 
 def health(seq, key=HEALTH):
     report = DaemonHealth(t=EPOCH_NS + seq, seq=seq, loop_lag_s=0.0, published=0, missed_reports=0)
-    return Sample(key, *encode(report, Encoding.JSON), SampleKind.PUT, report.t)
+    return Publication(key, *encode(report, Encoding.JSON), SampleKind.PUT, report.t)
 
 
 async def test_what_is_missing_is_counted_in_the_file(tmp_path):
@@ -244,7 +244,7 @@ async def test_what_is_missing_is_counted_in_the_file(tmp_path):
     with Recorder(path, {}, lambda: EPOCH_NS, LARGE) as recorder:
         for seq in (7, 8, 11, 12, 0, 1):  # two lost, then a restart
             recorder.take(health(seq))
-        recorder.take(Sample("ldcn/sim/tele/x/position", b"{}", "application/json", SampleKind.PUT, None))
+        recorder.take(Publication("ldcn/sim/tele/x/position", b"{}", "application/json", SampleKind.PUT, None))
 
     found = facts(path)
     assert {name: found[name] for name in ("messages", "missing", "restarts", "not_understood")} == {
@@ -272,7 +272,7 @@ async def test_a_sample_is_recorded_as_its_schema_has_it_or_not_at_all(tmp_path,
     sample |= {"counts": 1500, "following_error": 0.25}
     with Recorder(tmp_path / "run.mcap", {}, lambda: EPOCH_NS, LARGE) as recorder:
         payload = msgpack.packb(sample | changed)
-        recorder.take(Sample("ldcn/sim/tele/x/position", payload, "application/msgpack", SampleKind.PUT, None))
+        recorder.take(Publication("ldcn/sim/tele/x/position", payload, "application/msgpack", SampleKind.PUT, None))
 
     with (tmp_path / "run.mcap").open("rb") as stream:
         found = [json.loads(message.data) for _, _, message in make_reader(stream).iter_messages()]

@@ -10,8 +10,8 @@ from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
-from ldcnd.drives.ldcn.packet import Command
-from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan, FaultyReply, FaultyRequest
+from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, FaultyReply, FaultyRequest, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
 
@@ -48,7 +48,7 @@ async def arrivals(rig, axis, item):
 
 def moved_since(rig, seen):
     """Return the packets sent since `seen` that are not known to move and reset nothing."""
-    harmless = {Command.READ_STATUS, Command.NO_OPERATION, Command.SET_BAUD_RATE, Command.SET_ADDRESS}
+    harmless = {CommandCode.READ_STATUS, CommandCode.NO_OPERATION, CommandCode.SET_BAUD_RATE, CommandCode.SET_ADDRESS}
     return [packet for packet in rig.sent[seen:] if packet.command not in harmless]
 
 
@@ -232,7 +232,7 @@ async def test_members_of_a_group_with_a_leader_come_back_to_their_group():
 
 
 NOISE = tuple(
-    Fault(kind, 0.01, from_s=5.0, longest_s=0.01)
+    LineFault(kind, 0.01, from_s=5.0, longest_s=0.01)
     for kind in (
         FaultKind.REQUEST_LOST,
         FaultKind.REQUEST_BIT_FLIPPED,
@@ -294,7 +294,7 @@ async def test_an_sc_whose_replies_fail_for_a_while_is_not_reset_where_the_port_
         chain._injector = FailingModule(2, now_s + silent_s, questions)
         await asyncio.sleep(8.0)
 
-        resets = {packet.address for packet in rig.sent[sent:] if packet.command is Command.HARD_RESET}
+        resets = {packet.address for packet in rig.sent[sent:] if packet.command is CommandCode.HARD_RESET}
         assert not resets & {2, 0xFF, 0x81}
         assert drive(chain, 2).loop.servo_on
 

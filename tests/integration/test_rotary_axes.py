@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from ldcnd.contract.commands import Direction, Home, MoveAbsolute, MoveRelative, MoveVelocity, SetPosition, Track
 from ldcnd.contract.errors import NotSupported, OutcomeUnknown, WrongState
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.plant import MotorPlant
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V1, V4, DialectRig, adopting_rig, dialect_rig
 
@@ -143,7 +143,7 @@ async def test_a_lost_acknowledgement_of_the_counter_leaves_no_wrong_position(mo
 
         async def lose(exchange, *lanes, **options):
             reply = await execute(exchange, *lanes, **options)
-            if exchange.request[2] & 0x0F == Command.RESET_POSITION:
+            if exchange.request[2] & 0x0F == CommandCode.RESET_POSITION:
                 raise OutcomeUnknown("the reply was lost")
             return reply
 

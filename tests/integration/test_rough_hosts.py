@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rough_host import BAUD_CODES, HARD_RESET, enumeration, frame, jog, powered
 from tests.support.simulated_host import PATIENCE_S, SimulatedHost
@@ -236,4 +236,4 @@ def test_the_printed_frame_with_a_byte_too_many_fails_its_checksum_and_the_rest_
     # the surplus byte comes before the reply and takes it back
     assert answer == b""
     assert drive.chain.modules[0]._trajectory == before
-    assert drive.send(1, Command.NO_OPERATION)[0] & CHECKSUM_ERROR == 0
+    assert drive.send(1, CommandCode.NO_OPERATION)[0] & CHECKSUM_ERROR == 0

@@ -11,7 +11,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.samples import PositionSample, Quality, TelemetryItem
 from ldcnd.sim.chain import Chain
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import running_rig
 
@@ -20,22 +20,22 @@ PLACES = {"x": 30.0, "y": -30.0}
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
 
 
-def with_faults(*faults: Fault, seed: int = 7) -> Chain:
+def with_faults(*faults: LineFault, seed: int = 7) -> Chain:
     plan = FaultPlan(faults, seed=seed)
     return build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS), faults=plan, seed=seed))
 
 
 def echoing() -> Chain:
-    return with_faults(Fault(FaultKind.ECHO, 0.3, from_s=ROUGH_FROM_S))
+    return with_faults(LineFault(FaultKind.ECHO, 0.3, from_s=ROUGH_FROM_S))
 
 
 def duplicating() -> Chain:
-    return with_faults(Fault(FaultKind.REPLY_DUPLICATED, 0.3, from_s=ROUGH_FROM_S))
+    return with_faults(LineFault(FaultKind.REPLY_DUPLICATED, 0.3, from_s=ROUGH_FROM_S))
 
 
 def swapping(seed: int = 7) -> Chain:
     """A reply that is later than its exchange may take (50 ms here) is heard after a later request."""
-    return with_faults(Fault(FaultKind.REPLY_DELAYED, 0.2, from_s=ROUGH_FROM_S, longest_s=0.1), seed=seed)
+    return with_faults(LineFault(FaultKind.REPLY_DELAYED, 0.2, from_s=ROUGH_FROM_S, longest_s=0.1), seed=seed)
 
 
 def babbling() -> Chain:

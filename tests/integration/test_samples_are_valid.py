@@ -10,7 +10,7 @@ from ldcnd.contract.codec import decode
 from ldcnd.contract.commands import Halt, MoveVelocity, Power
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import SAMPLE_MODELS, AxisState, LinkState, TelemetryItem
-from ldcnd.net.session import Sample, SampleKind
+from ldcnd.net.session import Publication, SampleKind
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 
 FAULT_AT_S = 5.0
@@ -22,12 +22,12 @@ def simulated(encoding: str, events: list[dict[str, object]]) -> RigConfig:
     return RigConfig.model_validate({**document, "telemetry": {"encoding": encoding}})
 
 
-async def samples_of(rig: RunningRig, taken: list[Sample]) -> None:
+async def samples_of(rig: RunningRig, taken: list[Publication]) -> None:
     keys = Keys(rig.client.rig)
     await rig.session.subscribe(keys.telemetry_pattern("*", "*"), taken.append)
 
 
-def kinds(taken: list[Sample]) -> Counter[str]:
+def kinds(taken: list[Publication]) -> Counter[str]:
     """Count the samples of each item; each must be what its model says, to the letter."""
     found: Counter[str] = Counter()
     for sample in taken:
@@ -44,7 +44,7 @@ async def test_what_is_published_of_drives_that_move_stop_fail_and_fall_silent(e
         {"at_s": FAULT_AT_S, "module": 2, "begins": "overvoltage"},
         {"at_s": FAULT_AT_S, "module": 4, "power": "off"},
     ]
-    taken: list[Sample] = []
+    taken: list[Publication] = []
     async with running_rig(simulated(encoding, events)) as rig:
         await samples_of(rig, taken)
         for axis in ("x", "c"):
@@ -64,7 +64,7 @@ async def test_what_is_published_of_drives_that_move_stop_fail_and_fall_silent(e
 
 
 async def test_what_is_published_of_smartsteps():
-    taken: list[Sample] = []
+    taken: list[Publication] = []
     async with running_rig(load_config(SIMULATED.with_name("mixed.toml"))) as rig:
         await samples_of(rig, taken)
         await asyncio.sleep(10.0)

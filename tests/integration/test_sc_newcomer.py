@@ -8,7 +8,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.controls import StartUp
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on
 from tests.support.dialect_rig import COUNTS_PER_MM, GAINS
@@ -64,7 +64,7 @@ async def test_an_sc_that_restarts_is_reset_before_it_is_addressed_and_the_other
         await asyncio.sleep(14)  # the others arrive
         sent = rig.sent[seen:]
 
-    resets = [packet.address for packet in sent if packet.command is Command.HARD_RESET]
+    resets = [packet.address for packet in sent if packet.command is CommandCode.HARD_RESET]
     assert resets
     assert set(resets) <= {0, 2}  # who hears by a group or has another address works on
     assert not back.referenced

@@ -9,7 +9,7 @@ from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.samples import AxisState, LinkState, Moving, StateSample, TelemetryItem
 from ldcnd.drives.ldcn.controls import StopControl
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import LoadTrajectory
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -18,8 +18,8 @@ from tests.support.rig import running_rig
 
 ONE = 1 << 16
 """One count per tick, as programmed velocity."""
-HARMLESS = {Command.READ_STATUS, Command.NO_OPERATION}
-OPEN_LOOPS_OFF = {Command.STOP_MOTOR}
+HARMLESS = {CommandCode.READ_STATUS, CommandCode.NO_OPERATION}
+OPEN_LOOPS_OFF = {CommandCode.STOP_MOTOR}
 """Drives that an earlier host has left with an open loop are switched off, in case it was a duty."""
 ADOPTING = simulated_config(start="adopt")
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
@@ -59,7 +59,7 @@ async def test_a_daemon_killed_in_mid_move_is_followed_by_one_that_adopts():
         await asyncio.sleep(0.5)
         (bus,) = await rig.client.buses()
         sent = commands_in(rig.sent)
-        stops = [packet.data[0] & StopControl.SMOOTH for packet in rig.sent if packet.command is Command.STOP_MOTOR]
+        stops = [packet.data[0] & StopControl.SMOOTH for packet in rig.sent if packet.command is CommandCode.STOP_MOTOR]
 
     assert adopted_with <= HARMLESS | OPEN_LOOPS_OFF
     assert sent <= HARMLESS | OPEN_LOOPS_OFF
@@ -142,7 +142,7 @@ async def test_a_drive_that_moves_is_not_reset_by_the_fallback():
     assert "address 1, Logosol LS-182AP (id 90, version 20), moves" in bus.problem
     assert (later.up, later.started_by) == (True, "adoption")
     assert any("address 4 had lost power" in remark for remark in later.remarks)
-    assert Command.HARD_RESET not in commands_in(rig.sent)
+    assert CommandCode.HARD_RESET not in commands_in(rig.sent)
 
 
 def creep(chain, counts_per_tick):
@@ -173,7 +173,7 @@ async def test_a_drive_that_creeps_is_not_reset_by_the_fallback(counts_per_tick)
 
     assert drive(chain, 1).loop.servo_on
     assert "address 1, Logosol LS-182AP (id 90, version 20), moves" in bus.problem
-    assert Command.HARD_RESET not in commands_in(rig.sent)
+    assert CommandCode.HARD_RESET not in commands_in(rig.sent)
 
 
 async def test_a_drive_that_is_silent_is_not_known_to_stand_and_not_reset():
@@ -187,7 +187,7 @@ async def test_a_drive_that_is_silent_is_not_known_to_stand_and_not_reset():
         (bus,) = await rig.client.buses()
 
     assert "address 4 (axis c) does not answer and may move" in bus.problem
-    assert Command.HARD_RESET not in commands_in(rig.sent)
+    assert CommandCode.HARD_RESET not in commands_in(rig.sent)
 
 
 async def test_a_line_that_was_lost_with_a_drive_is_not_reset_while_another_moves():
@@ -232,7 +232,7 @@ async def test_a_drive_that_a_restarted_one_keeps_from_hearing_is_not_reset(stop
 
     assert bus.started_by == "adoption"
     assert any("address 1 had lost power" in remark for remark in bus.remarks)
-    assert Command.HARD_RESET not in sent
+    assert CommandCode.HARD_RESET not in sent
     assert (states["x"].enabled, states["x"].referenced) == (False, False)
     assert (abs(moved) < 100) == stopped
     assert drive(chain, 2).loop.servo_on

@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 
 from ldcnd.contract.errors import BusError, OutcomeUnknown, ReplyTimeout
-from ldcnd.drives.driver import AxisSpec, Gains, Motion
+from ldcnd.drives.driver import AxisSpec, CountsMotion, Gains
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.network import LdcnNetwork
@@ -16,7 +16,7 @@ from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.line.bus import Bus
 from ldcnd.line.queue import Lane
 from ldcnd.line.settings import BusSettings
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
 
@@ -49,7 +49,7 @@ async def test_every_caller_gets_one_outcome_and_no_value_of_another_node(seed):
     print(f"seed {seed}")
     dice = random.Random(seed)
     faults = tuple(
-        Fault(kind, share, from_s=FAULTS_FROM_S, longest_s=LONGEST_DELAY_S) for kind, share in SHARES.items()
+        LineFault(kind, share, from_s=FAULTS_FROM_S, longest_s=LONGEST_DELAY_S) for kind, share in SHARES.items()
     )
     chain = build_chain(
         ChainSpec(
@@ -84,7 +84,7 @@ async def test_every_caller_gets_one_outcome_and_no_value_of_another_node(seed):
         await network.bring_up()
         for number, axis in enumerate(network.axes.values(), 1):
             await axis.power(on=True)
-            await axis.load(Motion(10_000 * number, 20_000.0, 200_000.0))
+            await axis.load(CountsMotion(10_000 * number, 20_000.0, 200_000.0))
             await axis.start()
         await asyncio.sleep(FAULTS_FROM_S - asyncio.get_running_loop().time())
 

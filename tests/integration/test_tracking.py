@@ -14,7 +14,7 @@ from ldcnd.contract.errors import (
     ValueOutOfRange,
 )
 from ldcnd.contract.samples import AxisState
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from tests.support.dialect_rig import (
     AXIS,
     LS_173AP,
@@ -125,7 +125,7 @@ async def test_a_set_point_keeps_to_reference_and_software_limits():
 
 
 async def test_a_set_point_is_never_sent_twice_and_the_stream_goes_on():
-    no_replies = FaultPlan((Fault(FaultKind.REPLY_LOST, from_s=10.0, until_s=10.05),))
+    no_replies = FaultPlan((LineFault(FaultKind.REPLY_LOST, from_s=10.0, until_s=10.05),))
     async with dialect_rig(V4, faults=no_replies, tracking=TRACKING) as rig:
         await rig.power_on()
         await rig.send(Track(position=0.1))

@@ -15,11 +15,11 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import MoveRelative, Power
 from ldcnd.contract.errors import LdcndError, RequestRefused
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import PlainCommand
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
 from tests.support.jumping_loop import JumpingLoop
@@ -63,7 +63,7 @@ class Motions:
         execute = drive.execute
 
         def counted(packet):
-            self.started += packet == PlainCommand(Command.START_MOTION)
+            self.started += packet == PlainCommand(CommandCode.START_MOTION)
             execute(packet)
 
         drive.execute = counted
@@ -125,9 +125,9 @@ def schedule(seed: int) -> tuple[int, list[str]]:
     dice = random.Random(seed)
     share = dice.choice((0.0, 0.05, 0.2, 0.4))
     kinds = [kind for kind in FaultKind if kind not in (FaultKind.UNPLUGGED, FaultKind.ECHO)]
-    faults = tuple(Fault(kind, share / len(kinds), FAULTS_FROM_S, longest_s=0.02) for kind in kinds)
+    faults = tuple(LineFault(kind, share / len(kinds), FAULTS_FROM_S, longest_s=0.02) for kind in kinds)
     if dice.random() < 0.2:
-        faults = (*faults, Fault(FaultKind.UNPLUGGED, 0.02, FAULTS_FROM_S, longest_s=0.3))
+        faults = (*faults, LineFault(FaultKind.UNPLUGGED, 0.02, FAULTS_FROM_S, longest_s=0.3))
     chain = build_chain(ChainSpec((ModuleSpec("ls182ap"),), faults=FaultPlan(faults, seed), seed=seed))
     # to show the records of so many lives takes a seventh of the time; a seed that fails is lived through again
     with capture_logs(), asyncio.Runner(loop_factory=JumpingLoop) as runner:

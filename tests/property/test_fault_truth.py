@@ -16,7 +16,7 @@ from ldcnd.drives.ldcn.faults import WARNINGS, FaultCode
 from ldcnd.drives.ldcn.record import DriveState
 from ldcnd.drives.ldcn.registers import ServoRegisters
 from ldcnd.line.exchange import Timing
-from ldcnd.sim.ldcn.power import Condition, LogosolPower, Trip
+from ldcnd.sim.ldcn.power import FaultCondition, LogosolPower, Trip
 from tests.support.simulated_axis import ON, ONE, SimulatedAxis
 
 STEPS = 25
@@ -30,11 +30,11 @@ LATCHED = {
     Trip.SENSOR: FaultCode.SENSOR_FAULT,
 }
 PRESENT = {
-    Condition.STOP_INPUT: FaultCode.STOP_INPUT,
-    Condition.OVERHEAT: FaultCode.OVERHEAT,
-    Condition.OVERVOLTAGE: FaultCode.OVERVOLTAGE,
+    FaultCondition.STOP_INPUT: FaultCode.STOP_INPUT,
+    FaultCondition.OVERHEAT: FaultCode.OVERHEAT,
+    FaultCondition.OVERVOLTAGE: FaultCode.OVERVOLTAGE,
 }
-LOGOSOL_CONDITIONS = (*PRESENT, Condition.MOTOR_SHORT, Condition.OVERCURRENT, Condition.ENCODER_LOSS)
+LOGOSOL_CONDITIONS = (*PRESENT, FaultCondition.MOTOR_SHORT, FaultCondition.OVERCURRENT, FaultCondition.ENCODER_LOSS)
 
 
 class History:
@@ -126,15 +126,15 @@ class History:
         """Hold the shaft while the motor turns: a position error."""
         if not self.axis.drive.loop.servo_on:
             return
-        self.axis.suffer(Condition.STALLED)
+        self.axis.suffer(FaultCondition.STALLED)
         self.axis.jog(40 * ONE, acceleration=ONE)
         self.axis.wait(0.15)
-        self.axis.recover(Condition.STALLED)
+        self.axis.recover(FaultCondition.STALLED)
         self.axis.wait(0.01)
 
     @property
     def conditions(self):
-        return LOGOSOL_CONDITIONS if isinstance(self.stage, LogosolPower) else (Condition.MOTOR_POWER_OFF,)
+        return LOGOSOL_CONDITIONS if isinstance(self.stage, LogosolPower) else (FaultCondition.MOTOR_POWER_OFF,)
 
     # -- what is said, and what is true ------------------------------------------------------------------------------
 
@@ -157,7 +157,7 @@ class History:
             if not stage.enabled:
                 causes |= {code for condition, code in PRESENT.items() if condition in stage.conditions}
             return causes
-        off = Condition.MOTOR_POWER_OFF in stage.conditions
+        off = FaultCondition.MOTOR_POWER_OFF in stage.conditions
         step = self.story[-1].rstrip("?")
         if self.axis.drive.loop.servo_on:
             self.opened_by = set()

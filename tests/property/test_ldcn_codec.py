@@ -10,13 +10,13 @@ from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.packet import (
     AuxFlag,
-    Command,
+    CommandCode,
     Packet,
     PacketReader,
     ReceivedPacket,
-    Status,
     StatusFlag,
     StatusItem,
+    StatusPacket,
     decode_packet,
     decode_status,
     encode_packet,
@@ -35,7 +35,7 @@ from ldcnd.drives.ldcn.trajectory import (
 
 SERVOS = [profile for profile in PROFILES.values() if profile.support is Support.FULL]
 
-packets = st.builds(Packet, st.integers(0, 255), st.sampled_from(Command), st.binary(max_size=15))
+packets = st.builds(Packet, st.integers(0, 255), st.sampled_from(CommandCode), st.binary(max_size=15))
 profiles = st.sampled_from(SERVOS)
 register32 = st.none() | st.integers(0, 0x7FFF_FFFF)
 position32 = st.none() | st.integers(-0x7FFF_FFFF, 0x7FFF_FFFF)
@@ -89,7 +89,7 @@ def statuses(draw, profile: Profile, items: StatusItem):
     word = st.integers(-0x7FFF, 0x7FFF)
     double = st.integers(-0x8000_0000, 0x7FFF_FFFF)
     byte = st.integers(0, 255)
-    return Status(
+    return StatusPacket(
         StatusFlag(draw(byte)),
         position=asked(StatusItem.POSITION, double),
         adc=asked(StatusItem.ADC, st.integers(0, (1 << profile.adc_bits) - 1)),

@@ -24,9 +24,9 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.samples import LinkState, Moving, PositionSample, Quality, TelemetryItem
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.received import ResetPosition, SetGain, StopMotor
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.plant import MotorPlant
 from tests.support.chain_rig import ChainRig, drive, rig_on
 from tests.support.jumping_loop import JumpingLoop
@@ -93,7 +93,7 @@ class Story:
         divisor: int = 1,
         rate_hz: float = 20.0,
         plant: MotorPlant | None = None,
-        faults: tuple[Fault, ...] = (),
+        faults: tuple[LineFault, ...] = (),
         seed: int = 1,
     ) -> None:
         models = (model, "ls-182ap") if faults else (model,)
@@ -240,9 +240,9 @@ class Story:
             case "rate":
                 one.execute(SetGain(Gains(350, 3000, 400, 400, 250, 0, EL, max(1, self.divisor // 10))))
             case "jam":
-                one.set_condition(Condition.STALLED, present=True, at_s=loop.time())
+                one.set_condition(FaultCondition.STALLED, present=True, at_s=loop.time())
                 await asyncio.sleep(by / 1e6)
-                drive(self.chain, 1).set_condition(Condition.STALLED, present=False, at_s=loop.time())
+                drive(self.chain, 1).set_condition(FaultCondition.STALLED, present=False, at_s=loop.time())
             case "by hand":
                 one.shaft.velocity_counts = by / 10 * one.profile.servo_cycle_s
 
@@ -303,7 +303,7 @@ def by_lot(seed: int) -> str:
     stable = deed in ("set", "beyond", "zero", "nothing") and dice.random() < 0.7
     divisor = dice.choice((1, 1, 2, 4)) if stable else dice.randint(1, 255)
     kind = dice.choice((None, None, FaultKind.REPLY_DELAYED, FaultKind.REPLY_FALSIFIED))
-    faults = (Fault(kind, 0.1, from_s=ROUGH_FROM_S, longest_s=0.1),) if kind else ()
+    faults = (LineFault(kind, 0.1, from_s=ROUGH_FROM_S, longest_s=0.1),) if kind else ()
     rate_hz = dice.choice((8.0, 20.0, 50.0, 100.0))
     model = dice.choice(tuple(MODELS))
     motion = dice.choice(("move", "jog", "slow down", "home", "stand"))

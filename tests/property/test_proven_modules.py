@@ -33,7 +33,7 @@ from ldcnd.contract.commands import (
 )
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.rig_commands import AxisMove, MoveTogether, Rehearse, SetIo, SetIoTimer, SetSpeedOverride, Snapshot
-from ldcnd.drives.ldcn.packet import Command, Packet, StatusItem
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusItem
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
@@ -44,8 +44,8 @@ from tests.support.dialect_rig import GAINS
 
 SERVOS = ("pic-servo-v4", "ls-182ap", "ls-173ap", "pic-servo-sc", "pic-servo-v2")
 MODULES = (*SERVOS, "pic-io")
-READING = {Command.NO_OPERATION, Command.READ_STATUS}
-ARRANGING = {Command.SET_ADDRESS, Command.SET_BAUD_RATE, Command.HARD_RESET}
+READING = {CommandCode.NO_OPERATION, CommandCode.READ_STATUS}
+ARRANGING = {CommandCode.SET_ADDRESS, CommandCode.SET_BAUD_RATE, CommandCode.HARD_RESET}
 STOPS = {bytes([control]) for control in (0x00, 0x02, 0x04, 0x08, 0x05, 0x09)}
 """Stop Motor that stops a motor or switches it off."""
 LINES = ("as configured", "wrong", "exchanged", "missing", "of another host", "replaced")
@@ -76,7 +76,7 @@ class Line:
         """Judge a packet that a module executes."""
         if id(module) not in self.wrong or packet.command in READING:
             return
-        if packet.command == Command.STOP_MOTOR and bytes(packet.data) in STOPS:
+        if packet.command == CommandCode.STOP_MOTOR and bytes(packet.data) in STOPS:
             return
         if packet.command in ARRANGING and self.resets:
             return

@@ -27,7 +27,7 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.rig_commands import SetIo
 from ldcnd.contract.samples import LinkState
 from ldcnd.drives.ldcn.controls import LimitPins
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyRequest
@@ -44,13 +44,19 @@ ROUNDING = 1e-6
 """Tolerance of a profile, relative: it is made of register values."""
 SHAFT_EXCESS = 0.5
 """Tolerance of the shaft, relative: its servo, damped at every divisor, overshoots the profile at the end of a ramp."""
-WRITES = (Command.SET_GAIN, Command.LOAD_TRAJECTORY, Command.IO_CONTROL, Command.STOP_MOTOR, Command.SET_HOMING_MODE)
+WRITES = (
+    CommandCode.SET_GAIN,
+    CommandCode.LOAD_TRAJECTORY,
+    CommandCode.IO_CONTROL,
+    CommandCode.STOP_MOTOR,
+    CommandCode.SET_HOMING_MODE,
+)
 IO_WRITES = (
-    Command.RESET_POSITION,
-    Command.LOAD_TRAJECTORY,
-    Command.SET_GAIN,
-    Command.STOP_MOTOR,
-    Command.START_MOTION,
+    CommandCode.RESET_POSITION,
+    CommandCode.LOAD_TRAJECTORY,
+    CommandCode.SET_GAIN,
+    CommandCode.STOP_MOTOR,
+    CommandCode.START_MOTION,
 )
 LINES = (4, 9)
 

@@ -5,15 +5,18 @@ import itertools
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ldcnd.drives.ldcn.packet import Command, Packet, encode_packet
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import MODELS, ChainSpec, ModuleSpec, build_chain
 
 ALL_MODELS = tuple(ModuleSpec(name) for name in MODELS)
 ADDRESSING = [
-    encode_packet(Packet(0, Command.SET_ADDRESS, bytes([address, 0xFF]))) for address in range(1, len(ALL_MODELS) + 1)
+    encode_packet(Packet(0, CommandCode.SET_ADDRESS, bytes([address, 0xFF])))
+    for address in range(1, len(ALL_MODELS) + 1)
 ]
-commands = st.sampled_from(sorted(set(Command) - {Command.SET_BAUD_RATE, Command.SET_ADDRESS, Command.HARD_RESET}))
+commands = st.sampled_from(
+    sorted(set(CommandCode) - {CommandCode.SET_BAUD_RATE, CommandCode.SET_ADDRESS, CommandCode.HARD_RESET})
+)
 packets = st.builds(
     lambda address, command, data: encode_packet(Packet(address, command, data)),
     st.sampled_from([0, 1, 2, 5, 7, 8, 9, 0xFF]),
@@ -66,7 +69,7 @@ def test_any_commands_with_any_data_are_answered_with_right_checksums(requests):
 @settings(max_examples=30, deadline=None)
 @given(requests=st.lists(packets, max_size=10), seed=st.integers(0, 1000))
 def test_same_seed_and_same_commands_give_the_same_bytes_at_the_same_instants(requests, seed):
-    faults = tuple(Fault(kind, 0.1, longest_s=0.02) for kind in FaultKind if kind is not FaultKind.UNPLUGGED)
+    faults = tuple(LineFault(kind, 0.1, longest_s=0.02) for kind in FaultKind if kind is not FaultKind.UNPLUGGED)
     options = {"seed": seed, "faults": FaultPlan(faults, seed)}
 
     first = play(chain_of_all(**options), requests)

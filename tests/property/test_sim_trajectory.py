@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import HomingControl, StopControl
 from ldcnd.drives.ldcn.trajectory import ProfileMode
-from ldcnd.sim.ldcn.power import Condition, Trip
-from ldcnd.sim.ldcn.servo import HomeSearch, ServoLoop
+from ldcnd.sim.ldcn.power import FaultCondition, Trip
+from ldcnd.sim.ldcn.servo import ArmedSearch, ServoLoop
 from ldcnd.sim.ldcn.trajectory import ProfileGenerator
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, UTILITY_GAINS, SimulatedAxis
@@ -106,9 +106,11 @@ DOINGS = {
     "stop at once": lambda axis, _size: axis.stop(ON | StopControl.ABRUPT),
     "off": lambda axis, _size: axis.stop(ON | StopControl.MOTOR_OFF),
     "arm": lambda axis, _size: axis.arm(HomingControl.INDEX | HomingControl.LIMIT1 | HomingControl.STOP_SMOOTH),
-    "hold": lambda axis, _size: axis.suffer(Condition.STALLED),
-    "stick": lambda axis, _size: axis.suffer(Condition.ENCODER_STUCK),
-    "let go": lambda axis, _size: [axis.recover(each) for each in (Condition.STALLED, Condition.ENCODER_STUCK)],
+    "hold": lambda axis, _size: axis.suffer(FaultCondition.STALLED),
+    "stick": lambda axis, _size: axis.suffer(FaultCondition.ENCODER_STUCK),
+    "let go": lambda axis, _size: [
+        axis.recover(each) for each in (FaultCondition.STALLED, FaultCondition.ENCODER_STUCK)
+    ],
     "push": lambda axis, size: setattr(axis.drive.shaft, "velocity_counts", size / 100),
     "renumber": lambda axis, size: axis.drive.loop.renumber(size * 500_000),
     "clear": lambda axis, _size: axis.clear(),
@@ -124,7 +126,7 @@ def everything(axis):
     """Return all that can be told apart about a drive and its machine."""
     loop = axis.drive.loop
     parts = (loop, loop.trajectory, loop.trajectory.path, loop.shaft, loop.stage)
-    plain = (int, float, bool, set, HomeSearch, Gains, Trip, ProfileMode, type(None))
+    plain = (int, float, bool, set, ArmedSearch, Gains, Trip, ProfileMode, type(None))
     return [{name: each for name, each in vars(part).items() if isinstance(each, plain)} for part in parts]
 
 

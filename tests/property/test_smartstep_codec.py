@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from ldcnd.drives.smartstep.commands import reference, string_reference
 from ldcnd.drives.smartstep.packet import (
-    Command,
+    CommandPacket,
     Function,
-    Reply,
+    ReplyPacket,
     ReplyReader,
     ResponseStatus,
     add_parity,
@@ -32,9 +32,9 @@ from ldcnd.sim.smartstep.unit import string_reply
 
 units = st.integers(0, 15)
 words = st.integers(0, 0xFFFF)
-commands = st.builds(Command, units, st.sampled_from(Function), words, words)
-replies = st.builds(Reply, units, st.sampled_from(ResponseStatus), words, words)
-packets = replies.map(Reply.encode)
+commands = st.builds(CommandPacket, units, st.sampled_from(Function), words, words)
+replies = st.builds(ReplyPacket, units, st.sampled_from(ResponseStatus), words, words)
+packets = replies.map(ReplyPacket.encode)
 noise = st.binary(max_size=20) | st.text("W0123456789ABCDEF\r", max_size=40).map(str.encode)
 streams = st.lists(packets | noise, max_size=8).map(b"".join)
 
@@ -88,7 +88,7 @@ def test_any_chunking_gives_the_same_candidates(stream, places, longest):
 @given(streams, streams, st.lists(st.integers(0, 10_000), max_size=10))
 def test_answer_is_found_behind_anything_in_any_chunking(before, after, places):
     exchange = reference(3, 0x8000)
-    answer = Reply(3, ResponseStatus.REFERENCE, 0x8000, 1234).encode()
+    answer = ReplyPacket(3, ResponseStatus.REFERENCE, 0x8000, 1234).encode()
     stream = before + answer + after
 
     answers = found(exchange, cut(stream, places))
@@ -105,7 +105,7 @@ def test_answer_is_found_behind_anything_in_any_chunking(before, after, places):
 )
 def test_string_is_found_behind_noise_in_any_chunking(data, variant, before, places):
     exchange = string_reference(1, 0x3000, len(data))
-    packet = string_reply(Command(1, Function.STRING_REFERENCE, 0x3000, len(data)), data, variant)
+    packet = string_reply(CommandPacket(1, Function.STRING_REFERENCE, 0x3000, len(data)), data, variant)
 
     answers = found(exchange, cut(before + packet, places))
 

@@ -5,13 +5,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ldcnd.drives.smartstep.monitors import Counter, CounterReading
-from ldcnd.drives.smartstep.packet import Command, Function, decode_reply
+from ldcnd.drives.smartstep.packet import CommandPacket, Function, decode_reply
 from ldcnd.drives.smartstep.parameters import PN000
 from ldcnd.sim.smartstep.drive import SimulatedMotor
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 
 commands = st.builds(
-    Command,
+    CommandPacket,
     st.integers(0, 2),
     st.sampled_from(Function),
     st.sampled_from([0x0100, 0x1100, 0x2000, 0x2001, 0x3000, 0x5000, 0x5002, 0x5003, 0x5004, 0x8000, 0x8008, 0xC000])

@@ -30,9 +30,9 @@ from ldcnd.drives.driver import (
     AxisReading,
     AxisSpec,
     Ceiling,
+    CountsMotion,
     Gains,
     HomeCapture,
-    Motion,
     Moves,
     PwmOutput,
     StopMode,
@@ -100,11 +100,11 @@ class FakeDrive(Moves):
         return Exchange(1, b"", 0, lambda _data: ReplyVerdict.INTACT, lambda _data: self.shown, 0.0, repeatable=True)
 
     @override
-    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
         return motion
 
     @override
-    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         return ()
 
     @override
@@ -113,7 +113,7 @@ class FakeDrive(Moves):
         self.shown = replace(self.shown, enabled=on)
 
     @override
-    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         await self._take("load", motion if home is None else (motion, home))
 
     @override

@@ -14,7 +14,7 @@ from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.samples import LinkState
-from ldcnd.lab.bluesky import Axis, Devices
+from ldcnd.lab.bluesky import Devices, PlanAxis
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
@@ -68,7 +68,7 @@ class Laboratory:
     chain: Chain
 
     @contextmanager
-    def powered(self, *axes: str) -> Iterator[tuple[Axis, ...]]:
+    def powered(self, *axes: str) -> Iterator[tuple[PlanAxis, ...]]:
         """Control some axes, with their position loops closed."""
         with self.devices.control_all(*axes, client="scan") as held:
             for axis in held:

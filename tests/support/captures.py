@@ -16,7 +16,7 @@ from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.capture import config_of, lines_of
 from ldcnd.line.capture import Capture
 from ldcnd.net.memory_session import MemoryBroker
-from ldcnd.net.session import Sample
+from ldcnd.net.session import Publication
 from tests.support.jumping_loop import JumpingLoop
 from tests.support.replay import play, published_line, virtual_time
 
@@ -61,7 +61,7 @@ async def _record(name: str) -> Recording:
     def now_ns() -> int:
         return EPOCH_NS + round(loop.time() * 1e9)
 
-    def take(sample: Sample) -> None:
+    def take(sample: Publication) -> None:
         published.append(published_line(sample))
 
     broker = MemoryBroker()

@@ -9,7 +9,7 @@ from typing import Any
 
 from typing_extensions import override
 
-from ldcnd.console.commissioning.messages import ToPage, View
+from ldcnd.console.commissioning.messages import ToCommissioningPage, View
 from ldcnd.console.commissioning.routes import Commissioning
 from ldcnd.net.hand_over import Answer
 from ldcnd.net.memory_session import MemorySession
@@ -118,9 +118,9 @@ class OpenCommissioning:
         return next(each.state for each in self.view.steps if each.name == step)
 
 
-async def told_to(socket: PageSocket) -> ToPage:
+async def told_to(socket: PageSocket) -> ToCommissioningPage:
     """Return the next message to a page."""
-    return ToPage.model_validate_json(await socket.frame())
+    return ToCommissioningPage.model_validate_json(await socket.frame())
 
 
 @asynccontextmanager

@@ -14,7 +14,7 @@ from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 from tests.support.rig import RunningRig, running_rig
@@ -88,7 +88,7 @@ class DialectRig:
                     _, sample = await anext(faults)
                 return sample
 
-    def condition(self, condition: Condition, *, present: bool = True) -> None:
+    def condition(self, condition: FaultCondition, *, present: bool = True) -> None:
         """Let something go wrong around the drive, or be right again."""
         self.drive.set_condition(condition, present=present, at_s=asyncio.get_running_loop().time())
 

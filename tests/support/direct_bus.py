@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable
 from types import SimpleNamespace
 from typing import TypeVar
 
-from ldcnd.drives.ldcn.packet import Command, Packet, PacketReader
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, PacketReader
 from ldcnd.line.exchange import Exchange
 from ldcnd.line.proof import Proofs
 from ldcnd.line.queue import Lane
@@ -33,9 +33,9 @@ class DirectBus:
     def __init__(self, host: SimulatedHost) -> None:
         self.host = host
         self.packets: list[Packet] = []
-        self.sent: list[tuple[Command, Lane]] = []
-        self.instead: dict[Command, Interference] = {}
-        self.after: dict[Command, Interference] = {}
+        self.sent: list[tuple[CommandCode, Lane]] = []
+        self.instead: dict[CommandCode, Interference] = {}
+        self.after: dict[CommandCode, Interference] = {}
         self.settings = SimpleNamespace(name="direct", bits_per_byte=10)
         self.baud = 19_200
         self.proofs = Proofs()
@@ -43,7 +43,7 @@ class DirectBus:
     async def execute(self, exchange: Exchange[ReplyT], lane: Lane = Lane.COMMAND, *, once: bool = False) -> ReplyT:
         """Carry an exchange out; `once` makes no difference where nothing is repeated."""
         packet = packet_of(exchange.request)
-        command = Command(packet.command)
+        command = CommandCode(packet.command)
         self.packets.append(packet)
         self.sent.append((command, lane))
         await _happen(self.instead, command)
@@ -52,12 +52,12 @@ class DirectBus:
         await _happen(self.after, command)
         return exchange.decode(reply)
 
-    def commands(self, since: int = 0) -> list[Command]:
+    def commands(self, since: int = 0) -> list[CommandCode]:
         """Return the commands that were sent."""
         return [command for command, _ in self.sent[since:]]
 
 
-async def _happen(happenings: dict[Command, Interference], command: Command) -> None:
+async def _happen(happenings: dict[CommandCode, Interference], command: CommandCode) -> None:
     if command in happenings:
         result = happenings.pop(command)()
         if inspect.isawaitable(result):

@@ -11,7 +11,7 @@ from typing_extensions import override
 from ldcnd.contract.errors import BusError
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.packet import Status, StatusItem
+from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
 from ldcnd.line.bus import Bus
@@ -29,7 +29,7 @@ ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 CYCLE = ServoCycle(SERVO_CYCLE_S, BAUD / actual_baud(baud_divisor(BAUD)))
 
 
-class DrivePoller(Poller[Status]):
+class DrivePoller(Poller[StatusPacket]):
     """Asks a drive for position, velocity and inputs; absolute deadlines, turns that have passed are left out."""
 
     def __init__(self, address: int, period_s: float) -> None:
@@ -42,14 +42,14 @@ class DrivePoller(Poller[Status]):
         self._exchange = commands.read_status(Node(address, PROFILES["ls-182ap"]), ITEMS)
 
     @override
-    def next_exchange(self, now_s: float) -> Exchange[Status]:
+    def next_exchange(self, now_s: float) -> Exchange[StatusPacket]:
         self.asked_at_s.append(now_s)
         self.due_at_s += max(1, 1 + int((now_s - self.due_at_s) / self.period_s)) * self.period_s
         self.deadline_at_s = self.due_at_s + self.period_s
         return self._exchange
 
     @override
-    def deliver(self, reply: Status, timing: Timing) -> None:
+    def deliver(self, reply: StatusPacket, timing: Timing) -> None:
         del reply
         self.timings.append(timing)
 

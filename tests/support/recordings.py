@@ -15,7 +15,7 @@ from mcap.reader import make_reader
 
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.lab.recording.recorder import KEPT_SAMPLES, Recorder
-from ldcnd.net.session import Sample
+from ldcnd.net.session import Publication
 from ldcnd.sim.chain import Chain
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
@@ -55,7 +55,7 @@ async def recorded_rig(
             path, descriptions, lambda: EPOCH_NS + round(loop.time() * 1e9), rotate_bytes, rig.client.descriptions
         ) as recorder:
 
-            def take(sample: Sample) -> None:
+            def take(sample: Publication) -> None:
                 counts[sample.key] += 1
                 recorder.take(sample)
 

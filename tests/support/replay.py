@@ -22,11 +22,11 @@ from ldcnd.line.capture import Capture
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from ldcnd.line.port_url import SOCKET
 from ldcnd.net.memory_session import MemoryBroker, MemorySession
-from ldcnd.net.session import Sample
+from ldcnd.net.session import Publication
 from tests.support.jumping_loop import JumpingLoop
 from tests.support.recorded_line import Replay, ReplayDeviation
 
-Take = Callable[[Sample], None]
+Take = Callable[[Publication], None]
 """Gets every sample, event and report as it is published."""
 
 
@@ -45,7 +45,7 @@ class Played:
     late_s: float
 
 
-def published_line(sample: Sample) -> str:
+def published_line(sample: Publication) -> str:
     """Return what was published as one line of JSON: key, when it was true, value."""
     value = as_json(sample.payload, sample.encoding).decode()
     return (
@@ -95,7 +95,7 @@ async def play(capture: Capture, config: RigConfig, take: Take) -> Played:
     def now_ns() -> int:
         return header.zero_ns + round((loop.time() - shift_s) * 1e9)
 
-    def overhear(sample: Sample) -> None:
+    def overhear(sample: Publication) -> None:
         if not replay.ended.done():
             take(sample)
 

@@ -49,7 +49,7 @@ from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.net.memory_session import MemoryBroker
-from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
 from tests.support.jumping_loop import JumpingLoop
 from tests.support.shaft_judge import Held, ShaftJudge, now_ns
@@ -626,7 +626,7 @@ async def all_up(daemon: Daemon) -> None:
         await asyncio.sleep(0.05)
 
 
-def faults_of(seed: int, now_s: float) -> tuple[Fault, ...]:
+def faults_of(seed: int, now_s: float) -> tuple[LineFault, ...]:
     """Return what is wrong with the line in a schedule."""
     share = random.Random(seed).choice((0.0, 0.0, 0.02, 0.1))
-    return tuple(Fault(kind, share / len(KINDS), now_s, longest_s=0.02) for kind in KINDS) if share else ()
+    return tuple(LineFault(kind, share / len(KINDS), now_s, longest_s=0.02) for kind in KINDS) if share else ()

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from ldcnd.contract.errors import SessionError
-from ldcnd.net.session import UNDELIVERED_SAMPLES, Qos, Sample, SampleKind
+from ldcnd.net.session import UNDELIVERED_SAMPLES, Publication, Qos, SampleKind
 from tests.support.session_pair import HALT, JSON, KEYS, POSITION, Pair, echo, served, subscribed
 
 
@@ -20,7 +20,7 @@ class SampleFacts:
 
         async with asyncio.timeout(2):
             sample = await samples.get()
-        assert sample[:5] == Sample(POSITION, b"\x81", encoding, SampleKind.PUT, at_ns)[:5]
+        assert sample[:5] == Publication(POSITION, b"\x81", encoding, SampleKind.PUT, at_ns)[:5]
 
     async def test_a_sample_names_the_session_that_an_answer_names(self, pair: Pair) -> None:
         """The only proof of origin: a program on the way puts its own name into a time stamp that is missing."""
@@ -67,7 +67,7 @@ class SampleFacts:
 
     async def test_samples_that_may_linger_arrive_in_order_and_none_after_the_end(self, pair: Pair) -> None:
         await subscribed(pair.server, pair.client)
-        arrived: asyncio.Queue[Sample] = asyncio.Queue()
+        arrived: asyncio.Queue[Publication] = asyncio.Queue()
         declaration = await pair.client.subscribe("ldcn/bench1/tele/x/*", arrived.put_nowait, kept=1000, linger_s=0.02)
         while arrived.empty():
             pair.server.publish(POSITION, b"first", encoding=JSON, qos=Qos.TELEMETRY)
@@ -88,7 +88,7 @@ class SampleFacts:
 
     async def test_a_closed_subscription_takes_nothing_more(self, pair: Pair) -> None:
         kept = await subscribed(pair.server, pair.client)
-        dropped: list[Sample] = []
+        dropped: list[Publication] = []
         declaration = await pair.client.subscribe("ldcn/**", dropped.append)
 
         await declaration.close()

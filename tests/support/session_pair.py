@@ -9,7 +9,7 @@ from ldcnd.contract.codec import Encoding, decode
 from ldcnd.contract.commands import ErrorReply
 from ldcnd.contract.keys import Keys
 from ldcnd.net.hand_over import Answer, Query
-from ldcnd.net.session import Qos, Sample, Session
+from ldcnd.net.session import Publication, Qos, Session
 
 KEYS = Keys("bench1")
 JSON = Encoding.JSON.value
@@ -48,9 +48,9 @@ async def served(client: Session, key: str) -> None:
     await until(ready)
 
 
-async def subscribed(publisher: Session, subscriber: Session) -> "asyncio.Queue[Sample]":
+async def subscribed(publisher: Session, subscriber: Session) -> "asyncio.Queue[Publication]":
     """Subscribe to everything, and return when what is published arrives; the first samples are not kept."""
-    samples: asyncio.Queue[Sample] = asyncio.Queue()
+    samples: asyncio.Queue[Publication] = asyncio.Queue()
     probe = KEYS.telemetry("probe", "state")
     await subscriber.subscribe("ldcn/**", samples.put_nowait)
 

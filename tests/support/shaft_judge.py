@@ -28,7 +28,7 @@ from ldcnd.contract.commands import (
 from ldcnd.contract.rig_commands import AxisPath
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.drives.ldcn.controls import StopControl
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import AddPathPoints, LoadTrajectory, PlainCommand, ReceivedCommand, StopMotor
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.drives.ldcn.trajectory import ProfileMode
@@ -304,7 +304,7 @@ class ShaftJudge(Witness):
         match command:
             case LoadTrajectory(trajectory) if trajectory.start_now and trajectory.velocity:
                 pass
-            case PlainCommand(Command.START_MOTION) | AddPathPoints((), None):
+            case PlainCommand(CommandCode.START_MOTION) | AddPathPoints((), None):
                 pass
             case StopMotor(control, _) if control & StopControl.HERE:
                 pass

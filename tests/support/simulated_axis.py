@@ -4,12 +4,12 @@ from collections.abc import Callable
 
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import HomingControl, StopControl
-from ldcnd.drives.ldcn.packet import Command, Status, StatusFlag
+from ldcnd.drives.ldcn.packet import CommandCode, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.registers import encode_gains
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, encode_trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_host import SimulatedHost
@@ -39,22 +39,22 @@ class SimulatedAxis(SimulatedHost):
         self.drive = drive
         self.profile = drive.profile
         self.address_all()
-        self.send(1, Command.SET_GAIN, *encode_gains(self.profile, gains))
+        self.send(1, CommandCode.SET_GAIN, *encode_gains(self.profile, gains))
         if closed:
             self.stop(ON | StopControl.ABRUPT)
             self.clear()
 
     def stop(self, control: StopControl, *position: int) -> None:
         """Send Stop Motor."""
-        self.send(1, Command.STOP_MOTOR, control, *position)
+        self.send(1, CommandCode.STOP_MOTOR, control, *position)
 
     def clear(self) -> None:
         """Send Clear Sticky Bits."""
-        self.send(1, Command.CLEAR_STICKY_BITS)
+        self.send(1, CommandCode.CLEAR_STICKY_BITS)
 
     def load(self, trajectory: Trajectory) -> None:
         """Send Load Trajectory."""
-        self.send(1, Command.LOAD_TRAJECTORY, *encode_trajectory(self.profile, trajectory))
+        self.send(1, CommandCode.LOAD_TRAJECTORY, *encode_trajectory(self.profile, trajectory))
 
     def move(self, position: int, velocity: int = 5 * ONE, acceleration: int = 200) -> None:
         """Start a trapezoidal move."""
@@ -78,9 +78,9 @@ class SimulatedAxis(SimulatedHost):
 
     def arm(self, control: HomingControl) -> None:
         """Send Set Homing Mode."""
-        self.send(1, Command.SET_HOMING_MODE, control)
+        self.send(1, CommandCode.SET_HOMING_MODE, control)
 
-    def status(self) -> Status:
+    def status(self) -> StatusPacket:
         """Read everything."""
         return self.read(1, self.profile)
 
@@ -89,21 +89,21 @@ class SimulatedAxis(SimulatedHost):
         self.drive.catch_up(self.now_s)
         return self.drive.loop.pwm
 
-    def suffer(self, condition: Condition) -> None:
+    def suffer(self, condition: FaultCondition) -> None:
         """Let something go wrong around the drive."""
         self.drive.set_condition(condition, present=True, at_s=self.now_s)
 
-    def recover(self, condition: Condition) -> None:
+    def recover(self, condition: FaultCondition) -> None:
         """Let it be right again."""
         self.drive.set_condition(condition, present=False, at_s=self.now_s)
 
-    def wait_for(self, condition: Callable[[Status], object], most_s: float = 20.0) -> Status:
+    def wait_for(self, condition: Callable[[StatusPacket], object], most_s: float = 20.0) -> StatusPacket:
         """Poll until the status fulfils the condition; return it."""
         ends_s = self.now_s + most_s
         while not condition(status := self.status()):
             assert self.now_s < ends_s, status
         return status
 
-    def finish(self) -> Status:
+    def finish(self) -> StatusPacket:
         """Poll until the move is done."""
         return self.wait_for(lambda status: status.flags & StatusFlag.MOVE_DONE)

@@ -1,6 +1,6 @@
 """A host on a simulated LDCN/NMC chain that needs no event loop: it passes the time itself."""
 
-from ldcnd.drives.ldcn.packet import Command, Packet, Status, StatusItem, decode_status, encode_packet
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusItem, StatusPacket, decode_status, encode_packet
 from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.sim.chain import Chain
 
@@ -27,20 +27,20 @@ class SimulatedHost:
         self.heard = self.chain.advance(self.now_s)
         return b"".join(data for _, data in self.heard)
 
-    def send(self, address: int, command: Command, *data: int) -> bytes:
+    def send(self, address: int, command: CommandCode, *data: int) -> bytes:
         """Send one packet and return everything that comes back."""
         self.chain.write(self.now_s, encode_packet(Packet(address, command, bytes(data))))
         return self.wait(PATIENCE_S)
 
-    def read(self, address: int, profile: Profile, items: StatusItem | int = 0x7F) -> Status:
+    def read(self, address: int, profile: Profile, items: StatusItem | int = 0x7F) -> StatusPacket:
         """Read status items once."""
         wanted = StatusItem(items)
-        return decode_status(profile, wanted, self.send(address, Command.READ_STATUS, wanted))
+        return decode_status(profile, wanted, self.send(address, CommandCode.READ_STATUS, wanted))
 
     def address_all(self) -> None:
         """Give the modules addresses 1, 2, ... and the group FF."""
         for address in range(1, len(self.chain.modules) + 1):
-            reply = self.send(0, Command.SET_ADDRESS, address, 0xFF)
+            reply = self.send(0, CommandCode.SET_ADDRESS, address, 0xFF)
             assert len(reply) == 2, f"module {address} answered {reply.hex()}"
 
 

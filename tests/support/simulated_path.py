@@ -1,6 +1,6 @@
 """Path mode on a simulated axis: what a host sends, in points of counts and cycles."""
 
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, Status
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusPacket
 from ldcnd.drives.ldcn.path import PathPoint, encode_points
 from ldcnd.drives.ldcn.registers import FRACTION, SERVO_CYCLE_S
 from ldcnd.sim.ldcn.chain import model
@@ -22,13 +22,13 @@ class PathAxis(SimulatedAxis):
         """Send path points, in packets as full as possible."""
         for at in range(0, len(steps), 7):
             points = [PathPoint(step, cycles) for step in steps[at : at + 7]]
-            self.send(1, Command.ADD_PATH_POINTS, *encode_points(self.drive.dialect, points, fast_path=fast_path))
+            self.send(1, CommandCode.ADD_PATH_POINTS, *encode_points(self.drive.dialect, points, fast_path=fast_path))
 
     def start(self) -> None:
         """Start the path."""
-        self.send(1, Command.ADD_PATH_POINTS)
+        self.send(1, CommandCode.ADD_PATH_POINTS)
 
-    def look(self) -> Status:
+    def look(self) -> StatusPacket:
         """Read position, aux, position error and points left at once, as hosts of path mode do."""
         return self.read(1, self.drive.dialect, 0xC9)
 

@@ -6,10 +6,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from ldcnd.bench.tuning.ldcn.design import Proposal, duration_s, propose, stiff_gains, within_authority
-from ldcnd.bench.tuning.ldcn.excitation import Bounds, Excitation, Record, Shown, Trial, Trials
+from ldcnd.bench.tuning.ldcn.excitation import Bounds, Excitation, MoveRecord, Trial, TrialOutcome, Trials
 from ldcnd.bench.tuning.ldcn.identify import Identified, identify
 from ldcnd.bench.tuning.ldcn.plant import ENDLESS_COUNTS, Plant
-from ldcnd.bench.tuning.ldcn.response import Figures, Move, Response, Start, simulate
+from ldcnd.bench.tuning.ldcn.response import Figures, Response, Start, TrapezoidMove, simulate
 from ldcnd.bench.tuning.ldcn.verdict import measured, worst
 from ldcnd.contract.errors import DriveFault
 from ldcnd.drives.driver import Gains
@@ -77,26 +77,26 @@ class SimulatedAxis:
         self._at = 0.0
         self._dice = random.Random(plant.number)
 
-    def run(self, trials: Trials) -> tuple[Record, ...]:
+    def run(self, trials: Trials) -> tuple[MoveRecord, ...]:
         """Carry out all trials of a kind; return what they lead to."""
         try:
             trial = next(trials)
             while True:
                 trial = trials.send(self._shown(trial))
         except StopIteration as end:
-            records: tuple[Record, ...] = end.value
+            records: tuple[MoveRecord, ...] = end.value
             return records
 
-    def _shown(self, trial: Trial) -> Shown:
+    def _shown(self, trial: Trial) -> TrialOutcome:
         run = simulate(self._profile, self._motor, trial.gains, trial.move, trial.lasts_s, trial.start, COASTING_S)
         lowest, highest, last = run.shaft_counts
         self.farthest_counts = max(self.farthest_counts, -self._at - lowest, self._at + highest)
         self._at += last
         record = sampled(run, trial.gains, trial.move, trial.start, self._dice)
-        return Shown(record, run.tripped, run.rest_counts)
+        return TrialOutcome(record, run.tripped, run.rest_counts)
 
 
-def sampled(run: Response, gains: Gains, move: Move, start: Start, dice: random.Random) -> Record:
+def sampled(run: Response, gains: Gains, move: TrapezoidMove, start: Start, dice: random.Random) -> MoveRecord:
     """Return a move as a host has seen it: every 2.6 ms or so, its begin not known, until it has been at rest."""
     begun_s = dice.uniform(0.005, 0.03)
     cycle_s = float(run.times_s[0])
@@ -108,7 +108,7 @@ def sampled(run: Response, gains: Gains, move: Move, start: Start, dice: random.
         times.append(at)
         positions.append(int(run.positions[max(cycle, 0)]))
         at += SAMPLE_S + dice.uniform(0.0, 0.0002)
-    return Record(gains, move, start, tuple(times), tuple(positions))
+    return MoveRecord(gains, move, start, tuple(times), tuple(positions))
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +137,7 @@ class Tuned:
         return abs(self.known.plant.acceleration / self.true.acceleration - 1)
 
 
-def excited(profile: Profile, plant: DrawnPlant) -> tuple[Excitation, SimulatedAxis, tuple[Record, ...]]:
+def excited(profile: Profile, plant: DrawnPlant) -> tuple[Excitation, SimulatedAxis, tuple[MoveRecord, ...]]:
     """Give pulses to a machine and move it softly."""
     excitation, axis = Excitation(profile, Bounds(plant.distance_counts)), SimulatedAxis(profile, plant)
     axis.run(excitation.pulses())

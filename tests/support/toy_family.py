@@ -9,7 +9,7 @@ from collections.abc import Set as AbstractSet
 from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, BusError
-from ldcnd.line.exchange import Effect, Exchange, ReplyVerdict, Timing
+from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict, Timing
 from ldcnd.line.poller import Poller
 from ldcnd.line.resync import Resync
 from tests.support.scripted_line import Say, Script
@@ -77,7 +77,7 @@ def exchange(
         decode=decode if reply_bytes else lambda _data: number,
         response_s=response_s,
         repeatable=repeatable,
-        effect=Effect.READS,
+        effect=PacketEffect.READS,
     )
 
 
@@ -100,7 +100,7 @@ def probe(avoid: AbstractSet[int]) -> Exchange[int] | None:
         decode=_decode_probe,
         response_s=RESPONSE_S,
         repeatable=True,
-        effect=Effect.READS,
+        effect=PacketEffect.READS,
     )
 
 

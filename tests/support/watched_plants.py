@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from ldcnd.bench.tuning.ldcn.design import stiff_gains, within_authority
-from ldcnd.bench.tuning.ldcn.effort import Seen
+from ldcnd.bench.tuning.ldcn.effort import SeenPosition
 from ldcnd.bench.tuning.ldcn.identify import Identified
 from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.response import Move
+from ldcnd.bench.tuning.ldcn.response import TrapezoidMove
 from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.power import PicServoPower
@@ -78,7 +78,7 @@ class AxisAtWork:
         )
         self.gains = stiff_gains(profile, Identified(true, Plant(0, 0), 0.0))
         turn = drawn.motor.counts_per_rev
-        self.move = within_authority(true, Move(2 * turn, 6.0 * turn, 60.0 * turn))
+        self.move = within_authority(true, TrapezoidMove(2 * turn, 6.0 * turn, 60.0 * turn))
         self._shaft = Shaft(drawn.motor, profile.servo_cycle_s)
         stage = PicServoPower()
         stage.enable(on=True)
@@ -116,7 +116,7 @@ class AxisAtWork:
         """Whether the drive has opened its loop by itself: no motion follows."""
         return self._loop.faulted
 
-    def motion(self) -> Iterator[Seen]:
+    def motion(self) -> Iterator[SeenPosition]:
         """Move once; yield what is published meanwhile, and of the rest after it."""
         dice, loop, cycle_s = self._dice, self._loop, self.profile.servo_cycle_s
         tick_s = cycle_s * (self.gains.sr if self.profile.divisor_slows_profile else 1)
@@ -135,5 +135,5 @@ class AxisAtWork:
             self._t_s += left * cycle_s
             if until_s == math.inf and loop.trajectory.done:
                 until_s = self._t_s + PAUSE_S
-            yield Seen(self._t_s + dice.uniform(-TIMING_S, TIMING_S), loop.position, loop.following_error)
+            yield SeenPosition(self._t_s + dice.uniform(-TIMING_S, TIMING_S), loop.position, loop.following_error)
             left = round(self._sample_s * dice.uniform(0.95, 1.05) / cycle_s)

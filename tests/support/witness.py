@@ -9,7 +9,7 @@ from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.drives.ldcn.controls import StopControl
-from ldcnd.drives.ldcn.packet import Command, Packet, PacketReader
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, PacketReader
 from ldcnd.drives.ldcn.received import AddPathPoints, LoadTrajectory, StopMotor, received_command
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.drives.ldcn.trajectory import ProfileMode
@@ -92,7 +92,7 @@ class Witness:
                 stops = control & (StopControl.ABRUPT | StopControl.SMOOTH)
                 idle = not drive.loop.servo_on and not drive.loop.pwm
                 return bool(control & StopControl.HERE), bool(stops) and idle
-        if packet.command is not Command.START_MOTION:
+        if packet.command is not CommandCode.START_MOTION:
             return False, False
         loaded, profile = drive._trajectory, drive.loop.trajectory
         if loaded.mode is ProfileMode.VELOCITY:

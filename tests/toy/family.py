@@ -24,20 +24,20 @@ from ldcnd.drives.driver import (
     AxisReading,
     AxisSpec,
     Ceiling,
+    CountsMotion,
     Drive,
     HomeCapture,
-    Motion,
     Moves,
     PwmOutput,
     StopMode,
 )
-from ldcnd.drives.family import Demand, Family, Line, OpenLine, bus_settings
+from ldcnd.drives.family import Demand, Family, OpenLine, UnopenedLine, bus_settings
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.line_plan import Poll, Urgent
 from ldcnd.drives.network import BringUpReport, Network
 from ldcnd.drives.transcript import Describe
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Effect, Exchange, ReplyVerdict
+from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
 from ldcnd.line.flight_recorder import WireRecord
 from ldcnd.line.port_url import port_opener
 from ldcnd.line.resync import Resync
@@ -68,7 +68,7 @@ class Op(IntEnum):
     STATUS, ENABLE, DISABLE, LOAD, START, STOP = range(6)
 
 
-EFFECTS = {Op.STATUS: Effect.READS, Op.DISABLE: Effect.RELIEVES, Op.STOP: Effect.RELIEVES}
+EFFECTS = {Op.STATUS: PacketEffect.READS, Op.DISABLE: PacketEffect.RELIEVES, Op.STOP: PacketEffect.RELIEVES}
 
 
 class Flag(IntFlag):
@@ -113,7 +113,7 @@ def exchange(node: int, op: Op, position: int = 0, velocity: int = 0) -> Exchang
         decode,
         RESPONSE_S,
         op is not Op.START,
-        effect=EFFECTS.get(op, Effect.CHANGES),
+        effect=EFFECTS.get(op, PacketEffect.CHANGES),
     )
 
 
@@ -131,11 +131,11 @@ class ToyStage(Moves):
         return exchange(self.spec.address, Op.STATUS)
 
     @override
-    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
         return motion
 
     @override
-    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         node = self.spec.address
         return exchange(node, Op.LOAD), exchange(node, Op.START)
 
@@ -144,8 +144,8 @@ class ToyStage(Moves):
         await self._ask(Op.ENABLE if on else Op.DISABLE)
 
     @override
-    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
-        if not isinstance(motion, Motion) or motion.target_counts is None or home:
+    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        if not isinstance(motion, CountsMotion) or motion.target_counts is None or home:
             raise NotSupported("a toy goes to a position and nowhere else")
         await self._ask(Op.LOAD, motion.target_counts, round(motion.velocity_counts_per_s))
 
@@ -232,10 +232,10 @@ class ToyFamily(Family[ToyBusConfig]):
 TOY = ToyFamily()
 
 
-def open_toy_line(settings: ToyBusConfig, opener: Opener | None = None) -> Line:
+def open_toy_line(settings: ToyBusConfig, opener: Opener | None = None) -> UnopenedLine:
     bus = Bus(bus_settings(settings, BAUD), opener or port_opener(settings.port, BAUD))
     specs = tuple(AxisSpec(axis.name, axis.address, axis.model, None) for axis in settings.axis)
-    return Line(bus, ToyNetwork(bus, specs))
+    return UnopenedLine(bus, ToyNetwork(bus, specs))
 
 
 def _words(record: WireRecord) -> str:

@@ -5,7 +5,7 @@ from typing_extensions import override
 
 from ldcnd.contract.frozen import Frozen
 from ldcnd.line.transport import Opener
-from ldcnd.sim.chain import NEVER_S, Chain, Module, Reply
+from ldcnd.sim.chain import NEVER_S, Chain, Module, ModuleReply
 from ldcnd.sim.family import SimulatedFamily
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.sim.line_config import FaultyLineConfig
@@ -21,7 +21,7 @@ class SimulatedStage(Module):
     def __init__(self, node: int) -> None:
         self._node = node
         self._heard = bytearray()
-        self._replies: list[Reply] = []
+        self._replies: list[ModuleReply] = []
         self._enabled = False
         self._from = self._to = 0
         self._loaded = (0, 1)
@@ -44,9 +44,9 @@ class SimulatedStage(Module):
         flags = (Flag.ENABLED if self._enabled else 0) | (0 if moves else Flag.AT_REST)
         speed = 0 if not moves else self._velocity if self._to > now else -self._velocity
         self.next_event_s = at_s + RESPONSE_S / 2
-        self._replies.append(Reply(frame(REPLY, node, flags, now, speed), self.next_event_s, 10 / BAUD))
+        self._replies.append(ModuleReply(frame(REPLY, node, flags, now, speed), self.next_event_s, 10 / BAUD))
 
-    def advance(self, to_s: float) -> Reply | None:
+    def advance(self, to_s: float) -> ModuleReply | None:
         if not self._replies or self._replies[0].starts_at_s > to_s:
             return None
         reply = self._replies.pop(0)

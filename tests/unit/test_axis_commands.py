@@ -33,7 +33,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, Moving
-from ldcnd.drives.driver import Fault, Gains, Motion, StopMode
+from ldcnd.drives.driver import CountsMotion, Fault, Gains, StopMode
 from tests.support.axis_bench import GAINS, RUNNING, AxisBench, axis_bench, raising
 
 WARNING = Fault("position_wrap", "the counter has wrapped", stops=False)
@@ -41,7 +41,7 @@ OVERHEAT = Fault("overheat", "let it cool down")
 LOST = Fault("encoder", "the encoder was unplugged", loses_position=True)
 
 
-def loaded(bench: AxisBench) -> Motion:
+def loaded(bench: AxisBench) -> CountsMotion:
     (motion,) = [what for name, what in bench.drive.told if name == "load"]
     return motion
 
@@ -270,7 +270,7 @@ async def test_a_move_answers_what_the_drive_will_do():
     async with axis_bench() as bench:
         reply = await bench.send(MoveAbsolute(position=10.0, velocity=5.0, acceleration=50.0))
 
-        assert bench.drive.told == [("load", Motion(10_000, 5000.0, 50_000.0)), ("start", None)]
+        assert bench.drive.told == [("load", CountsMotion(10_000, 5000.0, 50_000.0)), ("start", None)]
         assert (reply.position, reply.velocity, reply.acceleration) == (10.0, 5.0, 50.0)
         assert reply.duration_s == pytest.approx(10.0 / 5.0 + 5.0 / 50.0)
 
@@ -345,7 +345,7 @@ async def test_a_jog_ends_at_the_limit_ahead_and_without_one_at_its_horizon(velo
         await bench.settled(position_counts=5000)
         bench.drive.told.clear()
         reply = await bench.send(MoveVelocity(velocity=velocity))
-        assert loaded(bench) == Motion(round(end * 1000), 10_000.0, 200_000.0)
+        assert loaded(bench) == CountsMotion(round(end * 1000), 10_000.0, 200_000.0)
         assert reply.velocity == velocity
         assert bench.tracker.state is AxisState.CONTINUOUS_MOTION
         await bench.settled(position_counts=5000)

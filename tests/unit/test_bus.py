@@ -11,7 +11,7 @@ from ldcnd.contract.errors import (
     NotSupported,
     WrongState,
 )
-from ldcnd.line.exchange import Effect
+from ldcnd.line.exchange import PacketEffect
 from ldcnd.line.queue import LANE_LIMITS, Lane
 from ldcnd.line.transaction import only_while
 from tests.support import toy_family as toy
@@ -62,7 +62,7 @@ async def test_what_can_move_is_sent_only_if_its_condition_holds_when_its_turn_c
         if not held:
             raise WrongState("not any more")
 
-    moving = replace(toy.exchange(2), effect=Effect.CHANGES)
+    moving = replace(toy.exchange(2), effect=PacketEffect.CHANGES)
     async with running(rig) as callers:
         rig.bus.proofs.expect(1, "node 1").prove()
         callers.create_task(rig.bus.execute(toy.exchange(1)), name="first")

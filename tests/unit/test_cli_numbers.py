@@ -5,7 +5,7 @@ import pytest
 from click.testing import CliRunner
 
 from ldcnd.cli.main import LazyGroup, cli
-from ldcnd.cli.typed import Finite, Whole
+from ldcnd.cli.typed import Finite, WholeNumber
 
 
 @click.group(cls=LazyGroup, homes={})
@@ -16,7 +16,7 @@ def program() -> None:
 @program.command(context_settings={"ignore_unknown_options": True})
 @click.argument("value", type=Finite())
 @click.option("-e", "--endpoint")
-@click.option("--count", type=Whole(0, 9))
+@click.option("--count", type=WholeNumber(0, 9))
 @click.option("--limit", type=Finite(0))
 def show(value: float, endpoint: str | None, count: int | None, limit: float | None) -> None:
     """Show what was understood."""

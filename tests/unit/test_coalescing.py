@@ -9,7 +9,7 @@ import pytest
 from typing_extensions import override
 
 from ldcnd.contract.errors import BusError
-from ldcnd.line.exchange import Effect, Exchange, Timing
+from ldcnd.line.exchange import Exchange, PacketEffect, Timing
 from ldcnd.line.queue import Lane
 from ldcnd.line.transaction import only_while
 from tests.support import toy_family as toy
@@ -57,7 +57,7 @@ def busy(rig: Rig, story: list[str]) -> list[NotedPoller]:
 
 
 def moving(number: int) -> Exchange[int]:
-    return replace(toy.exchange(number, node=9), effect=Effect.CHANGES)
+    return replace(toy.exchange(number, node=9), effect=PacketEffect.CHANGES)
 
 
 async def test_readings_of_a_busy_line_come_several_at_a_time_in_order_and_in_time():

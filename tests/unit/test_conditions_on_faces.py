@@ -41,7 +41,7 @@ from ldcnd.lab.ros2.bridge import ERROR, OK, STALE, WARN, Bridge
 from ldcnd.lab.top.columns import as_text
 from ldcnd.lab.top.rig_view import Description, RigView
 from ldcnd.net.memory_session import MemoryBroker
-from ldcnd.net.session import Sample, SampleKind
+from ldcnd.net.session import Publication, SampleKind
 
 NOW_NS = 1_000_000_000_000
 NUMBER = 60.0
@@ -152,12 +152,12 @@ def known(case: Case) -> Known:
     )
 
 
-def put(key: str, model: Frozen) -> Sample:
+def put(key: str, model: Frozen) -> Publication:
     payload, encoding = encode(model, Encoding.MSGPACK)
-    return Sample(key, payload, encoding, SampleKind.PUT, None)
+    return Publication(key, payload, encoding, SampleKind.PUT, None)
 
 
-def published(at: Known) -> list[Sample]:
+def published(at: Known) -> list[Publication]:
     tele = KEYS.telemetry
     return [
         put(tele("x", TelemetryItem.STATE), at.state),
@@ -275,7 +275,7 @@ def epics(at: Known) -> str:
 
 
 def console(at: Known) -> str:
-    sent: list[Sample] = []
+    sent: list[Publication] = []
     conditions = Conditions("sim", sent.append, lambda: 100.0)
     conditions.holders = holders(at)
     for sample in published(at):

@@ -11,18 +11,18 @@ import pytest
 from ldcnd.console.feed import MOST_PAGES, Feed, parse_subscription
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.contract.errors import MalformedRequest, TooManyRequests, ValueOutOfRange
-from ldcnd.net.session import Sample, SampleKind
+from ldcnd.net.session import Publication, SampleKind
 
 MSGPACK, JSON = "application/msgpack;position_sample", "application/json"
 
 
 def published(key, encoding=MSGPACK, **sample):
     payload = msgpack.packb(sample) if encoding == MSGPACK else json.dumps(sample).encode()
-    return Sample(f"ldcn/{key}", payload, encoding, SampleKind.PUT, None)
+    return Publication(f"ldcn/{key}", payload, encoding, SampleKind.PUT, None)
 
 
 def deleted(key):
-    return Sample(f"ldcn/{key}", b"", "", SampleKind.DELETE, None)
+    return Publication(f"ldcn/{key}", b"", "", SampleKind.DELETE, None)
 
 
 class Rig:
@@ -171,8 +171,8 @@ async def test_a_rig_that_publishes_json_looks_alike(rig):
     ("payload", "encoding"), [(b"", MSGPACK), (b"\xc1", MSGPACK), (b"\x01", MSGPACK), (b"{", JSON), (b"[1]", JSON)]
 )
 async def test_what_is_no_model_is_left_out(rig, payload, encoding):
-    rig.values.take(Sample("ldcn/sim/tele/x/position", payload, encoding, SampleKind.PUT, None))
-    rig.values.take(Sample("ldcn/sim/tele/x/event", payload, encoding, SampleKind.PUT, None))
+    rig.values.take(Publication("ldcn/sim/tele/x/position", payload, encoding, SampleKind.PUT, None))
+    rig.values.take(Publication("ldcn/sim/tele/x/event", payload, encoding, SampleKind.PUT, None))
 
     async with rig.page() as (_, frames):
         assert await told(frames) == []

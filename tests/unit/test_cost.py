@@ -52,7 +52,7 @@ async def test_every_exchange_takes_on_the_line_what_its_price_says(baud):
     line_timing = timing(baud, prices.node_baud)
     unaddressed = Node(0, PROFILES["pic-servo-v4"])
     await taken_s(line, receiver, commands.set_address(unaddressed, 1, 0xFF))
-    line.write(commands.set_baud(commands.Group(0xFF), baud).request)
+    line.write(commands.set_baud(commands.LeaderlessGroup(0xFF), baud).request)
     await asyncio.sleep(0.05)
     line.set_baud(baud)
 
@@ -121,7 +121,7 @@ def test_adapter_and_host_add_to_every_exchange_and_the_adapter_only_to_replies(
     prices = price_list("ls-182ap", 115_200)
 
     read = cost_of(prices.reading(frozenset()), slow)
-    silent = cost_of(commands.hard_reset(commands.Group(0xFF)), slow)
+    silent = cost_of(commands.hard_reset(commands.LeaderlessGroup(0xFF)), slow)
 
     assert read.overhead_s == pytest.approx(0.0011)
     assert silent.overhead_s == pytest.approx(0.0001)

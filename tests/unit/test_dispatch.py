@@ -61,7 +61,7 @@ from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.dispatch import PENDING_REQUESTS, Dispatcher, Requests
 from ldcnd.daemon.leases import Authority
 from ldcnd.daemon.ledger import EventLog, Ledger
-from ldcnd.daemon.rig import Rig
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.driver import Fault, StopMode
 from ldcnd.net.hand_over import Query
 from tests.support.axis_bench import KEYS, RUNNING, STANDING, AxisBench, axis_bench, raising
@@ -90,7 +90,7 @@ class Commanded:
     def __init__(self, x: AxisBench, y: AxisBench, group: asyncio.TaskGroup, *, required: bool) -> None:
         self.x, self.y = x, y
         self.wire: list[bytes] = []
-        self.rig = Rig("bench", (Line((x.axis, y.axis), self.wire),), {"both": ("x", "y")})
+        self.rig = OwnedRig("bench", (Line((x.axis, y.axis), self.wire),), {"both": ("x", "y")})
         self.authority = Authority(["x", "y"], required=required)
         clock = Clock(lambda: round(asyncio.get_running_loop().time() * 1e9))
         events = EventLog(x._publisher, clock, INSTANCE)

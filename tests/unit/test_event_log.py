@@ -10,7 +10,7 @@ from ldcnd.contract.codec import to_json
 from ldcnd.contract.commands import Power
 from ldcnd.contract.errors import BusDown, SessionError
 from ldcnd.contract.events import CommandStatus, ReadEvents
-from ldcnd.daemon.ledger import PAGE_BYTES, PUBLISHED_AFTER_S, UNPUBLISHED_EVENTS, Entry, EventLog
+from ldcnd.daemon.ledger import PAGE_BYTES, PUBLISHED_AFTER_S, UNPUBLISHED_EVENTS, EventLog, LedgerEntry
 from ldcnd.net.publisher import Publisher
 
 
@@ -25,7 +25,7 @@ class Told:
     def happens(
         self, status: CommandStatus = CommandStatus.ACCEPTED, error: BusDown | None = None, client: str | None = None
     ) -> None:
-        entry = Entry("c1", "x", Power(on=False), client=client, status=status)
+        entry = LedgerEntry("c1", "x", Power(on=False), client=client, status=status)
         self.log.changed(entry, error)
 
     def published(self) -> list[tuple[int, int, int, str, str | None]]:

@@ -7,13 +7,13 @@ import pytest
 from ldcnd.contract.errors import BadReply, NotSupported, ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn import commands
-from ldcnd.drives.ldcn.commands import Group, Node
+from ldcnd.drives.ldcn.commands import LeaderlessGroup, Node
 from ldcnd.drives.ldcn.controls import HomingControl, IoOption, LimitPins, StopControl
-from ldcnd.drives.ldcn.packet import Status, StatusFlag, StatusItem
+from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.line.exchange import Effect, ReplyVerdict
+from ldcnd.line.exchange import PacketEffect, ReplyVerdict
 
 LS_182AP = PROFILES["ls-182ap"]
 V1, V2, V3, V4 = (PROFILES[f"pic-servo-v{version}"] for version in (1, 2, 3, 4))
@@ -43,7 +43,7 @@ def test_a_status_command_is_answered_with_the_items_it_carries():
         commands.define_status(node, StatusItem.POSITION),
     ):
         assert exchange.reply_bytes == 6
-        assert exchange.decode(bytes.fromhex("09 00 28 00 00 31")) == Status(StatusFlag(9), position=0x2800)
+        assert exchange.decode(bytes.fromhex("09 00 28 00 00 31")) == StatusPacket(StatusFlag(9), position=0x2800)
 
 
 def test_the_reply_is_checked_and_decoded_as_a_status_packet():
@@ -55,7 +55,7 @@ def test_the_reply_is_checked_and_decoded_as_a_status_packet():
 
 
 def test_a_group_without_a_leader_stays_silent_for_a_servo_cycle():
-    exchange = commands.start_motion(Group(0xFF))
+    exchange = commands.start_motion(LeaderlessGroup(0xFF))
 
     assert exchange.request == bytes.fromhex("aa ff 05 04")
     assert (exchange.reply_bytes, exchange.response_s, exchange.node) == (0, commands.group_quiet_s(), 0xFF)
@@ -71,13 +71,13 @@ def test_a_group_with_a_leader_answers_in_the_leaders_layout():
 
 def test_hard_reset_is_never_answered():
     assert commands.hard_reset(NODE).reply_bytes == 0
-    assert commands.hard_reset(Group(0xFF)).request == bytes.fromhex("aa ff 0f 0e")
+    assert commands.hard_reset(LeaderlessGroup(0xFF)).request == bytes.fromhex("aa ff 0f 0e")
 
 
 @pytest.mark.parametrize("address", [0x7F, 0x100])
 def test_a_group_has_bit_7_in_its_address(address):
     with pytest.raises(ValueOutOfRange):
-        Group(address)
+        LeaderlessGroup(address)
 
 
 @pytest.mark.parametrize("address", [-1, 0x100])
@@ -89,19 +89,19 @@ def test_a_node_address_is_a_byte(address):
 # -- what may be sent again ------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("to", [NODE, Group(0x81, LS_182AP)])
+@pytest.mark.parametrize("to", [NODE, LeaderlessGroup(0x81, LS_182AP)])
 def test_a_packet_says_what_it_does(to):
     standing = Trajectory(velocity=0, acceleration=1, mode=ProfileMode.VELOCITY)
     amplifier = StopControl.AMP_ENABLE
     told = {
-        Effect.READS: (commands.read_status(to, StatusItem.AUX), commands.no_operation(to)),
-        Effect.RELIEVES: (
+        PacketEffect.READS: (commands.read_status(to, StatusItem.AUX), commands.no_operation(to)),
+        PacketEffect.RELIEVES: (
             commands.stop_motor(to, StopControl.MOTOR_OFF),
             commands.stop_motor(to, amplifier | StopControl.SMOOTH),
             commands.stop_motor(to, amplifier | StopControl.ABRUPT),
         ),
-        Effect.ARRANGES: (commands.hard_reset(to), commands.set_address(to, 1, 0x81)),
-        Effect.CHANGES: (
+        PacketEffect.ARRANGES: (commands.hard_reset(to), commands.set_address(to, 1, 0x81)),
+        PacketEffect.CHANGES: (
             commands.start_motion(to),
             commands.load_trajectory(to, standing),
             commands.set_gain(to, GAINS),
@@ -129,7 +129,7 @@ def test_what_could_act_twice_is_never_repeated():
         commands.load_trajectory(NODE, Trajectory(position=5, start_now=True)),
         commands.start_motion(NODE),
         commands.save_home(NODE),
-        commands.set_baud(Group(0xFF), 115_200),
+        commands.set_baud(LeaderlessGroup(0xFF), 115_200),
         commands.hard_reset(NODE),
         commands.reset_position_relative_to_home(Node(1, SC)),
         commands.set_position(Node(1, SC), 7),
@@ -222,9 +222,9 @@ def test_a_trapezoid_has_no_reverse_bit():
 
 def test_a_group_needs_a_profile_for_what_differs_between_dialects():
     with pytest.raises(NotSupported):
-        commands.load_trajectory(Group(0xFF), Trajectory(position=1))
+        commands.load_trajectory(LeaderlessGroup(0xFF), Trajectory(position=1))
 
-    assert commands.load_trajectory(Group(0xFF, V4), Trajectory(position=1)).reply_bytes == 0
+    assert commands.load_trajectory(LeaderlessGroup(0xFF, V4), Trajectory(position=1)).reply_bytes == 0
 
 
 # -- gains -----------------------------------------------------------------------------------------------------------
@@ -324,7 +324,7 @@ def test_version_1_cannot_stop_here_and_others_have_no_lock():
 
 
 def test_everybody_can_be_stopped_at_once_whatever_they_are():
-    assert commands.stop_motor(Group(0xFF), StopControl.SMOOTH).request == bytes.fromhex("aa ff 17 08 1e")
+    assert commands.stop_motor(LeaderlessGroup(0xFF), StopControl.SMOOTH).request == bytes.fromhex("aa ff 17 08 1e")
 
 
 def test_homing_combines_sources_and_one_stop():
@@ -401,21 +401,21 @@ def test_a_module_that_is_only_identified_is_never_moved():
 
 @pytest.mark.parametrize(("baud", "code"), [(9600, 0x81), (19_200, 0x3F), (57_600, 0x14), (115_200, 0x0A)])
 def test_the_baud_codes_of_the_manuals(baud, code):
-    exchange = commands.set_baud(Group(0xFF), baud)
+    exchange = commands.set_baud(LeaderlessGroup(0xFF), baud)
 
     assert exchange.request[3] == code
     assert actual_baud(code) == pytest.approx(baud, rel=0.034)
 
 
 def test_the_slower_code_for_57600_is_selectable():
-    assert commands.set_baud(Group(0xFF), 57_600, BaudCodes.ALTERNATE).request[3] == 21
+    assert commands.set_baud(LeaderlessGroup(0xFF), 57_600, BaudCodes.ALTERNATE).request[3] == 21
     assert actual_baud(20) / 57_600 == pytest.approx(1.033, abs=0.001)
     assert actual_baud(21) / 57_600 == pytest.approx(0.986, abs=0.001)
 
 
 def test_only_sc_reaches_230400():
-    assert commands.set_baud(Group(0xFF, SC), 230_400).request[3] == 5
-    for group in (Group(0xFF), Group(0xFF, V4)):
+    assert commands.set_baud(LeaderlessGroup(0xFF, SC), 230_400).request[3] == 5
+    for group in (LeaderlessGroup(0xFF), LeaderlessGroup(0xFF, V4)):
         with pytest.raises(ValueOutOfRange) as refusal:
             commands.set_baud(group, 230_400)
         assert refusal.value.nearest == 125_000

@@ -2,8 +2,8 @@
 
 import pytest
 
-from ldcnd.drives.ldcn.faults import WARNINGS, Fault, FaultCode, Knowledge, diagnose
-from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag
+from ldcnd.drives.ldcn.faults import WARNINGS, FaultCode, Knowledge, LdcnFault, diagnose
+from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import PROFILES
 
 LS_182AP = PROFILES["ls-182ap"]
@@ -20,7 +20,7 @@ def logosol(row, *, adc=None):
         | StatusFlag.POSITION_ERROR * pos_error
         | StatusFlag.POWER_ON * power_on
     )
-    return Status(StatusFlag(flags), adc=adc, aux=AuxFlag(AuxFlag.SERVO_ON * servo_on | AuxFlag.INDEX * index))
+    return StatusPacket(StatusFlag(flags), adc=adc, aux=AuxFlag(AuxFlag.SERVO_ON * servo_on | AuxFlag.INDEX * index))
 
 
 def found(profile, status, *, pic_ae, absolute_mode=False, **known):
@@ -52,7 +52,7 @@ def test_switched_on_the_limit_bits_are_limit_switches(row):
     ],
 )
 def test_switched_off_the_bits_say_what_is_wrong_at_present(row, codes):
-    assert found(LS_182AP, logosol(row), pic_ae=False) == tuple(Fault(code, latched=False) for code in codes)
+    assert found(LS_182AP, logosol(row), pic_ae=False) == tuple(LdcnFault(code, latched=False) for code in codes)
 
 
 @pytest.mark.parametrize(
@@ -69,13 +69,13 @@ def test_switched_off_the_bits_say_what_is_wrong_at_present(row, codes):
 )
 def test_switched_on_the_bits_say_what_switched_the_driver_off(row, code):
     loses = code is FaultCode.ENCODER_OR_HALL
-    assert found(LS_182AP, logosol(row), pic_ae=True) == (Fault(code, latched=True, loses_position=loses),)
+    assert found(LS_182AP, logosol(row), pic_ae=True) == (LdcnFault(code, latched=True, loses_position=loses),)
 
 
 @pytest.mark.parametrize("row", ["1 1 1 0 0 1", "0 0 1 0 0 1", "1 0 1 0 0 0"])
 @pytest.mark.parametrize("pic_ae", [False, None])
 def test_what_bit_3_stands_for_is_not_readable_while_a_cause_may_be_latched(row, pic_ae):
-    fault = Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=True)
+    fault = LdcnFault(FaultCode.LATCHED_FAULT, latched=True, loses_position=True)
 
     assert found(LS_182AP, logosol(row), pic_ae=pic_ae, nothing_latched=False) == (fault,)
 
@@ -83,13 +83,13 @@ def test_what_bit_3_stands_for_is_not_readable_while_a_cause_may_be_latched(row,
 @pytest.mark.parametrize("row", ["1 1 1 0 0 1", "0 0 1 0 0 1"])
 @pytest.mark.parametrize("pic_ae", [False, None])
 def test_a_cause_that_was_seen_keeps_its_name_while_bit_3_is_clear(row, pic_ae):
-    cause = Fault(FaultCode.OVERCURRENT, latched=True)
+    cause = LdcnFault(FaultCode.OVERCURRENT, latched=True)
 
     assert found(LS_182AP, logosol(row), pic_ae=pic_ae, nothing_latched=False, latched=cause) == (cause,)
 
 
 def test_a_cause_of_the_power_driver_is_gone_once_bit_3_is_set_again():
-    cause = Fault(FaultCode.OVERCURRENT, latched=True)
+    cause = LdcnFault(FaultCode.OVERCURRENT, latched=True)
 
     assert found(LS_182AP, logosol("1 1 1 1 0 1"), pic_ae=False, latched=cause) == ()
 
@@ -117,8 +117,10 @@ def test_an_analog_move_that_may_have_been_under_way_leaves_the_cause_open():
 def test_a_lost_sensor_is_reported_in_absolute_positioning_mode_only(adc):
     status = logosol("1 1 1 1 0 1", adc=adc)
 
-    assert found(LS_182AP, status, pic_ae=True, absolute_mode=True) == (Fault(FaultCode.SENSOR_FAULT, latched=True),)
-    assert found(LS_182AP, status, pic_ae=True) == (Fault(FaultCode.POSITION_ERROR, latched=True),)
+    assert found(LS_182AP, status, pic_ae=True, absolute_mode=True) == (
+        LdcnFault(FaultCode.SENSOR_FAULT, latched=True),
+    )
+    assert found(LS_182AP, status, pic_ae=True) == (LdcnFault(FaultCode.POSITION_ERROR, latched=True),)
 
 
 @pytest.mark.parametrize("adc", [None, 8, 500, 1015])
@@ -142,56 +144,56 @@ def test_an_old_position_error_in_a_closed_loop_is_no_fault():
 
 
 def test_without_the_auxiliary_byte_a_stop_input_and_a_lost_encoder_look_alike():
-    status = Status(StatusFlag.LIMIT2 | StatusFlag.POSITION_ERROR)
+    status = StatusPacket(StatusFlag.LIMIT2 | StatusFlag.POSITION_ERROR)
 
-    fault = Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=True)
+    fault = LdcnFault(FaultCode.LATCHED_FAULT, latched=True, loses_position=True)
     assert found(LS_182AP, status, pic_ae=True) == (fault,)
 
 
 def test_pic_servo_at_rest_with_everything_off_is_healthy():
-    status = Status(StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
+    status = StatusPacket(StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
 
     assert found(V4, status, pic_ae=False) == ()
 
 
 def test_pic_servo_tells_a_position_error_from_lost_power():
-    tripped = Status(StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
-    unpowered = Status(StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
+    tripped = StatusPacket(StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
+    unpowered = StatusPacket(StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
 
-    assert found(V4, tripped, pic_ae=True) == (Fault(FaultCode.POSITION_ERROR, latched=True),)
-    assert found(V4, unpowered, pic_ae=True) == (Fault(FaultCode.POWER_LOST, latched=True),)
-    assert found(V4, unpowered, pic_ae=False) == (Fault(FaultCode.POWER_LOST, latched=False),)
+    assert found(V4, tripped, pic_ae=True) == (LdcnFault(FaultCode.POSITION_ERROR, latched=True),)
+    assert found(V4, unpowered, pic_ae=True) == (LdcnFault(FaultCode.POWER_LOST, latched=True),)
+    assert found(V4, unpowered, pic_ae=False) == (LdcnFault(FaultCode.POWER_LOST, latched=False),)
 
 
 def test_missing_motor_power_stops_nothing_while_the_loop_is_open():
-    assert not Fault(FaultCode.POWER_LOST, latched=False).stops
-    assert Fault(FaultCode.POWER_LOST, latched=True).stops
+    assert not LdcnFault(FaultCode.POWER_LOST, latched=False).stops
+    assert LdcnFault(FaultCode.POWER_LOST, latched=True).stops
 
 
 def test_pic_servo_that_tripped_out_of_sight_does_not_say_why():
-    tripped = Status(StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
+    tripped = StatusPacket(StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag(0))
 
-    assert found(V4, tripped, pic_ae=True, seen=False) == (Fault(FaultCode.LATCHED_FAULT, latched=True),)
+    assert found(V4, tripped, pic_ae=True, seen=False) == (LdcnFault(FaultCode.LATCHED_FAULT, latched=True),)
 
 
 def test_pic_servo_limit_switches_are_no_faults():
-    status = Status(StatusFlag.POWER_ON, aux=AuxFlag.SERVO_ON)
+    status = StatusPacket(StatusFlag.POWER_ON, aux=AuxFlag.SERVO_ON)
 
     assert found(V4, status, pic_ae=True) == ()
 
 
 def test_current_limiting_is_known_on_pic_servo_only():
     flags = StatusFlag.POWER_ON | StatusFlag.OVERCURRENT | StatusFlag.LIMIT1 | StatusFlag.LIMIT2
-    status = Status(flags, aux=AuxFlag.SERVO_ON)
+    status = StatusPacket(flags, aux=AuxFlag.SERVO_ON)
 
-    assert found(V4, status, pic_ae=True) == (Fault(FaultCode.CURRENT_LIMIT, latched=True),)
+    assert found(V4, status, pic_ae=True) == (LdcnFault(FaultCode.CURRENT_LIMIT, latched=True),)
     assert found(LS_182AP, status, pic_ae=True) == ()
 
 
 @pytest.mark.parametrize("profile", [LS_182AP, V4])
 def test_warnings_come_from_the_auxiliary_byte(profile):
     aux = AuxFlag.SERVO_ON | AuxFlag.POSITION_WRAP | AuxFlag.SERVO_OVERRUN
-    status = Status(StatusFlag.POWER_ON | StatusFlag.LIMIT1 | StatusFlag.LIMIT2, aux=aux)
+    status = StatusPacket(StatusFlag.POWER_ON | StatusFlag.LIMIT1 | StatusFlag.LIMIT2, aux=aux)
 
     codes = [fault.code for fault in found(profile, status, pic_ae=True)]
 

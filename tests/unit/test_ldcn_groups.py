@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import pytest
 
 from ldcnd.contract.errors import DriveFault, NotSupported, OutcomeUnknown, ReplyTimeout, StopLatched, WrongState
-from ldcnd.drives.driver import AxisSpec, Gains, Motion, StopMode
+from ldcnd.drives.driver import AxisSpec, CountsMotion, Gains, StopMode
 from ldcnd.drives.ldcn.addressing import EVERYBODY, GroupPlan
-from ldcnd.drives.ldcn.commands import Group, save_home
+from ldcnd.drives.ldcn.commands import LeaderlessGroup, save_home
 from ldcnd.drives.ldcn.groups import Groups
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.drives.network import GroupSpec
@@ -19,7 +19,7 @@ from tests.support.simulated_host import SimulatedHost
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1, deadband=0)
 GROUP = 0x81
-THERE = Motion(20_000, 20_000.0, 100_000.0)
+THERE = CountsMotion(20_000, 20_000.0, 100_000.0)
 MOTIONS = {"a": THERE, "b": THERE}
 
 
@@ -34,7 +34,7 @@ class Addressing:
 
     async def regroup(self, address: int) -> bool:
         self.regrouped.append(address)
-        self.host.send(address, Command.SET_ADDRESS, address, GROUP)
+        self.host.send(address, CommandCode.SET_ADDRESS, address, GROUP)
         return self.succeeds
 
 
@@ -87,7 +87,7 @@ async def test_a_group_starts_by_one_packet():
 
     await pair.groups.start(MOTIONS, wanted)
 
-    assert pair.bus.commands().count(Command.START_MOTION) == 1
+    assert pair.bus.commands().count(CommandCode.START_MOTION) == 1
     assert pair.run_on() == [True, True]
 
 
@@ -100,7 +100,7 @@ async def test_members_that_have_started_are_stopped_when_another_has_not():
 
     pair.host.wait(0.5)
     assert pair.run_on() == [False, False]
-    assert pair.bus.commands().count(Command.START_MOTION) == 1
+    assert pair.bus.commands().count(CommandCode.START_MOTION) == 1
 
 
 @pytest.mark.parametrize("error", [ReplyTimeout("no reply"), StopLatched("a stop came")])
@@ -111,9 +111,9 @@ async def test_a_group_whose_start_cannot_be_proven_is_stopped_whole(error):
         def fail() -> None:
             raise error
 
-        pair.bus.instead[Command.READ_STATUS] = fail
+        pair.bus.instead[CommandCode.READ_STATUS] = fail
 
-    pair.bus.after[Command.START_MOTION] = meanwhile
+    pair.bus.after[CommandCode.START_MOTION] = meanwhile
     with pytest.raises(OutcomeUnknown, match="all were commanded to stop"):
         await pair.groups.start(MOTIONS, wanted)
 
@@ -128,14 +128,14 @@ async def test_each_member_is_stopped_by_itself_when_the_packet_for_all_fails_or
 
     def fail() -> None:
         if error := next(failures, None):
-            pair.bus.instead[Command.STOP_MOTOR] = fail
+            pair.bus.instead[CommandCode.STOP_MOTOR] = fail
             raise error
 
-    pair.bus.instead[Command.STOP_MOTOR] = fail
+    pair.bus.instead[CommandCode.STOP_MOTOR] = fail
     with pytest.raises(OutcomeUnknown):
         await pair.groups.start(MOTIONS, wanted)
 
-    stops = [packet.address for packet in pair.bus.packets if packet.command is Command.STOP_MOTOR]
+    stops = [packet.address for packet in pair.bus.packets if packet.command is CommandCode.STOP_MOTOR]
     assert stops == [GROUP, 1, 2]
 
 
@@ -148,7 +148,7 @@ async def test_a_stop_between_load_and_start_keeps_all_at_rest():
     with pytest.raises(StopLatched):
         await pair.groups.start(MOTIONS, overtaken)
 
-    assert Command.START_MOTION not in pair.bus.commands()
+    assert CommandCode.START_MOTION not in pair.bus.commands()
 
 
 async def test_a_group_whose_members_are_not_proven_gets_no_packet_and_is_proven_before_it_starts():
@@ -220,12 +220,12 @@ async def test_a_member_with_an_open_loop_or_in_motion_keeps_all_at_rest():
     with pytest.raises(WrongState, match="moves already"):
         await pair.groups.start(MOTIONS, wanted)
 
-    assert pair.bus.commands().count(Command.START_MOTION) == 1
+    assert pair.bus.commands().count(CommandCode.START_MOTION) == 1
 
 
 async def test_members_that_are_there_already_have_started():
     pair = await Pair().up()
-    here = Motion(0, 20_000.0, 100_000.0)
+    here = CountsMotion(0, 20_000.0, 100_000.0)
 
     await pair.groups.start({"a": here, "b": THERE}, wanted)
 
@@ -244,7 +244,7 @@ async def test_a_snapshot_of_a_line_with_other_modules_names_the_group_and_never
     with pytest.raises(ReplyTimeout, match="enough"):
         await pair.groups.snapshot(lambda: None)
 
-    assert sent == [save_home(Group(GROUP)).request]
+    assert sent == [save_home(LeaderlessGroup(GROUP)).request]
 
 
 async def test_a_path_that_is_refused_when_its_turn_on_the_line_comes_is_no_unknown_outcome():

@@ -7,11 +7,11 @@ import pytest
 
 from ldcnd.contract.commands import HomeMethod
 from ldcnd.contract.errors import NetworkMismatch, NotSupported, ReplyTimeout, StopLatched
-from ldcnd.drives.driver import HomeCapture, Motion, StopMode
+from ldcnd.drives.driver import CountsMotion, HomeCapture, StopMode
 from ldcnd.drives.ldcn.addressing import Expected, Identity, differences
 from ldcnd.drives.ldcn.adoption import Found
 from ldcnd.drives.ldcn.commands import Node, read_status
-from ldcnd.drives.ldcn.packet import Command, StatusItem
+from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drives.ldcn.registers import actual_baud
 from ldcnd.drives.network import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
@@ -67,7 +67,7 @@ async def test_both_families_of_divisors_reach_the_working_rate(baud, alternate,
     chain = chain_of("ls182ap", "picservo-v4")
     async with bare_network(chain, PAIR, baud, LineSpec(alternate_divisors=alternate)) as line:
         report = await line.network.bring_up()
-        codes = [packet.data for packet in line.sent() if packet.command is Command.SET_BAUD_RATE]
+        codes = [packet.data for packet in line.sent() if packet.command is CommandCode.SET_BAUD_RATE]
 
     assert (report.baud, report.reset) == (baud, True)
     assert codes[-1] == bytes([code])  # those before call stray modules to the rate of a reset
@@ -102,18 +102,18 @@ async def test_a_drive_whose_clock_is_fast_follows_57600_with_the_divisor_that_m
         report = await line.network.bring_up()
         packets = [(packet.address, packet.command, packet.data) for packet in line.sent()]
 
-    changes = [data for _, command, data in packets if command is Command.SET_BAUD_RATE]
-    last = max(at for at, packet in enumerate(packets) if packet[1] is Command.SET_BAUD_RATE)
+    changes = [data for _, command, data in packets if command is CommandCode.SET_BAUD_RATE]
+    last = max(at for at, packet in enumerate(packets) if packet[1] is CommandCode.SET_BAUD_RATE)
     after = {command for _, command, _ in packets[last + 1 :]}
     if alternate:  # 56,818 of a clock that is 2 % fast
         assert (report.baud, report.remarks) == (57_600, ())
         assert changes[-1] == b"\x15"
-        assert after == {Command.READ_STATUS}
+        assert after == {CommandCode.READ_STATUS}
     else:  # 59,524 of it are 60,739
         assert (report.baud, len(report.remarks)) == (19_200, 1)
         assert "address 2 does not answer at 57600 baud; the line stays at 19200" in report.remarks[0]
         assert changes.count(b"\x14") >= 2  # it may have been noise the first time
-        assert {Command.HARD_RESET, Command.SET_ADDRESS} <= after
+        assert {CommandCode.HARD_RESET, CommandCode.SET_ADDRESS} <= after
         assert [module.address for module in chain.modules] == [1, 2]
 
 
@@ -184,7 +184,7 @@ async def test_an_unknown_device_is_enumerated_and_never_moved():
         before = len(line.sent())
 
         with pytest.raises(NotSupported):
-            await line.network.start_group({"a1": Motion(100, 100.0, 100.0)}, lambda: None)
+            await line.network.start_group({"a1": CountsMotion(100, 100.0, 100.0)}, lambda: None)
 
         assert line.sent(before) == []
     assert (unknown.address, unknown.model, unknown.device_id, unknown.version) == (2, None, 123, 9)
@@ -205,7 +205,7 @@ async def test_an_adopted_homing_is_disarmed_by_a_stop():
         await line.network.bring_up()
         axis = line.network.axes["a2"]
         await axis.power(on=True)
-        await axis.load(Motion(None, 50.0, 5000.0), home=HomeCapture(HomeMethod.FORWARD_LIMIT))
+        await axis.load(CountsMotion(None, 50.0, 5000.0), home=HomeCapture(HomeMethod.FORWARD_LIMIT))
         await axis.start()
     async with bare_network(chain, PAIR, line=ADOPT) as line:
         await line.network.bring_up()
@@ -227,7 +227,7 @@ async def test_powering_an_adopted_closed_loop_starts_nothing():
         await line.network.axes["a1"].power(on=True)
         commands = {packet.command for packet in line.sent()}
 
-    assert Command.LOAD_TRAJECTORY not in commands
+    assert CommandCode.LOAD_TRAJECTORY not in commands
     assert chain.modules[0].loop.servo_on
 
 
@@ -263,7 +263,7 @@ async def test_adoption_refuses_drives_at_different_rates():
         with pytest.raises(NetworkMismatch, match="address 1 is at 19200 baud; address 2 is at 115200 baud"):
             await line.network.bring_up()
 
-        assert {packet.command for packet in line.sent()} <= {Command.READ_STATUS, Command.NO_OPERATION}
+        assert {packet.command for packet in line.sent()} <= {CommandCode.READ_STATUS, CommandCode.NO_OPERATION}
 
 
 @pytest.mark.parametrize("codes", [(0x14, 0x81), (0x0A, 0x81), (0x14, 0x3F), (0x3F, 0x0A)])
@@ -278,7 +278,7 @@ async def test_drives_at_rates_of_their_own_are_brought_together_where_more_than
 
         assert (report.baud, report.reset, len(report.remarks)) == (115_200, False, 1)
         assert [module.baud for module in chain.modules] == pytest.approx([actual_baud(0x0A)] * 2, rel=1e-4)
-        assert Command.HARD_RESET not in {packet.command for packet in line.sent()}
+        assert CommandCode.HARD_RESET not in {packet.command for packet in line.sent()}
 
 
 async def test_a_module_of_unknown_kind_may_move_for_all_that_is_known():
@@ -296,14 +296,14 @@ async def test_a_drive_that_may_move_keeps_the_fallback_from_resetting():
         await line.network.bring_up()
         axis = line.network.axes["a1"]
         await axis.power(on=True)
-        await axis.load(Motion(None, 5000.0, 50_000.0))
+        await axis.load(CountsMotion(None, 5000.0, 50_000.0))
         await axis.start()
     chain.modules[1].power(on=False, at_s=asyncio.get_running_loop().time())
     async with bare_network(chain, PAIR, line=ADOPT_OR_RESET) as line:
         with pytest.raises(NetworkMismatch, match=r"not reset either: address 1, .* moves"):
             await line.network.bring_up()
 
-        assert Command.HARD_RESET not in {packet.command for packet in line.sent()}
+        assert CommandCode.HARD_RESET not in {packet.command for packet in line.sent()}
 
 
 async def test_a_port_that_cannot_change_its_rate_takes_over_what_is_at_that_rate():
@@ -416,7 +416,7 @@ async def test_a_line_is_not_taken_down_again_and_again_for_a_drive_that_stays_d
         for _ in range(8):
             assert await line.network.rejoin(lambda _: None) == set()
 
-        assert Command.SET_BAUD_RATE not in {packet.command for packet in line.sent(seen)}
+        assert CommandCode.SET_BAUD_RATE not in {packet.command for packet in line.sent(seen)}
 
 
 @pytest.mark.parametrize(("baud", "hears"), [(19_200, True), (57_600, False)])
@@ -484,7 +484,7 @@ class MumblesOnce(SimulatedDrive):
 
     def _obey(self, packet, at_s):
         reply = super()._obey(packet, at_s)
-        if packet.command is Command.READ_STATUS and self.address == 0 and not self._mumbled:
+        if packet.command is CommandCode.READ_STATUS and self.address == 0 and not self._mumbled:
             self._mumbled = True
             return None
         return reply

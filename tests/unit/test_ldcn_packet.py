@@ -3,7 +3,7 @@
 import pytest
 
 from ldcnd.contract.errors import BadReply, ValueOutOfRange
-from ldcnd.drives.ldcn.packet import Command, Packet, PacketReader, ReceivedPacket, decode_packet, encode_packet
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, PacketReader, ReceivedPacket, decode_packet, encode_packet
 
 READ_POSITION = bytes.fromhex("aa 01 13 01 15")
 
@@ -13,29 +13,29 @@ def feed(reader, data):
 
 
 def test_the_checksum_leaves_the_header_out():
-    packet = Packet(1, Command.READ_STATUS, b"\x01")
+    packet = Packet(1, CommandCode.READ_STATUS, b"\x01")
 
     assert encode_packet(packet) == READ_POSITION
     assert decode_packet(READ_POSITION) == packet
 
 
 def test_the_checksum_is_a_byte():
-    assert encode_packet(Packet(0xFF, Command.HARD_RESET)) == bytes.fromhex("aa ff 0f 0e")
+    assert encode_packet(Packet(0xFF, CommandCode.HARD_RESET)) == bytes.fromhex("aa ff 0f 0e")
 
 
 @pytest.mark.parametrize(("address", "limit"), [(-1, 0), (256, 255)])
 def test_an_address_that_is_no_byte_is_refused(address, limit):
     with pytest.raises(ValueOutOfRange) as refusal:
-        encode_packet(Packet(address, Command.NO_OPERATION))
+        encode_packet(Packet(address, CommandCode.NO_OPERATION))
 
     assert (refusal.value.value, refusal.value.limit) == (address, limit)
 
 
 def test_the_count_nibble_limits_the_data():
-    encode_packet(Packet(1, Command.LOAD_TRAJECTORY, bytes(15)))
+    encode_packet(Packet(1, CommandCode.LOAD_TRAJECTORY, bytes(15)))
 
     with pytest.raises(ValueOutOfRange) as refusal:
-        encode_packet(Packet(1, Command.LOAD_TRAJECTORY, bytes(16)))
+        encode_packet(Packet(1, CommandCode.LOAD_TRAJECTORY, bytes(16)))
 
     assert (refusal.value.value, refusal.value.limit) == (16, 15)
 
@@ -62,8 +62,8 @@ def test_a_module_finds_packets_between_nulls_and_noise():
     received = feed(PacketReader(), stream)
 
     assert received == [
-        ReceivedPacket(Packet(1, Command.READ_STATUS, b"\x01"), checksum_ok=True),
-        ReceivedPacket(Packet(1, Command.RESET_POSITION), checksum_ok=True),
+        ReceivedPacket(Packet(1, CommandCode.READ_STATUS, b"\x01"), checksum_ok=True),
+        ReceivedPacket(Packet(1, CommandCode.RESET_POSITION), checksum_ok=True),
     ]
 
 
@@ -76,7 +76,7 @@ def test_a_module_hears_of_a_wrong_checksum_and_stays_in_step():
 
 
 def test_header_bytes_inside_a_packet_are_data():
-    packet = Packet(0xAA, Command.LOAD_TRAJECTORY, b"\xaa" * 5)
+    packet = Packet(0xAA, CommandCode.LOAD_TRAJECTORY, b"\xaa" * 5)
 
     received = feed(PacketReader(), encode_packet(packet))
 
@@ -105,4 +105,4 @@ def test_a_reader_can_be_told_to_forget():
 
 
 def test_every_nibble_is_a_command():
-    assert [Command(value) for value in range(16)] == list(Command)
+    assert [CommandCode(value) for value in range(16)] == list(CommandCode)

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.drives.ldcn.faults import FaultCode
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag, StatusItem
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag, StatusItem
 from ldcnd.drives.ldcn.profiles import PROFILES, Support
 
 PAGE = (Path(__file__).parents[2] / "docs" / "reference" / "ldcn-nmc.md").read_text(encoding="utf-8")
@@ -17,7 +17,7 @@ def bit_of(flag: int) -> str:
 
 
 EXPECTED = {
-    "commands": [f"| {command.name} | {command.value:X} |" for command in Command],
+    "commands": [f"| {command.name} | {command.value:X} |" for command in CommandCode],
     "items and flags": [f"| {flag.name} | {bit_of(flag)} |" for flag in [*StatusItem, *StatusFlag, *AuxFlag]],
     "faults": [f"| {code.value} |" for code in FaultCode],
     "dialects": [f"| `{profile.name}` |" for profile in PROFILES.values() if profile.support is Support.FULL],

@@ -7,21 +7,21 @@ import pytest
 
 from ldcnd.contract.commands import HomeMethod, PinMode
 from ldcnd.contract.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
-from ldcnd.drives.driver import AnalogMotion, AxisSpec, Gains, HomeCapture, Motion, PwmOutput, StopMode
+from ldcnd.drives.driver import AnalogMotion, AxisSpec, CountsMotion, Gains, HomeCapture, PwmOutput, StopMode
 from ldcnd.drives.ldcn.controls import HomingControl, LimitPins
-from ldcnd.drives.ldcn.packet import Command, StatusItem
+from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_V4
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.line.queue import Lane
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.plant import MotorPlant
 from tests.support.direct_bus import DirectBus, packet_of
 from tests.support.simulated_axis import SimulatedAxis
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1, deadband=0)
-THERE = Motion(20_000, 20_000.0, 100_000.0)
-JOG = Motion(None, 5000.0, 100_000.0)
+THERE = CountsMotion(20_000, 20_000.0, 100_000.0)
+JOG = CountsMotion(None, 5000.0, 100_000.0)
 SWITCHES = MotorPlant(reverse_limit_counts=-20_000, forward_limit_counts=20_000)
 
 
@@ -61,7 +61,7 @@ def ignored(bus: DirectBus) -> None:
         execute, drive = bus.host.drive.execute, bus.host.drive
         drive.execute = lambda _command: setattr(drive, "execute", execute)
 
-    bus.instead[Command.START_MOTION] = hold_back
+    bus.instead[CommandCode.START_MOTION] = hold_back
 
 
 def rejected(bus: DirectBus, *, executed: bool) -> None:
@@ -69,10 +69,10 @@ def rejected(bus: DirectBus, *, executed: bool) -> None:
 
     def reject() -> None:
         if executed:
-            bus.host.send(1, Command.START_MOTION)
+            bus.host.send(1, CommandCode.START_MOTION)
         raise PacketRejected("damaged")
 
-    bus.instead[Command.START_MOTION] = reject
+    bus.instead[CommandCode.START_MOTION] = reject
 
 
 # -- starting ----------------------------------------------------------------------------------------------------------
@@ -97,7 +97,7 @@ async def test_a_start_is_sent_once_and_a_running_profile_needs_no_second_look()
 
     await drive.axis.start()
 
-    assert drive.bus.commands(before) == [Command.START_MOTION]
+    assert drive.bus.commands(before) == [CommandCode.START_MOTION]
     assert await drive.runs()
 
 
@@ -149,13 +149,13 @@ async def test_a_start_that_was_received_damaged_is_reported_and_not_sent_again(
     with pytest.raises(PacketRejected):
         await drive.axis.start()
 
-    assert drive.bus.commands(before).count(Command.START_MOTION) == 1
+    assert drive.bus.commands(before).count(CommandCode.START_MOTION) == 1
     assert not await drive.runs()
 
 
 async def test_a_jog_too_slow_for_the_status_counts_as_started_and_a_duty_as_well():
     drive = await powered()
-    for motion in (Motion(None, 100.0, 100_000.0), PwmOutput(0.1, 100_000.0)):
+    for motion in (CountsMotion(None, 100.0, 100_000.0), PwmOutput(0.1, 100_000.0)):
         await drive.axis.load(motion)
         ignored(drive.bus)
         await drive.axis.start()
@@ -175,7 +175,8 @@ async def test_a_stop_goes_out_in_the_lane_of_stops_and_disarms_a_search(mode):
     await drive.axis.stop(mode)
 
     assert drive.bus.sent[before:] == [
-        (Command.STOP_MOTOR, Lane.STOP), (Command.SET_HOMING_MODE, Lane.STOP), (Command.STOP_MOTOR, Lane.STOP),
+        (CommandCode.STOP_MOTOR, Lane.STOP), (CommandCode.SET_HOMING_MODE, Lane.STOP),
+        (CommandCode.STOP_MOTOR, Lane.STOP),
     ]  # fmt: skip
     assert drive.module.loop.search is None
     assert drive.module.loop.servo_on is (mode is not StopMode.OFF)
@@ -188,14 +189,14 @@ async def test_a_stop_that_comes_while_a_search_is_being_armed_disarms_it():
         await drive.axis.stop(StopMode.SMOOTH)
         raise ReplyTimeout("the line was taken for the stop")
 
-    drive.bus.instead[Command.SET_HOMING_MODE] = stopped
+    drive.bus.instead[CommandCode.SET_HOMING_MODE] = stopped
     before = len(drive.bus.sent)
     with pytest.raises(ReplyTimeout):
         await drive.axis.load(JOG, home=HomeCapture(HomeMethod.INDEX))
 
     assert drive.bus.sent[before:] == [
-        (Command.SET_HOMING_MODE, Lane.COMMAND), (Command.STOP_MOTOR, Lane.STOP),
-        (Command.SET_HOMING_MODE, Lane.STOP),
+        (CommandCode.SET_HOMING_MODE, Lane.COMMAND), (CommandCode.STOP_MOTOR, Lane.STOP),
+        (CommandCode.SET_HOMING_MODE, Lane.STOP),
     ]  # fmt: skip
 
 
@@ -208,7 +209,7 @@ async def test_a_motion_that_is_no_search_disarms_the_search_before_it():
     await drive.axis.load(THERE)
 
     assert drive.module.loop.search is None
-    assert drive.bus.commands(before) == [Command.LOAD_TRAJECTORY]  # nothing is armed, so nothing is disarmed
+    assert drive.bus.commands(before) == [CommandCode.LOAD_TRAJECTORY]  # nothing is armed, so nothing is disarmed
 
 
 async def test_homing_on_a_pin_that_is_an_output_is_refused_before_anything_is_armed():
@@ -258,7 +259,7 @@ async def test_no_stop_closes_the_loop_of_a_motor_that_was_switched_off_or_is_be
     async def stop() -> None:
         stopped.append(await drive.axis.stop(mode))
 
-    drive.bus.instead[Command.STOP_MOTOR] = stop  # it is on the line when the other one comes
+    drive.bus.instead[CommandCode.STOP_MOTOR] = stop  # it is on the line when the other one comes
     await drive.axis.stop(StopMode.OFF)
     assert not drive.module.loop.servo_on
     await stop()
@@ -305,7 +306,7 @@ async def test_a_motion_onto_the_switch_that_the_axis_stands_on_is_refused_and_o
 
 async def test_a_loop_that_does_not_close_is_a_fault_with_its_cause():
     drive = Drive()
-    drive.host.suffer(Condition.STOP_INPUT)
+    drive.host.suffer(FaultCondition.STOP_INPUT)
 
     with pytest.raises(DriveFault, match="stop"):
         await drive.axis.power(on=True)
@@ -321,10 +322,10 @@ async def test_a_drive_is_initialised_once_before_its_loop_is_closed():
 
     await drive.axis.power(on=True)
 
-    assert first.count(Command.SET_GAIN) == 1
-    assert first.index(Command.LOAD_TRAJECTORY) < first.index(Command.CLEAR_STICKY_BITS)
-    assert Command.LOAD_TRAJECTORY not in drive.bus.commands(before)
-    assert drive.bus.commands(before).index(Command.SET_GAIN) == 0  # it may have been reset meanwhile
+    assert first.count(CommandCode.SET_GAIN) == 1
+    assert first.index(CommandCode.LOAD_TRAJECTORY) < first.index(CommandCode.CLEAR_STICKY_BITS)
+    assert CommandCode.LOAD_TRAJECTORY not in drive.bus.commands(before)
+    assert drive.bus.commands(before).index(CommandCode.SET_GAIN) == 0  # it may have been reset meanwhile
     assert drive.module.loop.servo_on
 
 
@@ -359,7 +360,7 @@ async def test_outputs_are_set_in_the_drive() -> None:
 
     await drive.axis.set_outputs(PinMode.HIGH, None)
 
-    assert drive.bus.packets[-1].command is Command.IO_CONTROL
+    assert drive.bus.packets[-1].command is CommandCode.IO_CONTROL
     assert drive.bus.packets[-1].data == bytes([LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_INPUT])
 
 
@@ -393,16 +394,16 @@ async def test_a_counter_is_set_back_only_once_what_is_kept_of_it_is_void(allowe
     since = len(drive.bus.packets)
 
     async def void() -> None:
-        assert Command.RESET_POSITION not in drive.bus.commands(since)
+        assert CommandCode.RESET_POSITION not in drive.bus.commands(since)
         if not allowed:
             raise WrongState("the disk cannot forget it")
 
     drive.axis.about_to_renumber = void
-    beyond = Motion(2_300_000_000, 20_000.0, 100_000.0)
+    beyond = CountsMotion(2_300_000_000, 20_000.0, 100_000.0)
     if allowed:
         await drive.axis.load(beyond)
     else:
         with pytest.raises(WrongState, match="cannot forget"):
             await drive.axis.load(beyond)
 
-    assert (Command.RESET_POSITION in drive.bus.commands(since)) is allowed
+    assert (CommandCode.RESET_POSITION in drive.bus.commands(since)) is allowed

@@ -7,9 +7,9 @@ import pytest
 from ldcnd.contract.commands import HomeMethod, PinMode
 from ldcnd.contract.errors import BadReply, NotSupported, ReplyTimeout, ValueOutOfRange
 from ldcnd.contract.meta import Provenance
-from ldcnd.drives.driver import AnalogMotion, Ceiling, Gains, HomeCapture, Motion, PwmOutput, StopMode
+from ldcnd.drives.driver import AnalogMotion, Ceiling, CountsMotion, Gains, HomeCapture, PwmOutput, StopMode
 from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, pin_bits
-from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag
+from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import (
     LS_173AP,
     LS_182AP,
@@ -29,7 +29,7 @@ CLOSED = AuxFlag.SERVO_ON | AuxFlag.INDEX
 
 
 def status(flags=StatusFlag.POWER_ON | StatusFlag.MOVE_DONE, aux=CLOSED, velocity=0, adc=None):
-    return Status(flags, position=5, velocity=velocity, aux=aux, adc=adc)
+    return StatusPacket(flags, position=5, velocity=velocity, aux=aux, adc=adc)
 
 
 # -- registers ---------------------------------------------------------------------------------------------------------
@@ -168,13 +168,13 @@ def test_only_a_position_error_and_motor_off_open_the_loop_at_home():
 def test_the_three_kinds_of_motion_are_three_trajectories():
     velocity, acceleration = 2000.0, 20_000.0
 
-    assert trajectory_of(Motion(-500, velocity, acceleration), 1, LS_182AP) == Trajectory(
+    assert trajectory_of(CountsMotion(-500, velocity, acceleration), 1, LS_182AP) == Trajectory(
         position=-500, velocity=67_109, acceleration=344
     )
-    assert trajectory_of(Motion(None, -velocity, acceleration), 1, LS_182AP) == Trajectory(
+    assert trajectory_of(CountsMotion(None, -velocity, acceleration), 1, LS_182AP) == Trajectory(
         velocity=67_109, acceleration=344, mode=ProfileMode.VELOCITY, reverse=True
     )
-    assert trajectory_of(Motion(None, velocity, acceleration), 1, LS_182AP) == Trajectory(
+    assert trajectory_of(CountsMotion(None, velocity, acceleration), 1, LS_182AP) == Trajectory(
         velocity=67_109, acceleration=344, mode=ProfileMode.VELOCITY
     )
     assert trajectory_of(AnalogMotion(356, velocity, acceleration), 1, LS_182AP) == Trajectory(
@@ -189,8 +189,8 @@ def test_the_three_kinds_of_motion_are_three_trajectories():
     ("profile", "most"), [(PIC_SERVO_V4, 500_000), (LS_182AP, 2_000_000), (PIC_SERVO_SC, 2_500_000)]
 )
 def test_a_speed_at_which_the_encoder_would_lose_counts_is_refused(profile, most):
-    assert quantised(Motion(None, float(most), 1e6), 1, profile).velocity_counts_per_s == pytest.approx(most)
-    for refused in (Motion(0, most * 1.001, 1e6), Motion(None, -most * 1.001, 1e6)):
+    assert quantised(CountsMotion(None, float(most), 1e6), 1, profile).velocity_counts_per_s == pytest.approx(most)
+    for refused in (CountsMotion(0, most * 1.001, 1e6), CountsMotion(None, -most * 1.001, 1e6)):
         with pytest.raises(ValueOutOfRange) as refusal:
             quantised(refused, 1, profile)
         assert abs(refusal.value.nearest) == most
@@ -215,7 +215,7 @@ def test_an_analog_target_outside_the_sensor_range_is_refused(profile, target, n
 
 
 def test_quantising_keeps_the_sign_and_rounds_to_the_register():
-    motion = quantised(Motion(None, -2000.0, 20_000.0), 1, LS_182AP)
+    motion = quantised(CountsMotion(None, -2000.0, 20_000.0), 1, LS_182AP)
 
     assert motion.velocity_counts_per_s == pytest.approx(-67_109 / 33.554432)
     assert motion.acceleration_counts_per_s2 == pytest.approx(344 / 0.017179869184)
@@ -223,8 +223,8 @@ def test_quantising_keeps_the_sign_and_rounds_to_the_register():
 
 def test_a_value_at_its_limit_is_rounded_down_where_the_nearest_register_is_above_it():
     step = 1 / 0.017179869184
-    free = quantised(Motion(0, 1000.0, 3.6 * step), 1, LS_182AP)
-    held = quantised(Motion(0, 1000.0, 3.6 * step), 1, LS_182AP, Ceiling(1000.0, 3.6 * step))
+    free = quantised(CountsMotion(0, 1000.0, 3.6 * step), 1, LS_182AP)
+    held = quantised(CountsMotion(0, 1000.0, 3.6 * step), 1, LS_182AP, Ceiling(1000.0, 3.6 * step))
 
     assert free.acceleration_counts_per_s2 == pytest.approx(4 * step)
     assert free.velocity_counts_per_s == pytest.approx(1000.0, abs=0.02)
@@ -233,7 +233,7 @@ def test_a_value_at_its_limit_is_rounded_down_where_the_nearest_register_is_abov
 
 
 def test_a_limit_that_is_a_register_value_is_reached():
-    held = quantised(Motion(0, 1000.0, 344 / 0.017179869184), 1, LS_182AP)
+    held = quantised(CountsMotion(0, 1000.0, 344 / 0.017179869184), 1, LS_182AP)
 
     again = quantised(held, 1, LS_182AP, Ceiling(held.velocity_counts_per_s, held.acceleration_counts_per_s2))
 
@@ -242,11 +242,13 @@ def test_a_limit_that_is_a_register_value_is_reached():
 
 def test_a_limit_below_one_step_of_the_register_is_refused_and_the_step_is_named():
     with pytest.raises(ValueOutOfRange, match="the limit is 30") as refusal:
-        quantised(Motion(0, 1000.0, 30.0), 1, LS_182AP, Ceiling(1000.0, 30.0))
+        quantised(CountsMotion(0, 1000.0, 30.0), 1, LS_182AP, Ceiling(1000.0, 30.0))
 
     assert refusal.value.limit == pytest.approx(58.2, abs=0.01)
     assert refusal.value.nearest is None
-    assert quantised(Motion(0, 1000.0, 30.0), 2, LS_182AP, Ceiling(1000.0, 30.0)).acceleration_counts_per_s2 < 30.0
+    assert (
+        quantised(CountsMotion(0, 1000.0, 30.0), 2, LS_182AP, Ceiling(1000.0, 30.0)).acceleration_counts_per_s2 < 30.0
+    )
 
 
 # -- pins --------------------------------------------------------------------------------------------------------------
@@ -347,4 +349,4 @@ def test_the_motion_lock_is_seen_where_there_is_one():
 
 def test_a_status_without_position_is_no_reading():
     with pytest.raises(BadReply):
-        state_of(LS_182AP).reading(Status(StatusFlag(0)))
+        state_of(LS_182AP).reading(StatusPacket(StatusFlag(0)))

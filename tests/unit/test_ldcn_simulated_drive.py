@@ -5,10 +5,10 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.drives.ldcn.controls import LimitPins, StopControl
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag
 from ldcnd.drives.ldcn.registers import encode_gains
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, UTILITY_GAINS, SimulatedAxis
@@ -40,7 +40,7 @@ def test_closing_the_loop_clears_the_position_error_bit_in_the_other_variant():
 
 def test_stalled_motor_exceeds_the_error_limit_and_opens_the_loop():
     axis = SimulatedAxis("picservo-v4")
-    axis.suffer(Condition.STALLED)
+    axis.suffer(FaultCondition.STALLED)
 
     axis.move(8000)
     status = axis.wait_for(lambda status: status.flags & StatusFlag.POSITION_ERROR)
@@ -52,7 +52,7 @@ def test_stalled_motor_exceeds_the_error_limit_and_opens_the_loop():
 
 def test_stuck_encoder_runs_away_until_the_error_limit():
     axis = SimulatedAxis()
-    axis.suffer(Condition.ENCODER_STUCK)
+    axis.suffer(FaultCondition.ENCODER_STUCK)
 
     axis.move(8000)
     status = axis.wait_for(lambda status: status.flags & StatusFlag.POSITION_ERROR)
@@ -63,7 +63,7 @@ def test_stuck_encoder_runs_away_until_the_error_limit():
 
 def test_position_counter_wraps_with_a_sticky_bit():
     axis = SimulatedAxis("picservo-sc")
-    axis.send(1, Command.RESET_POSITION, 2, *little(0x7FFF_FFFF - 500, 4))
+    axis.send(1, CommandCode.RESET_POSITION, 2, *little(0x7FFF_FFFF - 500, 4))
     axis.jog(5 * ONE)
     axis.wait(1.0)
 
@@ -83,7 +83,7 @@ def test_reset_position_renames_the_place_without_moving():
     axis.wait(1.0)
     before = axis.drive.shaft.position_counts
 
-    axis.send(1, Command.RESET_POSITION)
+    axis.send(1, CommandCode.RESET_POSITION)
     axis.wait(1.0)
 
     assert axis.status().position == pytest.approx(0, abs=1)
@@ -95,13 +95,13 @@ def test_saved_home_can_be_read_and_sc_can_count_from_it():
     axis.move(1000)
     axis.finish()
     axis.wait(1.0)
-    axis.send(1, Command.SAVE_CURRENT_POSITION_AS_HOME)
+    axis.send(1, CommandCode.SAVE_CURRENT_POSITION_AS_HOME)
     home = axis.status().home
     axis.move(1500)
     axis.finish()
     axis.wait(1.0)
 
-    axis.send(1, Command.RESET_POSITION, 1)
+    axis.send(1, CommandCode.RESET_POSITION, 1)
 
     assert home == pytest.approx(1000, abs=1)
     assert axis.status().position == pytest.approx(500, abs=2)
@@ -176,7 +176,7 @@ def test_absolute_positioning_ends_near_the_analog_target(name, target):
 
 def test_lost_sensor_stops_absolute_positioning_and_nothing_else():
     axis = SimulatedAxis()
-    axis.suffer(Condition.SENSOR_LOST)
+    axis.suffer(FaultCondition.SENSOR_LOST)
     axis.move(1000)
     axis.finish()
     plain = axis.status()
@@ -196,7 +196,7 @@ def test_lost_sensor_stops_absolute_positioning_and_nothing_else():
 def test_limit_pins_of_version_4_can_be_outputs():
     axis = SimulatedAxis("picservo-v4")
 
-    axis.send(1, Command.IO_CONTROL, LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_INPUT)
+    axis.send(1, CommandCode.IO_CONTROL, LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_INPUT)
 
     assert axis.status().flags & (StatusFlag.LIMIT1 | StatusFlag.LIMIT2) == StatusFlag.LIMIT1
 
@@ -205,11 +205,11 @@ def test_loss_of_motor_power_opens_the_loop_of_pic_servo_for_good():
     axis = SimulatedAxis("picservo-v4")
     axis.jog(4 * ONE)
 
-    axis.suffer(Condition.MOTOR_POWER_OFF)
+    axis.suffer(FaultCondition.MOTOR_POWER_OFF)
     lost = axis.status()
     axis.stop(ON | StopControl.ABRUPT)
     refused = axis.status()
-    axis.recover(Condition.MOTOR_POWER_OFF)
+    axis.recover(FaultCondition.MOTOR_POWER_OFF)
     back = axis.status()
 
     assert not lost.flags & StatusFlag.POWER_ON
@@ -223,12 +223,12 @@ def test_loss_of_motor_power_opens_the_loop_of_pic_servo_for_good():
 def test_current_limiting_that_is_switched_off_gives_the_output_back(name, off):
     gains = replace(UTILITY_GAINS, ol=200, cl=21)
     axis = SimulatedAxis(name, gains=gains)
-    axis.suffer(Condition.STALLED)
+    axis.suffer(FaultCondition.STALLED)
     axis.stop(ON | StopControl.HERE, *little(1000, 4))
     axis.wait(0.5)
     limited = axis.pwm()
 
-    axis.send(1, Command.SET_GAIN, *encode_gains(axis.profile, replace(gains, cl=off)))
+    axis.send(1, CommandCode.SET_GAIN, *encode_gains(axis.profile, replace(gains, cl=off)))
     axis.wait(0.5)
 
     assert limited < 100
@@ -237,15 +237,15 @@ def test_current_limiting_that_is_switched_off_gives_the_output_back(name, off):
 
 def test_an_output_that_was_limited_is_given_back_while_the_loop_is_open():
     axis = SimulatedAxis("picservo-v4", gains=replace(UTILITY_GAINS, ol=200, cl=21))
-    axis.suffer(Condition.STALLED)
+    axis.suffer(FaultCondition.STALLED)
     axis.stop(ON | StopControl.HERE, *little(1000, 4))
     axis.wait(0.5)
 
     axis.stop(ON | StopControl.MOTOR_OFF)
     axis.wait(0.5)
-    axis.recover(Condition.STALLED)
-    axis.send(1, Command.SET_GAIN, *encode_gains(axis.profile, replace(UTILITY_GAINS, ol=200)))
-    axis.suffer(Condition.STALLED)
+    axis.recover(FaultCondition.STALLED)
+    axis.send(1, CommandCode.SET_GAIN, *encode_gains(axis.profile, replace(UTILITY_GAINS, ol=200)))
+    axis.suffer(FaultCondition.STALLED)
     axis.stop(ON | StopControl.HERE, *little(1000, 4))
 
     assert axis.pwm() == 200
@@ -267,7 +267,7 @@ def test_the_pwm_value_is_reset_by_whatever_disables_the_servo(name, event):
         case "position_error":
             axis.stop(ON | StopControl.HERE, *little(20_000, 4))
         case _:
-            lost = Condition.STOP_INPUT if name == "ls182ap" else Condition.MOTOR_POWER_OFF
+            lost = FaultCondition.STOP_INPUT if name == "ls182ap" else FaultCondition.MOTOR_POWER_OFF
             axis.suffer(lost)
             axis.wait(0.01)
             axis.recover(lost)
@@ -285,9 +285,9 @@ def test_both_limit_switches_may_be_actuated_at_once_wherever_the_shaft_is():
     both = StatusFlag.LIMIT1 | StatusFlag.LIMIT2
     before = axis.status().flags & both
 
-    axis.suffer(Condition.LIMITS_ACTUATED)
+    axis.suffer(FaultCondition.LIMITS_ACTUATED)
     actuated = axis.status().flags & both
-    axis.recover(Condition.LIMITS_ACTUATED)
+    axis.recover(FaultCondition.LIMITS_ACTUATED)
 
     assert (before, actuated, axis.status().flags & both) == (0, both, 0)
 

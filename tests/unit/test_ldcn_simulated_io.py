@@ -3,13 +3,13 @@
 import pytest
 
 from ldcnd.contract.errors import ValueOutOfRange
-from ldcnd.drives.ldcn.packet import Command
+from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.pic_io import (
     IoItem,
     IoNode,
     SetDirection,
     SetOutput,
-    SetPwm,
+    SetPwmOutputs,
     SetSynchOutput,
     SetTimerMode,
     SynchInput,
@@ -18,7 +18,7 @@ from ldcnd.drives.ldcn.pic_io import (
     encode_io_command,
     send_io_command,
 )
-from ldcnd.sim.ldcn.chain import Analog, ChainSpec, Line, ModuleSpec, TimedEvent, build_chain, model
+from ldcnd.sim.ldcn.chain import Analog, ChainSpec, ModuleSpec, OutsideLevel, TimedEvent, build_chain, model
 from ldcnd.sim.ldcn.io import IoWiring
 from ldcnd.sim.ldcn.simulation import SimulatedChainConfig
 from tests.support.simulated_host import SimulatedHost
@@ -41,7 +41,7 @@ class IoHost(SimulatedHost):
         return decode_io_status(IoItem(0), self.wait(0.03))
 
     def look(self, items=0xFF):
-        return decode_io_status(IoItem(items), self.send(1, Command.READ_STATUS, items))
+        return decode_io_status(IoItem(items), self.send(1, CommandCode.READ_STATUS, items))
 
 
 # -- lines (2.2) ------------------------------------------------------------------------------------------------------
@@ -70,12 +70,12 @@ def test_the_frames_of_a_centrifuges_cabinet_are_obeyed():
     host = IoHost(IoWiring(low=frozenset({4}), wires={7: 10}))
     for data in ("20 ff 0f", "20 df 0f", "20 df 0e", "20 df 0c", "20 df 08", "26 00 00", "12 03"):
         command, *values = bytes.fromhex(data)
-        reply = host.send(1, Command(command & 0x0F), *values)
+        reply = host.send(1, CommandCode(command & 0x0F), *values)
 
     assert len(reply) == 5
     assert decode_io_status(IoItem(3), reply).levels == ALL & ~0b0111_0110_1000
-    host.send(1, Command.SET_GAIN, 0x00, 0x02)  # output 10 opens the door, which the input 7 sees
-    assert decode_io_status(IoItem(3), host.send(1, Command.NO_OPERATION)).levels >> 6 & 1
+    host.send(1, CommandCode.SET_GAIN, 0x00, 0x02)  # output 10 opens the door, which the input 7 sees
+    assert decode_io_status(IoItem(3), host.send(1, CommandCode.NO_OPERATION)).levels >> 6 & 1
 
 
 def test_a_line_follows_the_output_that_is_wired_to_it_and_else_its_own_level():
@@ -105,9 +105,9 @@ def test_an_output_moves_a_cylinder_with_a_sensor_at_either_end():
 
 def test_levels_and_voltages_change_when_the_schedule_says():
     events = [
-        TimedEvent(0.5, 1, Line(3), present=False),
+        TimedEvent(0.5, 1, OutsideLevel(3), present=False),
         TimedEvent(0.5, 1, Analog(2, 77), present=True),
-        TimedEvent(1.0, 1, Line(3), present=True),
+        TimedEvent(1.0, 1, OutsideLevel(3), present=True),
     ]
     host = IoHost(IoWiring(adc=(1, 2, 3)), events)
     before = host.look()
@@ -124,9 +124,9 @@ def test_a_reset_makes_everything_an_input_again_and_stops_the_outputs():
     host = IoHost()
     host.do(SetDirection(0))
     host.do(SetOutput(0))
-    host.do(SetPwm(200, 100))
+    host.do(SetPwmOutputs(200, 100))
 
-    host.send(0xFF, Command.HARD_RESET)
+    host.send(0xFF, CommandCode.HARD_RESET)
     host.address_all()
 
     assert host.look(1).levels == ALL
@@ -135,8 +135,8 @@ def test_a_reset_makes_everything_an_input_again_and_stops_the_outputs():
 
 def test_pwm_values_are_taken_and_a_wrong_checksum_changes_nothing():
     host = IoHost()
-    host.do(SetPwm(128, 64))
-    damaged = bytearray(encode_io_command(1, SetPwm(1, 1)))
+    host.do(SetPwmOutputs(128, 64))
+    damaged = bytearray(encode_io_command(1, SetPwmOutputs(1, 1)))
     damaged[-1] ^= 1
 
     host.chain.write(host.now_s, bytes(damaged))
@@ -149,7 +149,7 @@ def test_pwm_values_are_taken_and_a_wrong_checksum_changes_nothing():
 def test_undefined_bits_of_the_status_byte_may_be_anything():
     host = IoHost(undefined_status_bits=0xFF)
 
-    reply = host.send(1, Command.NO_OPERATION)
+    reply = host.send(1, CommandCode.NO_OPERATION)
 
     assert reply[0] == 0xFD
     assert not decode_io_status(IoItem(0), reply).rejected
@@ -163,13 +163,13 @@ def test_stored_outputs_take_effect_with_the_start_of_a_servo_group():
     host.address_all()
     io = host.chain.modules[0]
     for address in (1, 2):
-        host.send(address, Command.SET_ADDRESS, address, 0x81)
+        host.send(address, CommandCode.SET_ADDRESS, address, 0x81)
     for command in (SetDirection(0xEF7), SetSynchOutput(0x108, 200, 7)):
         host.chain.write(host.now_s, encode_io_command(1, command))
         host.wait(0.03)
     before = (io.levels & 0x108, io.pwm)
 
-    host.send(0x81, Command.START_MOTION)
+    host.send(0x81, CommandCode.START_MOTION)
 
     assert before == (0, (0, 0))
     assert (io.levels & 0x108, io.pwm) == (0x108, (200, 7))
@@ -193,7 +193,7 @@ def test_synch_input_captures_levels_and_timer_where_servos_save_home():
 
 def test_synch_output_before_anything_was_stored_sets_zeros():
     host = IoHost()
-    host.do(SetPwm(9, 9))
+    host.do(SetPwmOutputs(9, 9))
 
     host.do(SynchOutput())
 
@@ -205,7 +205,7 @@ def test_whether_stored_outputs_are_applied_again_is_a_switch(once):
     host = IoHost(synch_output_once=once)
     host.do(SetSynchOutput(0, 200, 7))
     host.do(SynchOutput())
-    host.do(SetPwm(9, 9))
+    host.do(SetPwmOutputs(9, 9))
 
     host.do(SynchOutput())
 
@@ -215,7 +215,7 @@ def test_whether_stored_outputs_are_applied_again_is_a_switch(once):
 def test_the_unused_half_of_the_inputs_may_be_anything():
     host = IoHost(undefined_level_bits=0xF)
 
-    reply = host.send(1, Command.READ_STATUS, 0x01)
+    reply = host.send(1, CommandCode.READ_STATUS, 0x01)
 
     assert reply[2] >> 4 == 0xF
     assert host.look(1).levels == ALL
@@ -292,7 +292,7 @@ def test_whether_a_new_mode_clears_the_count_is_a_switch(cleared):
 
 
 @pytest.mark.parametrize(
-    "command", [SetDirection(0x1000), SetOutput(-1), SetPwm(256, 0), SetTimerMode(enabled=True, prescale=3)]
+    "command", [SetDirection(0x1000), SetOutput(-1), SetPwmOutputs(256, 0), SetTimerMode(enabled=True, prescale=3)]
 )
 def test_what_a_pic_io_does_not_have_is_refused(command):
     with pytest.raises(ValueOutOfRange):
@@ -314,7 +314,7 @@ def test_a_pic_step_answers_with_the_widths_that_its_hosts_expect(mask, length):
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-step"),))))
     host.address_all()
 
-    reply = host.send(1, Command.DEFINE_STATUS, mask)
+    reply = host.send(1, CommandCode.DEFINE_STATUS, mask)
 
     assert len(reply) == length
 
@@ -334,9 +334,9 @@ def test_wiring_and_schedule_come_from_the_configuration():
     )
     host = SimulatedHost(build_chain(config.spec()))
     host.address_all()
-    before = decode_io_status(IoItem(3), host.send(1, Command.READ_STATUS, 3))
+    before = decode_io_status(IoItem(3), host.send(1, CommandCode.READ_STATUS, 3))
     host.wait(0.2)
-    after = decode_io_status(IoItem(3), host.send(1, Command.READ_STATUS, 3))
+    after = decode_io_status(IoItem(3), host.send(1, CommandCode.READ_STATUS, 3))
 
     assert (before.levels, before.adc1) == (ALL & ~0x004, 5)
     assert (after.levels, after.adc1) == (ALL, 200)

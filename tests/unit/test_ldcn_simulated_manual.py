@@ -7,11 +7,11 @@ import pytest
 
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import StopControl
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, Packet, StatusFlag, encode_packet
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, Packet, StatusFlag, encode_packet
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
-from ldcnd.sim.ldcn.power import Condition, Trip
+from ldcnd.sim.ldcn.power import FaultCondition, Trip
 from ldcnd.sim.ldcn.quirks import AnalogEnd, CommandBuffer
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, SimulatedAxis
@@ -33,8 +33,8 @@ def test_before_the_first_set_gain_a_tick_is_one_cycle(name):
     host.address_all()
     module = host.chain.modules[0]
 
-    host.send(1, Command.STOP_MOTOR, ON | StopControl.MOTOR_OFF)
-    host.send(1, Command.LOAD_TRAJECTORY, 0x88, *([60, 0] if name == "ls-182ap" else [60]))
+    host.send(1, CommandCode.STOP_MOTOR, ON | StopControl.MOTOR_OFF)
+    host.send(1, CommandCode.LOAD_TRAJECTORY, 0x88, *([60, 0] if name == "ls-182ap" else [60]))
     host.wait(0.5)
     velocity = host.read(1, module.dialect, 0x04).velocity
 
@@ -77,7 +77,7 @@ def test_a_sensor_lost_after_the_arrival_still_trips():
     analog_move(axis, 520)
     arrived = axis.finish()
 
-    axis.suffer(Condition.SENSOR_LOST)
+    axis.suffer(FaultCondition.SENSOR_LOST)
     axis.wait(0.01)
 
     assert arrived.aux & AuxFlag.SERVO_ON
@@ -91,7 +91,7 @@ def test_stop_motor_ends_the_check_of_the_sensor():
     axis.finish()
 
     axis.stop(ON | StopControl.ABRUPT)
-    axis.suffer(Condition.SENSOR_LOST)
+    axis.suffer(FaultCondition.SENSOR_LOST)
     axis.wait(0.01)
 
     assert axis.status().aux & AuxFlag.SERVO_ON
@@ -110,7 +110,7 @@ def two_groups(at_s=0.0001, **quirks):
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-v4", settings=settings),) * 2)))
     host.address_all()
     for address in (1, 2):
-        host.send(address, Command.SET_ADDRESS, address, 0x80 + address)
+        host.send(address, CommandCode.SET_ADDRESS, address, 0x80 + address)
     host.chain.write(host.now_s, bytes.fromhex("aa 81 1a 0a a5"))
     host.wait(0.01)
     host.chain.write(host.now_s, bytes.fromhex("aa 82 1a 0a a6"))
@@ -195,7 +195,7 @@ def test_a_burst_at_19200_overwrites_nothing_because_two_bytes_take_longer_than_
     host.address_all()
 
     host.chain.write(
-        host.now_s, b"".join(encode_packet(Packet(at, Command.STOP_MOTOR, b"\x05")) for at in (1, 2, 1, 2))
+        host.now_s, b"".join(encode_packet(Packet(at, CommandCode.STOP_MOTOR, b"\x05")) for at in (1, 2, 1, 2))
     )
     host.wait(0.05)
 
@@ -210,7 +210,7 @@ def test_a_burst_at_19200_overwrites_nothing_because_two_bytes_take_longer_than_
 def test_whether_a_reply_is_dropped_when_the_host_sends_is_a_switch(yields):
     settings = model("ls-182ap")[1].model_copy(update={"yields_to_host": yields, "reply_latency_s": 0.002})
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("ls-182ap", settings=settings),))))
-    host.chain.write(0.0, encode_packet(Packet(0, Command.SET_ADDRESS, b"\x01\xff")))
+    host.chain.write(0.0, encode_packet(Packet(0, CommandCode.SET_ADDRESS, b"\x01\xff")))
     host.wait(0.0045)
 
     host.chain.write(host.now_s, bytes(4))
@@ -260,7 +260,7 @@ STIFF = Gains(kp=350, kd=3000, ki=0, il=0, ol=250, cl=0, el=16_000, sr=1)
 
 def test_a_stall_becomes_overcurrent_after_the_overload_time():
     axis = axis_with("ls-182ap", gains=STIFF, overload_s=0.65)
-    axis.suffer(Condition.STALLED)
+    axis.suffer(FaultCondition.STALLED)
     axis.stop(ON | StopControl.HERE, *(2000).to_bytes(4, "little"))
 
     axis.wait(0.55)
@@ -276,7 +276,7 @@ def test_a_stall_becomes_overcurrent_after_the_overload_time():
 
 def test_a_current_below_the_peak_never_trips():
     axis = axis_with("ls-182ap", gains=STIFF, peak_current_a=20.0)
-    axis.suffer(Condition.STALLED)
+    axis.suffer(FaultCondition.STALLED)
 
     axis.stop(ON | StopControl.HERE, *(2000).to_bytes(4, "little"))
     axis.wait(5.0)
@@ -287,10 +287,10 @@ def test_a_current_below_the_peak_never_trips():
 def test_a_pause_restarts_the_overload_time():
     axis = axis_with("ls-182ap", gains=STIFF, overload_s=0.65)
     for _ in range(5):
-        axis.suffer(Condition.STALLED)
+        axis.suffer(FaultCondition.STALLED)
         axis.stop(ON | StopControl.HERE, *(axis.status().position + 1500).to_bytes(4, "little", signed=True))
         axis.wait(0.4)
-        axis.recover(Condition.STALLED)
+        axis.recover(FaultCondition.STALLED)
         axis.wait(0.6)
 
     assert axis.status().aux & AuxFlag.SERVO_ON
@@ -350,7 +350,7 @@ def test_the_enable_bit_alone_leaves_the_velocity_register():
 @pytest.mark.parametrize(("name", "step"), [("pic-servo-v4", 1), ("pic-servo-cmc", 1), ("pic-servo-sc", 2)])
 def test_current_limiting_takes_its_steps(name, step):
     axis = axis_with(name, gains=replace(STIFF, cl=43))
-    axis.suffer(Condition.STALLED)
+    axis.suffer(FaultCondition.STALLED)
     axis.stop(ON | StopControl.HERE, *(2000).to_bytes(4, "little"))
 
     outputs = []
@@ -366,7 +366,7 @@ def test_current_limiting_takes_its_steps(name, step):
 @pytest.mark.parametrize(("name", "limits"), [("pic-servo-v4", True), ("pic-servo-sc", False)])
 def test_a_current_limit_of_255_is_off_on_sc(name, limits):
     axis = axis_with(name, gains=replace(STIFF, cl=255), sense_counts_per_a=13.0)
-    axis.suffer(Condition.STALLED)
+    axis.suffer(FaultCondition.STALLED)
 
     axis.stop(ON | StopControl.HERE, *(2000).to_bytes(4, "little"))
     axis.wait(0.2)

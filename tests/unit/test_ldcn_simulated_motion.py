@@ -4,9 +4,9 @@ import pytest
 
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import StopControl
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag
 from ldcnd.drives.ldcn.trajectory import Trajectory
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, SOFT_GAINS, UTILITY_GAINS, SimulatedAxis
 from tests.support.simulated_host import little
@@ -49,7 +49,7 @@ def test_velocity_is_sent_negative_when_moving_forward():
     axis.jog(10 * ONE)
     axis.wait(1.0)
 
-    raw = axis.send(1, Command.READ_STATUS, 0x04)
+    raw = axis.send(1, CommandCode.READ_STATUS, 0x04)
 
     assert int.from_bytes(raw[1:3], "little", signed=True) == pytest.approx(-10, abs=1)
 
@@ -59,7 +59,7 @@ def test_sc_sends_the_velocity_positive_when_moving_forward():
     axis.jog(10 * ONE)
     axis.wait(1.0)
 
-    raw = axis.send(1, Command.READ_STATUS, 0x04)
+    raw = axis.send(1, CommandCode.READ_STATUS, 0x04)
 
     assert int.from_bytes(raw[1:3], "little", signed=True) == pytest.approx(10, abs=1)
 
@@ -99,7 +99,7 @@ def test_start_motion_executes_what_was_loaded_in_parts():
     axis.wait(0.5)
     assert axis.status().position == 0
 
-    axis.send(1, Command.START_MOTION)
+    axis.send(1, CommandCode.START_MOTION)
     axis.finish()
     axis.wait(1.0)
 
@@ -165,7 +165,7 @@ def test_output_limit_bounds_the_pwm_but_not_in_pwm_mode():
 def test_deadband_compensation_lifts_the_output_above_its_limit_on_version_4_only(name, pwm):
     gains = Gains(kp=256, kd=0, ki=0, il=0, ol=20, cl=0, el=16_000, sr=1, deadband=5)
     axis = SimulatedAxis(name, gains=gains)
-    axis.suffer(Condition.STALLED)
+    axis.suffer(FaultCondition.STALLED)
 
     axis.stop(ON | StopControl.HERE, *little(1000, 4))
     axis.wait(0.1)
@@ -184,7 +184,7 @@ def test_deadband_is_added_to_the_output():
 
 def test_integral_is_bounded_by_256_times_il():
     axis = SimulatedAxis(gains=Gains(kp=0, kd=0, ki=256, il=3, ol=250, cl=0, el=16_000, sr=1))
-    axis.suffer(Condition.STALLED)
+    axis.suffer(FaultCondition.STALLED)
 
     axis.stop(ON | StopControl.HERE, *little(100, 4))
     axis.wait(1.0)

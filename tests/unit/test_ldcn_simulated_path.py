@@ -8,13 +8,13 @@ from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.commands import Node, add_path_points, start_path
 from ldcnd.drives.ldcn.controls import IoOption, StopControl
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag
 from ldcnd.drives.ldcn.path import PathPoint, decode_point, encode_point
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.registers import FRACTION, encode_gains
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import HalfPoint, LimitInPath, PathOverflow, PathWithoutServo
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import ON, ONE, UTILITY_GAINS
@@ -70,7 +70,7 @@ def test_older_drives_have_no_path_mode():
 )
 def test_a_point_moves_its_step_in_its_cycles_at_constant_velocity(cycles, fast_path, option):
     axis = PathAxis()
-    axis.send(1, Command.IO_CONTROL, option)
+    axis.send(1, CommandCode.IO_CONTROL, option)
     axis.add(101, -37, cycles=cycles, fast_path=fast_path)
     axis.start()
 
@@ -146,7 +146,7 @@ def test_an_underrun_stops_at_the_last_point_without_a_ramp_and_later_points_wai
 
 def test_an_underrun_at_speed_trips_a_tight_error_limit():
     axis = PathAxis()
-    axis.send(1, Command.SET_GAIN, *encode_gains(axis.profile, Gains(20, 3000, 0, 0, 250, 0, 40, 1)))
+    axis.send(1, CommandCode.SET_GAIN, *encode_gains(axis.profile, Gains(20, 3000, 0, 0, 250, 0, 40, 1)))
     axis.add(*range(40, 1240, 40), *[1240] * 10)
 
     axis.start()
@@ -159,12 +159,12 @@ def test_a_group_starts_its_axes_with_one_packet():
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-sc"),) * 3)))
     host.address_all()
     for address, group in ((1, 0x01), (2, 0x81), (3, 0x81)):
-        host.send(address, Command.SET_GAIN, *encode_gains(PROFILES["pic-servo-sc"], UTILITY_GAINS))
-        host.send(address, Command.STOP_MOTOR, 0x05)
-        host.send(address, Command.SET_ADDRESS, address, group)
-        host.send(address, Command.ADD_PATH_POINTS, *(400).to_bytes(2, "little"))
+        host.send(address, CommandCode.SET_GAIN, *encode_gains(PROFILES["pic-servo-sc"], UTILITY_GAINS))
+        host.send(address, CommandCode.STOP_MOTOR, 0x05)
+        host.send(address, CommandCode.SET_ADDRESS, address, group)
+        host.send(address, CommandCode.ADD_PATH_POINTS, *(400).to_bytes(2, "little"))
 
-    reply = host.send(0x81, Command.ADD_PATH_POINTS)
+    reply = host.send(0x81, CommandCode.ADD_PATH_POINTS)
     host.wait(0.2)
     positions = []
     for module in host.chain.modules:
@@ -223,7 +223,7 @@ def test_a_fault_ends_a_path_and_what_becomes_of_the_rest_is_a_switch(cleared):
     axis.add(*[50] * 20)
     axis.start()
 
-    axis.suffer(Condition.MOTOR_POWER_OFF)
+    axis.suffer(FaultCondition.MOTOR_POWER_OFF)
     status = axis.look()
 
     assert not status.aux & (AuxFlag.PATH_MODE | AuxFlag.SERVO_ON)
@@ -241,7 +241,7 @@ def test_a_fault_ends_a_path_and_what_becomes_of_the_rest_is_a_switch(cleared):
 )
 def test_what_limit_protection_does_to_a_path_is_a_switch(variant, walks, beyond):
     axis = PathAxis(plant=MotorPlant(forward_limit_counts=500), limit_in_path=variant)
-    axis.send(1, Command.IO_CONTROL, IoOption.LIMIT_STOP)
+    axis.send(1, CommandCode.IO_CONTROL, IoOption.LIMIT_STOP)
     axis.add(*[100] * 20)
     axis.start()
 
@@ -280,7 +280,7 @@ def test_what_happens_to_points_too_many_is_a_switch(name, capacity, overflow, l
 def test_what_becomes_of_half_a_point_is_a_switch(variant, left):
     axis = PathAxis(half_point=variant)
 
-    axis.send(1, Command.ADD_PATH_POINTS, 0x92, 0x01, 0x00)
+    axis.send(1, CommandCode.ADD_PATH_POINTS, 0x92, 0x01, 0x00)
 
     assert points_left(axis) == left
     assert not axis.walks()
@@ -290,7 +290,7 @@ def test_half_a_point_alone_starts_nothing():
     axis = PathAxis()
     axis.add(50)
 
-    axis.send(1, Command.ADD_PATH_POINTS, 0x92)
+    axis.send(1, CommandCode.ADD_PATH_POINTS, 0x92)
 
     assert not axis.walks()
 
@@ -406,7 +406,7 @@ def test_move_done_and_slew_during_a_path_are_switches(shown):
 def test_when_the_fast_path_option_counts_is_a_switch(at_load, counts):
     axis = PathAxis(path_rate_at_load=at_load)
     axis.add(200, cycles=32)
-    axis.send(1, Command.IO_CONTROL, IoOption.FAST_PATH)
+    axis.send(1, CommandCode.IO_CONTROL, IoOption.FAST_PATH)
 
     axis.start()
     axis.wait(0.2)
@@ -419,13 +419,13 @@ def test_when_the_fast_path_option_counts_is_a_switch(at_load, counts):
 
 def test_a_cmc_is_a_version_4_until_its_advanced_features_are_turned_on():
     axis = PathAxis("pic-servo-cmc")
-    before = axis.send(1, Command.READ_STATUS, 0xC9)
-    axis.send(1, Command.ADD_PATH_POINTS, *(400).to_bytes(2, "little"))
+    before = axis.send(1, CommandCode.READ_STATUS, 0xC9)
+    axis.send(1, CommandCode.ADD_PATH_POINTS, *(400).to_bytes(2, "little"))
 
     axis.stop(ADVANCED_ON)
 
     assert len(before) == 2 + 5
-    assert len(axis.send(1, Command.READ_STATUS, 0xC9)) == 2 + 8
+    assert len(axis.send(1, CommandCode.READ_STATUS, 0xC9)) == 2 + 8
     assert points_left(axis) == 0
 
 
@@ -433,7 +433,7 @@ def test_a_cmc_is_a_version_4_until_its_advanced_features_are_turned_on():
 def test_whether_a_cmc_sends_the_new_items_before_is_a_switch(sends):
     axis = PathAxis("pic-servo-cmc", items_before_advanced=sends)
 
-    assert len(axis.send(1, Command.READ_STATUS, 0xC0)) == (5 if sends else 2)
+    assert len(axis.send(1, CommandCode.READ_STATUS, 0xC0)) == (5 if sends else 2)
 
 
 @pytest.mark.parametrize("sticky", [True, False])
@@ -442,12 +442,12 @@ def test_whether_a_later_stop_revokes_the_advanced_features_is_a_switch(sticky):
 
     axis.stop(ON)
 
-    assert len(axis.send(1, Command.READ_STATUS, 0x80)) == (3 if sticky else 2)
+    assert len(axis.send(1, CommandCode.READ_STATUS, 0x80)) == (3 if sticky else 2)
 
 
 def test_a_cmc_walks_and_keeps_its_limit_pins():
     axis = cmc()
-    axis.send(1, Command.IO_CONTROL, 0x4C)
+    axis.send(1, CommandCode.IO_CONTROL, 0x4C)
     axis.add(*[40] * 6, cycles=16, fast_path=True)
 
     axis.start()
@@ -460,7 +460,7 @@ def test_a_cmc_walks_and_keeps_its_limit_pins():
 def test_whether_the_divisor_slows_a_cmcs_path_is_a_switch(ignores):
     axis = cmc(path_ignores_divisor=ignores)
     slow = Gains(kp=350, kd=1000, ki=0, il=0, ol=250, cl=0, el=4000, sr=2)
-    axis.send(1, Command.SET_GAIN, *encode_gains(axis.profile, slow))
+    axis.send(1, CommandCode.SET_GAIN, *encode_gains(axis.profile, slow))
     axis.add(*[40] * 10)
     axis.start()
 

@@ -5,11 +5,11 @@ import pytest
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.faults import AFTER_RESET, FaultCode, Knowledge, diagnose
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag
 from ldcnd.drives.ldcn.profiles import LS_182AP
 from ldcnd.drives.ldcn.registers import encode_gains
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.simulated_host import SimulatedHost, little
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1)
@@ -21,13 +21,13 @@ class Rig(SimulatedHost):
     def __init__(self):
         super().__init__(build_chain(ChainSpec((ModuleSpec("ls182ap"),))))
         self.address_all()
-        self.send(1, Command.SET_GAIN, *encode_gains(LS_182AP, GAINS))
+        self.send(1, CommandCode.SET_GAIN, *encode_gains(LS_182AP, GAINS))
 
     def stop(self, control):
-        self.send(1, Command.STOP_MOTOR, control)
+        self.send(1, CommandCode.STOP_MOTOR, control)
 
     def clear(self):
-        self.send(1, Command.CLEAR_STICKY_BITS)
+        self.send(1, CommandCode.CLEAR_STICKY_BITS)
 
     def set(self, condition, *, present=True):
         self.chain.modules[0].set_condition(condition, present=present, at_s=self.now_s)
@@ -63,9 +63,9 @@ def test_healthy_rows():
 @pytest.mark.parametrize(
     ("condition", "limit2", "limit1", "power_on", "code"),
     [
-        (Condition.OVERHEAT, 0, 1, 1, FaultCode.OVERHEAT),
-        (Condition.STOP_INPUT, 1, 0, 1, FaultCode.STOP_INPUT),
-        (Condition.OVERVOLTAGE, 1, 1, 0, FaultCode.OVERVOLTAGE),
+        (FaultCondition.OVERHEAT, 0, 1, 1, FaultCode.OVERHEAT),
+        (FaultCondition.STOP_INPUT, 1, 0, 1, FaultCode.STOP_INPUT),
+        (FaultCondition.OVERVOLTAGE, 1, 1, 0, FaultCode.OVERVOLTAGE),
     ],
 )
 def test_standing_condition_is_shown_with_the_power_driver_off(condition, limit2, limit1, power_on, code):
@@ -81,12 +81,12 @@ def test_standing_condition_is_shown_with_the_power_driver_off(condition, limit2
 
 
 LATCHED_ROWS = [
-    (Condition.STOP_INPUT, [1, 0, 1, 0, 0, 1], FaultCode.STOP_INPUT),
-    (Condition.MOTOR_SHORT, [0, 1, 1, 0, 0, 1], FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
-    (Condition.OVERVOLTAGE, [0, 1, 1, 0, 0, 1], FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
-    (Condition.OVERHEAT, [1, 1, 1, 0, 0, 1], FaultCode.OVERHEAT),
-    (Condition.OVERCURRENT, [0, 0, 1, 0, 0, 1], FaultCode.OVERCURRENT),
-    (Condition.ENCODER_LOSS, [1, 0, 1, 0, 0, 0], FaultCode.ENCODER_OR_HALL),
+    (FaultCondition.STOP_INPUT, [1, 0, 1, 0, 0, 1], FaultCode.STOP_INPUT),
+    (FaultCondition.MOTOR_SHORT, [0, 1, 1, 0, 0, 1], FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
+    (FaultCondition.OVERVOLTAGE, [0, 1, 1, 0, 0, 1], FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE),
+    (FaultCondition.OVERHEAT, [1, 1, 1, 0, 0, 1], FaultCode.OVERHEAT),
+    (FaultCondition.OVERCURRENT, [0, 0, 1, 0, 0, 1], FaultCode.OVERCURRENT),
+    (FaultCondition.ENCODER_LOSS, [1, 0, 1, 0, 0, 0], FaultCode.ENCODER_OR_HALL),
 ]
 
 
@@ -131,7 +131,7 @@ def test_only_the_whole_recovery_sequence_restores_operation(condition, row, cod
 
 def test_standing_cause_is_latched_again_when_the_power_driver_is_enabled():
     rig = Rig()
-    rig.set(Condition.STOP_INPUT)
+    rig.set(FaultCondition.STOP_INPUT)
 
     rig.stop(CLOSE)
     rig.clear()
@@ -143,10 +143,10 @@ def test_position_error_keeps_power_on_and_needs_the_recovery_sequence():
     rig = Rig()
     rig.stop(CLOSE)
     rig.clear()
-    rig.set(Condition.STALLED)
-    rig.send(1, Command.STOP_MOTOR, StopControl.AMP_ENABLE | StopControl.HERE, *little(4001, 4))
+    rig.set(FaultCondition.STALLED)
+    rig.send(1, CommandCode.STOP_MOTOR, StopControl.AMP_ENABLE | StopControl.HERE, *little(4001, 4))
     tripped = rig.status()
-    rig.set(Condition.STALLED, present=False)
+    rig.set(FaultCondition.STALLED, present=False)
     rig.stop(CLOSE)
     refused = rig.status()
     rig.stop(OFF)
@@ -163,10 +163,10 @@ def test_position_error_keeps_power_on_and_needs_the_recovery_sequence():
 def test_tripped_drive_lets_the_motor_coast():
     rig = Rig()
     rig.stop(CLOSE)
-    rig.send(1, Command.LOAD_TRAJECTORY, 0xB6, *little(8 << 16, 4), *little(2000, 4))
+    rig.send(1, CommandCode.LOAD_TRAJECTORY, 0xB6, *little(8 << 16, 4), *little(2000, 4))
     rig.wait(0.5)
 
-    rig.set(Condition.STOP_INPUT)
+    rig.set(FaultCondition.STOP_INPUT)
     first = rig.status().position
     rig.wait(0.1)
 

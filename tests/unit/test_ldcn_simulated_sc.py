@@ -5,11 +5,11 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.drives.ldcn.controls import IoOption, StartUp, StopControl
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, StatusFlag
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag
 from ldcnd.drives.ldcn.registers import FRACTION, SERVO_CYCLE_S, encode_gains
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain, model
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ExcludedOptions, RelativeTo, ResetInMotion, UnknownBaud
 from ldcnd.sim.ldcn.simulation import SimulatedChainConfig
 from ldcnd.sim.plant import MotorPlant
@@ -56,7 +56,7 @@ def test_sc_looks_the_rate_up_and_the_others_divide(name, code, baud):
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec(name),))))
     host.address_all()
 
-    host.send(0xFF, Command.SET_BAUD_RATE, code)
+    host.send(0xFF, CommandCode.SET_BAUD_RATE, code)
 
     assert host.chain.modules[0].baud == pytest.approx(baud, rel=1e-4)
 
@@ -65,17 +65,17 @@ def test_a_host_talks_to_sc_at_230400():
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-sc"),) * 2)))
     host.address_all()
 
-    host.send(0xFF, Command.SET_BAUD_RATE, 5)
+    host.send(0xFF, CommandCode.SET_BAUD_RATE, 5)
     host.chain.baud = 230_400
 
-    assert [len(host.send(address, Command.NO_OPERATION)) for address in (1, 2)] == [2, 2]
+    assert [len(host.send(address, CommandCode.NO_OPERATION)) for address in (1, 2)] == [2, 2]
 
 
 @pytest.mark.parametrize(("variant", "baud"), [(UnknownBaud.KEPT, 19_200), (UnknownBaud.DIVIDED, 178_571)])
 def test_what_sc_makes_of_a_rate_that_it_does_not_know_is_a_switch(variant, baud):
     axis = sc(unknown_baud=variant)
 
-    axis.send(1, Command.SET_BAUD_RATE, 6)
+    axis.send(1, CommandCode.SET_BAUD_RATE, 6)
 
     assert axis.drive.baud == pytest.approx(baud, rel=0.01)
     assert axis.drive.unknown_bauds == 1
@@ -106,7 +106,7 @@ def test_an_older_drive_takes_the_same_bytes_for_an_absolute_goal():
     axis.move(2000)
     axis.finish()
 
-    axis.send(1, Command.LOAD_TRAJECTORY, *bytes.fromhex("d7 f4010000 00000500 a00f0000"))
+    axis.send(1, CommandCode.LOAD_TRAJECTORY, *bytes.fromhex("d7 f4010000 00000500 a00f0000"))
     axis.finish()
 
     assert commanded(axis) == 500
@@ -119,7 +119,7 @@ def test_what_a_relative_goal_that_waits_is_added_to_is_a_switch(relative_to, go
     axis.load(replace(relative(300), start_now=False))
     axis.stop(ON | StopControl.HERE, *little(300, 4))
     axis.wait(0.5)
-    axis.send(1, Command.START_MOTION)
+    axis.send(1, CommandCode.START_MOTION)
     axis.finish()
 
     assert commanded(axis) == goal
@@ -130,7 +130,7 @@ def test_a_second_load_replaces_all_that_waited():
     axis.load(Trajectory(position=1000, velocity=5 * ONE, acceleration=200))
     axis.load(Trajectory(velocity=3 * ONE, acceleration=200))
 
-    axis.send(1, Command.START_MOTION)
+    axis.send(1, CommandCode.START_MOTION)
     axis.wait(1.0)
 
     assert commanded(axis) == 0
@@ -199,7 +199,7 @@ def test_a_trapezoid_may_begin_in_velocity_mode():
 
 def test_the_divisor_does_not_slow_the_profile():
     axis = sc()
-    axis.send(1, Command.SET_GAIN, *bytes.fromhex("5e01 5802 0000 0000 fa 00 a00f 05 00"))
+    axis.send(1, CommandCode.SET_GAIN, *bytes.fromhex("5e01 5802 0000 0000 fa 00 a00f 05 00"))
 
     axis.jog(5 * ONE, acceleration=2000)
     axis.wait(1.0)
@@ -251,7 +251,7 @@ PLANT = MotorPlant(forward_limit_counts=2000, reverse_limit_counts=-2000)
 @pytest.mark.parametrize("direction", [1, -1])
 def test_limit_protection_ends_a_motion_into_a_limit(option, holds, direction):
     axis = sc(plant=PLANT)
-    axis.send(1, Command.IO_CONTROL, option)
+    axis.send(1, CommandCode.IO_CONTROL, option)
 
     axis.jog(direction * 5 * ONE)
     axis.wait(3.0)
@@ -274,7 +274,7 @@ def test_without_limit_protection_the_motor_reaches_the_hard_stop():
 
 def test_commands_into_the_limit_are_ignored_and_the_way_back_is_free():
     axis = sc(plant=PLANT)
-    axis.send(1, Command.IO_CONTROL, IoOption.LIMIT_STOP)
+    axis.send(1, CommandCode.IO_CONTROL, IoOption.LIMIT_STOP)
     axis.jog(5 * ONE)
     axis.wait(3.0)
     stopped = commanded(axis)
@@ -292,7 +292,7 @@ def test_commands_into_the_limit_are_ignored_and_the_way_back_is_free():
 
 def test_with_the_servo_off_limit_protection_takes_the_pwm_value_into_the_limit():
     axis = sc(plant=PLANT)
-    axis.send(1, Command.IO_CONTROL, IoOption.LIMIT_OFF)
+    axis.send(1, CommandCode.IO_CONTROL, IoOption.LIMIT_OFF)
 
     axis.drive_pwm(60)
     axis.wait(2.0)
@@ -308,7 +308,7 @@ def test_pwm_mode_without_a_value_keeps_the_present_output_on_sc():
     outputs = {}
     for name in ("pic-servo-sc", "pic-servo-v4"):
         axis = SimulatedAxis(name)
-        axis.suffer(Condition.STALLED)
+        axis.suffer(FaultCondition.STALLED)
         axis.stop(ON | StopControl.HERE, *little(40, 4))
         axis.wait(0.3)
         axis.load(Trajectory(servo=False, start_now=True))
@@ -323,7 +323,7 @@ def test_pwm_mode_without_a_value_keeps_the_present_output_on_sc():
 
 def test_a_supply_too_low_opens_the_loop_and_one_too_high_only_disables_the_amplifier():
     low, high = sc(), sc()
-    for axis, condition in ((low, Condition.MOTOR_POWER_OFF), (high, Condition.OVERVOLTAGE)):
+    for axis, condition in ((low, FaultCondition.MOTOR_POWER_OFF), (high, FaultCondition.OVERVOLTAGE)):
         axis.jog(5 * ONE)
         axis.suffer(condition)
         assert not axis.status().flags & StatusFlag.POWER_ON
@@ -345,10 +345,10 @@ def test_whether_the_home_register_moves_with_the_position_is_a_switch(shifts):
     axis.move(1000)
     axis.finish()
     axis.wait(0.5)
-    axis.send(1, Command.SAVE_CURRENT_POSITION_AS_HOME)
+    axis.send(1, CommandCode.SAVE_CURRENT_POSITION_AS_HOME)
     home = axis.status().home
 
-    axis.send(1, Command.RESET_POSITION, 2, *little(5000, 4))
+    axis.send(1, CommandCode.RESET_POSITION, 2, *little(5000, 4))
     status = axis.status()
 
     assert status.position == 5000
@@ -365,7 +365,7 @@ def test_what_reset_position_does_to_a_move_under_way_is_a_switch(rule, position
     while axis.status().position < 1000:
         axis.wait(0.001)
 
-    axis.send(1, Command.RESET_POSITION)
+    axis.send(1, CommandCode.RESET_POSITION)
     after = axis.status().position
     axis.finish()
 
@@ -386,9 +386,9 @@ def test_what_reset_position_does_to_a_move_under_way_is_a_switch(rule, position
 )
 def test_what_options_do_that_exclude_each_other_is_a_switch(variant, protection):
     axis = sc(excluded_options=variant)
-    axis.send(1, Command.IO_CONTROL, IoOption.LIMIT_STOP)
+    axis.send(1, CommandCode.IO_CONTROL, IoOption.LIMIT_STOP)
 
-    axis.send(1, Command.IO_CONTROL, 0x0C)
+    axis.send(1, CommandCode.IO_CONTROL, 0x0C)
 
     assert axis.drive.loop.protection == protection
 
@@ -396,11 +396,11 @@ def test_what_options_do_that_exclude_each_other_is_a_switch(variant, protection
 @pytest.mark.parametrize("steps_hz", [2000.0, -2000.0])
 def test_pulses_at_the_step_input_move_the_command_position_by_the_multiplier(steps_hz):
     axis = sc(steps_hz=steps_hz)
-    axis.send(1, Command.SET_GAIN, *encode_gains(axis.profile, replace(UTILITY_GAINS, step_multiplier=3)))
+    axis.send(1, CommandCode.SET_GAIN, *encode_gains(axis.profile, replace(UTILITY_GAINS, step_multiplier=3)))
     axis.wait(0.5)
     before = commanded(axis)
 
-    axis.send(1, Command.IO_CONTROL, IoOption.STEP_DIRECTION)
+    axis.send(1, CommandCode.IO_CONTROL, IoOption.STEP_DIRECTION)
     axis.wait(0.5)
 
     assert before == 0
@@ -411,7 +411,7 @@ def test_pulses_at_the_step_input_move_the_command_position_by_the_multiplier(st
 def test_steps_that_come_too_fast_make_the_servo_late():
     axis = sc(steps_hz=200_000.0)
 
-    axis.send(1, Command.IO_CONTROL, IoOption.STEP_DIRECTION)
+    axis.send(1, CommandCode.IO_CONTROL, IoOption.STEP_DIRECTION)
     axis.wait(0.01)
 
     assert axis.status().aux & AuxFlag.SERVO_OVERRUN
@@ -421,9 +421,9 @@ def test_steps_that_come_too_fast_make_the_servo_late():
 def test_whether_set_gain_without_a_multiplier_restores_it_is_a_switch(kept, multiplier):
     axis = sc(gains_keep_multiplier=kept)
     whole = encode_gains(axis.profile, replace(UTILITY_GAINS, step_multiplier=5))
-    axis.send(1, Command.SET_GAIN, *whole)
+    axis.send(1, CommandCode.SET_GAIN, *whole)
 
-    axis.send(1, Command.SET_GAIN, *whole[:14])
+    axis.send(1, CommandCode.SET_GAIN, *whole[:14])
 
     assert axis.drive.loop.gains.step_multiplier == multiplier
 
@@ -433,18 +433,18 @@ def test_whether_a_module_behind_a_fault_with_step_inputs_still_hears_is_a_switc
     settings = model("pic-servo-sc")[1].model_copy(update={"steps_hz": 100_000.0, "address_in_latched": latched})
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-sc", settings=settings),) * 2)))
     host.address_all()
-    host.send(1, Command.SET_GAIN, *encode_gains(host.chain.modules[0].profile, replace(UTILITY_GAINS, el=100)))
-    host.send(1, Command.STOP_MOTOR, 0x05)
-    host.send(1, Command.IO_CONTROL, IoOption.STEP_DIRECTION)
+    host.send(1, CommandCode.SET_GAIN, *encode_gains(host.chain.modules[0].profile, replace(UTILITY_GAINS, el=100)))
+    host.send(1, CommandCode.STOP_MOTOR, 0x05)
+    host.send(1, CommandCode.IO_CONTROL, IoOption.STEP_DIRECTION)
     host.wait(0.5)  # the motor cannot follow
-    host.send(1, Command.NO_OPERATION)
+    host.send(1, CommandCode.NO_OPERATION)
 
     assert not host.chain.modules[0].loop.servo_on
-    assert bool(host.send(2, Command.NO_OPERATION)) is latched
+    assert bool(host.send(2, CommandCode.NO_OPERATION)) is latched
 
-    host.send(1, Command.IO_CONTROL, 0)
-    host.send(1, Command.NO_OPERATION)
-    assert host.send(2, Command.NO_OPERATION)
+    host.send(1, CommandCode.IO_CONTROL, 0)
+    host.send(1, CommandCode.NO_OPERATION)
+    assert host.send(2, CommandCode.NO_OPERATION)
 
 
 # -- EEPROM (4.6, 5.2) ------------------------------------------------------------------------------------------------
@@ -454,7 +454,7 @@ def save(axis, *options):
     control = StartUp(0)
     for option in options:
         control |= option
-    axis.send(1, Command.HARD_RESET, control)
+    axis.send(1, CommandCode.HARD_RESET, control)
 
 
 def power_cycle(axis):
@@ -490,7 +490,7 @@ def test_a_saved_servo_comes_on_when_the_module_is_given_its_address():
     axis.wait(0.1)
     before = (axis.drive.stage.enabled, axis.drive.loop.servo_on)
 
-    axis.send(0, Command.SET_ADDRESS, 1, 0xFF)
+    axis.send(0, CommandCode.SET_ADDRESS, 1, 0xFF)
 
     assert before == (False, False)
     assert (axis.drive.stage.enabled, axis.drive.loop.servo_on) == (True, True)
@@ -501,8 +501,8 @@ def test_a_command_reset_before_set_address_keeps_the_saved_servo_off():
     save(axis, StartUp.SAVE, StartUp.AMPLIFIER_ON, StartUp.SERVO_ON)
     power_cycle(axis)
 
-    axis.send(0, Command.HARD_RESET)
-    axis.send(0, Command.SET_ADDRESS, 1, 0xFF)
+    axis.send(0, CommandCode.HARD_RESET)
+    axis.send(0, CommandCode.SET_ADDRESS, 1, 0xFF)
 
     assert (axis.drive.stage.enabled, axis.drive.loop.servo_on) == (False, False)
 
@@ -510,17 +510,17 @@ def test_a_command_reset_before_set_address_keeps_the_saved_servo_off():
 def test_saved_addresses_answer_at_once_and_let_the_next_module_hear():
     host = SimulatedHost(build_chain(ChainSpec((ModuleSpec("pic-servo-sc"),) * 2)))
     host.address_all()
-    host.send(1, Command.SET_ADDRESS, 5, 0x81)
-    host.send(5, Command.HARD_RESET, StartUp.SAVE | StartUp.ADDRESSES)
-    assert host.send(2, Command.NO_OPERATION) == b""
+    host.send(1, CommandCode.SET_ADDRESS, 5, 0x81)
+    host.send(5, CommandCode.HARD_RESET, StartUp.SAVE | StartUp.ADDRESSES)
+    assert host.send(2, CommandCode.NO_OPERATION) == b""
 
     first = host.chain.modules[0]
     first.power(on=False, at_s=host.now_s)
     first.power(on=True, at_s=host.now_s)
     host.wait(0.002)
 
-    assert len(host.send(5, Command.NO_OPERATION)) == 2
-    assert len(host.send(2, Command.NO_OPERATION)) == 2
+    assert len(host.send(5, CommandCode.NO_OPERATION)) == 2
+    assert len(host.send(2, CommandCode.NO_OPERATION)) == 2
     assert (first.group, first.leader) == (0x81, False)
 
 
@@ -528,9 +528,9 @@ def test_erasing_forgets_and_older_drives_just_reset():
     axis = sc()
     save(axis, StartUp.SAVE)
     axis.address_all()
-    axis.send(1, Command.HARD_RESET, 0)
+    axis.send(1, CommandCode.HARD_RESET, 0)
     old = SimulatedAxis("pic-servo-v4")
-    old.send(1, Command.HARD_RESET, StartUp.SAVE | StartUp.THREE_PHASE)
+    old.send(1, CommandCode.HARD_RESET, StartUp.SAVE | StartUp.THREE_PHASE)
 
     assert axis.drive.saved is None
     assert old.drive.saved is None
@@ -552,7 +552,7 @@ def test_the_sign_of_the_velocity_on_the_wire_is_a_switch(sign):
     axis.jog(10 * ONE)
     axis.wait(1.0)
 
-    raw = axis.send(1, Command.READ_STATUS, 0x04)
+    raw = axis.send(1, CommandCode.READ_STATUS, 0x04)
 
     assert int.from_bytes(raw[1:3], "little", signed=True) == pytest.approx(10 * sign, abs=1)
 
@@ -560,8 +560,8 @@ def test_the_sign_of_the_velocity_on_the_wire_is_a_switch(sign):
 @pytest.mark.parametrize("scaled", [True, False])
 def test_whether_the_integral_limit_counts_256_times_is_a_switch(scaled):
     axis = sc(il_times_256=scaled)
-    axis.send(1, Command.SET_GAIN, *bytes.fromhex("0000 0000 0001 0300 fa 00 803e 01 00 01"))
-    axis.suffer(Condition.STALLED)
+    axis.send(1, CommandCode.SET_GAIN, *bytes.fromhex("0000 0000 0001 0300 fa 00 803e 01 00 01"))
+    axis.suffer(FaultCondition.STALLED)
 
     axis.stop(ON | StopControl.HERE, *little(100, 4))
     axis.wait(1.0)
@@ -572,8 +572,8 @@ def test_whether_the_integral_limit_counts_256_times_is_a_switch(scaled):
 @pytest.mark.parametrize("added", [True, False])
 def test_whether_deadband_compensation_applies_at_zero_is_a_switch(added):
     axis = sc(deadband_at_zero=added)
-    axis.send(1, Command.SET_GAIN, *bytes.fromhex("0001 0000 0000 0000 fa 00 803e 01 05 01"))
-    axis.suffer(Condition.STALLED)
+    axis.send(1, CommandCode.SET_GAIN, *bytes.fromhex("0001 0000 0000 0000 fa 00 803e 01 05 01"))
+    axis.suffer(FaultCondition.STALLED)
     axis.stop(ON | StopControl.HERE, *little(axis.status().position, 4))
 
     assert abs(axis.pwm()) == (5 if added else 0)

@@ -5,9 +5,9 @@ import pytest
 from ldcnd.contract.errors import BadReply
 from ldcnd.drives.ldcn.packet import (
     AuxFlag,
-    Status,
     StatusFlag,
     StatusItem,
+    StatusPacket,
     check_status,
     decode_status,
     encode_status,
@@ -39,7 +39,7 @@ def test_the_full_mask_makes_these_data_bytes(name, data_bytes):
 
 
 def test_equal_lengths_do_not_mean_equal_layouts():
-    data = encode_status(LS_182AP, EVERYTHING, Status(StatusFlag(0x09), position=1, adc=0x0203, velocity=4))
+    data = encode_status(LS_182AP, EVERYTHING, StatusPacket(StatusFlag(0x09), position=1, adc=0x0203, velocity=4))
 
     other = decode_status(PIC_SERVO_SC, EVERYTHING, data)
 
@@ -53,7 +53,7 @@ def test_every_item_comes_in_the_order_of_its_bit():
 
     status = decode_status(LS_182AP, EVERYTHING, data)
 
-    assert status == Status(
+    assert status == StatusPacket(
         StatusFlag.MOVE_DONE | StatusFlag.CHECKSUM_ERROR | StatusFlag.POWER_ON,
         position=0x01020304,
         adc=0x0506,
@@ -110,4 +110,4 @@ def test_a_reply_is_judged_by_checksum_and_checksum_error_bit(frame, verdict):
 
 def test_a_value_that_does_not_fit_is_not_sent():
     with pytest.raises(OverflowError):
-        encode_status(PIC_SERVO_SC, StatusItem.ADC, Status(StatusFlag(0), adc=256))
+        encode_status(PIC_SERVO_SC, StatusItem.ADC, StatusPacket(StatusFlag(0), adc=256))

@@ -11,13 +11,13 @@ import pytest
 from ldcnd.contract.errors import BadReply, ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn import commands, pic_io
-from ldcnd.drives.ldcn.commands import Group, Node
+from ldcnd.drives.ldcn.commands import LeaderlessGroup, Node
 from ldcnd.drives.ldcn.controls import IoOption, LimitPins, StartUp
 from ldcnd.drives.ldcn.packet import (
-    Command,
-    Status,
+    CommandCode,
     StatusFlag,
     StatusItem,
+    StatusPacket,
     decode_packet,
     decode_status,
     encode_packet,
@@ -137,7 +137,7 @@ def expected_of_io(decoded):
         case "Set Direction":
             return pic_io.SetDirection(decoded["directions"])
         case "Set PWM":
-            return pic_io.SetPwm(decoded["pwm1"], decoded["pwm2"])
+            return pic_io.SetPwmOutputs(decoded["pwm1"], decoded["pwm2"])
         case "Synch Output":
             return pic_io.SynchOutput()
         case "Set Output":
@@ -152,30 +152,30 @@ def expected_of_io(decoded):
 
 
 def expected_of_servo(decoded):  # noqa: PLR0911, PLR0912 - one branch per command
-    match Command(decoded["cmd"]):
-        case Command.RESET_POSITION:
+    match CommandCode(decoded["cmd"]):
+        case CommandCode.RESET_POSITION:
             return ResetPosition(decoded.get("set_position", 0), decoded.get("relative_to_home", False))
-        case Command.SET_ADDRESS:
+        case CommandCode.SET_ADDRESS:
             return SetAddress(decoded["individual"], decoded["group"], decoded["leader"])
-        case Command.DEFINE_STATUS:
+        case CommandCode.DEFINE_STATUS:
             return DefineStatus(StatusItem(decoded["mask"]))
-        case Command.READ_STATUS:
+        case CommandCode.READ_STATUS:
             return ReadStatus(StatusItem(decoded["mask"]))
-        case Command.LOAD_TRAJECTORY:
+        case CommandCode.LOAD_TRAJECTORY:
             return LoadTrajectory(trajectory_of(decoded))
-        case Command.SET_GAIN:
+        case CommandCode.SET_GAIN:
             return SetGain(gains_of(decoded))
-        case Command.STOP_MOTOR:
+        case CommandCode.STOP_MOTOR:
             return StopMotor(bits(decoded["bits"], STOP_BITS), decoded.get("position"))
-        case Command.IO_CONTROL:
+        case CommandCode.IO_CONTROL:
             return IoControl(decoded["control"])
-        case Command.SET_HOMING_MODE:
+        case CommandCode.SET_HOMING_MODE:
             return SetHomingMode(bits(decoded["bits"], HOMING_BITS))
-        case Command.SET_BAUD_RATE:
+        case CommandCode.SET_BAUD_RATE:
             return SetBaudRate(decoded["brd"])
-        case Command.ADD_PATH_POINTS:
+        case CommandCode.ADD_PATH_POINTS:
             return AddPathPoints(tuple(decoded["points_raw"]))
-        case Command.HARD_RESET:
+        case CommandCode.HARD_RESET:
             return HardReset(decoded.get("control"))
         case plain:
             return PlainCommand(plain)
@@ -225,7 +225,7 @@ def built_for_servo(profile, address, command, decoded):  # noqa: PLR0911, PLR09
             return commands.set_homing(to, control)
         case SetBaudRate(code):
             codes = next(codes for codes in BaudCodes if BAUD_DIVISORS[codes].get(decoded["baud"]) == code)
-            return commands.set_baud(Group(address, profile), decoded["baud"], codes)
+            return commands.set_baud(LeaderlessGroup(address, profile), decoded["baud"], codes)
         case AddPathPoints(()):
             return commands.start_path(to)
         case AddPathPoints(words):
@@ -234,13 +234,13 @@ def built_for_servo(profile, address, command, decoded):  # noqa: PLR0911, PLR09
             return commands.add_path_points(to, points, fast_path=fast_path)
         case HardReset(control) if control is not None:
             return commands.configure_start_up(to, StartUp(control))
-        case PlainCommand(Command.START_MOTION):
+        case PlainCommand(CommandCode.START_MOTION):
             return commands.start_motion(to)
-        case PlainCommand(Command.CLEAR_STICKY_BITS):
+        case PlainCommand(CommandCode.CLEAR_STICKY_BITS):
             return commands.clear_sticky_bits(to)
-        case PlainCommand(Command.SAVE_CURRENT_POSITION_AS_HOME):
+        case PlainCommand(CommandCode.SAVE_CURRENT_POSITION_AS_HOME):
             return commands.save_home(to)
-        case PlainCommand(Command.NO_OPERATION):
+        case PlainCommand(CommandCode.NO_OPERATION):
             return commands.no_operation(to)
         case HardReset(None):
             return commands.hard_reset(to)
@@ -334,7 +334,7 @@ def test_a_wrong_frame_is_taken_as_the_firmware_would(row):
 
 def status_of(decoded, profile):
     raw = decoded.get("velocity_raw")
-    return Status(
+    return StatusPacket(
         StatusFlag(decoded["status"]),
         position=decoded.get("position"),
         adc=decoded.get("ad"),

@@ -5,13 +5,13 @@ from ldcnd.contract.commands import REPLAYED_WITHIN_S, CommandReply, Halt, MoveA
 from ldcnd.contract.errors import CommandIdReused, StopLatched, TooManyRequests, UnknownCommand
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState
-from ldcnd.daemon.ledger import ANSWERS_PER_SENDER, SENDERS, Entry, Ledger
+from ldcnd.daemon.ledger import ANSWERS_PER_SENDER, SENDERS, Ledger, LedgerEntry
 
 MOVE = MoveAbsolute(position=1.0)
 
 
-def entry(command_id="c1", command=MOVE) -> Entry:
-    return Entry(command_id, "x", command, "ann")
+def entry(command_id="c1", command=MOVE) -> LedgerEntry:
+    return LedgerEntry(command_id, "x", command, "ann")
 
 
 def reached(ledger: Ledger, command_id: str, status: CommandStatus, reason: str | None = None) -> None:
@@ -85,7 +85,7 @@ def test_an_unknown_id_says_so(ledger):
 
 def done(ledger, command_id, client="ann", **fields):
     command = MoveAbsolute(position=1.0, command_id=command_id, client=client, **fields)
-    ledger.open(Entry(command_id, "x", command, client))
+    ledger.open(LedgerEntry(command_id, "x", command, client))
     reached(ledger, command_id, CommandStatus.DONE)
 
 
@@ -116,7 +116,7 @@ def test_nobody_elses_commands_push_an_answer_out(ledger):
     for number in range(10 * ANSWERS_PER_SENDER):
         done(ledger, f"b{number}", client="bob")
         halt = Halt(command_id=f"h{number}", client="ann")
-        ledger.open(Entry(f"h{number}", "x", halt, "ann"))
+        ledger.open(LedgerEntry(f"h{number}", "x", halt, "ann"))
         reached(ledger, f"h{number}", CommandStatus.DONE)
 
     assert ledger.get("mine").status is CommandStatus.DONE
@@ -163,7 +163,7 @@ def test_an_id_under_a_lease_with_a_sequence_takes_no_memory(ledger):
 
 
 def test_an_entry_keeps_whose_it_is_through_all_its_states(ledger):
-    ledger.open(Entry("c1", "x", MOVE, "ann", "operator"))
+    ledger.open(LedgerEntry("c1", "x", MOVE, "ann", "operator"))
     ledger.answered("c1", CommandReply(command_id="c1", axis="x", verb="move_absolute"), CommandStatus.EXECUTING)
     reached(ledger, "c1", CommandStatus.DONE)
 
@@ -175,14 +175,14 @@ def test_a_sender_with_a_login_is_known_by_it():
     ledger = Ledger(lambda _entry, _error: None, lambda: 0.0)
     for number in range(2 * SENDERS):
         command = MoveAbsolute(position=1.0, command_id=f"c{number}")
-        ledger.open(Entry(f"c{number}", "x", command, f"client{number}", "operator"))
+        ledger.open(LedgerEntry(f"c{number}", "x", command, f"client{number}", "operator"))
         reached(ledger, f"c{number}", CommandStatus.DONE)
 
     assert ledger.get("c0").login == "operator"  # all are of one sender
 
 
 def test_a_sender_with_a_command_under_way_is_not_forgotten(ledger):
-    ledger.open(Entry("running", "x", MOVE, "ann"))
+    ledger.open(LedgerEntry("running", "x", MOVE, "ann"))
     for number in range(2 * SENDERS):
         done(ledger, f"c{number}", client=f"client{number}")
 

@@ -8,7 +8,7 @@ import pytest
 from ldcnd.contract.errors import OutcomeUnknown
 from ldcnd.net.hand_over import Query
 from ldcnd.net.memory_session import MemoryBroker
-from ldcnd.net.session import Qos, Sample
+from ldcnd.net.session import Publication, Qos
 from tests.support.query_facts import QueryFacts
 from tests.support.session_facts import SampleFacts, TokenFacts
 from tests.support.session_pair import JSON, KEYS, Pair, echo
@@ -101,9 +101,9 @@ async def test_undelivered_queries_are_refused_when_serving_ends(pair: Pair) -> 
 async def test_a_subscription_that_raises_still_gets_what_follows(pair: Pair) -> None:
     unhandled: list[object] = []
     asyncio.get_running_loop().set_exception_handler(lambda _, context: unhandled.append(context["exception"]))
-    samples: asyncio.Queue[Sample] = asyncio.Queue()
+    samples: asyncio.Queue[Publication] = asyncio.Queue()
 
-    def take(sample: Sample) -> None:
+    def take(sample: Publication) -> None:
         if sample.payload == b"bad":
             raise ZeroDivisionError
         samples.put_nowait(sample)

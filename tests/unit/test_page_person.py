@@ -6,7 +6,7 @@ import pytest
 
 from ldcnd.bench.person import Left
 from ldcnd.console.commissioning.conversation import Conversation
-from ldcnd.console.commissioning.messages import Answer, FromPage, Hold, View
+from ldcnd.console.commissioning.messages import FromCommissioningPage, HoldButton, PersonAnswer, View
 from ldcnd.console.commissioning.page_person import HELD_S, PagePerson
 
 
@@ -26,12 +26,12 @@ async def test_only_an_answer_to_the_present_question_counts(person):
     async with asyncio.TaskGroup() as group:
         choice = group.create_task(person.choose("which", {"one": "the first", "other": "the second"}))
         question = await asked(person)
-        person.answer(Answer(number=question.number - 1, text="one"))
-        person.answer(Answer(number=question.number, text="neither"))
-        person.hold(Hold(number=question.number, on=True))
+        person.answer(PersonAnswer(number=question.number - 1, text="one"))
+        person.answer(PersonAnswer(number=question.number, text="neither"))
+        person.hold(HoldButton(number=question.number, on=True))
         await asyncio.sleep(0)
         assert not choice.done()
-        person.answer(Answer(number=question.number, text="other"))
+        person.answer(PersonAnswer(number=question.number, text="other"))
 
     assert choice.result() == "other"
 
@@ -40,10 +40,10 @@ async def test_a_number_is_asked_for_until_it_is_one(person):
     async with asyncio.TaskGroup() as group:
         number = group.create_task(person.number("how far", 2.5))
         first = await asked(person)
-        person.answer(Answer(number=first.number, text="far"))
+        person.answer(PersonAnswer(number=first.number, text="far"))
         while person.question is None or person.question.number == first.number:
             await asyncio.sleep(0)
-        person.answer(Answer(number=person.question.number, text=" 4 "))
+        person.answer(PersonAnswer(number=person.question.number, text=" 4 "))
 
     assert first.default == "2.5"
     assert number.result() == 4
@@ -65,12 +65,12 @@ async def test_a_press_that_is_over_at_once_holds_nothing(person):
     async with asyncio.TaskGroup() as group:
         group.create_task(held())
         first = (await asked(person)).number
-        person.hold(Hold(number=first, on=True))
-        person.hold(Hold(number=first, on=False))
+        person.hold(HoldButton(number=first, on=True))
+        person.hold(HoldButton(number=first, on=False))
         while person.question is None or person.question.number == first:
             await asyncio.sleep(0)
         assert not person.holds
-        person.hold(Hold(number=first, on=True))  # a late message of the first button
+        person.hold(HoldButton(number=first, on=True))  # a late message of the first button
         await asyncio.sleep(0)
         assert not person.holds
         person.leave()
@@ -84,7 +84,7 @@ async def test_a_page_that_goes_in_the_instant_of_its_press_holds_nothing(person
 
     async with asyncio.TaskGroup() as group:
         group.create_task(held())
-        person.hold(Hold(number=(await asked(person)).number, on=True))
+        person.hold(HoldButton(number=(await asked(person)).number, on=True))
         person.leave()
 
 
@@ -93,10 +93,10 @@ async def test_a_number_with_which_nothing_can_be_worked_out_is_none(person, typ
     async with asyncio.TaskGroup() as group:
         number = group.create_task(person.number("how far"))
         first = (await asked(person)).number
-        person.answer(Answer(number=first, text=typed))
+        person.answer(PersonAnswer(number=first, text=typed))
         while person.question is None or person.question.number == first:
             await asyncio.sleep(0)
-        person.answer(Answer(number=person.question.number, text="-2"))
+        person.answer(PersonAnswer(number=person.question.number, text="-2"))
 
     assert number.result() == -2
     assert "is no number" in person.lines[0]
@@ -129,11 +129,11 @@ class Steps(Conversation):
 async def test_leaving_twice_does_not_cut_short_how_a_step_is_brought_to_its_end():
     page = Steps()
     running = asyncio.create_task(page.run())
-    page.heard(FromPage(begin="step"))
+    page.heard(FromCommissioningPage(begin="step"))
     await asked(page.person)
-    page.heard(FromPage(leave=True))
+    page.heard(FromCommissioningPage(leave=True))
     await asyncio.sleep(0.5)
-    page.heard(FromPage(leave=True))
+    page.heard(FromCommissioningPage(leave=True))
     await asyncio.sleep(1.0)
     running.cancel()
 
@@ -143,8 +143,8 @@ async def test_leaving_twice_does_not_cut_short_how_a_step_is_brought_to_its_end
 async def test_a_step_that_is_left_before_it_has_begun_does_not_begin():
     page = Steps()
     running = asyncio.create_task(page.run())
-    page.heard(FromPage(begin="step"))
-    page.heard(FromPage(leave=True))
+    page.heard(FromCommissioningPage(begin="step"))
+    page.heard(FromCommissioningPage(leave=True))
     await asyncio.sleep(5.0)
     running.cancel()
 
@@ -161,7 +161,7 @@ async def test_silence_releases_the_button_for_good(person):
         async def press():
             question = await begun
             for _ in range(5):
-                person.hold(Hold(number=question.number, on=True))
+                person.hold(HoldButton(number=question.number, on=True))
                 await asyncio.sleep(0.1)
             return question.number, loop.time()
 
@@ -169,7 +169,7 @@ async def test_silence_releases_the_button_for_good(person):
         async with person.holding("it moves") as released:
             await released.wait()
             number, last_s = await pressing
-            person.hold(Hold(number=number, on=True))
+            person.hold(HoldButton(number=number, on=True))
             assert released.is_set()
             assert not person.holds
 

@@ -6,9 +6,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.axis.plausibility import NOISE_COUNTS, ROUNDS, Judgement, PlausibilityGate, Step, Verdict, agree
+from ldcnd.axis.plausibility import (
+    NOISE_COUNTS,
+    ROUNDS,
+    CounterStep,
+    Judgement,
+    PlausibilityGate,
+    ReadingVerdict,
+    agree,
+)
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import AxisReading, Fault, Motion
+from ldcnd.drives.driver import AxisReading, CountsMotion, Fault
 from ldcnd.line.exchange import Timing
 
 CONFIG = AxisConfig.model_validate(
@@ -35,16 +43,16 @@ class Axis:
         self.read(reading)
         moved = reading.position_counts + round(reading.velocity_counts_per_s * EXCHANGE_S)
         self.position_counts = moved
-        assert self.read(replace(reading, position_counts=moved), standing=False) is Verdict.BELIEVED
+        assert self.read(replace(reading, position_counts=moved), standing=False) is ReadingVerdict.BELIEVED
 
     def read_until_believed(self, reading: AxisReading, after_s: float = EXCHANGE_S) -> int:
         """Return how many such readings it takes."""
         for number in range(1, ROUNDS + 1):
-            if self.read(reading, after_s if number == 1 else EXCHANGE_S) is Verdict.BELIEVED:
+            if self.read(reading, after_s if number == 1 else EXCHANGE_S) is ReadingVerdict.BELIEVED:
                 return number
         raise AssertionError(f"{ROUNDS} readings that agree are not believed")
 
-    def read(self, reading: AxisReading, after_s: float = EXCHANGE_S, *, standing: bool = True) -> Verdict:
+    def read(self, reading: AxisReading, after_s: float = EXCHANGE_S, *, standing: bool = True) -> ReadingVerdict:
         self.now_s += after_s
         timing = Timing(self.now_s - 0.001, self.now_s - 0.0006, self.now_s - 0.0005, self.now_s)
         self.judged = self.gate.judge(reading, timing, standing=standing)
@@ -64,7 +72,7 @@ def test_the_first_reading_is_believed_but_nothing_has_jumped_away_from_it():
     ]
 
     verdicts = [each.verdict for each in judged]
-    assert verdicts == [Verdict.BELIEVED, *[Verdict.ASK_AGAIN] * (ROUNDS - 1), Verdict.BELIEVED]
+    assert verdicts == [ReadingVerdict.BELIEVED, *[ReadingVerdict.ASK_AGAIN] * (ROUNDS - 1), ReadingVerdict.BELIEVED]
     assert not any(each.step for each in judged)
 
 
@@ -74,7 +82,7 @@ def test_any_other_position_of_a_standing_axis_is_asked_again(counts: int):
 
     verdict = axis.read(at(counts), POLL_S)
 
-    assert (verdict is Verdict.BELIEVED) == (abs(counts - 1000) <= NOISE_COUNTS)
+    assert (verdict is ReadingVerdict.BELIEVED) == (abs(counts - 1000) <= NOISE_COUNTS)
 
 
 @pytest.mark.parametrize(
@@ -88,8 +96,8 @@ def test_any_change_of_the_status_is_asked_again_and_believed_when_it_stands(cha
     axis = Axis()
     other = replace(RESTING, **changed)  # type: ignore[arg-type]
 
-    assert axis.read(other, POLL_S) is Verdict.ASK_AGAIN
-    assert axis.read(other) is Verdict.BELIEVED
+    assert axis.read(other, POLL_S) is ReadingVerdict.ASK_AGAIN
+    assert axis.read(other) is ReadingVerdict.BELIEVED
     assert axis.judged.confirmed
     assert axis.judged.confirmed[0] is other
 
@@ -99,8 +107,8 @@ def test_a_reading_that_the_next_one_contradicts_is_forgotten_and_counted():
 
     axis.read(replace(RESTING, faults=(OVERCURRENT,)), POLL_S)
 
-    assert axis.read(RESTING) is Verdict.BELIEVED
-    assert (axis.judged, axis.gate.withheld) == (Judgement(Verdict.BELIEVED), 1)
+    assert axis.read(RESTING) is ReadingVerdict.BELIEVED
+    assert (axis.judged, axis.gate.withheld) == (Judgement(ReadingVerdict.BELIEVED), 1)
 
 
 def test_readings_that_contradict_each_other_are_said_to_do_so():
@@ -108,7 +116,7 @@ def test_readings_that_contradict_each_other_are_said_to_do_so():
 
     verdicts = [axis.read(at(100_000 * (number + 1))) for number in range(ROUNDS)]
 
-    assert verdicts == [Verdict.ASK_AGAIN] * (ROUNDS - 1) + [Verdict.CONTRADICTS]
+    assert verdicts == [ReadingVerdict.ASK_AGAIN] * (ROUNDS - 1) + [ReadingVerdict.CONTRADICTS]
 
 
 @given(
@@ -131,7 +139,7 @@ def test_a_motion_within_the_limits_of_the_axis_is_believed_at_once(velocity: fl
     # between two readings the instants are known to a servo cycle
     later = replace(moving, position_counts=axis.position_counts + round(way), velocity_counts_per_s=told(end))
 
-    assert axis.read(later, dt_s, standing=False) is Verdict.BELIEVED
+    assert axis.read(later, dt_s, standing=False) is ReadingVerdict.BELIEVED
 
 
 @pytest.mark.parametrize(("counts", "jumped"), [(1000 + 20_000, True), (1000 - 20_000, True), (1000 + 500, False)])
@@ -139,7 +147,7 @@ def test_a_confirmed_position_that_no_motion_leads_to_is_a_jump(*, counts: int, 
     axis = Axis()
 
     assert axis.read_until_believed(at(counts), POLL_S) == (ROUNDS if jumped else 2)
-    assert (axis.judged.step is Step.JUMPED) is jumped
+    assert (axis.judged.step is CounterStep.JUMPED) is jumped
 
 
 @given(st.lists(st.integers(1, ROUNDS - 1), min_size=1, max_size=6))
@@ -148,9 +156,9 @@ def test_late_replies_of_another_drive_are_not_believed_though_they_agree(runs: 
 
     for run in runs:
         verdicts = [axis.read(at(-30_000)) for _ in range(run)]
-        assert verdicts == [Verdict.ASK_AGAIN] * run
+        assert verdicts == [ReadingVerdict.ASK_AGAIN] * run
         assert axis.judged.foreign
-        assert axis.read(RESTING) is Verdict.BELIEVED
+        assert axis.read(RESTING) is ReadingVerdict.BELIEVED
         assert axis.judged.step is None
 
 
@@ -158,7 +166,7 @@ def test_a_place_too_far_for_its_speed_is_asked_again_also_of_an_axis_that_was_n
     """What the axis may accelerate would lead there in that time."""
     axis = Axis()
 
-    assert axis.read(at(47_000), 0.38, standing=False) is Verdict.ASK_AGAIN
+    assert axis.read(at(47_000), 0.38, standing=False) is ReadingVerdict.ASK_AGAIN
     assert axis.judged.foreign
 
 
@@ -184,30 +192,30 @@ def test_a_motion_that_is_faster_than_the_velocity_of_an_axis_without_limits_is_
         for number in range(1, 7)
     ]
 
-    assert verdicts[2:] == [Verdict.BELIEVED] * 4
+    assert verdicts[2:] == [ReadingVerdict.BELIEVED] * 4
 
 
 def test_a_counter_that_wraps_has_not_jumped():
     axis = Axis(at(2**31 - 3))
 
-    assert axis.read(at(-(2**31) + 4), POLL_S) is Verdict.BELIEVED
+    assert axis.read(at(-(2**31) + 4), POLL_S) is ReadingVerdict.BELIEVED
 
 
 def test_a_drive_that_is_back_is_believed_at_once_only_where_it_was():
     axis = Axis()
     axis.gate.after_gap()
-    assert axis.read(at(1000 + NOISE_COUNTS), 5.0, standing=False) is Verdict.BELIEVED
+    assert axis.read(at(1000 + NOISE_COUNTS), 5.0, standing=False) is ReadingVerdict.BELIEVED
 
     axis.gate.after_gap()
-    assert axis.read(at(1500), 5.0, standing=False) is Verdict.ASK_AGAIN
+    assert axis.read(at(1500), 5.0, standing=False) is ReadingVerdict.ASK_AGAIN
     assert axis.judged.foreign
-    assert axis.read(at(1500), standing=False) is Verdict.BELIEVED
+    assert axis.read(at(1500), standing=False) is ReadingVerdict.BELIEVED
 
 
 def test_a_velocity_that_no_acceleration_leads_to_is_asked_again_though_the_way_fits_it():
     axis = Axis()
 
-    assert axis.read(at(1000 + 2755, 110_000.0), POLL_S, standing=False) is Verdict.ASK_AGAIN
+    assert axis.read(at(1000 + 2755, 110_000.0), POLL_S, standing=False) is ReadingVerdict.ASK_AGAIN
     assert not axis.judged.foreign
 
 
@@ -216,7 +224,7 @@ def test_what_a_drive_that_is_back_shows_at_its_place_is_not_another_drives(coun
     axis = Axis()
     axis.gate.after_gap()
 
-    assert axis.read(replace(at(1000 + counts), enabled=False), 5.0, standing=False) is Verdict.ASK_AGAIN
+    assert axis.read(replace(at(1000 + counts), enabled=False), 5.0, standing=False) is ReadingVerdict.ASK_AGAIN
     assert axis.judged.foreign is foreign
 
 
@@ -227,7 +235,7 @@ def test_what_leaves_the_place_that_was_confirmed_after_a_gap_has_jumped():
 
     axis.read_until_believed(at(30_000))
 
-    assert axis.judged.step is Step.JUMPED
+    assert axis.judged.step is CounterStep.JUMPED
 
 
 @pytest.mark.parametrize(("counts", "readings"), [(613, 2), (615, ROUNDS)])
@@ -244,17 +252,17 @@ def test_a_jump_of_an_axis_at_rest_is_farther_than_noise_and_resolution_and_an_e
 def test_a_counter_that_is_set_back_in_mid_motion_has_jumped_also_where_the_axis_soon_passes_its_old_place(back: int):
     speed = 20_000.0
     axis = Axis(replace(at(40_000, speed), profile_done=False))
-    axis.gate.expect(Motion(90_000, speed, 200_000.0))
+    axis.gate.expect(CountsMotion(90_000, speed, 200_000.0))
     began_s, counts = axis.now_s, axis.position_counts
 
-    def read(after_s: float) -> Verdict:
+    def read(after_s: float) -> ReadingVerdict:
         place = counts - back + round((axis.now_s + after_s - began_s) * speed)
         return axis.read(replace(at(place, speed), profile_done=False), after_s, standing=False)
 
     verdicts = [read(after_s) for after_s in (0.01, *[0.025] * (ROUNDS - 1))]
 
-    assert verdicts == [Verdict.ASK_AGAIN] * (ROUNDS - 1) + [Verdict.BELIEVED]
-    assert axis.judged.step is Step.JUMPED
+    assert verdicts == [ReadingVerdict.ASK_AGAIN] * (ROUNDS - 1) + [ReadingVerdict.BELIEVED]
+    assert axis.judged.step is CounterStep.JUMPED
 
 
 def test_a_false_velocity_that_would_explain_a_jump_does_not_hide_it():
@@ -262,15 +270,15 @@ def test_a_false_velocity_that_would_explain_a_jump_does_not_hide_it():
 
     verdicts = [axis.read(at(40_000, velocity), standing=False) for velocity in (30e6, *[0.0] * (ROUNDS - 1))]
 
-    assert verdicts == [Verdict.ASK_AGAIN] * (ROUNDS - 1) + [Verdict.BELIEVED]
-    assert axis.judged.step is Step.JUMPED
+    assert verdicts == [ReadingVerdict.ASK_AGAIN] * (ROUNDS - 1) + [ReadingVerdict.BELIEVED]
+    assert axis.judged.step is CounterStep.JUMPED
 
 
 @pytest.mark.parametrize("off", [-20_000, -2500, -700, 700, 2500, 20_000])
 def test_one_false_reply_in_mid_motion_is_no_jump(off: int):
     speed = 50_000.0
     axis = Axis(replace(at(0, speed), profile_done=False))
-    axis.gate.expect(Motion(90_000, speed, 200_000.0))
+    axis.gate.expect(CountsMotion(90_000, speed, 200_000.0))
     began_s, counts = axis.now_s, axis.position_counts
 
     for after_s, wrong in ((0.02, off), *[(0.025, 0)] * ROUNDS):
@@ -278,7 +286,7 @@ def test_one_false_reply_in_mid_motion_is_no_jump(off: int):
         axis.read(replace(at(place, speed), profile_done=False), after_s, standing=False)
         assert axis.judged.step is None
 
-    assert axis.judged.verdict is Verdict.BELIEVED
+    assert axis.judged.verdict is ReadingVerdict.BELIEVED
 
 
 def test_a_loop_that_hunts_is_not_asked_again_once_its_readings_contradict_each_other_and_then_agrees():
@@ -289,8 +297,8 @@ def test_a_loop_that_hunts_is_not_asked_again_once_its_readings_contradict_each_
     hunting = [axis.read(at((-1) ** number * 2000), POLL_S) for number in range(ROUNDS, 20)]
     standing = [axis.read(at(700), POLL_S) for _ in range(ROUNDS + 1)]
 
-    assert hunting == [Verdict.CONTRADICTS] * len(hunting)
-    assert standing == [Verdict.CONTRADICTS] * ROUNDS + [Verdict.BELIEVED]
+    assert hunting == [ReadingVerdict.CONTRADICTS] * len(hunting)
+    assert standing == [ReadingVerdict.CONTRADICTS] * ROUNDS + [ReadingVerdict.BELIEVED]
 
 
 @pytest.mark.parametrize(
@@ -306,7 +314,7 @@ def test_a_counter_that_has_restarted_shows_that_it_began_anew_where_no_motion_l
     reading = replace(at(counts), enabled=False, begun_anew=after)  # which is asked again, whatever it shows besides
     axis.read_until_believed(reading, EXCHANGE_S)
 
-    assert (axis.judged.step is Step.ZEROED) is zeroed
+    assert (axis.judged.step is CounterStep.ZEROED) is zeroed
 
 
 def test_after_a_gap_another_position_is_confirmed_and_is_no_jump():
@@ -320,12 +328,12 @@ def test_after_a_gap_another_position_is_confirmed_and_is_no_jump():
 @pytest.mark.parametrize(("seconds", "readings"), [(1.0, 2), (0.1, ROUNDS)])
 def test_what_is_a_jump_depends_on_what_was_commanded_and_the_time_in_between(seconds: float, readings: int):
     axis = Axis()
-    axis.gate.expect(Motion(60_000, 50_000.0, 1_000_000.0))
+    axis.gate.expect(CountsMotion(60_000, 50_000.0, 1_000_000.0))
 
     came = [axis.read(at(51_000), after_s, standing=False) for after_s in (seconds, *[EXCHANGE_S] * (ROUNDS - 1))]
 
-    assert came.index(Verdict.BELIEVED) + 1 == readings
-    assert (axis.judged.step is Step.JUMPED) is (readings == ROUNDS)
+    assert came.index(ReadingVerdict.BELIEVED) + 1 == readings
+    assert (axis.judged.step is CounterStep.JUMPED) is (readings == ROUNDS)
 
 
 def test_readings_agree_within_what_the_axis_moves_meanwhile():

@@ -42,7 +42,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, TelemetryItem
-from ldcnd.drives.driver import AnalogMotion, Fault, HomeCapture, Motion, PwmOutput, StopMode
+from ldcnd.drives.driver import AnalogMotion, CountsMotion, Fault, HomeCapture, PwmOutput, StopMode
 from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, raising
 
 LOST = ReplyTimeout("no reply")
@@ -74,7 +74,7 @@ async def test_a_search_is_armed_started_once_and_taken_over_when_it_has_capture
         assert bench.drive.calls == ["load", "start"]
         motion, capture = loads(bench)[0]
         assert capture == HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH)
-        assert motion == Motion(round(5000 * 60.0 * 1.1), 5000.0, 200_000.0)
+        assert motion == CountsMotion(round(5000 * 60.0 * 1.1), 5000.0, 200_000.0)
         assert (bench.tracker.state, bench.tracker.referenced) == (AxisState.HOMING, False)
 
         await bench.pass_s(0.5, **SEARCHING)
@@ -368,7 +368,7 @@ async def test_the_preset_completes_a_request_and_the_request_outranks_it():
     async with axis_bench(home=preset) as bench:
         reply = await bench.send(Home())
         assert reply.position == 7.0
-        assert loads(bench)[0][0] == Motion(4000, 10_000.0, 200_000.0)
+        assert loads(bench)[0][0] == CountsMotion(4000, 10_000.0, 200_000.0)
         await bench.stop()
         await bench.settled()
         bench.tracker.cleared(0.0)
@@ -376,7 +376,7 @@ async def test_the_preset_completes_a_request_and_the_request_outranks_it():
         bench.drive.told.clear()
         await bench.send(Home(method=HomeMethod.INDEX, velocity=2.0, position=0.0, distance=8.0, stop=HomeStop.SMOOTH))
 
-        assert loads(bench) == [(Motion(8000, 2000.0, 200_000.0), HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH))]
+        assert loads(bench) == [(CountsMotion(8000, 2000.0, 200_000.0), HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH))]
 
 
 @pytest.mark.parametrize(
@@ -491,7 +491,7 @@ async def test_a_jog_changes_its_velocity_in_velocity_mode_and_is_ended_before_t
     async with axis_bench(limits={"position_max": 50.0}) as bench:
         await jogging(bench)
         reply = await bench.send(MoveVelocity(velocity=5.0), "slower")
-        assert bench.drive.told == [("load", Motion(None, 5000.0, 200_000.0)), ("start", None)]
+        assert bench.drive.told == [("load", CountsMotion(None, 5000.0, 200_000.0)), ("start", None)]
         assert (reply.velocity, reply.acceleration) == (5.0, 200.0)
 
         # 10 mm/s before the change: 10 * 10 / (2 * 200) + 10 * 0.2

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.contract.errors import AxisUnreachable, LdcndError, NotIdentified
-from ldcnd.line.exchange import Effect
+from ldcnd.line.exchange import PacketEffect
 from ldcnd.line.proof import MISSES_UNTIL_LOST, bringing_up
 from ldcnd.line.queue import Lane
 from tests.support import toy_family as toy
@@ -16,11 +16,11 @@ from tests.support.scripted_line import Say
 NODE, OTHER, GROUP = 1, 2, 0x81
 
 
-def packet(effect: Effect, node: int = NODE, number: int = 7):
+def packet(effect: PacketEffect, node: int = NODE, number: int = 7):
     return replace(toy.exchange(number, node), effect=effect)
 
 
-async def sent(rig: Rig, effect: Effect, node: int = NODE, lane: Lane = Lane.COMMAND) -> type[LdcndError] | None:
+async def sent(rig: Rig, effect: PacketEffect, node: int = NODE, lane: Lane = Lane.COMMAND) -> type[LdcndError] | None:
     try:
         await rig.bus.execute(packet(effect, node), lane)
     except LdcndError as error:
@@ -30,7 +30,7 @@ async def sent(rig: Rig, effect: Effect, node: int = NODE, lane: Lane = Lane.COM
 
 
 @pytest.mark.parametrize("lane", [Lane.STOP, Lane.COMMAND, Lane.BACKGROUND])
-@pytest.mark.parametrize("effect", Effect)
+@pytest.mark.parametrize("effect", PacketEffect)
 async def test_to_a_node_without_proof_goes_only_what_reads_or_takes_energy_out(effect, lane):
     rig = Rig()
     async with running(rig):
@@ -38,7 +38,7 @@ async def test_to_a_node_without_proof_goes_only_what_reads_or_takes_energy_out(
 
         refused = await sent(rig, effect, lane=lane)
 
-    assert refused is (None if effect in (Effect.READS, Effect.RELIEVES) else AxisUnreachable)
+    assert refused is (None if effect in (PacketEffect.READS, PacketEffect.RELIEVES) else AxisUnreachable)
 
 
 async def test_to_a_proven_node_goes_everything_and_to_one_that_is_not_configured_nothing_that_changes_it():
@@ -46,8 +46,8 @@ async def test_to_a_proven_node_goes_everything_and_to_one_that_is_not_configure
     async with running(rig):
         rig.bus.proofs.expect(NODE, "axis x", "x").prove()
 
-        assert await sent(rig, Effect.CHANGES, OTHER) is NotIdentified
-        for effect in Effect:
+        assert await sent(rig, PacketEffect.CHANGES, OTHER) is NotIdentified
+        for effect in PacketEffect:
             await rig.bus.execute(packet(effect))
 
 
@@ -61,11 +61,11 @@ async def test_what_is_sent_to_a_group_concerns_all_its_members():
         other.lose("address 2 (axis y): expected PIC-SERVO v4, PIC-I/O", silent=False)
 
         with pytest.raises(NotIdentified, match=r"axis y .* expected PIC-SERVO v4, PIC-I/O") as refused:
-            await rig.bus.execute(packet(Effect.CHANGES, GROUP))
+            await rig.bus.execute(packet(PacketEffect.CHANGES, GROUP))
         assert refused.value.axis == "y"
 
         other.prove()
-        assert await sent(rig, Effect.CHANGES, GROUP) is None
+        assert await sent(rig, PacketEffect.CHANGES, GROUP) is None
 
 
 @pytest.mark.promise("proven-before-changed")
@@ -76,7 +76,7 @@ async def test_proof_is_asked_when_the_turn_comes_and_not_before():
         proof.prove()
         callers.create_task(rig.bus.execute(toy.exchange(1)), name="on the wire")
         await asyncio.sleep(0)
-        waiting = callers.create_task(sent_or_error(rig, packet(Effect.CHANGES)), name="waits")
+        waiting = callers.create_task(sent_or_error(rig, packet(PacketEffect.CHANGES)), name="waits")
         await asyncio.sleep(0)
         proof.lose("it has restarted")
 
@@ -109,7 +109,7 @@ async def test_a_node_that_stops_answering_loses_its_proof_and_gets_it_by_no_rep
         await rig.bus.execute(toy.exchange(2, NODE))
         assert rig.bus.proofs.heard_again.is_set()
         with pytest.raises(AxisUnreachable, match="stopped answering"):
-            await rig.bus.execute(packet(Effect.CHANGES))
+            await rig.bus.execute(packet(PacketEffect.CHANGES))
 
 
 async def test_a_lost_line_has_lost_all_proofs():
@@ -128,13 +128,13 @@ async def test_the_pass_of_a_bring_up_lets_addresses_through_and_no_motion_and_e
 
         async def outlives() -> object:
             await begun.wait()
-            return await sent_or_error(rig, packet(Effect.ARRANGES, number=3))
+            return await sent_or_error(rig, packet(PacketEffect.ARRANGES, number=3))
 
         rig.bus.proofs.expect(NODE, "axis x", "x")
         with bringing_up():
             late = callers.create_task(outlives(), name="outlives")
-            await rig.bus.execute(packet(Effect.ARRANGES, number=1))
-            assert isinstance(await sent_or_error(rig, packet(Effect.CHANGES, number=2)), AxisUnreachable)
+            await rig.bus.execute(packet(PacketEffect.ARRANGES, number=1))
+            assert isinstance(await sent_or_error(rig, packet(PacketEffect.CHANGES, number=2)), AxisUnreachable)
         begun.set()
 
     assert isinstance(late.result(), AxisUnreachable)

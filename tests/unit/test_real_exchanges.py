@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.drives.ldcn.packet import Command, StatusItem, check_status, decode_status
+from ldcnd.drives.ldcn.packet import CommandCode, StatusItem, check_status, decode_status
 from ldcnd.drives.ldcn.pic_io import IoItem, decode_io_status
 from ldcnd.drives.ldcn.profiles import LS_231, PIC_IO, PIC_SERVO_V4, SK_2310G2, identify
 from ldcnd.drives.ldcn.received import decode_command
@@ -45,16 +45,16 @@ def test_a_simulated_module_answers_the_requests_of_real_ones_in_order_as_far_as
     for exchange in ordered(device):
         request, reply, mask = bytes.fromhex(exchange["request"]), bytes.fromhex(exchange["reply"]), exchange["mask"]
         if request[1] == 0:
-            host.send(module.address, Command.HARD_RESET)
+            host.send(module.address, CommandCode.HARD_RESET)
         elif module.address != request[1]:
-            host.send(module.address, Command.SET_ADDRESS, request[1], 0xFF)
+            host.send(module.address, CommandCode.SET_ADDRESS, request[1], 0xFF)
         if mask >= TWO_MASK_BYTES:
-            host.send(module.address, Command.DEFINE_STATUS, mask & 0xFF, mask >> 8)
+            host.send(module.address, CommandCode.DEFINE_STATUS, mask & 0xFF, mask >> 8)
             continue
         if "WITHOUT a data byte" in exchange["note"]:
-            host.send(module.address, Command.DEFINE_STATUS)
+            host.send(module.address, CommandCode.DEFINE_STATUS)
         elif mask:
-            host.send(module.address, Command.DEFINE_STATUS, mask)
+            host.send(module.address, CommandCode.DEFINE_STATUS, mask)
 
         host.chain.write(host.now_s, request)
         answer = host.wait(0.03)
@@ -98,12 +98,12 @@ def test_the_real_replies_say_what_their_devices_showed():
 def test_define_status_without_its_byte_takes_what_set_address_left_in_the_receive_buffer():
     host = simulated("SK-2310g2")
     (module,) = host.chain.modules
-    host.send(0, Command.SET_ADDRESS, 6, 0xFF)
-    host.send(6, Command.NO_OPERATION)
+    host.send(0, CommandCode.SET_ADDRESS, 6, 0xFF)
+    host.send(6, CommandCode.NO_OPERATION)
 
-    host.send(6, Command.DEFINE_STATUS)
+    host.send(6, CommandCode.DEFINE_STATUS)
     short = module.items
-    host.send(6, Command.DEFINE_STATUS, 0xFF, 0xFF)
-    host.send(6, Command.DEFINE_STATUS)
+    host.send(6, CommandCode.DEFINE_STATUS, 0xFF, 0xFF)
+    host.send(6, CommandCode.DEFINE_STATUS)
 
     assert (short, module.items) == (StatusItem(0x06), StatusItem(0xFF))

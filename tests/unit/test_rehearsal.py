@@ -3,7 +3,7 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.drives.cost import Cost
-from ldcnd.drives.simulated_polling import Drive, mean_lengths_s
+from ldcnd.drives.simulated_polling import PolledDrive, mean_lengths_s
 from tests.support.polled_chain import BAUD, CYCLE, saturated
 
 BYTE_S = 10 / BAUD
@@ -12,7 +12,7 @@ COST = Cost(request_s=5 * BYTE_S, wait_s=CYCLE.length_s, reply_s=9 * BYTE_S * CY
 
 def wait_s(drives: int, rate_hz: float, seed: int = 1) -> float:
     """Return how long drives with equal rates make the line wait on average."""
-    lengths_s = mean_lengths_s((Drive(rate_hz, COST),) * drives, CYCLE, seed)
+    lengths_s = mean_lengths_s((PolledDrive(rate_hz, COST),) * drives, CYCLE, seed)
     return sum(lengths_s) / drives - COST.wire_s - COST.overhead_s
 
 
@@ -37,13 +37,13 @@ def test_where_the_cycles_lie_matters_little(rate_hz: float):
 
 async def test_a_line_that_polls_all_the_time_is_as_quick_as_one_that_is_simulated_byte_by_byte():
     simulated = await saturated(31, 3.0, by_phase=True)
-    drive = Drive(2000.0, replace(COST, overhead_s=0.0))
+    drive = PolledDrive(2000.0, replace(COST, overhead_s=0.0))
 
     assert sum(mean_lengths_s((drive,) * 31, CYCLE)) / 31 == pytest.approx(1.0 / simulated.per_s, rel=0.03)
 
 
 def test_a_drive_that_has_no_turn_is_reckoned_with_as_without_an_order():
-    seldom = Drive(0.0001, Cost(0.001, 0.002, 0.003, 0.004))
-    lengths_s = mean_lengths_s((Drive(10_000.0, COST), seldom), CYCLE)
+    seldom = PolledDrive(0.0001, Cost(0.001, 0.002, 0.003, 0.004))
+    lengths_s = mean_lengths_s((PolledDrive(10_000.0, COST), seldom), CYCLE)
 
     assert lengths_s[1] == seldom.cost.mean_s

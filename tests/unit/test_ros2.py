@@ -9,7 +9,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.contract.samples import LinkState
 from ldcnd.lab.ros2.bridge import Bridge
 from ldcnd.lab.ros2.cdr import JOINT_STATE
-from ldcnd.lab.ros2.graph import Node, advertise, attachment_of
+from ldcnd.lab.ros2.graph import RosNode, advertise, attachment_of
 from ldcnd.net.memory_session import MemoryBroker
 from tests.support.rig import running_rig, two_axes
 from tests.support.ros2_messages import DIAGNOSTICS, JOINTS
@@ -57,7 +57,7 @@ def test_attachments_are_what_zenoh_s_own_serializer_writes():
 
 
 def test_keys_and_tokens_are_those_of_the_design_document():
-    node = Node(2, "ldcnd_sim", "8b20917502ee955ac4476e0266340d5c")
+    node = RosNode(2, "ldcnd_sim", "8b20917502ee955ac4476e0266340d5c")
 
     assert node.token == "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/0/NN/%/%/ldcnd_sim"  # noqa: S105
     assert node.publisher_token(1, "/joint_states", JOINT_STATE) == (
@@ -75,7 +75,7 @@ async def test_a_publisher_is_seen_while_it_is_declared():
     broker = MemoryBroker()
     async with broker.session() as session:
         watching = await session.watch_tokens("@ros2_lv/0/**", lambda key, alive: seen.append((key, alive)))
-        node = Node(0, "n", "0" * 31 + "1")
+        node = RosNode(0, "n", "0" * 31 + "1")
         listening = await session.subscribe(
             node.topic_key("/joint_states", JOINT_STATE), lambda sample: published.append(sample.payload)
         )

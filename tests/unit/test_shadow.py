@@ -5,9 +5,9 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from ldcnd.bench.tuning.ldcn.effort import MOST_GAP_S, EffortMeter, Seen
+from ldcnd.bench.tuning.ldcn.effort import MOST_GAP_S, EffortMeter, SeenPosition
 from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Shadow
+from ldcnd.bench.tuning.ldcn.shadow import LEARNT_MOTIONS, FigureAlarm, FigureName, Shadow
 from ldcnd.bench.tuning.ldcn.watching import meaning
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC
 from tests.support.simulated_plants import drawn_plants
@@ -44,7 +44,7 @@ class Watched:
         assert not watched.shadow.is_learning
         return watched
 
-    def alarms(self, motions: int) -> list[tuple[int, Alarm]]:
+    def alarms(self, motions: int) -> list[tuple[int, FigureAlarm]]:
         return [
             (motion, alarm)
             for motion in range(1, motions + 1)
@@ -146,7 +146,7 @@ def test_an_output_that_moves_nothing_is_said_anew_at_another_place_and_ends_aft
         told = []
         for _ in range(30):
             axis._t_s += 0.01
-            told += shadow.take(Seen(axis._t_s, counts, FAR_COUNTS))
+            told += shadow.take(SeenPosition(axis._t_s, counts, FAR_COUNTS))
         return told
 
     (first,), (again,), nothing = stands(10**6), stands(10**6 + 500), stands(10**6)

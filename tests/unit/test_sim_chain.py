@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, Reply, received_at
+from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, ModuleReply, received_at
 
 HOST_BYTE_S = 10 / 19_200
 
@@ -25,7 +25,7 @@ class Parrot(Module):
 
     def advance(self, to_s):
         at_s, self.next_event_s = self.next_event_s, NEVER_S
-        return Reply(self.answer, at_s, 10 / self.baud)
+        return ModuleReply(self.answer, at_s, 10 / self.baud)
 
 
 def test_bytes_take_ten_bit_times_and_queue_behind_each_other():

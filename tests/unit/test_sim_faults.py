@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.sim.faults import Fault, FaultInjector, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 
 REQUEST = bytes(range(1, 9))
 
@@ -23,40 +23,40 @@ def test_no_fault_changes_nothing():
 
 
 def test_lost_request_reaches_nobody():
-    assert injector(Fault(FaultKind.REQUEST_LOST)).request(REQUEST, 0.0).values == (None,) * 8
+    assert injector(LineFault(FaultKind.REQUEST_LOST)).request(REQUEST, 0.0).values == (None,) * 8
 
 
 def test_one_byte_of_a_request_is_lost():
-    values = injector(Fault(FaultKind.REQUEST_BYTE_LOST)).request(REQUEST, 0.0).values
+    values = injector(LineFault(FaultKind.REQUEST_BYTE_LOST)).request(REQUEST, 0.0).values
 
     assert values.count(None) == 1
     assert all(value in {None, sent} for value, sent in zip(values, REQUEST, strict=True))
 
 
 def test_one_bit_of_a_request_flips():
-    values = injector(Fault(FaultKind.REQUEST_BIT_FLIPPED)).request(REQUEST, 0.0).values
+    values = injector(LineFault(FaultKind.REQUEST_BIT_FLIPPED)).request(REQUEST, 0.0).values
 
     assert (bits(values) ^ bits(REQUEST)).bit_count() == 1
 
 
 def test_lost_reply_is_empty():
-    assert injector(Fault(FaultKind.REPLY_LOST)).reply(REQUEST, 0.0).data == b""
+    assert injector(LineFault(FaultKind.REPLY_LOST)).reply(REQUEST, 0.0).data == b""
 
 
 def test_one_byte_of_a_reply_is_lost():
-    data = injector(Fault(FaultKind.REPLY_BYTE_LOST)).reply(REQUEST, 0.0).data
+    data = injector(LineFault(FaultKind.REPLY_BYTE_LOST)).reply(REQUEST, 0.0).data
 
     assert any(data == REQUEST[:at] + REQUEST[at + 1 :] for at in range(8))
 
 
 def test_one_bit_of_a_reply_flips():
-    data = injector(Fault(FaultKind.REPLY_BIT_FLIPPED)).reply(REQUEST, 0.0).data
+    data = injector(LineFault(FaultKind.REPLY_BIT_FLIPPED)).reply(REQUEST, 0.0).data
 
     assert (bits(data) ^ bits(REQUEST)).bit_count() == 1
 
 
 def test_delay_stays_within_its_bound():
-    dice = injector(Fault(FaultKind.REPLY_DELAYED, longest_s=0.1))
+    dice = injector(LineFault(FaultKind.REPLY_DELAYED, longest_s=0.1))
 
     delays = [dice.reply(REQUEST, 0.0).delay_s for _ in range(100)]
 
@@ -64,21 +64,21 @@ def test_delay_stays_within_its_bound():
 
 
 def test_duplicated_reply_comes_twice():
-    assert injector(Fault(FaultKind.REPLY_DUPLICATED)).reply(REQUEST, 0.0).copies == 2
+    assert injector(LineFault(FaultKind.REPLY_DUPLICATED)).reply(REQUEST, 0.0).copies == 2
 
 
 def test_unplugging_says_for_how_long():
-    assert injector(Fault(FaultKind.UNPLUGGED, longest_s=3.0)).request(REQUEST, 0.0).unplugged_s == 3.0
+    assert injector(LineFault(FaultKind.UNPLUGGED, longest_s=3.0)).request(REQUEST, 0.0).unplugged_s == 3.0
 
 
 def test_fault_only_strikes_within_its_schedule():
-    dice = injector(Fault(FaultKind.REPLY_LOST, from_s=1.0, until_s=2.0))
+    dice = injector(LineFault(FaultKind.REPLY_LOST, from_s=1.0, until_s=2.0))
 
     assert [bool(dice.reply(REQUEST, at_s).data) for at_s in (0.9, 1.0, 1.9, 2.0)] == [True, False, False, True]
 
 
 def test_probability_is_the_share_of_packets_that_suffer():
-    dice = injector(Fault(FaultKind.REQUEST_LOST, probability=0.25))
+    dice = injector(LineFault(FaultKind.REQUEST_LOST, probability=0.25))
 
     lost = sum(dice.request(REQUEST, 0.0).values[0] is None for _ in range(2000))
 
@@ -86,7 +86,7 @@ def test_probability_is_the_share_of_packets_that_suffer():
 
 
 def test_same_seed_gives_the_same_faults_and_another_seed_others():
-    fault = Fault(FaultKind.REPLY_BIT_FLIPPED, probability=0.5)
+    fault = LineFault(FaultKind.REPLY_BIT_FLIPPED, probability=0.5)
 
     def play(seed):
         dice = injector(fault, seed=seed)

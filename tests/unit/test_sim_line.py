@@ -6,7 +6,7 @@ import pytest
 
 from ldcnd.contract.errors import TransportLost
 from ldcnd.sim.chain import Delivery
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
 from tests.support.jumping_loop import JumpingLoop
@@ -157,7 +157,7 @@ async def test_replugged_line_finds_the_modules_as_they_were():
 
 
 async def test_unplug_fault_reports_the_loss_after_the_write_returned():
-    chain = chain_of("ls182ap", faults=FaultPlan((Fault(FaultKind.UNPLUGGED, longest_s=2.0),)))
+    chain = chain_of("ls182ap", faults=FaultPlan((LineFault(FaultKind.UNPLUGGED, longest_s=2.0),)))
     line, listener = await opened(chain)
 
     line.write(NO_OPERATION_1)
@@ -182,7 +182,7 @@ async def test_closed_line_refuses_writing_and_may_be_closed_again():
 
 
 async def test_echo_comes_before_the_reply():
-    line, listener = await opened(chain_of("ls182ap", faults=FaultPlan((Fault(FaultKind.ECHO),))))
+    line, listener = await opened(chain_of("ls182ap", faults=FaultPlan((LineFault(FaultKind.ECHO),))))
 
     line.write(SET_ADDRESS_1)
     await asyncio.sleep(0.1)
@@ -193,7 +193,7 @@ async def test_echo_comes_before_the_reply():
 
 
 async def test_delayed_reply_survives_the_next_request():
-    chain = chain_of("ls182ap", faults=FaultPlan((Fault(FaultKind.REPLY_DELAYED, until_s=0.01, longest_s=0.5),)))
+    chain = chain_of("ls182ap", faults=FaultPlan((LineFault(FaultKind.REPLY_DELAYED, until_s=0.01, longest_s=0.5),)))
     line, listener = await opened(chain)
 
     line.write(SET_ADDRESS_1)
@@ -206,7 +206,7 @@ async def test_delayed_reply_survives_the_next_request():
 
 
 async def test_duplicated_reply_follows_the_first():
-    line, listener = await opened(chain_of("ls182ap", faults=FaultPlan((Fault(FaultKind.REPLY_DUPLICATED),))))
+    line, listener = await opened(chain_of("ls182ap", faults=FaultPlan((LineFault(FaultKind.REPLY_DUPLICATED),))))
 
     line.write(SET_ADDRESS_1)
     await asyncio.sleep(0.1)
@@ -219,7 +219,7 @@ async def test_duplicated_reply_follows_the_first():
 
 def test_same_seed_and_same_requests_give_the_same_bytes_at_the_same_instants():
     kinds = set(FaultKind) - {FaultKind.UNPLUGGED, FaultKind.ECHO}
-    faults = tuple(Fault(kind, 0.1, longest_s=0.01) for kind in sorted(kinds))
+    faults = tuple(LineFault(kind, 0.1, longest_s=0.01) for kind in sorted(kinds))
 
     async def session():
         line, listener = await opened(chain_of("ls182ap", "picservo-v4", faults=FaultPlan(faults, seed=6)))

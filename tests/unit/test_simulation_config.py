@@ -11,9 +11,9 @@ from ldcnd.cli.sim import command
 from ldcnd.contract.errors import ConfigError
 from ldcnd.drives.toml import read_toml
 from ldcnd.sim.chain import Delivery
-from ldcnd.sim.faults import Fault, FaultKind
+from ldcnd.sim.faults import FaultKind, LineFault
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, build_chain
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
 from ldcnd.sim.ldcn.simulation import PlantConfig, SimulatedChainConfig, SimulationConfig
 from ldcnd.sim.line_config import FaultPlanConfig
@@ -92,10 +92,10 @@ def test_events_happen_at_their_instants_counted_from_the_opening(tmp_path):
         seen.append((set(drive.stage.conditions), io._powered))
 
     assert seen == [
-        ({Condition.STOP_INPUT}, True),
-        ({Condition.STOP_INPUT, Condition.OVERHEAT}, True),
-        ({Condition.OVERHEAT}, True),
-        ({Condition.OVERHEAT}, False),
+        ({FaultCondition.STOP_INPUT}, True),
+        ({FaultCondition.STOP_INPUT, FaultCondition.OVERHEAT}, True),
+        ({FaultCondition.OVERHEAT}, True),
+        ({FaultCondition.OVERHEAT}, False),
     ]
     assert chain.next_event_s() is None
 
@@ -113,7 +113,7 @@ def test_faults_are_counted_from_the_opening(tmp_path):
     spec = config.spec(delivery=config.delivery, starts_at_s=10.0)
 
     assert spec.delivery is Delivery.BYTEWISE
-    assert spec.faults.faults == (Fault(FaultKind.REPLY_DELAYED, 0.5, 11.0, 12.0, 0.01),)
+    assert spec.faults.faults == (LineFault(FaultKind.REPLY_DELAYED, 0.5, 11.0, 12.0, 0.01),)
 
 
 def test_index_pulses_can_be_nearer_than_a_revolution(tmp_path):

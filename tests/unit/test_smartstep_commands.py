@@ -22,7 +22,7 @@ from ldcnd.drives.smartstep.commands import (
     write_trace_register,
 )
 from ldcnd.drives.smartstep.monitors import SPEED_FEEDBACK
-from ldcnd.drives.smartstep.packet import Command, Function, Reply, ResponseStatus, checksum
+from ldcnd.drives.smartstep.packet import CommandPacket, Function, ReplyPacket, ResponseStatus, checksum
 from ldcnd.drives.smartstep.parameters import PN100, PN304, parameter_at
 from ldcnd.drives.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum
 from ldcnd.line.exchange import ReplyVerdict
@@ -68,7 +68,7 @@ GOOD = b"W0001000028D7\r"
 
 
 def reply_of(unit: int, status: int, address: int, data: int) -> bytes:
-    return Reply(unit, ResponseStatus(status), address, data).encode()
+    return ReplyPacket(unit, ResponseStatus(status), address, data).encode()
 
 
 def test_reference_gives_the_word():
@@ -207,13 +207,13 @@ def test_profile_may_grant_another_response_time():
 
 
 def test_poll_for_normal_mode_looks_like_its_reply():
-    command = Command(1, Function.REFERENCE, 0x2000).encode()
+    command = CommandPacket(1, Function.REFERENCE, 0x2000).encode()
 
     assert read_operating_mode(1).decode(command) is OperatingMode.NORMAL
 
 
 DATA = bytes.fromhex("000080017FFFFFFF")
-COMMAND = Command(1, Function.STRING_REFERENCE, 0x3000, 8)
+COMMAND = CommandPacket(1, Function.STRING_REFERENCE, 0x3000, 8)
 VARIANTS = [StringChecksum.HEADER, StringChecksum.ALL, StringChecksum.TRAILER]
 
 
@@ -262,7 +262,7 @@ def test_missing_characters_are_corrupt_even_if_the_header_fits():
 
 
 def test_reply_to_another_string_is_foreign():
-    packet = string_reply(Command(1, Function.STRING_REFERENCE, 0x3008, 8), DATA, StringChecksum.HEADER)
+    packet = string_reply(CommandPacket(1, Function.STRING_REFERENCE, 0x3008, 8), DATA, StringChecksum.HEADER)
 
     assert string_reference(1, 0x3000, 8).check(packet) is ReplyVerdict.FOREIGN
 
@@ -284,7 +284,7 @@ def test_other_count_unit_is_named(digits, unit):
 @pytest.mark.parametrize(("unit", "count"), [(CountUnit.BYTES, 8), (CountUnit.WORDS, 4), (CountUnit.CHARS, 16)])
 def test_count_is_given_in_the_unit_of_the_profile(unit, count):
     profile = SmartStepProfile(string_count_unit=unit)
-    command = Command(1, Function.STRING_REFERENCE, 0x3000, count)
+    command = CommandPacket(1, Function.STRING_REFERENCE, 0x3000, count)
 
     exchange = string_reference(1, 0x3000, 8, profile)
 
@@ -295,11 +295,11 @@ def test_count_is_given_in_the_unit_of_the_profile(unit, count):
 @pytest.mark.parametrize("status", [ResponseStatus.STRING_ADDRESS_ERROR, ResponseStatus.BYTE_COUNT_ERROR])
 def test_refusal_has_14_characters_with_the_count_echoed(status):
     exchange = string_reference(1, 0x3000, 8)
-    packet = Reply(1, status, 0x3000, 8).encode()
+    packet = ReplyPacket(1, status, 0x3000, 8).encode()
 
     assert exchange.total_bytes(packet) == 14
     assert exchange.decode(packet) == Refusal(1, status, 0x3000, 8)
-    assert exchange.check(Reply(1, status, 0x3000, 6).encode()) is ReplyVerdict.FOREIGN
+    assert exchange.check(ReplyPacket(1, status, 0x3000, 6).encode()) is ReplyVerdict.FOREIGN
 
 
 def test_reply_ends_at_its_cr():

@@ -8,7 +8,7 @@ from ldcnd.drives.smartstep.addresses import OperatingMode
 from ldcnd.drives.smartstep.commands import set_operating_mode
 from ldcnd.drives.smartstep.packet import ResponseStatus
 from ldcnd.line.flight_recorder import WireEvent
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import executes_in_a_fresh_mode_only, losing_once, simulated, smartstep_line
@@ -140,7 +140,7 @@ async def test_a_counter_that_is_not_zero_after_its_clear_is_remarked_upon():
 @pytest.mark.parametrize("seed", range(12))
 async def test_a_bad_line_leaves_no_mode_armed_and_executes_in_a_fresh_mode_only(seed):
     unit = turned()
-    faults = FaultPlan((Fault(FaultKind.REQUEST_LOST, 0.15), Fault(FaultKind.REPLY_LOST, 0.15)), seed=seed)
+    faults = FaultPlan((LineFault(FaultKind.REQUEST_LOST, 0.15), LineFault(FaultKind.REPLY_LOST, 0.15)), seed=seed)
     async with smartstep_line([unit], faults=faults) as line:
         try:
             value = await line.axis("u1").parameters.clear_counter(CounterName.FEEDBACK)

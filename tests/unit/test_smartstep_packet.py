@@ -3,9 +3,9 @@ import pytest
 from ldcnd.contract.errors import BadReply, ValueOutOfRange
 from ldcnd.drives.smartstep.packet import (
     DAMAGED,
-    Command,
+    CommandPacket,
     Function,
-    Reply,
+    ReplyPacket,
     ReplyReader,
     ResponseStatus,
     add_parity,
@@ -18,17 +18,17 @@ from ldcnd.drives.smartstep.packet import (
 @pytest.mark.parametrize("unit", [-1, 16])
 def test_unit_numbers_end_at_15(unit):
     with pytest.raises(ValueOutOfRange):
-        Command(unit, Function.REFERENCE, 0x8000)
+        CommandPacket(unit, Function.REFERENCE, 0x8000)
 
 
 @pytest.mark.parametrize(("address", "data"), [(0x10000, 0), (-1, 0), (0, 0x10000), (0, -1)])
 def test_fields_fit_four_digits(address, data):
     with pytest.raises(ValueOutOfRange):
-        Command(1, Function.SETTING, address, data)
+        CommandPacket(1, Function.SETTING, address, data)
 
 
 def test_unit_15_is_written_as_f():
-    assert Command(15, Function.REFERENCE, 0x8000).encode()[:3] == b"WF0"
+    assert CommandPacket(15, Function.REFERENCE, 0x8000).encode()[:3] == b"WF0"
 
 
 @pytest.mark.parametrize(
@@ -51,7 +51,7 @@ def test_reply_that_breaks_a_rule_is_bad(damaged):
 
 @pytest.mark.parametrize("code", [0x3, 0x7, 0xB, 0xC, 0xF])
 def test_status_outside_the_manuals_table_is_bad(code):
-    packet = Reply(1, ResponseStatus.REFERENCE, 0x8000, 0).encode()
+    packet = ReplyPacket(1, ResponseStatus.REFERENCE, 0x8000, 0).encode()
     ss = (int(packet[11:13], 16) - code) & 0xFF
     packet = b"W1%X80000000%02X\r" % (code, ss)
 

@@ -23,7 +23,7 @@ from ldcnd.drives.smartstep.commands import set_operating_mode
 from ldcnd.drives.smartstep.parameters import PN000, PN100, PN102, PN202, PN304, PN402
 from ldcnd.drives.smartstep.profiles import EepromWrite, SmartStepProfile
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 from tests.support.smartstep_line import simulated, smartstep_line
 
@@ -203,7 +203,7 @@ async def test_nothing_is_asked_of_a_drive_that_hears_itself():
 async def test_a_lost_reply_to_an_eeprom_write_is_settled_by_reading_back(tmp_path):
     drive = simulated(1)
     # the third reply is that of the write: both memories are read before
-    faults = FaultPlan((Fault(FaultKind.REPLY_LOST, from_s=0.10, until_s=0.13),))
+    faults = FaultPlan((LineFault(FaultKind.REPLY_LOST, from_s=0.10, until_s=0.13),))
     async with smartstep_line([drive], ledger=tmp_path / "ledger.json", faults=faults) as line:
         done = await line.axis("u1").parameters.write(to_eeprom("Pn100", 120))
         timeouts = line.bus.statistics.timeouts
@@ -215,7 +215,7 @@ async def test_a_lost_reply_to_an_eeprom_write_is_settled_by_reading_back(tmp_pa
 
 async def test_a_lost_eeprom_write_is_sent_again_only_after_the_old_value_was_read(tmp_path):
     drive = simulated(1)
-    faults = FaultPlan((Fault(FaultKind.REQUEST_LOST, from_s=0.08, until_s=0.12),))
+    faults = FaultPlan((LineFault(FaultKind.REQUEST_LOST, from_s=0.08, until_s=0.12),))
     async with smartstep_line([drive], ledger=tmp_path / "ledger.json", faults=faults) as line:
         done = await line.axis("u1").parameters.write(to_eeprom("Pn100", 120))
         sent = [record.data for record in line.bus.wire_log.records() if record.data[:7] in (b"W110100", b"W100100")]
@@ -228,7 +228,7 @@ async def test_a_lost_eeprom_write_is_sent_again_only_after_the_old_value_was_re
 
 async def test_a_write_that_cannot_be_read_back_stays_counted(tmp_path):
     drive = simulated(1)
-    faults = FaultPlan((Fault(FaultKind.REPLY_LOST, from_s=0.10),))
+    faults = FaultPlan((LineFault(FaultKind.REPLY_LOST, from_s=0.10),))
     async with smartstep_line([drive], ledger=tmp_path / "ledger.json", faults=faults) as line:
         with pytest.raises(OutcomeUnknown, match="read back"):
             await line.axis("u1").parameters.write(to_eeprom("Pn100", 120))
@@ -247,8 +247,8 @@ def five_percent(seed: int) -> FaultPlan:
         FaultKind.REPLY_BIT_FLIPPED,
         FaultKind.REPLY_DUPLICATED,
     )
-    delayed = Fault(FaultKind.REPLY_DELAYED, 0.05, longest_s=0.25)
-    return FaultPlan((*(Fault(kind, 0.05) for kind in kinds), delayed), seed=seed)
+    delayed = LineFault(FaultKind.REPLY_DELAYED, 0.05, longest_s=0.25)
+    return FaultPlan((*(LineFault(kind, 0.05) for kind in kinds), delayed), seed=seed)
 
 
 @pytest.mark.parametrize("times", [200, pytest.param(2000, marks=pytest.mark.soak)])

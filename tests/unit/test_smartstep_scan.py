@@ -7,7 +7,7 @@ from ldcnd.bench.smartstep.family import SMARTSTEP_BENCH, SOFT_PARITY
 from ldcnd.contract.health import Verdict
 from ldcnd.drives.smartstep.network import smartstep_opener
 from ldcnd.drives.smartstep.profiles import Framing, Wiring
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from tests.support.smartstep_line import simulated
@@ -50,6 +50,6 @@ async def test_a_line_without_drives_says_what_is_wrong(line, words):
 async def test_wrong_parity_is_told_from_silence():
     jamming = [simulated(0), simulated(1)]
 
-    found = await scanned(jamming, faults=FaultPlan((Fault(FaultKind.REPLY_BIT_FLIPPED, 1.0),)))
+    found = await scanned(jamming, faults=FaultPlan((LineFault(FaultKind.REPLY_BIT_FLIPPED, 1.0),)))
 
     assert found[-1].verdict is Verdict.WRONG or "unit 0" in found[0].axis

@@ -15,7 +15,7 @@ from ldcnd.line.bus import Bus
 from ldcnd.line.resync import Resync
 from ldcnd.line.settings import BusSettings
 from ldcnd.sim.chain import Chain, Delivery
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.sim.smartstep.cable import SimulatedCable, smartstep_chain
 from ldcnd.sim.smartstep.simulation import SimulatedUnitConfig, simulated_units
@@ -190,7 +190,7 @@ async def test_bus_drops_its_echo_by_count():
 
 
 async def test_lost_replies_are_read_again():
-    faults = FaultPlan((Fault(FaultKind.REPLY_LOST, 0.3), Fault(FaultKind.REPLY_BYTE_LOST, 0.1)), seed=4)
+    faults = FaultPlan((LineFault(FaultKind.REPLY_LOST, 0.3), LineFault(FaultKind.REPLY_BYTE_LOST, 0.1)), seed=4)
     async with bus_on(smartstep_chain([unit(1)], faults=faults)) as bus:
         values = []
         for _ in range(30):
@@ -203,7 +203,7 @@ async def test_lost_replies_are_read_again():
 
 
 async def test_lost_reply_to_an_eeprom_write_is_never_repeated():
-    faults = FaultPlan((Fault(FaultKind.REPLY_LOST),))
+    faults = FaultPlan((LineFault(FaultKind.REPLY_LOST),))
     drive = unit(1)
     async with bus_on(smartstep_chain([drive], faults=faults)) as bus:
         with pytest.raises(OutcomeUnknown):

@@ -14,7 +14,7 @@ from ldcnd.drives.smartstep.monitors import (
 )
 from ldcnd.drives.smartstep.packet import ResponseStatus
 from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000, PN100, PN304, PN505
-from ldcnd.sim.smartstep.drive import EEPROM_LIFE, SimulatedDrive, SimulatedMemory, SimulatedMotor
+from ldcnd.sim.smartstep.drive import EEPROM_LIFE, SimulatedMemory, SimulatedMotor, SimulatedSmartStep
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 
 
@@ -146,8 +146,8 @@ SETTING, DATA_ERROR, ADDRESS_ERROR = (
 RATE_AT_3000_RPM = 100_000.0
 
 
-def drive_with(variant: SimulatedVariant | None = None, *, run: bool = True) -> SimulatedDrive:
-    drive = SimulatedDrive(variant or SimulatedVariant(), {PN100: 40})
+def drive_with(variant: SimulatedVariant | None = None, *, run: bool = True) -> SimulatedSmartStep:
+    drive = SimulatedSmartStep(variant or SimulatedVariant(), {PN100: 40})
     if run:
         drive.set_run(0.0, on=True)
     return drive

@@ -29,7 +29,7 @@ from ldcnd.drives.smartstep.profiles import (
 from ldcnd.drives.smartstep.trace_upload import TraceUpload
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.line.queue import Lane
-from ldcnd.sim.faults import Fault, FaultKind, FaultPlan
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
 from tests.support.smartstep_line import executes_in_a_fresh_mode_only, losing_once, simulated, smartstep_line
@@ -199,7 +199,7 @@ async def test_a_bad_line_gives_the_true_trace_or_an_error_and_executes_in_a_fre
     drive.drive.set_run(0.0, on=True)
     drive.drive.set_pulse_rate(3000.0, 0.0)
     kinds = (FaultKind.REQUEST_LOST, FaultKind.REPLY_LOST, FaultKind.REPLY_BIT_FLIPPED)
-    faults = FaultPlan(tuple(Fault(kind, 0.08) for kind in kinds), seed=seed)
+    faults = FaultPlan(tuple(LineFault(kind, 0.08) for kind in kinds), seed=seed)
     recorded = None
     async with smartstep_line([drive], faults=faults) as line:
         try:

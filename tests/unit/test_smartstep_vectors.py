@@ -10,9 +10,9 @@ import pytest
 from ldcnd.drives.smartstep.addresses import OperatingMode
 from ldcnd.drives.smartstep.commands import StringReply, reference, string_reference
 from ldcnd.drives.smartstep.packet import (
-    Command,
+    CommandPacket,
     Function,
-    Reply,
+    ReplyPacket,
     ResponseStatus,
     checksum,
     decode_command,
@@ -159,7 +159,7 @@ def test_example_4_as_printed_is_a_reference_and_cannot_have_its_printed_reply()
 
 def test_checksum_example_of_the_manual():
     assert checksum(b"0000010000") == 0xFF
-    assert Command(0, Function.REFERENCE, 0x0001).encode() == b"W0000010000FF\r"
+    assert CommandPacket(0, Function.REFERENCE, 0x0001).encode() == b"W0000010000FF\r"
 
 
 @pytest.mark.parametrize(
@@ -208,4 +208,4 @@ def test_every_vector_is_used():
 
 
 def test_example_6_is_a_data_error_of_a_setting():
-    assert decode_reply(b"W0501000BB837\r") == Reply(0, ResponseStatus.SETTING_DATA_ERROR, 0x0100, 3000)
+    assert decode_reply(b"W0501000BB837\r") == ReplyPacket(0, ResponseStatus.SETTING_DATA_ERROR, 0x0100, 3000)

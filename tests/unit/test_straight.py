@@ -6,7 +6,7 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from ldcnd.axis.straight import LineAxis, Profile, deviation_of, straight_line
+from ldcnd.axis.straight import LineAxis, Trapezoid, deviation_of, straight_line
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.trajectory import quantised
 
@@ -22,7 +22,7 @@ def axis(target, velocity=20_000.0, acceleration=100_000.0, divisor=1, begin=0):
 
 def durations(line, axes):
     return [
-        Profile(axes[name].way, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2).duration_s
+        Trapezoid(axes[name].way, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2).duration_s
         for name, motion in line.motions.items()
         if axes[name].way
     ]
@@ -45,7 +45,7 @@ def test_an_axis_that_stays_keeps_its_place():
 
 
 def test_without_common_ramps_the_deviation_is_that_of_the_ramps():
-    fast, slow = Profile(40.0, 20.0, 100.0), Profile(10.0, 5.0, 100.0)
+    fast, slow = Trapezoid(40.0, 20.0, 100.0), Trapezoid(10.0, 5.0, 100.0)
 
     assert deviation_of([fast, slow]) > 0.1
 

@@ -1,8 +1,16 @@
-from ldcnd.drives.ldcn.packet import Command, Packet, Status, StatusFlag, StatusItem, encode_packet, encode_status
+from ldcnd.drives.ldcn.packet import (
+    CommandCode,
+    Packet,
+    StatusFlag,
+    StatusItem,
+    StatusPacket,
+    encode_packet,
+    encode_status,
+)
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_IO, PIC_SERVO_V4
 from ldcnd.drives.ldcn.transcript import LdcnTranscript
-from ldcnd.drives.smartstep.packet import Command as SmartStepCommand
-from ldcnd.drives.smartstep.packet import Function, Reply, ResponseStatus, SmartStepTranscript
+from ldcnd.drives.smartstep.packet import CommandPacket as SmartStepCommand
+from ldcnd.drives.smartstep.packet import Function, ReplyPacket, ResponseStatus, SmartStepTranscript
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
 
 
@@ -17,9 +25,9 @@ def received(data: bytes) -> WireRecord:
 def test_a_status_request_and_its_reply_are_told_in_words():
     transcript = LdcnTranscript({})
     items = StatusItem.POSITION | StatusItem.ADC
-    status = Status(StatusFlag.MOVE_DONE | StatusFlag.POWER_ON, position=-1200, adc=1001)
+    status = StatusPacket(StatusFlag.MOVE_DONE | StatusFlag.POWER_ON, position=-1200, adc=1001)
 
-    request = transcript.describe(sent(encode_packet(Packet(3, Command.READ_STATUS, bytes([items])))))
+    request = transcript.describe(sent(encode_packet(Packet(3, CommandCode.READ_STATUS, bytes([items])))))
     reply = transcript.describe(received(encode_status(LS_182AP, items, status)))
 
     assert request.startswith("node 3: ReadStatus(")
@@ -30,10 +38,10 @@ def test_a_status_request_and_its_reply_are_told_in_words():
 def test_the_layout_of_a_reply_follows_the_node_s_dialect_and_its_defined_items():
     transcript = LdcnTranscript({1: PIC_SERVO_V4})
     items = StatusItem.ADC
-    defined = encode_status(PIC_SERVO_V4, items, Status(StatusFlag(0), adc=77))
+    defined = encode_status(PIC_SERVO_V4, items, StatusPacket(StatusFlag(0), adc=77))
 
-    transcript.describe(sent(encode_packet(Packet(1, Command.DEFINE_STATUS, bytes([items])))))
-    transcript.describe(sent(encode_packet(Packet(1, Command.NO_OPERATION, b""))))
+    transcript.describe(sent(encode_packet(Packet(1, CommandCode.DEFINE_STATUS, bytes([items])))))
+    transcript.describe(sent(encode_packet(Packet(1, CommandCode.NO_OPERATION, b""))))
 
     assert len(defined) == 3  # one byte less than a LS-182AP would send
     assert transcript.describe(received(defined)) == "status 00, adc 77"
@@ -67,10 +75,10 @@ def test_a_node_that_tells_its_identity_is_read_by_its_dialect_until_the_next_re
 
 def test_a_reset_takes_the_defined_items_back():
     transcript = LdcnTranscript({})
-    transcript.describe(sent(encode_packet(Packet(1, Command.DEFINE_STATUS, bytes([StatusItem.POSITION])))))
+    transcript.describe(sent(encode_packet(Packet(1, CommandCode.DEFINE_STATUS, bytes([StatusItem.POSITION])))))
 
-    transcript.describe(sent(encode_packet(Packet(0xFF, Command.HARD_RESET, b""))))
-    transcript.describe(sent(encode_packet(Packet(1, Command.NO_OPERATION, b""))))
+    transcript.describe(sent(encode_packet(Packet(0xFF, CommandCode.HARD_RESET, b""))))
+    transcript.describe(sent(encode_packet(Packet(1, CommandCode.NO_OPERATION, b""))))
 
     assert transcript.describe(received(b"\x08\x08")) == "status 08 POWER_ON"
 
@@ -86,8 +94,8 @@ def test_what_is_no_packet_is_said_to_be_none():
 def test_a_reply_that_came_in_pieces_is_told_with_its_last_piece():
     transcript = LdcnTranscript({})
     items = StatusItem.POSITION
-    reply = encode_status(LS_182AP, items, Status(StatusFlag(0), position=77))
-    transcript.describe(sent(encode_packet(Packet(3, Command.READ_STATUS, bytes([items])))))
+    reply = encode_status(LS_182AP, items, StatusPacket(StatusFlag(0), position=77))
+    transcript.describe(sent(encode_packet(Packet(3, CommandCode.READ_STATUS, bytes([items])))))
 
     first = transcript.describe(WireRecord(0.0, WireEvent.PART, reply[:2]))
     last = transcript.describe(received(reply[2:]))
@@ -97,7 +105,7 @@ def test_a_reply_that_came_in_pieces_is_told_with_its_last_piece():
 
 def test_smartstep_packets_are_told_in_words():
     request = SmartStepCommand(2, Function.REFERENCE, 0xE000).encode()
-    reply = Reply(2, ResponseStatus(Function.REFERENCE), 0xE000, 0x1234).encode()
+    reply = ReplyPacket(2, ResponseStatus(Function.REFERENCE), 0xE000, 0x1234).encode()
     transcript = SmartStepTranscript()
 
     assert transcript.describe(sent(request)) == "unit 2: REFERENCE E000H, 0000H"

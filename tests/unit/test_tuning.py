@@ -15,10 +15,10 @@ from ldcnd.bench.tuning.ldcn.design import (
     stiff_gains,
     within_authority,
 )
-from ldcnd.bench.tuning.ldcn.excitation import PULSE_TICKS, Bounds, Excitation, Record, Shown
+from ldcnd.bench.tuning.ldcn.excitation import PULSE_TICKS, Bounds, Excitation, MoveRecord, TrialOutcome
 from ldcnd.bench.tuning.ldcn.identify import Identified, identify
 from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.response import Figures, Move, Start, figures, simulate
+from ldcnd.bench.tuning.ldcn.response import Figures, Start, TrapezoidMove, figures, simulate
 from ldcnd.bench.tuning.ldcn.verdict import objection
 from ldcnd.contract.commands import SetGains
 from ldcnd.contract.errors import DriveFault, ValueOutOfRange
@@ -27,7 +27,7 @@ from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_plants import REFERENCE, SimulatedAxis, drawn_plants, tuned
 
 SMALL_MOTOR = Plant.of(MotorPlant())
-MOVE = Move(500, 20_000.0, 400_000.0)
+MOVE = TrapezoidMove(500, 20_000.0, 400_000.0)
 SEED = 24
 CHEAP = (11, 57)
 """Machines of the sixty of `test_sixty_plants.py`: one comes to rest soon, one has hardly any friction."""
@@ -135,7 +135,7 @@ def test_stiff_gains_follow_a_step_on_a_plant_whose_dead_time_is_not_known():
 
     gains = replace(stiff_gains(PIC_SERVO_V4, known), ki=0, il=0)
     for delay_s in (0.0, 0.003):
-        run = simulate(PIC_SERVO_V4, replace(heavy, delay_s=delay_s), gains, Move(250, 25_000.0, 2.5e7), 0.6)
+        run = simulate(PIC_SERVO_V4, replace(heavy, delay_s=delay_s), gains, TrapezoidMove(250, 25_000.0, 2.5e7), 0.6)
 
         assert not run.tripped
         assert run.positions[-1] == pytest.approx(250, abs=50)  # friction holds it there
@@ -144,7 +144,7 @@ def test_stiff_gains_follow_a_step_on_a_plant_whose_dead_time_is_not_known():
 def test_a_move_is_slowed_down_to_half_of_what_the_motor_can_do():
     plant = Plant(1000.0, 20.0, friction_pwm=5.0, load_pwm=-20.0)
 
-    move = within_authority(plant, Move(5000, 1e6, 1e9))
+    move = within_authority(plant, TrapezoidMove(5000, 1e6, 1e9))
 
     needed = move.acceleration_counts_per_s2 + move.speed_counts_per_s * plant.damping_per_s
     assert needed / plant.acceleration + 25.0 <= 125.0
@@ -153,7 +153,7 @@ def test_a_move_is_slowed_down_to_half_of_what_the_motor_can_do():
 
 
 def test_a_trace_without_motion_tells_nothing():
-    still = Record(REFERENCE, MOVE, Start(), tuple(n / 400 for n in range(100)), (0,) * 100)
+    still = MoveRecord(REFERENCE, MOVE, Start(), tuple(n / 400 for n in range(100)), (0,) * 100)
 
     with pytest.raises(ValueOutOfRange, match="tells too little"):
         identify(PIC_SERVO_V4, [still])
@@ -179,7 +179,7 @@ def test_pulses_end_in_the_drive_itself():
     blind = replace(plant.motor, encoder_disconnected=True)
     excitation = Excitation(PIC_SERVO_V4, Bounds(plant.distance_counts))
     pulses = excitation.pulses()
-    nothing = Shown(Record(REFERENCE, MOVE, Start(), (0.0,), (0,)), tripped=False, rest_counts=0)
+    nothing = TrialOutcome(MoveRecord(REFERENCE, MOVE, Start(), (0.0,), (0,)), tripped=False, rest_counts=0)
 
     forward = []
     trial = next(pulses)
@@ -216,8 +216,8 @@ def test_an_axis_that_is_carried_away_between_moves_gets_no_move_that_could_leav
     try:
         while True:  # by one count, which passes for noise
             assert abs(excitation.offset_counts + trial.move.distance_counts) <= 1000
-            still = Record(trial.gains, trial.move, Start(), (0.0,), (0,))
-            trial = pulses.send(Shown(still, tripped=False, rest_counts=1))
+            still = MoveRecord(trial.gains, trial.move, Start(), (0.0,), (0,))
+            trial = pulses.send(TrialOutcome(still, tripped=False, rest_counts=1))
     except DriveFault as error:
         refused = error
 

@@ -12,7 +12,7 @@ from typing_extensions import override
 
 from ldcnd.axis.guards import Permit, start_path, walking
 from ldcnd.axis.motion import AxisMotion, MotionPlan
-from ldcnd.axis.polyline import PathAxis, Walk, walk
+from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.group import Rendezvous
 from ldcnd.axis.state import Completion
@@ -28,7 +28,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.rig_commands import PathReply
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AxisReading, Motion, StopMode
+from ldcnd.drives.driver import AxisReading, CountsMotion, StopMode
 from ldcnd.drives.network import Network
 from ldcnd.line.bus import Bus
 from ldcnd.log import get_logger
@@ -95,7 +95,7 @@ class SharedPath(Rendezvous):
         self, network: Network, bus: Bus, names: frozenset[str], speed: float | None, max_deviation: float | None
     ) -> None:
         super().__init__(names, speed, max_deviation)
-        self.plan: Walk | None = None
+        self.plan: PathWalk | None = None
         self.broken = ""
         self.begun_s = 0.0
         self._network = network
@@ -148,7 +148,7 @@ class SharedPath(Rendezvous):
             else:
                 self._started.set_result(None)
 
-    def _planned(self, axes: Mapping[str, PathAxis]) -> Walk:
+    def _planned(self, axes: Mapping[str, PathAxis]) -> PathWalk:
         """Plan the points.
 
         Raises:
@@ -193,7 +193,7 @@ class SharedPath(Rendezvous):
 
     def reply(self, replies: tuple[CommandReply, ...]) -> PathReply:
         """Return the reply to the command whose members were answered so."""
-        plan = self.plan or Walk({}, 1.0, 0.0)
+        plan = self.plan or PathWalk({}, 1.0, 0.0)
         return PathReply(
             replies=replies,
             duration_s=plan.duration_s,
@@ -324,7 +324,7 @@ class PathMember(Procedure):
     async def prepare(self) -> None:
         """Put the acceleration in force by which a smooth stop ends the path: a trapezoid that goes nowhere."""
         motion = self.plan.motion
-        here = Motion(self._here, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
+        here = CountsMotion(self._here, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
         await self.permit.load(here)
         await self.permit.start(stays=True)
 

@@ -13,7 +13,7 @@ from ldcnd.axis.state import AxisTracker, Completion
 from ldcnd.contract.commands import CommandReply, SetPwm
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.driver import AxisReading, Motion, PwmOutput, StopMode
+from ldcnd.drives.driver import AxisReading, CountsMotion, PwmOutput, StopMode
 
 FULL_DUTY = 255
 """Steps of the duty in one direction on these drives."""
@@ -35,7 +35,7 @@ class PwmRun(EndlessMotion):
         self._check_bounds()
         speed, rate = motion.config.velocity, motion.config.acceleration
         counts_per_unit = abs(motion.counts_per_unit)
-        acceleration = motion.quantise(Motion(None, speed * counts_per_unit, rate * counts_per_unit))
+        acceleration = motion.quantise(CountsMotion(None, speed * counts_per_unit, rate * counts_per_unit))
         self.acceleration = acceleration.acceleration_counts_per_s2 / counts_per_unit
         self.check_room(request.duty)
         duty = request.duty if motion.counts_per_unit > 0 else -request.duty

@@ -15,11 +15,11 @@ from ldcnd.bench.commissioning.holding import HoldingOutput
 from ldcnd.bench.commissioning.homing import HomeRepeatability
 from ldcnd.bench.commissioning.limit_switches import LimitSwitches
 from ldcnd.bench.commissioning.motor import MotorDirection
-from ldcnd.bench.commissioning.questions import Gains, Load
-from ldcnd.bench.commissioning.record import Proposal, Record, Result, StepRecord, StepState
+from ldcnd.bench.commissioning.questions import GainsStep, LoadStep
+from ldcnd.bench.commissioning.record import CommissioningRecord, ConfigProposal, Result, StepRecord, StepState
 from ldcnd.bench.commissioning.scale import Scale
 from ldcnd.bench.commissioning.speed import HighestSpeed
-from ldcnd.bench.commissioning.step import Site, Step
+from ldcnd.bench.commissioning.step import Step, StepContext
 from ldcnd.bench.commissioning.travel import Travel
 from ldcnd.bench.person import Person, said
 from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
@@ -35,7 +35,7 @@ from ldcnd.drives.axis_config import AxisConfig, MovedAxisConfig
 STEPS: dict[str, Step] = {
     each.name: each
     for each in (
-        Load(),
+        LoadStep(),
         FirstSettings(),
         MotorDirection(),
         HoldingOutput(),
@@ -44,7 +44,7 @@ STEPS: dict[str, Step] = {
         HomeRepeatability(),
         Travel(),
         HighestSpeed(),
-        Gains(),
+        GainsStep(),
     )
 }
 """All of them, in the order in which they build on each other."""
@@ -233,25 +233,25 @@ class Checklist:
 
     # -- what it stands on -------------------------------------------------------------------------------------------
 
-    async def _site(self) -> Site:
+    async def _site(self) -> StepContext:
         config = axis_of(load_config(self._config), self._axis)
         infos = {info.axis: info for info in await self._rig.describe()}
         if self._axis not in infos:
             raise UnknownAxis(f"rig {self._rig.name} has no axis {self._axis!r}", axis=self._axis)
         self.record = records.read(self.path, self._rig.name, self._axis)  # another session may have added to it
-        return Site(self._rig, infos[self._axis], config, self._person, self.record)
+        return StepContext(self._rig, infos[self._axis], config, self._person, self.record)
 
-    def _kept(self, step: Step, site: Site, result: Result) -> StepRecord:
+    def _kept(self, step: Step, site: StepContext, result: Result) -> StepRecord:
         at = self._now().isoformat(timespec="seconds")
         return StepRecord(step=step.name, result=result, at=at, by=self._by, basis=_basis(step, site))
 
-    def _settle(self, step: Step, site: Site, result: Result) -> StepRecord:
+    def _settle(self, step: Step, site: StepContext, result: Result) -> StepRecord:
         kept = self._kept(step, site, result)
         self.record = records.read(self.path, self._rig.name, self._axis)
         self._keep(self.record.with_step(kept))
         return kept
 
-    def _keep(self, record: Record) -> None:
+    def _keep(self, record: CommissioningRecord) -> None:
         records.write(self.path, record)
         self.record = record
 
@@ -268,7 +268,7 @@ def axis_of(rig: RigConfig, name: str) -> AxisConfig:
     return axes[name]
 
 
-def _without_run(step: Step, site: Site) -> Result | None:
+def _without_run(step: Step, site: StepContext) -> Result | None:
     """Return the result of a step that cannot be run, or need not be; None for any other."""
     if obstacle := step.obstacle(site):
         return Result(state=StepState.NOT_POSSIBLE, text=obstacle)
@@ -277,7 +277,7 @@ def _without_run(step: Step, site: Site) -> Result | None:
     return None
 
 
-def _basis(step: Step, site: Site) -> dict[str, JsonValue]:
+def _basis(step: Step, site: StepContext) -> dict[str, JsonValue]:
     """Return what a step depends on: who the drive is, and some of its configuration."""
     settings = site.config.model_dump(mode="json")
     basis: dict[str, JsonValue] = {"model": site.info.model, "address": site.info.address}
@@ -291,7 +291,7 @@ def _basis(step: Step, site: Site) -> dict[str, JsonValue]:
     return basis
 
 
-def _require_same(site: Site) -> None:
+def _require_same(site: StepContext) -> None:
     """Refuse a daemon that runs with another configuration than the file.
 
     Raises:
@@ -312,5 +312,5 @@ def _differing(info: AxisInfo, config: AxisConfig) -> Iterator[str]:
             yield name
 
 
-def _is_reloaded(proposal: Proposal) -> bool:
+def _is_reloaded(proposal: ConfigProposal) -> bool:
     return (proposal.table or proposal.key).partition(".")[0] in RELOADED

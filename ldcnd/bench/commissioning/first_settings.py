@@ -7,8 +7,8 @@ from collections.abc import Iterator
 
 from typing_extensions import override
 
-from ldcnd.bench.commissioning.record import Proposal, Result, StepState
-from ldcnd.bench.commissioning.step import Site, Step
+from ldcnd.bench.commissioning.record import ConfigProposal, Result, StepState
+from ldcnd.bench.commissioning.step import Step, StepContext
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Verb
 
@@ -39,26 +39,26 @@ class FirstSettings(Step):
     needs = (Verb.SET_GAINS,)
 
     @override
-    def unneeded(self, site: Site) -> str:
+    def unneeded(self, site: StepContext) -> str:
         config = site.config
         known = config.gains is not None and config.counts_per_unit is not None
         return "unit, scale and gains are in the configuration" if known else ""
 
     @override
-    async def preview(self, site: Site) -> tuple[str, ...]:
+    async def preview(self, site: StepContext) -> tuple[str, ...]:
         gains = ", ".join(f"{name} = {value}" for name, value in SOFT_GAINS.items())
         return (*await super().preview(site), f"soft gains for the beginning: {gains}")
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         proposals = [*await _scale(site)] if site.config.counts_per_unit is None else []
         if site.config.gains is None:
-            proposals += [Proposal(table="gains", key=name, value=value) for name, value in SOFT_GAINS.items()]
+            proposals += [ConfigProposal(table="gains", key=name, value=value) for name, value in SOFT_GAINS.items()]
         text = "; ".join(f"{each.name} = {each.literal}" for each in proposals if not each.table)
         return Result(state=StepState.DONE, text=text or "gains only", proposals=tuple(proposals))
 
 
-async def _scale(site: Site) -> tuple[Proposal, ...]:
+async def _scale(site: StepContext) -> tuple[ConfigProposal, ...]:
     """Ask for unit, scale, and what is measured in them."""
     person, config = site.person, site.config
     while not (unit := await person.ask("unit of the axis, such as mm, deg or turn; count for encoder counts")):
@@ -79,10 +79,10 @@ async def _scale(site: Site) -> tuple[Proposal, ...]:
         settings[key] = value
     mark = await person.choose("what marks its reference position", MARKS)
     home = () if mark == "none" else tuple(_home(mark, scale))
-    return (*(Proposal(table="", key=key, value=value) for key, value in settings.items()), *home)
+    return (*(ConfigProposal(table="", key=key, value=value) for key, value in settings.items()), *home)
 
 
-def _home(mark: str, scale: float) -> Iterator[Proposal]:
+def _home(mark: str, scale: float) -> Iterator[ConfigProposal]:
     speed = float(f"{HOME_COUNTS_PER_S / scale:.{DIGITS}g}")
-    yield Proposal(table="home", key="method", value=mark)
-    yield Proposal(table="home", key="velocity", value=-speed if mark == "reverse_limit" else speed)
+    yield ConfigProposal(table="home", key="method", value=mark)
+    yield ConfigProposal(table="home", key="velocity", value=-speed if mark == "reverse_limit" else speed)

@@ -22,8 +22,8 @@ from ldcnd.bench.commissioning.motor import (
     lent_gains,
 )
 from ldcnd.bench.commissioning.questions import powered_off
-from ldcnd.bench.commissioning.record import Figure, Result, Series, StepState
-from ldcnd.bench.commissioning.step import Site, Step, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
+from ldcnd.bench.commissioning.step import Step, StepContext, refuse_latched, refuse_previewed, rest_counts
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import open_loop
 from ldcnd.client.standstill import seen
@@ -61,7 +61,7 @@ class HoldingOutput(Step):
     depends = ("direction",)
 
     @override
-    def obstacle(self, site: Site) -> str:
+    def obstacle(self, site: StepContext) -> str:
         if super().obstacle(site):
             return super().obstacle(site)
         if site.config.gains is None:
@@ -71,7 +71,7 @@ class HoldingOutput(Step):
         return ""
 
     @override
-    async def preview(self, site: Site) -> tuple[str, ...]:
+    async def preview(self, site: StepContext) -> tuple[str, ...]:
         el, way = error_limit(site), _way(site)
         velocity, acceleration = _profile(site)
         async with site.rig.watch(site.info.axis) as axis:
@@ -89,7 +89,7 @@ class HoldingOutput(Step):
         )
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         el = error_limit(site)
         async with lent_gains(site, axis) as old:
             origin, output = await rest_counts(axis), OUTPUTS[0]
@@ -108,7 +108,7 @@ class HoldingOutput(Step):
         )
 
     @staticmethod
-    async def _approach(site: Site, axis: Axis, output: int, el: int, origin: int) -> list[tuple[int, float]]:
+    async def _approach(site: StepContext, axis: Axis, output: int, el: int, origin: int) -> list[tuple[int, float]]:
         """Move to and fro with an output limit; return direction and output at rest of each motion until it trips."""
         kp = min(math.ceil(PWM_PER_GAIN * output / (SATURATED_SHARE * el)), REGISTER_MOST)
         await axis.set_gains(kp=kp, kd=min(DAMPING * kp, REGISTER_MOST), ki=0, il=0, ol=output, el=el, lent=True)
@@ -131,12 +131,12 @@ class HoldingOutput(Step):
         return outputs
 
 
-def _way(site: Site) -> float:
+def _way(site: StepContext) -> float:
     """Return how far each motion goes, in axis units."""
     return WAY * error_limit(site) / site.counts_per_unit
 
 
-def _profile(site: Site) -> tuple[float, float]:
+def _profile(site: StepContext) -> tuple[float, float]:
     """Return velocity and acceleration of the motions, in axis units."""
     limits = site.info.limits
     velocity = min(_way(site) / DURATION_S, limits.velocity or math.inf)
@@ -149,7 +149,7 @@ def _held(outputs: list[tuple[int, float]], direction: int) -> float:
     return sum(held) / len(held)
 
 
-def _judged(site: Site, outputs: list[tuple[int, float]], limit: int | None) -> Result:
+def _judged(site: StepContext, outputs: list[tuple[int, float]], limit: int | None) -> Result:
     forward, back = _held(outputs, 1), _held(outputs, -1)
     # the next whole step would have moved it on
     friction, load = max((forward - back) / 2 + HALF_A_STEP, 0.0), (forward + back) / 2
@@ -175,11 +175,11 @@ def _judged(site: Site, outputs: list[tuple[int, float]], limit: int | None) -> 
         *_current_limit(limit),
     )
     points = tuple((float(number), output) for number, (_, output) in enumerate(outputs, 1))
-    series = (Series(title="Output at rest", x="motion", y="PWM steps of 255", points=points),)
+    series = (PlotSeries(title="Output at rest", x="motion", y="PWM steps of 255", points=points),)
     return Result(state=StepState.DONE, text=text, figures=figures, series=series)
 
 
-def _said(site: Site) -> object:
+def _said(site: StepContext) -> object:
     """Return what the person has answered in the step `load`."""
     figures = site.record.of("load").result.figures
     return next((each.value for each in figures if each.what == "load"), None)

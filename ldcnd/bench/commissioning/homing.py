@@ -4,8 +4,8 @@ from functools import partial
 
 from typing_extensions import override
 
-from ldcnd.bench.commissioning.record import Figure, Result, Series, StepState
-from ldcnd.bench.commissioning.step import Site, Step, moved_while_held, rest_counts
+from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
+from ldcnd.bench.commissioning.step import Step, StepContext, moved_while_held, rest_counts
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Home, Verb
 from ldcnd.contract.errors import CommandAborted
@@ -29,13 +29,13 @@ class HomeRepeatability(Step):
     depends = ("direction", "counts_per_unit", "home")
 
     @override
-    def obstacle(self, site: Site) -> str:
+    def obstacle(self, site: StepContext) -> str:
         if site.config.home is None and not super().obstacle(site):
             return "not possible without `home` in the configuration: say there what marks the reference position"
         return super().obstacle(site)
 
     @override
-    async def preview(self, site: Site) -> tuple[str, ...]:
+    async def preview(self, site: StepContext) -> tuple[str, ...]:
         home = site.config.home
         if home is None:
             return ()
@@ -56,7 +56,7 @@ class HomeRepeatability(Step):
         )
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         home, person = site.config.home, site.person
         if home is None:
             return Result(state=StepState.NOT_POSSIBLE, text=self.obstacle(site))
@@ -85,7 +85,7 @@ class HomeRepeatability(Step):
         return _judged(site, marks)
 
 
-async def _mark(site: Site, axis: Axis) -> float:
+async def _mark(site: StepContext, axis: Axis) -> float:
     """Return where position 0 is, by the encoder, in axis units from where it counted from at first."""
     await rest_counts(axis)
     sample = axis.position.sample
@@ -97,7 +97,7 @@ def _halted(axis: Axis) -> CommandAborted:
     return CommandAborted(f"axis {axis.name}: the key was let go", axis=axis.name, remedy="run the step again")
 
 
-def _judged(site: Site, marks: list[float]) -> Result:
+def _judged(site: StepContext, marks: list[float]) -> Result:
     mean = sum(marks) / len(marks)
     deviations = [mark - mean for mark in marks]
     spread = max(marks) - min(marks)
@@ -113,7 +113,7 @@ def _judged(site: Site, marks: list[float]) -> Result:
             Figure(what="one count", value=1 / site.counts_per_unit, unit=unit),
         ),
         series=(
-            Series(
+            PlotSeries(
                 title="Deviation from the mean",
                 x="search",
                 y=unit,

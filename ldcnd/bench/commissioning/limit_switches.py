@@ -7,8 +7,8 @@ from typing import Literal
 from pydantic import ValidationError
 from typing_extensions import override
 
-from ldcnd.bench.commissioning.record import Figure, Proposal, Result, StepState
-from ldcnd.bench.commissioning.step import Site, Step, done
+from ldcnd.bench.commissioning.record import ConfigProposal, Figure, Result, StepState
+from ldcnd.bench.commissioning.step import Step, StepContext, done
 from ldcnd.client.axis import Axis
 from ldcnd.contract.errors import WrongState
 from ldcnd.contract.samples import InputsSample, TelemetryItem
@@ -17,7 +17,7 @@ PRESS_S = 60.0
 """Longest time in which a switch is pressed, seconds."""
 SIDES = ("reverse", "forward")
 LEVELS: Mapping[bool, Literal["high", "low"]] = {True: "high", False: "low"}
-STOPS = Proposal(table="", key="limit_switches", value="stop")
+STOPS = ConfigProposal(table="", key="limit_switches", value="stop")
 """The drive itself stops a motion that runs onto a switch, also without a host."""
 Levels = tuple[bool | None, bool | None]
 
@@ -34,12 +34,12 @@ class LimitSwitches(Step):
     depends = ("direction", "home.switch_active", "limit_switches")
 
     @override
-    def obstacle(self, site: Site) -> str:
+    def obstacle(self, site: StepContext) -> str:
         shows = TelemetryItem.INPUTS.value in site.info.items
         return "" if shows else f"not possible on this model: a {site.info.model} shows no limit switch inputs"
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         person = site.person
         if not await person.confirm("has the axis limit switches?"):
             return Result(state=StepState.SKIPPED, text="it has no limit switches")
@@ -57,7 +57,7 @@ class LimitSwitches(Step):
             await self._until(site, lambda levels: levels == idle, "did not come back to its level at rest")
         return _judged(site, idle, pressed)
 
-    async def _pressed(self, site: Site, idle: Levels, side: str) -> int:
+    async def _pressed(self, site: StepContext, idle: Levels, side: str) -> int:
         """Wait until one input differs from its level at rest; return which."""
         changed = await self._until(
             site,
@@ -74,7 +74,7 @@ class LimitSwitches(Step):
         return which[0]
 
     @staticmethod
-    async def _until(site: Site, wanted: Callable[[Levels], bool], otherwise: str) -> Levels:
+    async def _until(site: StepContext, wanted: Callable[[Levels], bool], otherwise: str) -> Levels:
         """Watch the inputs until their levels are as wanted; return them."""
         axis = site.info.axis
         try:
@@ -91,7 +91,7 @@ def _levels(sample: object) -> Levels:
     return (sample.reverse_limit, sample.forward_limit) if isinstance(sample, InputsSample) else (None, None)
 
 
-def _judged(site: Site, idle: Levels, pressed: list[int]) -> Result:
+def _judged(site: StepContext, idle: Levels, pressed: list[int]) -> Result:
     figures = tuple(
         Figure(what=f"{side} switch", value=f"{SIDES[number]} input, {LEVELS[not idle[number]]} when pressed")
         for side, number in zip(SIDES, pressed, strict=True)
@@ -107,20 +107,20 @@ def _judged(site: Site, idle: Levels, pressed: list[int]) -> Result:
         return Result(state=StepState.FAILED, text=text, figures=figures)
     active: Literal["high", "low"] = LEVELS[not idle[0]]
     result = done(f"both inputs are {active} when their switch is pressed").model_copy(update={"figures": figures})
-    proposals: list[Proposal] = []
+    proposals: list[ConfigProposal] = []
     text = result.text
     if active != site.config.switch_active and site.config.home is None:
         text += f': write `switch_active = "{active}"` into `home` when it gets one'
     else:
         if active != site.config.switch_active:
-            proposals.append(Proposal(table="home", key="switch_active", value=active))
+            proposals.append(ConfigProposal(table="home", key="switch_active", value=active))
         if site.config.limit_switches != STOPS.value and _can_stop(site, active):
             text += "; the drive can stop on them by itself"
             proposals.append(STOPS)
     return result.model_copy(update={"text": text, "proposals": tuple(proposals)})
 
 
-def _can_stop(site: Site, active: str) -> bool:
+def _can_stop(site: StepContext, active: str) -> bool:
     """Return whether the configuration may say that the drive stops on its switches."""
     document = site.config.model_dump(mode="json") | {STOPS.key: STOPS.value}
     if document["home"]:

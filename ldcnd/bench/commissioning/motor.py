@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 from typing_extensions import override
 
-from ldcnd.bench.commissioning.record import Figure, Result, Series, StepState
-from ldcnd.bench.commissioning.step import Site, Step, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
+from ldcnd.bench.commissioning.step import Step, StepContext, refuse_latched, refuse_previewed, rest_counts
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import KeptGains, gains_in, keep, open_loop, restore
 from ldcnd.client.standstill import seen
@@ -64,13 +64,13 @@ class MotorDirection(Step):
     needs = (Verb.POWER, Verb.MOVE_RELATIVE, Verb.SET_GAINS)
 
     @override
-    def obstacle(self, site: Site) -> str:
+    def obstacle(self, site: StepContext) -> str:
         if site.config.gains is None and not super().obstacle(site):
             return "not possible without `gains` in the configuration: the loop stays open"
         return super().obstacle(site)
 
     @override
-    async def preview(self, site: Site) -> tuple[str, ...]:
+    async def preview(self, site: StepContext) -> tuple[str, ...]:
         el = error_limit(site)
         caught = CAUGHT * el
         lead = _lead(site, el)
@@ -93,7 +93,7 @@ class MotorDirection(Step):
         )
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         el = error_limit(site)
         points: list[tuple[float, float]] = []
         async with lent_gains(site, axis) as old:
@@ -111,7 +111,7 @@ class MotorDirection(Step):
                 return _mistaken(name, el, points)
         return _judged(el, points)
 
-    async def _try(self, site: Site, axis: Axis, output: int, el: int) -> int:
+    async def _try(self, site: StepContext, axis: Axis, output: int, el: int) -> int:
         """Ask for a motion with an output limit; return how far the axis is then from where it was, in counts."""
         # from half the position error limit on the output is at its limit
         kp = min(math.ceil(2 * PWM_PER_GAIN * output / el), REGISTER_MOST)
@@ -136,7 +136,7 @@ class MotorDirection(Step):
 
 
 @asynccontextmanager
-async def lent_gains(site: Site, axis: Axis) -> AsyncIterator[dict[str, int]]:
+async def lent_gains(site: StepContext, axis: Axis) -> AsyncIterator[dict[str, int]]:
     """Open the loop, yield the gains that the drive has, and put them back at the end, whatever ends the context.
 
     The loop is open afterwards. Where control was lost meanwhile they stay kept: the checklist puts them back.
@@ -158,7 +158,7 @@ async def lent_gains(site: Site, axis: Axis) -> AsyncIterator[dict[str, int]]:
             await restore(axis, kept)
 
 
-def error_limit(site: Site) -> int:
+def error_limit(site: StepContext) -> int:
     """Return the position error limit of the step, in counts: that of the configuration if it is lower."""
     return min(MOST_EL_COUNTS, site.config.gains.el) if site.config.gains else MOST_EL_COUNTS
 
@@ -172,13 +172,13 @@ class _Lead:
     acceleration: float
 
 
-def _lead(site: Site, el: int) -> _Lead:
+def _lead(site: StepContext, el: int) -> _Lead:
     distance, limits = LEAD * el / site.counts_per_unit, site.info.limits
     velocity = min(distance / DURATION_S, limits.velocity or math.inf)
     return _Lead(distance, velocity, min(velocity / (RAMP_SHARE * DURATION_S), limits.acceleration or math.inf))
 
 
-async def _refuse_what_cannot_be(site: Site, lead: _Lead) -> None:
+async def _refuse_what_cannot_be(site: StepContext, lead: _Lead) -> None:
     """Raise what the daemon would refuse about the distance."""
     async with site.rig.watch(site.info.axis) as axis:
         refuse_latched(await seen(axis))
@@ -223,5 +223,7 @@ def _result(state: StepState, text: str, el: int, points: list[tuple[float, floa
         Figure(what="position error limit", value=el, unit="counts"),
         Figure(what="stated distance", value=CAUGHT * el, unit="counts"),
     )
-    series = (Series(title="Motion by output limit", x="PWM steps of 255", y="counts forward", points=tuple(points)),)
+    series = (
+        PlotSeries(title="Motion by output limit", x="PWM steps of 255", y="counts forward", points=tuple(points)),
+    )
     return Result(state=state, text=text, figures=figures, series=series)

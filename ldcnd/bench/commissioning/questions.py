@@ -3,7 +3,7 @@
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import Figure, Result, StepState
-from ldcnd.bench.commissioning.step import Site, Step, done
+from ldcnd.bench.commissioning.step import Step, StepContext, done
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Verb
 from ldcnd.drives.axis_config import AxisConfig, LossPolicy
@@ -24,7 +24,7 @@ def powered_off(config: AxisConfig) -> str:
     return f"; `loss` powers it off when {' and '.join(losses)} is lost: it falls then" if losses else ""
 
 
-class Load(Step):
+class LoadStep(Step):
     """Asks for a hanging load and a brake."""
 
     name = "load"
@@ -36,7 +36,7 @@ class Load(Step):
     depends = ("loss.client", "loss.bus", "loss.daemon")
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         answer = await site.person.choose("what falls without power", LOADS)
         remark = await site.person.ask("a remark for the report, or nothing")
         figures = [Figure(what="load", value=answer)]
@@ -53,7 +53,7 @@ class Load(Step):
         return done(text).model_copy(update={"figures": tuple(figures)})
 
 
-class Gains(Step):
+class GainsStep(Step):
     """Points to tuning."""
 
     name = "gains"
@@ -66,12 +66,12 @@ class Gains(Step):
     needs = (Verb.SET_GAINS,)
 
     @override
-    def obstacle(self, site: Site) -> str:
+    def obstacle(self, site: StepContext) -> str:
         gains_are_parameters = Verb.WRITE_PARAMETER in site.info.capabilities
         return "" if gains_are_parameters else super().obstacle(site)
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         registers = {each.name: each.value for each in site.info.registers if each.value is not None}
         figures = tuple(Figure(what=name, value=registers[name]) for name in SHOWN if name in registers)
         if await site.person.confirm(

@@ -33,7 +33,7 @@ class Figure(Frozen):
     """Unit of a number."""
 
 
-class Series(Frozen):
+class PlotSeries(Frozen):
     """Points that belong together, for a plot."""
 
     title: str
@@ -46,7 +46,7 @@ class Series(Frozen):
     """In the order in which they were measured."""
 
 
-class Proposal(Frozen):
+class ConfigProposal(Frozen):
     """A value for the configuration of the axis."""
 
     table: str
@@ -76,9 +76,9 @@ class Result(Frozen):
     """The same in a sentence; for a skipped step the reason."""
     figures: tuple[Figure, ...] = ()
     """What was measured."""
-    series: tuple[Series, ...] = ()
+    series: tuple[PlotSeries, ...] = ()
     """The same over something, for plots."""
-    proposals: tuple[Proposal, ...] = ()
+    proposals: tuple[ConfigProposal, ...] = ()
     """What it proposes for the configuration."""
 
 
@@ -99,7 +99,7 @@ class StepRecord(Frozen):
     """Why it is open again; empty when it is not."""
 
 
-class Record(Frozen):
+class CommissioningRecord(Frozen):
     """Everything that is known of commissioning one axis."""
 
     rig: str
@@ -113,7 +113,7 @@ class Record(Frozen):
         """Return what is kept of a step."""
         return self.steps.get(step) or StepRecord(step=step)
 
-    def with_step(self, record: StepRecord) -> "Record":
+    def with_step(self, record: StepRecord) -> "CommissioningRecord":
         """Return the record with a step replaced."""
         return self.model_copy(update={"steps": {**self.steps, record.step: record}})
 
@@ -123,14 +123,14 @@ def file_of(config: Path, rig: str, axis: str) -> Path:
     return config.with_name(f"commissioning-{rig}-{axis}.json")
 
 
-def read(path: Path, rig: str, axis: str) -> Record:
+def read(path: Path, rig: str, axis: str) -> CommissioningRecord:
     """Return the record in a file; an empty one without a file.
 
     Raises:
         ConfigError: the file is no record of this axis.
     """
     try:
-        record = durable.read(path, Record.model_validate_json) or Record(rig=rig, axis=axis)
+        record = durable.read(path, CommissioningRecord.model_validate_json) or CommissioningRecord(rig=rig, axis=axis)
     except durable.DamagedFile as error:
         raise ConfigError(str(error), remedy="move it away to begin anew") from error
     if (record.rig, record.axis) != (rig, axis):
@@ -138,7 +138,7 @@ def read(path: Path, rig: str, axis: str) -> Record:
     return record
 
 
-def write(path: Path, record: Record) -> None:
+def write(path: Path, record: CommissioningRecord) -> None:
     """Replace the file; it is on the disk when this returns.
 
     Raises:

@@ -2,7 +2,7 @@
 
 from html import escape
 
-from ldcnd.bench.commissioning.record import Figure, Record, Series, StepRecord
+from ldcnd.bench.commissioning.record import CommissioningRecord, Figure, PlotSeries, StepRecord
 from ldcnd.bench.commissioning.step import Step
 from ldcnd.printable import printable
 
@@ -18,7 +18,7 @@ code { font-family: monospace } section { break-inside: avoid } svg { display: b
 """
 
 
-def html_of(record: Record, steps: dict[str, Step], configuration: str, version: str, at: str) -> str:
+def html_of(record: CommissioningRecord, steps: dict[str, Step], configuration: str, version: str, at: str) -> str:
     """Return the report.
 
     Args:
@@ -84,7 +84,7 @@ def _figure(figure: Figure) -> str:
     return f"{value} {figure.unit}".strip()
 
 
-def _plot(series: Series) -> str:
+def _plot(series: PlotSeries) -> str:
     """Return points, joined in their order, with the ends of both axes."""
     xs, ys = [x for x, _ in series.points], [y for _, y in series.points]
     low_x, high_x = _range(xs)

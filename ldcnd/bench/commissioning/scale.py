@@ -4,8 +4,8 @@ from functools import partial
 
 from typing_extensions import override
 
-from ldcnd.bench.commissioning.record import Figure, Proposal, Result, StepState
-from ldcnd.bench.commissioning.step import Site, Step, done, moved_while_held, refuse_previewed, rest_counts
+from ldcnd.bench.commissioning.record import ConfigProposal, Figure, Result, StepState
+from ldcnd.bench.commissioning.step import Step, StepContext, done, moved_while_held, refuse_previewed, rest_counts
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import ValueOutOfRange
@@ -32,13 +32,13 @@ class Scale(Step):
     depends = ("direction", "counts_per_unit", "unit")
 
     @override
-    def obstacle(self, site: Site) -> str:
+    def obstacle(self, site: StepContext) -> str:
         if site.info.counts_per_unit is None and not super().obstacle(site):
             return "not possible while the axis works in counts: give it `unit` and a guess of `counts_per_unit`"
         return super().obstacle(site)
 
     @override
-    async def preview(self, site: Site) -> tuple[str, ...]:
+    async def preview(self, site: StepContext) -> tuple[str, ...]:
         velocity = SHARE * site.config.velocity
         return (
             (
@@ -50,7 +50,7 @@ class Scale(Step):
         )
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         person, unit = site.person, site.info.unit
         velocity = SHARE * site.config.velocity
         while not (distance := await person.number(f"how far shall it move, signed, in {unit}", velocity * DEFAULT_S)):
@@ -67,7 +67,7 @@ class Scale(Step):
         return _judged(site, distance, counts, measured)
 
 
-def _judged(site: Site, distance: float, counts: int, measured: float) -> Result:
+def _judged(site: StepContext, distance: float, counts: int, measured: float) -> Result:
     axis = site.info.axis
     if not measured or not counts:
         raise ValueOutOfRange(
@@ -86,9 +86,9 @@ def _judged(site: Site, distance: float, counts: int, measured: float) -> Result
     )
     proposals = []
     if direction != site.info.direction:
-        proposals.append(Proposal(table="", key="direction", value=direction))
+        proposals.append(ConfigProposal(table="", key="direction", value=direction))
     if abs(scale / site.counts_per_unit - 1) > AGREES:
-        proposals.append(Proposal(table="", key="counts_per_unit", value=scale))
+        proposals.append(ConfigProposal(table="", key="counts_per_unit", value=scale))
     if not proposals:
         return done("direction and scale are as configured").model_copy(update={"figures": figures})
     changed = " and ".join(each.name for each in proposals)

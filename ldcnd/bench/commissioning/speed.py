@@ -9,8 +9,8 @@ from functools import partial
 
 from typing_extensions import override
 
-from ldcnd.bench.commissioning.record import Figure, Proposal, Result, Series, StepState
-from ldcnd.bench.commissioning.step import Site, Step, moved_while_held, refuse_previewed
+from ldcnd.bench.commissioning.record import ConfigProposal, Figure, PlotSeries, Result, StepState
+from ldcnd.bench.commissioning.step import Step, StepContext, moved_while_held, refuse_previewed
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import open_loop
 from ldcnd.contract.commands import Verb
@@ -70,7 +70,7 @@ class HighestSpeed(Step):
     depends = ("counts_per_unit", "gains")
 
     @override
-    async def preview(self, site: Site) -> tuple[str, ...]:
+    async def preview(self, site: StepContext) -> tuple[str, ...]:
         velocity, acceleration = _highest(site)
         el = f"; beyond {site.config.gains.el} counts the drive opens its loop and coasts" if site.config.gains else ""
         speeds = f"{site.config.velocity:g} to {site.length(velocity)}/s"
@@ -83,7 +83,7 @@ class HighestSpeed(Step):
         )
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         person, config = site.person, site.config
         velocity, _ = _highest(site)
         enough = CRUISE * velocity * velocity / config.acceleration
@@ -99,7 +99,7 @@ class HighestSpeed(Step):
 
 
 async def _tried(
-    site: Site, axis: Axis, distance: float, moves: Iterable[tuple[float, float]], held: asyncio.Event
+    site: StepContext, axis: Axis, distance: float, moves: Iterable[tuple[float, float]], held: asyncio.Event
 ) -> list[Tried]:
     """Move there and back with each velocity and acceleration; end behind the first that is not followed."""
     tried: list[Tried] = []
@@ -114,7 +114,7 @@ async def _tried(
 
 
 async def _try(
-    site: Site, axis: Axis, distance: float, velocity: float, acceleration: float, held: asyncio.Event
+    site: StepContext, axis: Axis, distance: float, velocity: float, acceleration: float, held: asyncio.Event
 ) -> Tried:
     lags: list[float] = []
     late_s, objection = 0.0, ""
@@ -152,12 +152,12 @@ async def _watch(axis: Axis, lags: list[float]) -> None:
                 lags.append(abs(sample.following_error))  # noqa: PERF401 - it does not end
 
 
-def _highest(site: Site) -> tuple[float, float]:
+def _highest(site: StepContext) -> tuple[float, float]:
     config, limits = site.config, site.info.limits
     return limits.velocity or MOST_TIMES * config.velocity, limits.acceleration or MOST_TIMES * config.acceleration
 
 
-def _velocities(site: Site, distance: float) -> Iterator[tuple[float, float]]:
+def _velocities(site: StepContext, distance: float) -> Iterator[tuple[float, float]]:
     """Yield growing velocities that the distance is long enough for; the configured one in any case."""
     acceleration = site.config.acceleration
     reached = math.sqrt(abs(distance) * acceleration / CRUISE)
@@ -165,7 +165,7 @@ def _velocities(site: Site, distance: float) -> Iterator[tuple[float, float]]:
         yield velocity, acceleration
 
 
-def _accelerations(site: Site) -> Iterator[tuple[float, float]]:
+def _accelerations(site: StepContext) -> Iterator[tuple[float, float]]:
     first, *_ = growing = list(_growing(site.config.acceleration, _highest(site)[1]))
     for acceleration in growing:
         if acceleration != first:  # which was tried with the velocities
@@ -180,11 +180,11 @@ def _growing(first: float, last: float) -> Iterator[float]:
     yield last
 
 
-def _judged(site: Site, distance: float, fast: list[Tried], hard: list[Tried]) -> Result:
+def _judged(site: StepContext, distance: float, fast: list[Tried], hard: list[Tried]) -> Result:
     unit, config = site.info.unit, site.config
     slowest = fast[0]
     series = tuple(
-        Series(title=title, x=x, y=f"following error, {unit}", points=points)
+        PlotSeries(title=title, x=x, y=f"following error, {unit}", points=points)
         for title, x, points in (
             ("Following error by velocity", f"{unit}/s", _points(fast, [each.velocity for each in fast])),
             ("Following error by acceleration", f"{unit}/s²", _points(hard, [each.acceleration for each in hard])),
@@ -201,7 +201,7 @@ def _judged(site: Site, distance: float, fast: list[Tried], hard: list[Tried]) -
     if slowest.objection:
         text = f"it does not follow at {slowest.velocity:g} {unit}/s: {slowest.objection}; tune it, or begin slower"
         return Result(state=StepState.FAILED, text=text, figures=figures, series=series)
-    proposals: list[Proposal] = []
+    proposals: list[ConfigProposal] = []
     said = []
     for key, tried, best in (("velocity", fast, velocity), ("acceleration", hard, acceleration)):
         if not tried or not tried[-1].objection:
@@ -209,9 +209,9 @@ def _judged(site: Site, distance: float, fast: list[Tried], hard: list[Tried]) -
             continue
         share = float(f"{SHARE * best:.{DIGITS}g}")
         said.append(f"{key}: it followed up to {best:.4g}; then {tried[-1].objection}")
-        proposals.append(Proposal(table="limits", key=key, value=share))
+        proposals.append(ConfigProposal(table="limits", key=key, value=share))
         if getattr(config, key) > share:
-            proposals.append(Proposal(table="", key=key, value=share))
+            proposals.append(ConfigProposal(table="", key=key, value=share))
     return Result(
         state=StepState.DONE, text="; ".join(said), figures=figures, series=series, proposals=tuple(proposals)
     )

@@ -6,7 +6,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ldcnd.bench.commissioning.record import Record, Result, StepState
+from ldcnd.bench.commissioning.record import CommissioningRecord, Result, StepState
 from ldcnd.bench.person import Person
 from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion, State
@@ -23,7 +23,7 @@ STILL_COUNTS = 2
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class StepContext:
     """What a step works on.
 
     Attributes:
@@ -38,7 +38,7 @@ class Site:
     info: AxisInfo
     config: AxisConfig
     person: Person
-    record: Record
+    record: CommissioningRecord
 
     @property
     def counts_per_unit(self) -> float:
@@ -65,16 +65,16 @@ class Step(ABC):
     depends: ClassVar[tuple[str, ...]] = ()
     """Settings of the axis, such as `direction`, whose change opens it again; the drive's identity always does."""
 
-    def obstacle(self, site: Site) -> str:
+    def obstacle(self, site: StepContext) -> str:
         """Return why it is not possible with this axis; empty when it is."""
         missing = [verb.value for verb in self.needs if verb not in site.info.capabilities]
         return f"not possible on this model: a {site.info.model} has no {', '.join(missing)}" if missing else ""
 
-    def unneeded(self, site: Site) -> str:  # noqa: ARG002 - most steps are needed
+    def unneeded(self, site: StepContext) -> str:  # noqa: ARG002 - most steps are needed
         """Return why there is nothing to do; empty when there is."""
         return ""
 
-    async def preview(self, site: Site) -> tuple[str, ...]:
+    async def preview(self, site: StepContext) -> tuple[str, ...]:
         """Return what would move, how far, how fast, and which limits catch it.
 
         Raises:
@@ -83,7 +83,7 @@ class Step(ABC):
         return (f"nothing moves: {site.info.axis} stays as it is",)
 
     @abstractmethod
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         """Carry it out.
 
         Args:

@@ -4,8 +4,8 @@ from contextlib import suppress
 
 from typing_extensions import override
 
-from ldcnd.bench.commissioning.record import Figure, Proposal, Result, StepState
-from ldcnd.bench.commissioning.step import Site, Step, rest_counts
+from ldcnd.bench.commissioning.record import ConfigProposal, Figure, Result, StepState
+from ldcnd.bench.commissioning.step import Step, StepContext, rest_counts
 from ldcnd.bench.person import typed_number
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Verb
@@ -27,13 +27,13 @@ class Travel(Step):
     depends = ("direction", "counts_per_unit", "home")
 
     @override
-    def obstacle(self, site: Site) -> str:
+    def obstacle(self, site: StepContext) -> str:
         if site.config.modulo is not None:
             return "a rotary axis turns endlessly: it has no ends"
         return super().obstacle(site)
 
     @override
-    async def preview(self, site: Site) -> tuple[str, ...]:
+    async def preview(self, site: StepContext) -> tuple[str, ...]:
         limits = site.info.limits
         low = "none" if limits.position_min is None else site.length(limits.position_min)
         high = "none" if limits.position_max is None else site.length(limits.position_max)
@@ -47,7 +47,7 @@ class Travel(Step):
         )
 
     @override
-    async def run(self, site: Site, axis: Axis) -> Result:
+    async def run(self, site: StepContext, axis: Axis) -> Result:
         if not axis.state.referenced:
             raise ValueOutOfRange(
                 f"axis {axis.name} is not referenced: its ends would mean nothing",
@@ -65,7 +65,7 @@ class Travel(Step):
         lowest, highest = (float(f"{each:.{DIGITS}g}") for each in (low + margin, high - margin))
         unit, limits = site.info.unit, site.config.limits
         proposals = [
-            Proposal(table="limits", key=key, value=value)
+            ConfigProposal(table="limits", key=key, value=value)
             for key, value, now in (
                 ("position_min", lowest, limits.position_min),
                 ("position_max", highest, limits.position_max),
@@ -83,7 +83,7 @@ class Travel(Step):
             proposals=tuple(proposals),
         )
 
-    async def _end(self, site: Site, axis: Axis, side: str) -> float:
+    async def _end(self, site: StepContext, axis: Axis, side: str) -> float:
         """Return where an end is, in axis units."""
         person = site.person
         while True:
@@ -100,7 +100,7 @@ class Travel(Step):
                     person.tell(HELP)
 
     @staticmethod
-    async def _jog(site: Site, axis: Axis, velocity: float) -> None:
+    async def _jog(site: StepContext, axis: Axis, velocity: float) -> None:
         """Run while the key is held, no faster than configured."""
         bounded = max(-site.config.velocity, min(velocity, site.config.velocity))
         await axis.power(on=True)

@@ -9,7 +9,7 @@ from ldcnd.bench.person import Left, Person
 RUN = {"yes": "Run it", "skip": "Skip it, for a reason", "no": "Not now"}
 
 
-class Walk:
+class ChecklistWalk:
     """What one person does with a checklist.
 
     Args:

@@ -12,7 +12,7 @@ from ldcnd.bench.family import TrialMove
 from ldcnd.bench.ldcn.examination import Held
 from ldcnd.contract.errors import BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.contract.health import Finding, Verdict
-from ldcnd.drives.driver import AxisSpec, Motion, StopMode
+from ldcnd.drives.driver import AxisSpec, CountsMotion, StopMode
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import (
     ANY_DIALECT,
@@ -26,12 +26,12 @@ from ldcnd.drives.ldcn.addressing import (
     read_identity,
 )
 from ldcnd.drives.ldcn.commands import Node, unanswered
-from ldcnd.drives.ldcn.packet import Status, StatusFlag, StatusItem
+from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import Profile, Support
 from ldcnd.drives.ldcn.registers import RESET_BAUD, SERVO_CYCLE_S, BaudCodes
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Effect
+from ldcnd.line.exchange import PacketEffect
 from ldcnd.line.settings import BusSettings
 from ldcnd.line.transport import Opener
 
@@ -275,7 +275,9 @@ class _Drive:
     async def nulls(self) -> Finding:
         """See `ASSUMPTIONS`."""
         half = commands.no_operation(self._node).request[:2]
-        await self._bus.execute(unanswered(EVERYBODY, half, NULLS_SETTLE_S, repeatable=False, effect=Effect.READS))
+        await self._bus.execute(
+            unanswered(EVERYBODY, half, NULLS_SETTLE_S, repeatable=False, effect=PacketEffect.READS)
+        )
         await self._bus.execute(nulls(NULLS_SETTLE_S))
         await self._bus.execute(once(read_identity(self.address, self._known)))
         return self._finding(
@@ -381,7 +383,7 @@ class _Trial:
         text = f"stopped at {positions[-1] - self._origin} counts from where it began"
         return (self.finding("smooth_stop", text, confirmed=still),)
 
-    async def _run_to(self, target: int, until: Callable[[Status], bool]) -> list[Status]:
+    async def _run_to(self, target: int, until: Callable[[StatusPacket], bool]) -> list[StatusPacket]:
         """Move until the condition is met, and return what was seen.
 
         Raises:
@@ -389,7 +391,7 @@ class _Trial:
         """
         self._require_held()
         velocity, acceleration = self._move.velocity_counts_per_s, self._move.acceleration_counts_per_s2
-        await self._axis.load(Motion(target, velocity, acceleration))
+        await self._axis.load(CountsMotion(target, velocity, acceleration))
         self._require_held()
         await self._axis.start()
         loop = asyncio.get_running_loop()
@@ -403,7 +405,7 @@ class _Trial:
             await asyncio.sleep(CHECK_PERIOD_S)
         raise LdcndError(f"the move took longer than {LONGEST_MOVE_S:g} s")
 
-    async def _settled(self) -> list[Status]:
+    async def _settled(self) -> list[StatusPacket]:
         seen = []
         for _ in range(READINGS):
             self._require_held()
@@ -411,10 +413,10 @@ class _Trial:
             await asyncio.sleep(CHECK_PERIOD_S)
         return seen
 
-    async def _look(self) -> Status:
+    async def _look(self) -> StatusPacket:
         return await self._bus.execute(commands.read_status(self._node, MOTION))
 
-    def _done(self, status: Status) -> bool:
+    def _done(self, status: StatusPacket) -> bool:
         return bool(status.flags & StatusFlag.MOVE_DONE)
 
     def _require_held(self) -> None:
@@ -431,6 +433,6 @@ async def _tried(part: Part, address: int) -> Finding:
         return Finding(axis=str(address), what=name, verdict=Verdict.WRONG, text=error.message, verifies=name)
 
 
-def _words(status: Status) -> str:
+def _words(status: StatusPacket) -> str:
     flags = [flag.name or "" for flag in StatusFlag if flag in status.flags]
     return f"status {int(status.flags):02X} ({', '.join(flags)})"

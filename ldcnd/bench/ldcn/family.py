@@ -4,10 +4,10 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 
 from typing_extensions import override
 
-from ldcnd.bench.family import BenchFamily, Scan, ScannedDrive, Trial, TrialMove
+from ldcnd.bench.family import BenchFamily, LineTrial, Scan, ScannedDrive, TrialMove
 from ldcnd.bench.ldcn import acceptance, examination, scan
 from ldcnd.contract.health import Finding
-from ldcnd.drives.family import Line
+from ldcnd.drives.family import UnopenedLine
 from ldcnd.drives.ldcn.config import LdcnBusConfig
 from ldcnd.drives.ldcn.network import LdcnNetwork
 from ldcnd.drives.ldcn.registers import RESET_BAUD
@@ -24,7 +24,7 @@ class LdcnBench(BenchFamily[LdcnBusConfig]):
     is_tuned_by_host = True
 
     @override
-    def examine(self, line: Line, settings: LdcnBusConfig) -> AsyncIterator[Finding]:
+    def examine(self, line: UnopenedLine, settings: LdcnBusConfig) -> AsyncIterator[Finding]:
         if not isinstance(line.network, LdcnNetwork):
             raise TypeError(f"{settings.name} is no line of this family")
         configured = examination.LineAsConfigured(
@@ -60,9 +60,9 @@ class LdcnBench(BenchFamily[LdcnBusConfig]):
         move: TrialMove | None,
         held: Callable[[], bool],
         opener: Opener | None = None,
-    ) -> Trial:
+    ) -> LineTrial:
         bus = acceptance.trial_bus(opener or port_opener(port, RESET_BAUD))
-        return Trial(bus, acceptance.accept(bus, move, held))
+        return LineTrial(bus, acceptance.accept(bus, move, held))
 
 
 LDCN_BENCH = LdcnBench()

@@ -29,7 +29,7 @@ from ldcnd.drives.ldcn.adoption import MOTION_ITEMS, STILL_COUNTS, WATCH_S, Foun
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.costs import price_list
 from ldcnd.drives.ldcn.faults import Knowledge, diagnose
-from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag
+from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import PIC_IO, PROFILES, Profile, Support
 from ldcnd.drives.ldcn.registers import RESET_BAUD, BaudCodes
 from ldcnd.line.adapter import Adapter, adapter_of
@@ -47,7 +47,7 @@ CLOSE_BY = 3
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class ScannedModule:
     """The state of one module.
 
     Attributes:
@@ -142,15 +142,15 @@ class LineScan:
             found |= {address: Found(baud, identity) for address, identity in here.items()}
         return dict(sorted(found.items()))
 
-    async def _watch(self, found: dict[int, Found]) -> dict[int, Seen]:
+    async def _watch(self, found: dict[int, Found]) -> dict[int, ScannedModule]:
         """Read every module twice; what moves in between moves."""
         before = await self._states(found)
         await asyncio.sleep(WATCH_S)
         after = await self._states(found)
         return {address: _seen(each.identity, before[address], after[address]) for address, each in found.items()}
 
-    async def _states(self, found: dict[int, Found]) -> dict[int, Status | None]:
-        states: dict[int, Status | None] = {}
+    async def _states(self, found: dict[int, Found]) -> dict[int, StatusPacket | None]:
+        states: dict[int, StatusPacket | None] = {}
         for address, each in found.items():
             profile = each.identity.profile
             states[address] = None
@@ -167,7 +167,7 @@ class LineScan:
 
     # -- giving addresses --------------------------------------------------------------------------------------------
 
-    def _why_not(self, found: dict[int, Found], seen: dict[int, Seen]) -> Finding | None:
+    def _why_not(self, found: dict[int, Found], seen: dict[int, ScannedModule]) -> Finding | None:
         """Return what keeps a line that answers from being reset; None when nothing on it can be moving."""
         obstacles = [f"address {address}: {seen[address].words}" for address in found if not seen[address].at_rest]
         if found and self._waiting:
@@ -188,7 +188,7 @@ class LineScan:
 
     # -- what that means ---------------------------------------------------------------------------------------------
 
-    def _drives(self, found: dict[int, Found], seen: dict[int, Seen]) -> list[Finding]:
+    def _drives(self, found: dict[int, Found], seen: dict[int, ScannedModule]) -> list[Finding]:
         findings = []
         for address, each in found.items():
             profile = each.identity.profile
@@ -277,12 +277,12 @@ class LineScan:
         yield self._finding("cost", Verdict.FINE, text, f"adapter_latency_ms = {held.adapter_ms:.1f}")
 
 
-def _seen(identity: Identity, before: Status | None, after: Status | None) -> Seen:
+def _seen(identity: Identity, before: StatusPacket | None, after: StatusPacket | None) -> ScannedModule:
     profile = identity.profile
     if profile is None or profile.support is not Support.FULL:
-        return Seen(profile is PIC_IO or None, "its status is not read" if profile else "an unknown device")
+        return ScannedModule(profile is PIC_IO or None, "its status is not read" if profile else "an unknown device")
     if before is None or after is None:
-        return Seen(None, "its state could not be read")
+        return ScannedModule(None, "its state could not be read")
     aux = after.aux or AuxFlag(0)
     moved = abs((after.position or 0) - (before.position or 0))
     words = []
@@ -301,7 +301,7 @@ def _seen(identity: Identity, before: Status | None, after: Status | None) -> Se
     faults = diagnose(profile, after, Knowledge(closed=bool(aux & AuxFlag.SERVO_ON)))
     words += [fault.code.replace("_", " ") for fault in faults]
     words.append(f"at {after.position} counts")
-    return Seen(len(words) > 1 and words[0] == "stands" and not aux & AuxFlag.SERVO_ON, ", ".join(words))
+    return ScannedModule(len(words) > 1 and words[0] == "stands" and not aux & AuxFlag.SERVO_ON, ", ".join(words))
 
 
 def configured_line(name: str, port: str, drives: Sequence[ScannedDrive]) -> str:

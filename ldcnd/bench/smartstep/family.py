@@ -6,12 +6,12 @@ from collections.abc import AsyncIterator, Callable, Sequence
 import click
 from typing_extensions import override
 
-from ldcnd.bench.family import BenchFamily, Scan, ScannedDrive, Trial, TrialMove
+from ldcnd.bench.family import BenchFamily, LineTrial, Scan, ScannedDrive, TrialMove
 from ldcnd.bench.smartstep.examination import examine
 from ldcnd.bench.smartstep.examination import scan as scan_units
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import Finding
-from ldcnd.drives.family import Line
+from ldcnd.drives.family import UnopenedLine
 from ldcnd.drives.smartstep.commands import FLUSH
 from ldcnd.drives.smartstep.config import SmartStepBusConfig
 from ldcnd.drives.smartstep.costs import BAUD
@@ -37,7 +37,7 @@ class SmartStepBench(BenchFamily[SmartStepBusConfig]):
     )
 
     @override
-    async def examine(self, line: Line, settings: SmartStepBusConfig) -> AsyncIterator[Finding]:
+    async def examine(self, line: UnopenedLine, settings: SmartStepBusConfig) -> AsyncIterator[Finding]:
         for axis in line.network.axes.values():
             if isinstance(axis, SmartStepAxis):
                 async for finding in examine(line.bus, axis):
@@ -90,7 +90,7 @@ rates = {{ position = 0.5, velocity = 1, state = 1 }}
         move: TrialMove | None,
         held: Callable[[], bool],
         opener: Opener | None = None,
-    ) -> Trial:
+    ) -> LineTrial:
         axes = [
             {"name": f"unit{number}", "address": number, "model": SMARTSTEP.name, "unit": "count"} for number in units
         ]
@@ -101,7 +101,7 @@ rates = {{ position = 0.5, velocity = 1, state = 1 }}
             raise ConfigError(f"{port}, units {units}: {error}") from error
         line = open_smartstep_line(settings, opener)
         line.bus.resync = line.network.resync
-        return Trial(line.bus, self.examine(line, settings), settings)
+        return LineTrial(line.bus, self.examine(line, settings), settings)
 
 
 SMARTSTEP_BENCH = SmartStepBench()

@@ -6,12 +6,12 @@ from typing_extensions import override
 
 from ldcnd.bench.commissioning import record as records
 from ldcnd.bench.commissioning.checklist import STEPS, Checklist
-from ldcnd.bench.commissioning.record import Record, StepRecord, StepState
-from ldcnd.bench.commissioning.walk import Walk
+from ldcnd.bench.commissioning.record import CommissioningRecord, StepRecord, StepState
+from ldcnd.bench.commissioning.walk import ChecklistWalk
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config
 from ldcnd.console.commissioning.conversation import Conversation
-from ldcnd.console.commissioning.messages import CurveView, FromPage, StepView, View
+from ldcnd.console.commissioning.messages import CurveView, FromCommissioningPage, StepView, View
 from ldcnd.console.commissioning.tuning import ABOUT, is_offered, tune
 from ldcnd.console.rigs import Rigs
 from ldcnd.contract.errors import UnknownVerb
@@ -36,7 +36,7 @@ class AxisConversation(Conversation):
         self._config = config
         self._axis = axis
         self._visitor = visitor
-        self._record = Record(rig="", axis=axis)
+        self._record = CommissioningRecord(rig="", axis=axis)
         self._curves: tuple[CurveView, ...] = ()
         self._unit = ""
         self._seen: object = None
@@ -64,11 +64,11 @@ class AxisConversation(Conversation):
         return self._outside() != self._seen
 
     @override
-    async def carry_out(self, begun: FromPage) -> None:
+    async def carry_out(self, begun: FromCommissioningPage) -> None:
         if begun.begin not in STEPS:
             raise UnknownVerb(f"there is no step {begun.begin!r}", value=begun.begin)
         checklist = await self._opened(begun.by.strip() or self._visitor)
-        walk = Walk(checklist, self.person, str(self._config), lambda kept: self._keep(checklist, kept))
+        walk = ChecklistWalk(checklist, self.person, str(self._config), lambda kept: self._keep(checklist, kept))
         await walk.put_back_gains()
         possible = checklist.record.of(begun.begin).result.state is not StepState.NOT_POSSIBLE
         if begun.begin == TUNING and self._is_tuned_here and possible:
@@ -89,7 +89,7 @@ class AxisConversation(Conversation):
         self._record = checklist.record
         self.person.tell(kept.result.text)
 
-    async def _tune(self, checklist: Checklist, walk: Walk) -> None:
+    async def _tune(self, checklist: Checklist, walk: ChecklistWalk) -> None:
         """Tune the axis, keep the result as that of the step, and offer its gains for the configuration."""
         tuning = await tune(self._rigs.client(self._record.rig), self.person, self._axis)
         if tuning is None:

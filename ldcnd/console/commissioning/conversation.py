@@ -9,7 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Coroutine
 
 from ldcnd.bench.person import Left
-from ldcnd.console.commissioning.messages import FromPage, View
+from ldcnd.console.commissioning.messages import FromCommissioningPage, View
 from ldcnd.console.commissioning.page_person import PagePerson
 from ldcnd.contract.codec import error_reply
 from ldcnd.contract.commands import ErrorReply
@@ -30,13 +30,13 @@ class Conversation(ABC):
         self._changed = asyncio.Event()
         self._changed.set()
         self.person = PagePerson(self._changed.set)
-        self._begun: FromPage | None = None
+        self._begun: FromCommissioningPage | None = None
         self._begin = asyncio.Event()
         self._activity: asyncio.Task[None] | None = None
         self._failure: ErrorReply | None = None
         self._hindrance: ErrorReply | None = None
 
-    def heard(self, message: FromPage) -> None:
+    def heard(self, message: FromCommissioningPage) -> None:
         """Take a message of the page; it may begin something only while nothing runs."""
         if message.answer:
             self.person.answer(message.answer)
@@ -95,7 +95,7 @@ class Conversation(ABC):
         """Tell whether that has changed since."""
 
     @abstractmethod
-    async def carry_out(self, begun: FromPage) -> None:
+    async def carry_out(self, begun: FromCommissioningPage) -> None:
         """Do what the page has begun.
 
         Raises:

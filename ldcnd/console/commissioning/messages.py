@@ -91,7 +91,7 @@ class View(Frozen):
     """Test moves of the last tuning."""
 
 
-class ToPage(Frozen):
+class ToCommissioningPage(Frozen):
     """One message to a page: either of both."""
 
     view: View | None = None
@@ -100,7 +100,7 @@ class ToPage(Frozen):
     """Why the page has no part in it; the web socket closes."""
 
 
-class Answer(Frozen):
+class PersonAnswer(Frozen):
     """What the person answers."""
 
     number: int
@@ -109,7 +109,7 @@ class Answer(Frozen):
     """The answer, or one of the words of a choice."""
 
 
-class Hold(Frozen):
+class HoldButton(Frozen):
     """Whether the button is held."""
 
     number: int
@@ -118,16 +118,16 @@ class Hold(Frozen):
     """It is, for a while more; false: it was let go."""
 
 
-class FromPage(Frozen):
+class FromCommissioningPage(Frozen):
     """One message of a page; nothing in it but one of these has any effect."""
 
     begin: str | None = Field(default=None, max_length=64)
     """A step of the checklist, or `scan`, to begin."""
     by: str = Field(default="", max_length=64)
     """With `begin`: who the person is, for the record."""
-    answer: Answer | None = None
+    answer: PersonAnswer | None = None
     """To the question."""
-    hold: Hold | None = None
+    hold: HoldButton | None = None
     """Of the button."""
     leave: bool = False
     """End what is going on: what moves is halted."""

@@ -12,7 +12,7 @@ from contextlib import asynccontextmanager
 from typing_extensions import override
 
 from ldcnd.bench.person import Left, Person
-from ldcnd.console.commissioning.messages import Answer, Choice, Hold, Question
+from ldcnd.console.commissioning.messages import Choice, HoldButton, PersonAnswer, Question
 from ldcnd.printable import printable
 
 HELD_S = 1.0
@@ -114,7 +114,7 @@ class PagePerson(Person):
         """Forget the lines: something else begins."""
         self._lines.clear()
 
-    def answer(self, answer: Answer) -> None:
+    def answer(self, answer: PersonAnswer) -> None:
         """Take an answer; one to another question, or none of the choices, is none."""
         question = self.question
         if question is None or question.number != answer.number or question.kind == "hold":
@@ -124,7 +124,7 @@ class PagePerson(Person):
             return
         self._settle(answer.text)
 
-    def hold(self, hold: Hold) -> None:
+    def hold(self, hold: HoldButton) -> None:
         """Take a message of the button."""
         question = self.question
         if question is None or question.kind != "hold" or question.number != hold.number:

@@ -23,7 +23,7 @@ from ldcnd.bench.commissioning.report import html_of
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.console.commissioning.axis_conversation import TUNING, AxisConversation
 from ldcnd.console.commissioning.conversation import Conversation
-from ldcnd.console.commissioning.messages import FromPage, ToPage
+from ldcnd.console.commissioning.messages import FromCommissioningPage, ToCommissioningPage
 from ldcnd.console.commissioning.scan_conversation import ScanConversation
 from ldcnd.console.errors import answering_errors
 from ldcnd.console.reading import NOTHING_TO_SAY, SEND_TIME_S
@@ -130,7 +130,7 @@ class Commissioning:
                 )
             conversation = new()
         except LdcndError as error:
-            await socket.send_text(ToPage(refused=error_reply(error)).model_dump_json(exclude_none=True))
+            await socket.send_text(ToCommissioningPage(refused=error_reply(error)).model_dump_json(exclude_none=True))
             await socket.close(NOTHING_TO_SAY)
             return
         self._count += 1
@@ -217,7 +217,7 @@ async def _hear(socket: WebSocket, conversation: Conversation) -> bool:
         try:
             if left < 0:
                 raise TooManyRequests("this page says too much", limit=MOST_MESSAGES_PER_S)
-            conversation.heard(decode(FromPage, (message.get("text") or "").encode(), Encoding.JSON))
+            conversation.heard(decode(FromCommissioningPage, (message.get("text") or "").encode(), Encoding.JSON))
         except LdcndError:
             return False
     return True
@@ -228,4 +228,4 @@ async def _tell(socket: WebSocket, conversation: Conversation) -> None:
         while True:
             view = await conversation.view()
             async with asyncio.timeout(SEND_TIME_S):
-                await socket.send_text(ToPage(view=view).model_dump_json(exclude_none=True))
+                await socket.send_text(ToCommissioningPage(view=view).model_dump_json(exclude_none=True))

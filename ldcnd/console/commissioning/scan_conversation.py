@@ -10,7 +10,7 @@ from ldcnd.bench.family import ScannedDrive
 from ldcnd.bench.known import BENCHES
 from ldcnd.bench.opened import ports
 from ldcnd.console.commissioning.conversation import Conversation
-from ldcnd.console.commissioning.messages import FromPage, View
+from ldcnd.console.commissioning.messages import FromCommissioningPage, View
 from ldcnd.contract.errors import UnknownVerb
 from ldcnd.contract.health import Finding
 
@@ -46,7 +46,7 @@ class ScanConversation(Conversation):
         return False
 
     @override
-    async def carry_out(self, begun: FromPage) -> None:
+    async def carry_out(self, begun: FromCommissioningPage) -> None:
         if begun.begin != SCAN:
             raise UnknownVerb(f"there is no {begun.begin!r} here", value=begun.begin)
         person = self.person

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from ldcnd.bench.commissioning.checklist import CLIENT, STEPS
-from ldcnd.bench.commissioning.record import Figure, Proposal, Result, Series, StepState
+from ldcnd.bench.commissioning.record import ConfigProposal, Figure, PlotSeries, Result, StepState
 from ldcnd.bench.known import BENCHES
 from ldcnd.bench.person import Person
 from ldcnd.client.kept_gains import LEASE_S, open_loop
@@ -83,10 +83,14 @@ async def tune(client: RigClient, person: Person, name: str) -> Tuning | None:
             *(Figure(what=register, value=value) for register, value in report.gains.items()),
         ),
         series=tuple(
-            Series(title=each.label, x="s", y=info.unit, points=tuple(zip(each.times_s, each.positions, strict=True)))
+            PlotSeries(
+                title=each.label, x="s", y=info.unit, points=tuple(zip(each.times_s, each.positions, strict=True))
+            )
             for each in tuned.curves
         ),
-        proposals=tuple(Proposal(table="gains", key=register, value=value) for register, value in report.gains.items()),
+        proposals=tuple(
+            ConfigProposal(table="gains", key=register, value=value) for register, value in report.gains.items()
+        ),
     )
     return Tuning(result, curves, info.unit)
 

@@ -16,12 +16,12 @@ from typing import TypeVar
 from ldcnd.contract.errors import BadReply, CommandAborted, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node, spaced, unanswered
-from ldcnd.drives.ldcn.packet import Status, StatusItem, decode_status
+from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket, decode_status
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
 from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud, baud_at_reset, baud_divisor
 from ldcnd.drives.network import GroupSpec
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Effect, Exchange
+from ldcnd.line.exchange import Exchange, PacketEffect
 
 ReplyT = TypeVar("ReplyT")
 
@@ -82,13 +82,13 @@ def differences(expected: tuple[Expected, ...], found: Mapping[int, Identity]) -
     return tuple(difference for difference in said if difference)
 
 
-def read_identity(address: int, known: Identity | None = None) -> Exchange[Status]:
+def read_identity(address: int, known: Identity | None = None) -> Exchange[StatusPacket]:
     """Return the exchange that reads id and version, and insists on the known ones if they are given."""
     exchange = commands.read_status(Node(address, ANY_DIALECT), StatusItem.IDENTITY)
     if known is None:
         return exchange
 
-    def decode(data: bytes) -> Status:
+    def decode(data: bytes) -> StatusPacket:
         status = decode_status(ANY_DIALECT, StatusItem.IDENTITY, data)
         if identity_in(status) != known:
             raise BadReply(f"node {address} says {identity_in(status)}, known as {known}")
@@ -97,7 +97,7 @@ def read_identity(address: int, known: Identity | None = None) -> Exchange[Statu
     return replace(exchange, decode=decode)
 
 
-def identity_in(status: Status) -> Identity:
+def identity_in(status: StatusPacket) -> Identity:
     """Return the identity that a status packet carries."""
     return Identity(status.device_id or 0, status.version or 0)
 
@@ -195,7 +195,7 @@ NULLS_SETTLE_S = 0.001
 
 def nulls(quiet_s: float) -> Exchange[None]:
     """Return the exchange that fills up any half-received packet, and a pause."""
-    return unanswered(EVERYBODY, NULLS, quiet_s, repeatable=True, effect=Effect.READS)
+    return unanswered(EVERYBODY, NULLS, quiet_s, repeatable=True, effect=PacketEffect.READS)
 
 
 RESET_S = 2.0
@@ -278,13 +278,15 @@ class LineRate:
             return
         packets = [self.set_baud(address, baud).request for address in (*self.groups, WAITING_GROUP)]
         quiet_s = commands.group_quiet_s(self.cycle_s)
-        burst = unanswered(EVERYBODY, self.spaced(packets), quiet_s, repeatable=False, effect=Effect.ARRANGES)
+        burst = unanswered(EVERYBODY, self.spaced(packets), quiet_s, repeatable=False, effect=PacketEffect.ARRANGES)
         await self._bus.change_baud(burst, baud)
 
     def set_baud(self, group: int, baud: int) -> Exchange[None]:
         """Return the exchange that moves one group without a leader to a rate."""
         profile = PIC_SERVO_SC if baud == FASTEST_BAUD else None
-        return commands.set_baud(commands.Group(group, profile, self.cycle_s), baud, self._codes, self._clock_hz)
+        return commands.set_baud(
+            commands.LeaderlessGroup(group, profile, self.cycle_s), baud, self._codes, self._clock_hz
+        )
 
     def spaced(self, packets: list[bytes]) -> bytes:
         """Return group packets as one piece, a servo cycle apart at the present rate."""
@@ -310,7 +312,7 @@ class LineRate:
             return await self._answer(lambda: self._bus.execute(exchange))
         return await self._answer(lambda: self._bus.execute_at(baud, exchange))
 
-    async def _answer(self, ask: Callable[[], Awaitable[Status]]) -> Identity | None:
+    async def _answer(self, ask: Callable[[], Awaitable[StatusPacket]]) -> Identity | None:
         while True:
             try:
                 return identity_in(await ask())
@@ -367,8 +369,8 @@ class Addressing:
         if not await self.rate.host_to(baud):
             return
         groups = (*(address for address in self._plan.addresses if address != EVERYBODY), WAITING_GROUP, EVERYBODY)
-        burst = self.rate.spaced([commands.hard_reset(commands.Group(address)).request for address in groups])
-        reset = unanswered(EVERYBODY, burst, settle_s, repeatable=False, effect=Effect.ARRANGES)
+        burst = self.rate.spaced([commands.hard_reset(commands.LeaderlessGroup(address)).request for address in groups])
+        reset = unanswered(EVERYBODY, burst, settle_s, repeatable=False, effect=PacketEffect.ARRANGES)
         for _ in range(2):
             await self._bus.execute(reset)
 

@@ -12,7 +12,7 @@ from ldcnd.contract.errors import BusDown, BusError, NetworkMismatch
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import Expected, Identity, LineRate, differences
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem
+from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import Profile, Support
 from ldcnd.line.bus import Bus
 
@@ -49,7 +49,7 @@ class Adopted:
 
     baud: int
     identities: Mapping[int, Identity]
-    states: Mapping[int, Status]
+    states: Mapping[int, StatusPacket]
 
 
 class Adoption:
@@ -129,8 +129,8 @@ class Adoption:
             and await self._rate.who_is(UNADDRESSED, patient=True) is not None
         )
 
-    async def _motion_states(self, watched: Mapping[int, tuple[Found, Profile]]) -> dict[int, Status | None]:
-        states: dict[int, Status | None] = dict.fromkeys(watched)
+    async def _motion_states(self, watched: Mapping[int, tuple[Found, Profile]]) -> dict[int, StatusPacket | None]:
+        states: dict[int, StatusPacket | None] = dict.fromkeys(watched)
         for address, (found, profile) in watched.items():
             exchange = commands.read_status(Node(address, profile), MOTION_ITEMS)
             if await self._rate.host_to(found.baud):
@@ -177,7 +177,7 @@ class Adoption:
                 remedy="stop that host, or reset the line",
             ) from error
 
-    async def _motion_state(self, each: Expected) -> Status:
+    async def _motion_state(self, each: Expected) -> StatusPacket:
         return await self._bus.execute(commands.read_status(Node(each.address, each.profile), MOTION_ITEMS))
 
 
@@ -185,7 +185,7 @@ def _is_servo(each: Expected) -> bool:
     return each.profile.support is Support.FULL
 
 
-def moves(before: Status | None, after: Status | None) -> bool:
+def moves(before: StatusPacket | None, after: StatusPacket | None) -> bool:
     """Judge by velocity, by a profile that runs with the loop closed, and by two positions; not known counts as yes."""
     if before is None or after is None or before.position is None or after.position is None:
         return True

@@ -1,7 +1,7 @@
 """LDCN/NMC commands as the host sends them: for each a function from a destination and values to an `Exchange`.
 
-A destination is one answering module (`Node`) or a silent `Group`. No state of a module is kept here: its default
-status items travel with its `Node`. The other direction is in received.py. Commands that not every dialect has
+A destination is one answering module (`Node`) or a silent `LeaderlessGroup`. No state of a module is kept here: its
+default status items travel with its `Node`. The other direction is in received.py. Commands that not every dialect has
 are refused for the others, and so is everything that could move a module which ldcnd only identifies.
 Sources: LS-182AP manual, "Addressing", "Command Description"; PIC-SERVO manual, 4.1, 5.2; for PIC-SERVO SC later vendor
 data sheets.
@@ -34,10 +34,10 @@ from ldcnd.drives.ldcn.packet import (
     MOST_ADDRESS,
     POSITION,
     STATUS_BYTE_ONLY,
-    Command,
+    CommandCode,
     Packet,
-    Status,
     StatusItem,
+    StatusPacket,
     check_status,
     encode_packet,
     status_bytes,
@@ -47,7 +47,7 @@ from ldcnd.drives.ldcn.path import PathPoint, encode_points
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile, Support
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, BaudCodes, baud_divisor, encode_gains
 from ldcnd.drives.ldcn.trajectory import Trajectory, encode_trajectory
-from ldcnd.line.exchange import Effect, Exchange, ReplyVerdict
+from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
 from ldcnd.line.settings import HOST_LATE_S
 
 ReplyT = TypeVar("ReplyT")
@@ -68,13 +68,13 @@ class Destination(ABC, Generic[ReplyT]):
 
     @abstractmethod
     def exchange(
-        self, request: bytes, items: StatusItem | None, *, repeatable: bool, effect: Effect = Effect.CHANGES
+        self, request: bytes, items: StatusItem | None, *, repeatable: bool, effect: PacketEffect = PacketEffect.CHANGES
     ) -> Exchange[ReplyT]:
         """Pair a request with its reply: these status items, or those sent by default when None."""
 
 
 @dataclass(frozen=True, slots=True)
-class Node(Destination[Status]):
+class Node(Destination[StatusPacket]):
     """One module, or a group whose leader answers as if it had been meant alone.
 
     Attributes:
@@ -95,8 +95,8 @@ class Node(Destination[Status]):
             )
 
     def exchange(
-        self, request: bytes, items: StatusItem | None, *, repeatable: bool, effect: Effect = Effect.CHANGES
-    ) -> Exchange[Status]:
+        self, request: bytes, items: StatusItem | None, *, repeatable: bool, effect: PacketEffect = PacketEffect.CHANGES
+    ) -> Exchange[StatusPacket]:
         """See `Destination`.
 
         Raises:
@@ -122,7 +122,7 @@ class Node(Destination[Status]):
 
 
 @dataclass(frozen=True, slots=True)
-class Group(Destination[None]):
+class LeaderlessGroup(Destination[None]):
     """All modules of a group without a leader: none answers, and the line rests until the command is executed.
 
     Attributes:
@@ -145,7 +145,7 @@ class Group(Destination[None]):
         items: StatusItem | None,  # noqa: ARG002 - no module answers
         *,
         repeatable: bool,
-        effect: Effect = Effect.CHANGES,
+        effect: PacketEffect = PacketEffect.CHANGES,
     ) -> Exchange[None]:
         """See `Destination`; the manuals require 0.51 ms of quiet."""
         return unanswered(self.address, request, group_quiet_s(self.cycle_s), repeatable=repeatable, effect=effect)
@@ -157,7 +157,7 @@ def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:
 
 
 def unanswered(
-    address: int, request: bytes, quiet_s: float, *, repeatable: bool, effect: Effect = Effect.CHANGES
+    address: int, request: bytes, quiet_s: float, *, repeatable: bool, effect: PacketEffect = PacketEffect.CHANGES
 ) -> Exchange[None]:
     """Return an exchange that draws no reply and keeps the line quiet for a while."""
     return Exchange(
@@ -207,21 +207,21 @@ EEPROM_SETTLE_S = 0.3
 """Time for PIC-SERVO SC to write its EEPROM and to restart, seconds; the data sheet names no time."""
 COMMON_COMMANDS = frozenset(
     {
-        Command.SET_ADDRESS,
-        Command.DEFINE_STATUS,
-        Command.READ_STATUS,
-        Command.SET_BAUD_RATE,
-        Command.NO_OPERATION,
-        Command.HARD_RESET,
+        CommandCode.SET_ADDRESS,
+        CommandCode.DEFINE_STATUS,
+        CommandCode.READ_STATUS,
+        CommandCode.SET_BAUD_RATE,
+        CommandCode.NO_OPERATION,
+        CommandCode.HARD_RESET,
     }
 )
 """Commands of every module, servo or not."""
 EFFECTS = {
-    Command.READ_STATUS: Effect.READS,
-    Command.NO_OPERATION: Effect.READS,
-    Command.SET_ADDRESS: Effect.ARRANGES,
-    Command.SET_BAUD_RATE: Effect.ARRANGES,
-    Command.HARD_RESET: Effect.ARRANGES,
+    CommandCode.READ_STATUS: PacketEffect.READS,
+    CommandCode.NO_OPERATION: PacketEffect.READS,
+    CommandCode.SET_ADDRESS: PacketEffect.ARRANGES,
+    CommandCode.SET_BAUD_RATE: PacketEffect.ARRANGES,
+    CommandCode.HARD_RESET: PacketEffect.ARRANGES,
 }
 """All others change something; Stop Motor, which does not only stop, by its control byte."""
 RELIEVING = frozenset(
@@ -239,7 +239,7 @@ RELIEVING = frozenset(
 
 def reset_position(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Set position counter and command position to 0; not to be sent during a trapezoidal move."""
-    return _exchange(to, Command.RESET_POSITION, repeatable=False)
+    return _exchange(to, CommandCode.RESET_POSITION, repeatable=False)
 
 
 def reset_position_relative_to_home(to: Destination[ReplyT]) -> Exchange[ReplyT]:
@@ -249,7 +249,7 @@ def reset_position_relative_to_home(to: Destination[ReplyT]) -> Exchange[ReplyT]
         NotSupported: the module is no PIC-SERVO SC.
     """
     _require_sc(to, "resetting the position relative to home")
-    return _exchange(to, Command.RESET_POSITION, bytes((PositionReset.RELATIVE_TO_HOME,)), repeatable=False)
+    return _exchange(to, CommandCode.RESET_POSITION, bytes((PositionReset.RELATIVE_TO_HOME,)), repeatable=False)
 
 
 def set_position(to: Destination[ReplyT], position: int) -> Exchange[ReplyT]:
@@ -261,7 +261,7 @@ def set_position(to: Destination[ReplyT], position: int) -> Exchange[ReplyT]:
     """
     _require_sc(to, "setting the position counter")
     data = bytes((PositionReset.SET_POSITION,)) + POSITION.encode(position)
-    return _exchange(to, Command.RESET_POSITION, data, repeatable=False)
+    return _exchange(to, CommandCode.RESET_POSITION, data, repeatable=False)
 
 
 def set_address(to: Destination[ReplyT], address: int, group: int, *, leader: bool = False) -> Exchange[ReplyT]:
@@ -278,7 +278,7 @@ def set_address(to: Destination[ReplyT], address: int, group: int, *, leader: bo
     """
     GROUP_ADDRESS.check(group)
     data = ADDRESS.encode(address) + bytes((group & ~GROUP_MEMBER if leader else group,))
-    return _exchange(to, Command.SET_ADDRESS, data, repeatable=False)
+    return _exchange(to, CommandCode.SET_ADDRESS, data, repeatable=False)
 
 
 def define_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT]:
@@ -287,7 +287,7 @@ def define_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT
     Raises:
         NotSupported: the layout of these items is not known for this module.
     """
-    return _exchange(to, Command.DEFINE_STATUS, bytes((items,)), items=items)
+    return _exchange(to, CommandCode.DEFINE_STATUS, bytes((items,)), items=items)
 
 
 def read_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT]:
@@ -296,7 +296,7 @@ def read_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT]:
     Raises:
         NotSupported: the layout of these items is not known for this module.
     """
-    return _exchange(to, Command.READ_STATUS, bytes((items,)), items=items)
+    return _exchange(to, CommandCode.READ_STATUS, bytes((items,)), items=items)
 
 
 def load_trajectory(to: Destination[ReplyT], trajectory: Trajectory) -> Exchange[ReplyT]:
@@ -307,12 +307,12 @@ def load_trajectory(to: Destination[ReplyT], trajectory: Trajectory) -> Exchange
         NotSupported: see `encode_trajectory`.
     """
     data = encode_trajectory(_dialect(to), trajectory)
-    return _exchange(to, Command.LOAD_TRAJECTORY, data, repeatable=not trajectory.start_now)
+    return _exchange(to, CommandCode.LOAD_TRAJECTORY, data, repeatable=not trajectory.start_now)
 
 
 def start_motion(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Execute the trajectory loaded last."""
-    return _exchange(to, Command.START_MOTION, repeatable=False)
+    return _exchange(to, CommandCode.START_MOTION, repeatable=False)
 
 
 def set_gain(to: Destination[ReplyT], gains: Gains) -> Exchange[ReplyT]:
@@ -322,7 +322,7 @@ def set_gain(to: Destination[ReplyT], gains: Gains) -> Exchange[ReplyT]:
         ValueOutOfRange: a value does not fit its register.
         NotSupported: the module lacks a register that is not at its default.
     """
-    return _exchange(to, Command.SET_GAIN, encode_gains(_dialect(to), gains))
+    return _exchange(to, CommandCode.SET_GAIN, encode_gains(_dialect(to), gains))
 
 
 def stop_motor(to: Destination[ReplyT], control: StopControl, position: int | None = None) -> Exchange[ReplyT]:
@@ -343,14 +343,14 @@ def stop_motor(to: Destination[ReplyT], control: StopControl, position: int | No
     if (position is not None) != bool(control & StopControl.HERE):
         raise ValueOutOfRange("Stop Motor takes a position exactly with the bit for stopping here", value=position)
     data = bytes((control,)) + (POSITION.encode(position) if position is not None else b"")
-    effect = Effect.RELIEVES if control in RELIEVING else Effect.CHANGES
-    return _exchange(to, Command.STOP_MOTOR, data, effect=effect)
+    effect = PacketEffect.RELIEVES if control in RELIEVING else PacketEffect.CHANGES
+    return _exchange(to, CommandCode.STOP_MOTOR, data, effect=effect)
 
 
 def close_loop(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Close the loop at the present position: the bytes of an abrupt stop, which take energy out of a closed loop."""
     control = StopControl.AMP_ENABLE | StopControl.ABRUPT
-    return _exchange(to, Command.STOP_MOTOR, bytes((control,)), effect=Effect.CHANGES)
+    return _exchange(to, CommandCode.STOP_MOTOR, bytes((control,)), effect=PacketEffect.CHANGES)
 
 
 def io_control(to: Destination[ReplyT], pins: LimitPins, *, fast_path: bool = False) -> Exchange[ReplyT]:
@@ -365,7 +365,7 @@ def io_control(to: Destination[ReplyT], pins: LimitPins, *, fast_path: bool = Fa
         raise NotSupported(f"{profile.title} has no limit pins that can be outputs")
     if fast_path and not profile.path_points:
         raise NotSupported(f"{profile.title} has no path mode")
-    return _exchange(to, Command.IO_CONTROL, bytes((pins | (IoOption.FAST_PATH if fast_path else 0),)))
+    return _exchange(to, CommandCode.IO_CONTROL, bytes((pins | (IoOption.FAST_PATH if fast_path else 0),)))
 
 
 def set_options(to: Destination[ReplyT], options: IoOption) -> Exchange[ReplyT]:
@@ -377,7 +377,7 @@ def set_options(to: Destination[ReplyT], options: IoOption) -> Exchange[ReplyT]:
     """
     _require_sc(to, "options of I/O Control")
     check_options(options)
-    return _exchange(to, Command.IO_CONTROL, bytes((options,)))
+    return _exchange(to, CommandCode.IO_CONTROL, bytes((options,)))
 
 
 def add_path_points(
@@ -390,7 +390,7 @@ def add_path_points(
         ValueOutOfRange: a point does not fit, or there are too many.
     """
     data = encode_points(_dialect(to), points, fast_path=fast_path)
-    return _exchange(to, Command.ADD_PATH_POINTS, data, repeatable=False)
+    return _exchange(to, CommandCode.ADD_PATH_POINTS, data, repeatable=False)
 
 
 def start_path(to: Destination[ReplyT]) -> Exchange[ReplyT]:
@@ -401,7 +401,7 @@ def start_path(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """
     if not _dialect(to).path_points:
         raise NotSupported(f"{_dialect(to).title} has no path mode")
-    return _exchange(to, Command.ADD_PATH_POINTS, repeatable=False)
+    return _exchange(to, CommandCode.ADD_PATH_POINTS, repeatable=False)
 
 
 def set_homing(to: Destination[ReplyT], control: HomingControl) -> Exchange[ReplyT]:
@@ -412,10 +412,12 @@ def set_homing(to: Destination[ReplyT], control: HomingControl) -> Exchange[Repl
         NotSupported: the module lacks a source, or does not stop on home.
     """
     check_homing(control, to.profile)
-    return _exchange(to, Command.SET_HOMING_MODE, bytes((control,)))
+    return _exchange(to, CommandCode.SET_HOMING_MODE, bytes((control,)))
 
 
-def set_baud(to: Group, baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int = CLOCK_HZ) -> Exchange[None]:
+def set_baud(
+    to: LeaderlessGroup, baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int = CLOCK_HZ
+) -> Exchange[None]:
     """Change the rate of all modules; the host changes its own before it sends anything else.
 
     Only for a group without a leader, as the manuals insist: a reply would come at the new rate.
@@ -426,28 +428,28 @@ def set_baud(to: Group, baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz
     top = to.profile.top_baud if to.profile else COMMON_TOP_BAUD
     if baud > top:
         raise ValueOutOfRange(f"{baud} baud is above {top}", value=baud, limit=top, nearest=top)
-    return _exchange(to, Command.SET_BAUD_RATE, bytes((baud_divisor(baud, codes, clock_hz),)), repeatable=False)
+    return _exchange(to, CommandCode.SET_BAUD_RATE, bytes((baud_divisor(baud, codes, clock_hz),)), repeatable=False)
 
 
 def clear_sticky_bits(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Clear position error, position wrap, servo overrun and current limiting as far as their causes are gone."""
-    return _exchange(to, Command.CLEAR_STICKY_BITS)
+    return _exchange(to, CommandCode.CLEAR_STICKY_BITS)
 
 
 def save_home(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Save the present position in the home register."""
-    return _exchange(to, Command.SAVE_CURRENT_POSITION_AS_HOME, repeatable=False)
+    return _exchange(to, CommandCode.SAVE_CURRENT_POSITION_AS_HOME, repeatable=False)
 
 
 def no_operation(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Do nothing but draw a reply."""
-    return _exchange(to, Command.NO_OPERATION)
+    return _exchange(to, CommandCode.NO_OPERATION)
 
 
-def hard_reset(to: Node | Group) -> Exchange[None]:
+def hard_reset(to: Node | LeaderlessGroup) -> Exchange[None]:
     """Put modules back into the state after power-up: 19200 baud, address 0, motor off; not answered."""
-    request = encode_packet(Packet(to.address, Command.HARD_RESET))
-    return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False, effect=EFFECTS[Command.HARD_RESET])
+    request = encode_packet(Packet(to.address, CommandCode.HARD_RESET))
+    return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False, effect=EFFECTS[CommandCode.HARD_RESET])
 
 
 def configure_start_up(to: Node, start_up: StartUp) -> Exchange[None]:
@@ -462,23 +464,23 @@ def configure_start_up(to: Node, start_up: StartUp) -> Exchange[None]:
     """
     _require_sc(to, "saving its configuration")
     ADDRESS.check(to.address)
-    request = encode_packet(Packet(to.address, Command.HARD_RESET, bytes((start_up,))))
+    request = encode_packet(Packet(to.address, CommandCode.HARD_RESET, bytes((start_up,))))
     return unanswered(to.address, request, EEPROM_SETTLE_S, repeatable=False)
 
 
 def _exchange(
     to: Destination[ReplyT],
-    command: Command,
+    command: CommandCode,
     data: bytes = b"",
     *,
     items: StatusItem | None = None,
     repeatable: bool = True,
-    effect: Effect | None = None,
+    effect: PacketEffect | None = None,
 ) -> Exchange[ReplyT]:
     if to.profile and to.profile.support is Support.IDENTIFY and command not in COMMON_COMMANDS:
         raise NotSupported(f"{to.profile.title} is only identified: it takes no {command.name}")
     request = encode_packet(Packet(to.address, command, data))
-    effect = effect or EFFECTS.get(command, Effect.CHANGES)
+    effect = effect or EFFECTS.get(command, PacketEffect.CHANGES)
     return to.exchange(request, items, repeatable=repeatable, effect=effect)
 
 

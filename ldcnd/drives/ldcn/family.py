@@ -11,7 +11,7 @@ from typing_extensions import override
 
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.cost import LineTiming, cost_of
-from ldcnd.drives.family import Demand, Family, Line, OpenLine, bus_settings
+from ldcnd.drives.family import Demand, Family, OpenLine, UnopenedLine, bus_settings
 from ldcnd.drives.ldcn.config import LdcnBusConfig
 from ldcnd.drives.ldcn.costs import price_list
 from ldcnd.drives.ldcn.io_module import poll_io
@@ -64,14 +64,16 @@ class LdcnFamily(Family[LdcnBusConfig]):
 LDCN = LdcnFamily()
 
 
-def open_ldcn_line(settings: LdcnBusConfig, opener: Opener | None = None) -> Line:
+def open_ldcn_line(settings: LdcnBusConfig, opener: Opener | None = None) -> UnopenedLine:
     """Return a line that is not open yet, which is opened by its port or by `opener`."""
     baud = settings.baud if settings.port.startswith(SOCKET) else baud_at_reset(settings.clock_hz)
     bus = Bus(
         bus_settings(settings, baud, cycle=servo_cycle(settings), coalesce_s=settings.coalesce_ms / 1000),
         opener or port_opener(settings.port, baud, working_baud=settings.baud, rs485=settings.rs485),
     )
-    return Line(bus, LdcnNetwork(bus, tuple(axis.spec() for axis in settings.axis), settings.baud, settings.spec()))
+    return UnopenedLine(
+        bus, LdcnNetwork(bus, tuple(axis.spec() for axis in settings.axis), settings.baud, settings.spec())
+    )
 
 
 # -- the load of a line ----------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
 
-from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag
+from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import Profile
 
 SENSOR_LEAST = 8
@@ -82,7 +82,7 @@ _REMEDIES = MappingProxyType(
 
 
 @dataclass(frozen=True, slots=True)
-class Fault:
+class LdcnFault:
     """One complaint.
 
     Attributes:
@@ -126,7 +126,7 @@ class Knowledge:
 
     pic_ae: bool | None = None
     nothing_latched: bool = False
-    latched: Fault | None = None
+    latched: LdcnFault | None = None
     closed: bool = False
     seen: bool = True
     absolute: bool | None = None
@@ -136,7 +136,7 @@ AFTER_RESET = Knowledge(pic_ae=False, nothing_latched=True, absolute=False)
 """Manuals, "Power-up and Reset Conditions"."""
 
 
-def diagnose(profile: Profile, status: Status, known: Knowledge) -> tuple[Fault, ...]:
+def diagnose(profile: Profile, status: StatusPacket, known: Knowledge) -> tuple[LdcnFault, ...]:
     """List what is wrong, worst first; empty when nothing is, or nothing is known to be.
 
     A servo that was switched off on purpose with the amplifier left on appears like one that a position error switched
@@ -159,26 +159,26 @@ def diagnose(profile: Profile, status: Status, known: Knowledge) -> tuple[Fault,
     return tuple(faults + _warnings(status))
 
 
-def _power_driver_off(status: Status, known: Knowledge) -> list[Fault]:
+def _power_driver_off(status: StatusPacket, known: Knowledge) -> list[LdcnFault]:
     """Read the rows of the table with Pic_ae = 0; a limit bit at 0 is no limit switch then."""
     flags, cause = status.flags, known.latched
     both = StatusFlag.LIMIT1 | StatusFlag.LIMIT2
     if flags & StatusFlag.POWER_ON:
         faults = [cause] if cause and cause.code in _DRIVER_STAYS else []  # the others would hold bit 3 at 0
         if not flags & StatusFlag.LIMIT1:
-            faults.append(Fault(FaultCode.STOP_INPUT, latched=False))
+            faults.append(LdcnFault(FaultCode.STOP_INPUT, latched=False))
         if not flags & StatusFlag.LIMIT2:
-            faults.append(Fault(FaultCode.OVERHEAT, latched=False))
+            faults.append(LdcnFault(FaultCode.OVERHEAT, latched=False))
         return faults
     if known.nothing_latched:
         # the chapter on the stop input says that it, too, clears bit 3
         code = FaultCode.OVERVOLTAGE if flags & both == both else FaultCode.LATCHED_FAULT
-        present = Fault(code, latched=False)
+        present = LdcnFault(code, latched=False)
         return [cause, present] if cause else [present]
     return [cause or _UNREADABLE]
 
 
-def _power_driver_not_known(status: Status, known: Knowledge) -> list[Fault]:
+def _power_driver_not_known(status: StatusPacket, known: Knowledge) -> list[LdcnFault]:
     """Read a status that means one thing with Pic_ae = 0 and another with 1, with the loop open."""
     flags = status.flags
     if known.latched:
@@ -187,11 +187,11 @@ def _power_driver_not_known(status: Status, known: Knowledge) -> list[Fault]:
         return [_UNREADABLE]
     both = StatusFlag.LIMIT1 | StatusFlag.LIMIT2
     if flags & both != both and flags & StatusFlag.POSITION_ERROR:
-        return [Fault(FaultCode.LATCHED_FAULT, latched=True)]  # position error, or stop input or overheat
+        return [LdcnFault(FaultCode.LATCHED_FAULT, latched=True)]  # position error, or stop input or overheat
     return []
 
 
-def _power_driver_on(profile: Profile, status: Status, known: Knowledge) -> list[Fault]:
+def _power_driver_on(profile: Profile, status: StatusPacket, known: Knowledge) -> list[LdcnFault]:
     """Read the rows of the table with Pic_ae = 1."""
     flags = status.flags
     if not flags & StatusFlag.POWER_ON:
@@ -203,43 +203,43 @@ def _power_driver_on(profile: Profile, status: Status, known: Knowledge) -> list
     both = StatusFlag.LIMIT1 | StatusFlag.LIMIT2
     if known.absolute is not False and flags & both == both and sensor_lost(profile, status.adc):
         code = FaultCode.SENSOR_FAULT if known.absolute else FaultCode.LATCHED_FAULT
-        return [Fault(code, latched=True)]
-    return [Fault(FaultCode.POSITION_ERROR, latched=True)]
+        return [LdcnFault(code, latched=True)]
+    return [LdcnFault(FaultCode.POSITION_ERROR, latched=True)]
 
 
-def _power_driver_cause(status: Status) -> Fault:
+def _power_driver_cause(status: StatusPacket) -> LdcnFault:
     match bool(status.flags & StatusFlag.LIMIT2), bool(status.flags & StatusFlag.LIMIT1):
         case True, True:
-            return Fault(FaultCode.OVERHEAT, latched=True)
+            return LdcnFault(FaultCode.OVERHEAT, latched=True)
         case False, True:
-            return Fault(FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE, latched=True)
+            return LdcnFault(FaultCode.MOTOR_SHORT_OR_OVERVOLTAGE, latched=True)
         case False, False:
-            return Fault(FaultCode.OVERCURRENT, latched=True)
+            return LdcnFault(FaultCode.OVERCURRENT, latched=True)
         case _ if status.aux is None:
             return _UNREADABLE
     if status.aux & AuxFlag.INDEX:
-        return Fault(FaultCode.STOP_INPUT, latched=True)
-    return Fault(FaultCode.ENCODER_OR_HALL, latched=True, loses_position=True)
+        return LdcnFault(FaultCode.STOP_INPUT, latched=True)
+    return LdcnFault(FaultCode.ENCODER_OR_HALL, latched=True, loses_position=True)
 
 
-def _pic_servo_faults(profile: Profile, status: Status, known: Knowledge) -> list[Fault]:
+def _pic_servo_faults(profile: Profile, status: StatusPacket, known: Knowledge) -> list[LdcnFault]:
     cause = known.latched
     if cause is None and known.closed and _tripped(status):
         # a loss of motor power opens the loop and sets the same flag, so the drive must have been watched
         code = FaultCode.POSITION_ERROR if status.flags & StatusFlag.POWER_ON else FaultCode.POWER_LOST
-        cause = Fault(code if known.seen else FaultCode.LATCHED_FAULT, latched=True)
+        cause = LdcnFault(code if known.seen else FaultCode.LATCHED_FAULT, latched=True)
     faults = [cause] if cause else []
     if not status.flags & StatusFlag.POWER_ON and not (cause and cause.code is FaultCode.POWER_LOST):
-        faults.append(Fault(FaultCode.POWER_LOST, latched=False))
+        faults.append(LdcnFault(FaultCode.POWER_LOST, latched=False))
     if profile.current_limit and status.flags & StatusFlag.OVERCURRENT:
-        faults.append(Fault(FaultCode.CURRENT_LIMIT, latched=True))
+        faults.append(LdcnFault(FaultCode.CURRENT_LIMIT, latched=True))
     return faults
 
 
-def _warnings(status: Status) -> list[Fault]:
+def _warnings(status: StatusPacket) -> list[LdcnFault]:
     aux = status.aux or AuxFlag(0)
     return [
-        Fault(code, latched=True, loses_position=code is FaultCode.POSITION_WRAP)
+        LdcnFault(code, latched=True, loses_position=code is FaultCode.POSITION_WRAP)
         for flag, code in (
             (AuxFlag.POSITION_WRAP, FaultCode.POSITION_WRAP),
             (AuxFlag.SERVO_OVERRUN, FaultCode.SERVO_OVERRUN),
@@ -248,19 +248,19 @@ def _warnings(status: Status) -> list[Fault]:
     ]
 
 
-def servo_on(status: Status) -> bool:
+def servo_on(status: StatusPacket) -> bool:
     """Tell whether a status shows the loop closed."""
     return status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
 
 
-def _tripped(status: Status) -> bool:
+def _tripped(status: StatusPacket) -> bool:
     """Whether the drive has switched the servo off; with the servo on the flag is an old one."""
     return bool(status.flags & StatusFlag.POSITION_ERROR) and not servo_on(status)
 
 
 _DRIVER_STAYS = frozenset({FaultCode.POSITION_ERROR, FaultCode.SENSOR_FAULT, FaultCode.LATCHED_FAULT})
 """Causes that a Logosol drive shows with bit 3 set."""
-_UNREADABLE = Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=True)
+_UNREADABLE = LdcnFault(FaultCode.LATCHED_FAULT, latched=True, loses_position=True)
 """Encoder or Hall signals may be among what it can be."""
 
 

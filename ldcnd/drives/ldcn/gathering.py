@@ -48,9 +48,9 @@ from ldcnd.drives.ldcn.addressing import (
 )
 from ldcnd.drives.ldcn.adoption import MOTION_ITEMS, WATCH_S, moves
 from ldcnd.drives.ldcn.commands import Node, unanswered
-from ldcnd.drives.ldcn.packet import Status, check_status
+from ldcnd.drives.ldcn.packet import StatusPacket, check_status
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Effect, Exchange, ReplyVerdict
+from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
 from ldcnd.log import get_logger
 
 ReplyT = TypeVar("ReplyT")
@@ -226,7 +226,7 @@ class Gathering:
 
         One that is deaf, behind one that restarts, keeps its waiting address: it is looked for there later.
         """
-        reset = commands.hard_reset(commands.Group(WAITING_GROUP))
+        reset = commands.hard_reset(commands.LeaderlessGroup(WAITING_GROUP))
         for baud in dict.fromkeys((self._bus.baud, self._rate.at_reset)):
             await self._at(baud, reset)
         self._empty.update(self._waiting)
@@ -285,7 +285,7 @@ class Gathering:
             return await self._bus.execute(exchange)
         return await self._bus.execute_at(baud, exchange)
 
-    async def _acknowledged(self, baud: int | None, exchange: Exchange[Status]) -> None:
+    async def _acknowledged(self, baud: int | None, exchange: Exchange[StatusPacket]) -> None:
         """Send a packet whose effect is seen otherwise."""
         try:
             await self._at(baud, exchange)
@@ -442,7 +442,9 @@ class Gathering:
         # behind the resynchronisation, whose end follows the last reply and so the cycle of a module
         await asyncio.sleep(self._bus.quarantine_s + self._attempt * GOLDEN % 1.0 * self._rate.cycle_s)
         quiet_s = 3.0 * self._rate.cycle_s
-        await self._bus.execute(unanswered(WAITING_GROUP, request, quiet_s, repeatable=False, effect=Effect.ARRANGES))
+        await self._bus.execute(
+            unanswered(WAITING_GROUP, request, quiet_s, repeatable=False, effect=PacketEffect.ARRANGES)
+        )
 
     def _report(self, stock: Stock) -> None:
         """Say once what keeps modules from their addresses."""

@@ -18,17 +18,17 @@ from ldcnd.contract.errors import (
     RequestRefused,
     WrongState,
 )
-from ldcnd.drives.driver import Motion, StopMode
+from ldcnd.drives.driver import CountsMotion, StopMode
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
 from ldcnd.drives.ldcn.commands import Node, unanswered
 from ldcnd.drives.ldcn.io_module import IoModule
-from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem
+from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.pic_io import LINES, IoStatus
 from ldcnd.drives.ldcn.servo import STOP_CONTROLS, LdcnAxis
 from ldcnd.drives.network import CapturedIo, Instant
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Effect
+from ldcnd.line.exchange import PacketEffect
 from ldcnd.line.queue import Lane
 from ldcnd.log import get_logger
 
@@ -80,9 +80,11 @@ class Groups:
         if not groups:
             return
         control = STOP_CONTROLS[mode]
-        packets = [commands.stop_motor(commands.Group(group.address), control).request for group in groups]
+        packets = [commands.stop_motor(commands.LeaderlessGroup(group.address), control).request for group in groups]
         burst = self._rate.spaced(packets)
-        stop = unanswered(groups[0].address, burst, self._quiet_s(groups), repeatable=True, effect=Effect.RELIEVES)
+        stop = unanswered(
+            groups[0].address, burst, self._quiet_s(groups), repeatable=True, effect=PacketEffect.RELIEVES
+        )
         try:
             await self._bus.execute(stop, Lane.STOP)
         finally:
@@ -90,7 +92,7 @@ class Groups:
                 for name in group.members:
                     self._drives[name].state.switched_unconfirmed()
 
-    async def start(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:
+    async def start(self, motions: Mapping[str, CountsMotion], still_wanted: Callable[[], None]) -> None:
         """See `Network.start_group`.
 
         Raises:
@@ -138,7 +140,9 @@ class Groups:
         sent = False
         try:
             if group.leader is None:
-                await self._bus.execute(commands.start_path(commands.Group(group.address, profile, self._rate.cycle_s)))
+                await self._bus.execute(
+                    commands.start_path(commands.LeaderlessGroup(group.address, profile, self._rate.cycle_s))
+                )
             else:
                 await self._bus.execute(commands.start_path(Node(group.address, profile)))
             sent = True
@@ -182,7 +186,7 @@ class Groups:
         before = {name: await self._frozen(name) for name in self._drives}
         io_before = {module.name: await module.captured() for module in self._io} if self.all_capture else {}
         addresses = dict.fromkeys(group.address for group in groups) | ({EVERYBODY: None} if io_before else {})
-        packets = [commands.save_home(commands.Group(address)).request for address in addresses]
+        packets = [commands.save_home(commands.LeaderlessGroup(address)).request for address in addresses]
         save = unanswered(EVERYBODY, self._rate.spaced(packets), self._quiet_s(groups), repeatable=False)
         still_free()
         _, timing = await self._bus.execute_timed(save)
@@ -232,7 +236,7 @@ class Groups:
                 raise ReplyTimeout(f"axis {name}: the drive does not take its group address", axis=name)
         self.proven = True
 
-    async def _ready(self, name: str) -> Status:
+    async def _ready(self, name: str) -> StatusPacket:
         """Read a drive that is about to be started.
 
         Raises:
@@ -248,12 +252,14 @@ class Groups:
     async def _start_motion(self, group: Group) -> None:
         """Start Motion, once; a leader's reply proves that the packet was understood, and its loss proves nothing."""
         if group.leader is None:
-            await self._bus.execute(commands.start_motion(commands.Group(group.address, cycle_s=self._rate.cycle_s)))
+            await self._bus.execute(
+                commands.start_motion(commands.LeaderlessGroup(group.address, cycle_s=self._rate.cycle_s))
+            )
             return
         leader = self._drives[group.leader]
         await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)))
 
-    async def _started(self, name: str, motion: Motion, came_from: int) -> bool:
+    async def _started(self, name: str, motion: CountsMotion, came_from: int) -> bool:
         """Tell from the drive's status whether it has set out, or has arrived already."""
         status = await self._read(name, READY_ITEMS)
         if not status.flags & StatusFlag.MOVE_DONE:
@@ -279,7 +285,7 @@ class Groups:
         except BusError as error:
             log.error("stop not confirmed", axis=name, reason=error.message)
 
-    def _counts(self, name: str, status: Status) -> int:
+    def _counts(self, name: str, status: StatusPacket) -> int:
         """Return a position in counts since the reset of the drive."""
         return (status.position or 0) + self._drives[name].state.offset_counts
 
@@ -290,9 +296,9 @@ class Groups:
         proven = counter != before.captured_counter
         return CapturedIo(module.name, tuple(bool(levels & 1 << bit) for bit in range(LINES)), counter, proven)
 
-    async def _frozen(self, name: str) -> Status:
+    async def _frozen(self, name: str) -> StatusPacket:
         return await self._read(name, FROZEN_ITEMS)
 
-    async def _read(self, name: str, items: StatusItem) -> Status:
+    async def _read(self, name: str, items: StatusItem) -> StatusPacket:
         drive = self._drives[name]
         return await self._bus.execute(commands.read_status(Node(drive.spec.address, drive.profile), items))

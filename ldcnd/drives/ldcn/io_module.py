@@ -25,7 +25,7 @@ from ldcnd.drives.ldcn.pic_io import (
     IoStatus,
     SetDirection,
     SetOutput,
-    SetPwm,
+    SetPwmOutputs,
     SetSynchOutput,
     SetTimerMode,
     SynchOutput,
@@ -149,7 +149,7 @@ class IoModule(Poller[IoStatus], IoDriver):
                     await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
         elif pwm_after:
             with self._book.writing(dict(zip(PWM, pwm_after, strict=True))):
-                await self._bus.execute(send_io_command(self._node, SetPwm(*pwm_after)))
+                await self._bus.execute(send_io_command(self._node, SetPwmOutputs(*pwm_after)))
         return self._reading(await self._bus.execute(self._exchange))
 
     def _mask_after(self, asked: Mapping[str, int]) -> int:

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import BusError, NetworkMismatch
 from ldcnd.contract.meta import ModuleInfo
-from ldcnd.drives.driver import AxisSpec, Drive, Motion, StopMode
+from ldcnd.drives.driver import AxisSpec, CountsMotion, Drive, StopMode
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import (
     ANY_DIALECT,
@@ -34,7 +34,7 @@ from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.gathering import Gathering
 from ldcnd.drives.ldcn.groups import Groups
 from ldcnd.drives.ldcn.io_module import IoModule
-from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, Status, StatusItem
+from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PIC_IO, PIC_STEP, PROFILES, Support, at_clock
 from ldcnd.drives.ldcn.registers import BaudCodes
 from ldcnd.drives.ldcn.servo import LdcnAxis
@@ -58,12 +58,12 @@ PERIOD_S = 1.0
 """From one question for the status byte of a module that is no axis to the next."""
 
 
-def watch_module(address: int) -> Exchange[Status]:
+def watch_module(address: int) -> Exchange[StatusPacket]:
     """Return the question for a module's status byte."""
     return commands.read_status(Node(address, ANY_DIALECT), STATUS_BYTE_ONLY)
 
 
-class ModuleWatch(Poller[Status]):
+class ModuleWatch(Poller[StatusPacket]):
     """One module's status byte.
 
     Attributes:
@@ -77,14 +77,14 @@ class ModuleWatch(Poller[Status]):
         self.deadline_at_s = self.due_at_s + PERIOD_S
         self._exchange = watch_module(address)
 
-    def next_exchange(self, now_s: float) -> Exchange[Status]:
+    def next_exchange(self, now_s: float) -> Exchange[StatusPacket]:
         """See `Poller`; a late turn does not shift the next one."""
         self.due_at_s = next_on_grid(self.due_at_s, PERIOD_S, now_s)
         self.deadline_at_s = self.due_at_s + PERIOD_S
         return self._exchange
 
     @override
-    def deliver(self, reply: Status, timing: Timing) -> None:
+    def deliver(self, reply: StatusPacket, timing: Timing) -> None:
         self.status = int(reply.flags)
 
     @override
@@ -484,7 +484,7 @@ class LdcnNetwork(Network):
         await self._groups.stop(mode, names)
 
     @override
-    async def start_group(self, motions: Mapping[str, Motion], still_wanted: Callable[[], None]) -> None:
+    async def start_group(self, motions: Mapping[str, CountsMotion], still_wanted: Callable[[], None]) -> None:
         await self._groups.start(motions, still_wanted)
 
     @override

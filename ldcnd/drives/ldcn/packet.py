@@ -27,7 +27,7 @@ FRAME_BYTES = 4
 """Header, address, command byte and checksum."""
 
 
-class Command(IntEnum):
+class CommandCode(IntEnum):
     """The lower nibble of the command byte (manuals, "List of Commands")."""
 
     RESET_POSITION = 0x0
@@ -59,7 +59,7 @@ class Packet:
     """
 
     address: int
-    command: Command
+    command: CommandCode
     data: bytes = b""
 
 
@@ -105,7 +105,7 @@ def decode_packet(data: bytes) -> Packet:
     computed = sum(data[1:-1]) & 0xFF
     if data[-1] != computed:
         raise BadReply(f"packet checksum {data[-1]:02X}, computed {computed:02X}")
-    return Packet(data[1], Command(data[2] & 0x0F), data[3:-1])
+    return Packet(data[1], CommandCode(data[2] & 0x0F), data[3:-1])
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,12 +157,12 @@ class PacketReader:
             return None
         body = bytes(self._body)
         self._body.clear()
-        packet = Packet(body[0], Command(body[1] & 0x0F), body[2:-1])
+        packet = Packet(body[0], CommandCode(body[1] & 0x0F), body[2:-1])
         return ReceivedPacket(packet, checksum_ok=sum(body[:-1]) & 0xFF == body[-1])
 
 
 @dataclass(frozen=True, slots=True)
-class Field:
+class RegisterField:
     """One register as it travels.
 
     Attributes:
@@ -206,12 +206,12 @@ class Field:
         return int.from_bytes(data[: self.width].ljust(self.width, b"\0"), "little", signed=self.least < 0)
 
 
-ADDRESS = Field("individual address", 1, 0x01, 0x7F)
+ADDRESS = RegisterField("individual address", 1, 0x01, 0x7F)
 """PIC-SERVO takes 0 to 255 [manual, 5.2], but above 127 an individual address could be taken for a group's."""
-GROUP_ADDRESS = Field("group address", 1, 0x80, 0xFF)
+GROUP_ADDRESS = RegisterField("group address", 1, 0x80, 0xFF)
 GROUP_MEMBER = 0x80
 """This bit of the group address, cleared in the data of Set Address, makes the module the leader of its group."""
-POSITION = Field("position", 4, -0x7FFF_FFFF, 0x7FFF_FFFF)
+POSITION = RegisterField("position", 4, -0x7FFF_FFFF, 0x7FFF_FFFF)
 """Both manuals leave out the most negative 32-bit value."""
 
 # -- status packets ----------------------------------------------------------------------------------------------------
@@ -261,7 +261,7 @@ class AuxFlag(IntFlag):
 
 
 @dataclass(frozen=True, slots=True)
-class Status:
+class StatusPacket:
     """One decoded status packet; None where the mask did not request the item.
 
     Attributes:
@@ -322,7 +322,7 @@ def check_status(data: bytes) -> ReplyVerdict:
     return ReplyVerdict.INTACT
 
 
-def encode_status(profile: Profile, items: StatusItem, status: Status) -> bytes:
+def encode_status(profile: Profile, items: StatusItem, status: StatusPacket) -> bytes:
     """Build the packet that a device with this profile sends; absent values count as zero.
 
     Raises:
@@ -350,7 +350,7 @@ def encode_status(profile: Profile, items: StatusItem, status: Status) -> bytes:
     return bytes(body)
 
 
-def decode_status(profile: Profile, items: StatusItem, data: bytes) -> Status:
+def decode_status(profile: Profile, items: StatusItem, data: bytes) -> StatusPacket:
     """Decode a status packet of this device for these items; unknown flag bits are kept.
 
     Raises:
@@ -359,20 +359,20 @@ def decode_status(profile: Profile, items: StatusItem, data: bytes) -> Status:
     return status_decoder(profile, items)(data)
 
 
-def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], Status]:
+def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], StatusPacket]:
     """Return `decode_status` for many packets of one kind."""
     mask, expected, sign = int(items), status_bytes(profile, items), profile.velocity_sign
     layout, pick = _layout(mask, profile.adc_bytes, profile.position_error_bytes, profile.bit7_bytes)
     unpack = layout.unpack
 
-    def decode(data: bytes) -> Status:
+    def decode(data: bytes) -> StatusPacket:
         if len(data) != expected:
             raise BadReply(f"{profile.title}: {len(data)} status bytes, mask {mask:02X} makes {expected}")
         if (sum(data) - data[-1]) & 0xFF != data[-1]:
             raise BadReply(f"{profile.title}: status checksum {data[-1]:02X}, computed {sum(data[:-1]) & 0xFF:02X}")
         fields = pick((None, *unpack(data)))
         flags, position, adc, velocity, aux, home, device_id, version, position_error, bit7 = fields
-        return Status(
+        return StatusPacket(
             _STATUS_FLAGS[flags],
             position,
             adc,
@@ -392,7 +392,7 @@ def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], Sta
 def _layout(
     mask: int, adc_bytes: int, position_error_bytes: int, bit7_bytes: int
 ) -> tuple[Struct, Callable[[tuple[Any, ...]], tuple[Any, ...]]]:
-    """Return how the bytes are read, and what picks the fields of a `Status` from None and what was read."""
+    """Return how the bytes are read, and what picks the fields of a `StatusPacket` from None and what was read."""
     formats = (
         (_POSITION, "i"),
         (_ADC, "B" if adc_bytes == 1 else "H"),

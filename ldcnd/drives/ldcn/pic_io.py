@@ -16,10 +16,10 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, ValueOutOfRange
 from ldcnd.drives.ldcn.commands import Destination
-from ldcnd.drives.ldcn.packet import MOST_ADDRESS, Command, Packet, check_status, encode_packet
+from ldcnd.drives.ldcn.packet import MOST_ADDRESS, CommandCode, Packet, check_status, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_IO, Profile
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
-from ldcnd.line.exchange import Effect, Exchange
+from ldcnd.line.exchange import Exchange, PacketEffect
 
 LINES = 12
 ALL_LINES = (1 << LINES) - 1
@@ -83,7 +83,7 @@ class SetDirection:
 
 
 @dataclass(frozen=True, slots=True)
-class SetPwm:
+class SetPwmOutputs:
     """Set both PWM outputs, 0 to 255 for 0 to 100 %."""
 
     pwm1: int
@@ -129,15 +129,15 @@ class SynchInput:
     """Capture levels and counter; the byte is that of Save Current Position as Home."""
 
 
-IoCommand = SetDirection | SetPwm | SynchOutput | SetOutput | SetSynchOutput | SetTimerMode | SynchInput
+IoCommand = SetDirection | SetPwmOutputs | SynchOutput | SetOutput | SetSynchOutput | SetTimerMode | SynchInput
 DATA_BYTES = {
-    Command.RESET_POSITION: 2,
-    Command.LOAD_TRAJECTORY: 2,
-    Command.START_MOTION: 0,
-    Command.SET_GAIN: 2,
-    Command.STOP_MOTOR: 4,
-    Command.IO_CONTROL: 1,
-    Command.SAVE_CURRENT_POSITION_AS_HOME: 0,
+    CommandCode.RESET_POSITION: 2,
+    CommandCode.LOAD_TRAJECTORY: 2,
+    CommandCode.START_MOTION: 0,
+    CommandCode.SET_GAIN: 2,
+    CommandCode.STOP_MOTOR: 4,
+    CommandCode.IO_CONTROL: 1,
+    CommandCode.SAVE_CURRENT_POSITION_AS_HOME: 0,
 }
 """By the servo's name of the code."""
 
@@ -150,17 +150,17 @@ def decode_io_command(packet: Packet) -> IoCommand | None:
     data = packet.data[:count].ljust(count, b"\0")
     lines = int.from_bytes(data[:2], "little") & ALL_LINES
     match packet.command:
-        case Command.RESET_POSITION:
+        case CommandCode.RESET_POSITION:
             return SetDirection(lines)
-        case Command.LOAD_TRAJECTORY:
-            return SetPwm(data[0], data[1])
-        case Command.START_MOTION:
+        case CommandCode.LOAD_TRAJECTORY:
+            return SetPwmOutputs(data[0], data[1])
+        case CommandCode.START_MOTION:
             return SynchOutput()
-        case Command.SET_GAIN:
+        case CommandCode.SET_GAIN:
             return SetOutput(lines)
-        case Command.STOP_MOTOR:
+        case CommandCode.STOP_MOTOR:
             return SetSynchOutput(lines, data[2], data[3])
-        case Command.IO_CONTROL:
+        case CommandCode.IO_CONTROL:
             return SetTimerMode(bool(data[0] & 0x01), bool(data[0] & 0x02), PRESCALES[data[0] >> 4 & 0x03])
         case _:
             return SynchInput()
@@ -174,19 +174,19 @@ def encode_io_command(address: int, command: IoCommand) -> bytes:
     """
     match command:
         case SetDirection(inputs):
-            packet = Packet(address, Command.RESET_POSITION, _lines(inputs))
-        case SetPwm(pwm1, pwm2):
-            packet = Packet(address, Command.LOAD_TRAJECTORY, _pwm(pwm1, pwm2))
+            packet = Packet(address, CommandCode.RESET_POSITION, _lines(inputs))
+        case SetPwmOutputs(pwm1, pwm2):
+            packet = Packet(address, CommandCode.LOAD_TRAJECTORY, _pwm(pwm1, pwm2))
         case SynchOutput():
-            packet = Packet(address, Command.START_MOTION)
+            packet = Packet(address, CommandCode.START_MOTION)
         case SetOutput(levels):
-            packet = Packet(address, Command.SET_GAIN, _lines(levels))
+            packet = Packet(address, CommandCode.SET_GAIN, _lines(levels))
         case SetSynchOutput(levels, pwm1, pwm2):
-            packet = Packet(address, Command.STOP_MOTOR, _lines(levels) + _pwm(pwm1, pwm2))
+            packet = Packet(address, CommandCode.STOP_MOTOR, _lines(levels) + _pwm(pwm1, pwm2))
         case SetTimerMode():
-            packet = Packet(address, Command.IO_CONTROL, bytes((timer_control(command),)))
+            packet = Packet(address, CommandCode.IO_CONTROL, bytes((timer_control(command),)))
         case SynchInput():
-            packet = Packet(address, Command.SAVE_CURRENT_POSITION_AS_HOME)
+            packet = Packet(address, CommandCode.SAVE_CURRENT_POSITION_AS_HOME)
     return encode_packet(packet)
 
 
@@ -277,7 +277,7 @@ class IoNode(Destination[IoStatus]):
 
     @override
     def exchange(
-        self, request: bytes, items: int | None, *, repeatable: bool, effect: Effect = Effect.CHANGES
+        self, request: bytes, items: int | None, *, repeatable: bool, effect: PacketEffect = PacketEffect.CHANGES
     ) -> Exchange[IoStatus]:
         asked = self.items if items is None else IoItem(items)
         reply_bytes, rejected_bytes = io_status_bytes(asked), io_status_bytes(self.items)
@@ -307,14 +307,14 @@ def send_io_command(to: IoNode, command: IoCommand) -> Exchange[IoStatus]:
 def define_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:
     """Choose what the module adds to every reply, this one included; keep `IoNode.items` in step."""
     return to.exchange(
-        encode_packet(Packet(to.address, Command.DEFINE_STATUS, bytes((items,)))), items, repeatable=True
+        encode_packet(Packet(to.address, CommandCode.DEFINE_STATUS, bytes((items,)))), items, repeatable=True
     )
 
 
 def read_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:
     """Request these items once instead of the default ones."""
-    request = encode_packet(Packet(to.address, Command.READ_STATUS, bytes((items,))))
-    return to.exchange(request, items, repeatable=True, effect=Effect.READS)
+    request = encode_packet(Packet(to.address, CommandCode.READ_STATUS, bytes((items,))))
+    return to.exchange(request, items, repeatable=True, effect=PacketEffect.READS)
 
 
 def _total_bytes(rejected_bytes: int, reply_bytes: int, data: bytes) -> int:

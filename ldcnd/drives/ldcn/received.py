@@ -16,7 +16,7 @@ from ldcnd.drives.ldcn.controls import HomingControl, PositionReset, StopControl
 from ldcnd.drives.ldcn.packet import (
     GROUP_MEMBER,
     POSITION,
-    Command,
+    CommandCode,
     Packet,
     PacketReader,
     ReceivedPacket,
@@ -37,14 +37,14 @@ OLDEST_GAIN_BYTES = 13
 class PlainCommand:
     """A command without data: Start Motion, Clear Sticky Bits, Save Current Position as Home, No Operation."""
 
-    command: Command
+    command: CommandCode
 
 
 @dataclass(frozen=True, slots=True)
 class UndefinedCommand:
     """A command that this device does not define; it answers and does nothing."""
 
-    command: Command
+    command: CommandCode
     data: bytes
 
 
@@ -52,7 +52,7 @@ class UndefinedCommand:
 class UndescribedCommand:
     """A command of a device that ldcnd only identifies: what its data mean is not known."""
 
-    command: Command
+    command: CommandCode
     data: bytes
 
 
@@ -272,7 +272,7 @@ def _oddities(profile: Profile, packet: Packet, command: ReceivedCommand, expect
     if count == expected:
         return ()
     what = f"{count} data bytes, {packet.command.name} takes {expected}"
-    if packet.command is Command.LOAD_TRAJECTORY and packet.data:
+    if packet.command is CommandCode.LOAD_TRAJECTORY and packet.data:
         what = f"{count} data bytes, control byte {packet.data[0]:02X} implies {expected}"
     if count > expected:
         return (f"{what}: the surplus is ignored",)
@@ -290,20 +290,20 @@ def _decode(profile: Profile, packet: Packet) -> tuple[ReceivedCommand, int]:
         if profile.support is Support.IDENTIFY:
             return UndescribedCommand(packet.command, data), 0
     match packet.command:
-        case Command.RESET_POSITION | Command.IO_CONTROL | Command.ADD_PATH_POINTS | Command.HARD_RESET:
+        case CommandCode.RESET_POSITION | CommandCode.IO_CONTROL | CommandCode.ADD_PATH_POINTS | CommandCode.HARD_RESET:
             return _decode_by_dialect(profile, packet, first)
-        case Command.SET_ADDRESS | Command.DEFINE_STATUS | Command.READ_STATUS | Command.SET_BAUD_RATE:
+        case CommandCode.SET_ADDRESS | CommandCode.DEFINE_STATUS | CommandCode.READ_STATUS | CommandCode.SET_BAUD_RATE:
             return _decode_network(packet, first)
-        case Command.LOAD_TRAJECTORY:
+        case CommandCode.LOAD_TRAJECTORY:
             return LoadTrajectory(decode_trajectory(profile, data)), trajectory_bytes(profile, TrajectoryControl(first))
-        case Command.SET_GAIN:
+        case CommandCode.SET_GAIN:
             short = profile.sc_extensions and len(data) < profile.gain_bytes
             return SetGain(decode_gains(profile, data), short), _gain_bytes(profile, len(data))
-        case Command.STOP_MOTOR:
+        case CommandCode.STOP_MOTOR:
             if first & StopControl.HERE:
                 return StopMotor(StopControl(first), POSITION.decode(data[1:])), 1 + POSITION_BYTES
             return StopMotor(StopControl(first), None), 1
-        case Command.SET_HOMING_MODE:
+        case CommandCode.SET_HOMING_MODE:
             return SetHomingMode(HomingControl(first)), 1
     return PlainCommand(packet.command), 0
 
@@ -320,12 +320,12 @@ def _gain_bytes(profile: Profile, count: int) -> int:
 
 def _decode_network(packet: Packet, first: int) -> tuple[ReceivedCommand, int]:
     match packet.command:
-        case Command.SET_ADDRESS:
+        case CommandCode.SET_ADDRESS:
             group = packet.data[1] if len(packet.data) > 1 else 0
             return SetAddress(first, group | GROUP_MEMBER, leader=not group & GROUP_MEMBER), 2
-        case Command.DEFINE_STATUS:
+        case CommandCode.DEFINE_STATUS:
             return DefineStatus(StatusItem(first)), 1
-        case Command.READ_STATUS:
+        case CommandCode.READ_STATUS:
             return ReadStatus(StatusItem(first)), 1
     return SetBaudRate(first), 1
 
@@ -333,18 +333,18 @@ def _decode_network(packet: Packet, first: int) -> tuple[ReceivedCommand, int]:
 def _decode_by_dialect(profile: Profile, packet: Packet, first: int) -> tuple[ReceivedCommand, int]:
     data = packet.data
     match packet.command:
-        case Command.RESET_POSITION if data and profile.sc_extensions:
+        case CommandCode.RESET_POSITION if data and profile.sc_extensions:
             return _decode_sc_reset_position(data)
-        case Command.RESET_POSITION:
+        case CommandCode.RESET_POSITION:
             return ResetPosition(), 0
-        case Command.IO_CONTROL if profile.limit_outputs or profile.sc_extensions:
+        case CommandCode.IO_CONTROL if profile.limit_outputs or profile.sc_extensions:
             return IoControl(first), 1
-        case Command.ADD_PATH_POINTS if profile.path_points:
+        case CommandCode.ADD_PATH_POINTS if profile.path_points:
             points = tuple(int.from_bytes(data[at : at + 2], "little") for at in range(0, len(data) - 1, 2))
             return AddPathPoints(points, data[-1] if len(data) % 2 else None), 2 * len(points)
-        case Command.HARD_RESET if data and profile.sc_extensions:
+        case CommandCode.HARD_RESET if data and profile.sc_extensions:
             return HardReset(first), 1
-        case Command.HARD_RESET:
+        case CommandCode.HARD_RESET:
             return HardReset(), 0
     return UndefinedCommand(packet.command, data), 0
 

@@ -11,8 +11,8 @@ from ldcnd.contract.errors import BadReply
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives import driver
 from ldcnd.drives.driver import AxisReading
-from ldcnd.drives.ldcn.faults import AFTER_RESET, Fault, FaultCode, Knowledge, diagnose, servo_on
-from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag
+from ldcnd.drives.ldcn.faults import AFTER_RESET, FaultCode, Knowledge, LdcnFault, diagnose, servo_on
+from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.drives.ldcn.registers import ServoRegisters
 
@@ -85,7 +85,7 @@ class DriveState:
         self.guard_hit = False
         self.offset_counts = self.setting_back = self.counts = 0
 
-    def taken_over(self, status: Status) -> None:
+    def taken_over(self, status: StatusPacket) -> None:
         """The drive is adopted as it is, and this host has never known it; the status packet has the auxiliary byte."""
         self.restarted()
         self.known = Knowledge(closed=servo_on(status))
@@ -111,7 +111,9 @@ class DriveState:
         """Clear Sticky Bits is on its way: a cause that was known may be gone before that is acknowledged."""
         if self.known.latched and self.known.pic_ae is not True:
             loses = self.known.latched.loses_position
-            self.known = replace(self.known, latched=Fault(FaultCode.LATCHED_FAULT, latched=True, loses_position=loses))
+            self.known = replace(
+                self.known, latched=LdcnFault(FaultCode.LATCHED_FAULT, latched=True, loses_position=loses)
+            )
 
     def cleared(self) -> None:
         """The drive acknowledged Clear Sticky Bits; it discards the cause of a switch-off only with Pic_ae = 0."""
@@ -125,7 +127,7 @@ class DriveState:
 
     # -- what it shows -----------------------------------------------------------------------------------------------
 
-    def reading(self, status: Status, asked: frozenset[TelemetryItem] = frozenset()) -> AxisReading:
+    def reading(self, status: StatusPacket, asked: frozenset[TelemetryItem] = frozenset()) -> AxisReading:
         """Interpret a status packet that was requested for these items.
 
         Raises:
@@ -167,7 +169,7 @@ class DriveState:
             velocity_uncertain=uncertain,
         )
 
-    def faults(self, status: Status) -> tuple[driver.Fault, ...]:
+    def faults(self, status: StatusPacket) -> tuple[driver.Fault, ...]:
         """Return the drive's complaints; recomputed only when something that they depend on has changed."""
         adc = status.adc if self.known.absolute is not False else None
         if (status.flags, status.aux, adc, self.known, self.loop_may_open) != self._question:
@@ -197,7 +199,7 @@ class DriveState:
             known.pic_ae,
         )
 
-    def _diagnose(self, status: Status) -> tuple[driver.Fault, ...]:
+    def _diagnose(self, status: StatusPacket) -> tuple[driver.Fault, ...]:
         self._learn(status)
         open_on_purpose = self.loop_may_open and not status.flags & StatusFlag.HOME_IN_PROGRESS
         found = tuple(
@@ -213,7 +215,7 @@ class DriveState:
             for fault in found
         )
 
-    def _learn(self, status: Status) -> None:
+    def _learn(self, status: StatusPacket) -> None:
         """Take from a status what it proves."""
         logosol = self._profile.pic_ae_diagnostics
         if servo_on(status):

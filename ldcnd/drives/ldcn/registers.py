@@ -19,7 +19,7 @@ from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.meta import Provenance, RegisterInfo
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import LimitPins
-from ldcnd.drives.ldcn.packet import Field
+from ldcnd.drives.ldcn.packet import RegisterField
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile
 
 SERVO_CYCLE_S = CYCLE_CLOCKS / CLOCK_HZ
@@ -93,16 +93,16 @@ def module_baud(profile: Profile, code: int) -> float | None:
     return BAUD_KEYS.get(code) if profile.baud_keys else actual_baud(code, profile.clock_hz)
 
 
-_KP = Field("KP", 2, 0, 0x7FFF)
-_KD = Field("KD", 2, 0, 0x7FFF)
-_KI = Field("KI", 2, 0, 0x7FFF)
-_IL = Field("IL", 2, 0, 0x7FFF)
-_OL = Field("OL", 1, 0, 0xFF)
-_CL = Field("CL", 1, 0, 0xFF)
-_RESERVED_CL = Field("CL (reserved on this drive)", 1, 0, 0)
-_SR = Field("SR", 1, 1, MOST_DIVISOR)
-_DEADBAND = Field("deadband compensation", 1, 0, 0xFF)
-_STEP_MULTIPLIER = Field("step multiplier", 1, 1, 0xFF)
+_KP = RegisterField("KP", 2, 0, 0x7FFF)
+_KD = RegisterField("KD", 2, 0, 0x7FFF)
+_KI = RegisterField("KI", 2, 0, 0x7FFF)
+_IL = RegisterField("IL", 2, 0, 0x7FFF)
+_OL = RegisterField("OL", 1, 0, 0xFF)
+_CL = RegisterField("CL", 1, 0, 0xFF)
+_RESERVED_CL = RegisterField("CL (reserved on this drive)", 1, 0, 0)
+_SR = RegisterField("SR", 1, 1, MOST_DIVISOR)
+_DEADBAND = RegisterField("deadband compensation", 1, 0, 0xFF)
+_STEP_MULTIPLIER = RegisterField("step multiplier", 1, 1, 0xFF)
 
 BYTES_WITH_DEADBAND = 14
 _BYTES_WITH_STEP_MULTIPLIER = 15
@@ -139,16 +139,16 @@ def decode_gains(profile: Profile, data: bytes) -> Gains:
     return Gains(*values)
 
 
-def gain_fields(profile: Profile) -> tuple[Field, ...]:
+def gain_fields(profile: Profile) -> tuple[RegisterField, ...]:
     """Return the registers in order; older devices have fewer."""
-    fields: tuple[Field, ...] = (
+    fields: tuple[RegisterField, ...] = (
         _KP,
         _KD,
         _KI,
         _IL,
         _OL,
         _CL if profile.current_limit else _RESERVED_CL,
-        Field("EL", 2, 0, profile.most_error_limit),
+        RegisterField("EL", 2, 0, profile.most_error_limit),
         _SR,
     )
     if profile.gain_bytes >= BYTES_WITH_DEADBAND:

@@ -42,10 +42,10 @@ from ldcnd.drives.driver import (
     AxisReading,
     AxisSpec,
     Ceiling,
+    CountsMotion,
     Evidence,
     Gains,
     HomeCapture,
-    Motion,
     Moves,
     PathStatus,
     PwmOutput,
@@ -55,7 +55,7 @@ from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, StopControl, blocking_pin, pin_bits
 from ldcnd.drives.ldcn.faults import FaultCode, sensor_lost
-from ldcnd.drives.ldcn.packet import AuxFlag, Status, StatusFlag, StatusItem, status_decoder
+from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket, status_decoder
 from ldcnd.drives.ldcn.path import MOST_POINTS_PER_PACKET, PathPoint, most_step
 from ldcnd.drives.ldcn.profiles import HomingSource, Profile
 from ldcnd.drives.ldcn.record import DriveState
@@ -126,16 +126,16 @@ def opens_loop(profile: Profile, capture: HomeCapture) -> bool:
     return profile.stops_on_home and capture.stop is StopMode.OFF
 
 
-def _limits_ahead(motion: Motion | AnalogMotion | PwmOutput, here_counts: int) -> tuple[HomeMethod, ...]:
+def _limits_ahead(motion: CountsMotion | AnalogMotion | PwmOutput, here_counts: int) -> tuple[HomeMethod, ...]:
     """Return the limit switches that a motion may run onto; both where the drive finds the direction itself."""
     match motion:
         case AnalogMotion():
             return (HomeMethod.FORWARD_LIMIT, HomeMethod.REVERSE_LIMIT)
         case PwmOutput():
             way = motion.duty
-        case Motion(None):
+        case CountsMotion(None):
             way = motion.velocity_counts_per_s
-        case Motion():
+        case CountsMotion():
             way = (motion.target_counts or 0) - here_counts
     if way == 0:
         return ()
@@ -148,7 +148,7 @@ LEAST_SET_BACK = 1000
 log = get_logger("ldcn")
 
 
-def _shifted(motion: Motion, offset_counts: int) -> Motion:
+def _shifted(motion: CountsMotion, offset_counts: int) -> CountsMotion:
     """Return a motion in terms of a position counter that lacks so many counts."""
     if motion.target_counts is None or not offset_counts:
         return motion
@@ -207,7 +207,7 @@ class LdcnAxis(Moves):
         self.path_most_counts = PATH_MOST_COUNTS
         self._switching_off = 0
         self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
-        self._stops: dict[int, Exchange[Status]] = {}
+        self._stops: dict[int, Exchange[StatusPacket]] = {}
 
     def forget(self) -> None:
         """Note that the drive was reset or lost power: nothing that was sent before holds any more."""
@@ -215,7 +215,7 @@ class LdcnAxis(Moves):
         self._book.reset()
         self._initialised = False
 
-    def adopted(self, status: Status, *, known: bool) -> None:
+    def adopted(self, status: StatusPacket, *, known: bool) -> None:
         """The drive was taken over as it is, with this status; its gains are assumed to be the configured ones.
 
         Args:
@@ -287,7 +287,7 @@ class LdcnAxis(Moves):
     # -- power -------------------------------------------------------------------------------------------------------
 
     @override
-    def exchanges(self, motion: Motion) -> tuple[Exchange[Any], ...]:
+    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         first: tuple[Exchange[Any], ...] = ()
         offset = self.state.offset_counts
         if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
@@ -358,7 +358,7 @@ class LdcnAxis(Moves):
             exchange = self._stops[bits] = commands.stop_motor(self._node, control)
         await self._switch(exchange, Lane.STOP, pic_ae=bool(bits & _AMP_ENABLE), closed=not bits & _MOTOR_OFF)
 
-    async def _switch(self, exchange: Exchange[Status], lane: Lane, *, pic_ae: bool, closed: bool) -> None:
+    async def _switch(self, exchange: Exchange[StatusPacket], lane: Lane, *, pic_ae: bool, closed: bool) -> None:
         """Send Stop Motor, and take note of what became of power driver and loop."""
         try:
             await self._bus.execute(exchange, lane)
@@ -429,7 +429,7 @@ class LdcnAxis(Moves):
     # -- motion ------------------------------------------------------------------------------------------------------
 
     @override
-    def quantise(self, motion: Motion, most: Ceiling = NO_CEILING) -> Motion:
+    def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
         return quantised(motion, self._next_divisor(), self.profile, most)
 
     def _next_divisor(self) -> int:
@@ -479,7 +479,7 @@ class LdcnAxis(Moves):
             return True
         return bool(status.flags & StatusFlag.MOVE_DONE) and abs(status.velocity or 0) <= 1
 
-    async def load(self, motion: Motion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         """See `Moves`. A motion lock, set by homing on a limit switch, is lifted: the command is to move on.
 
         Raises:
@@ -490,11 +490,11 @@ class LdcnAxis(Moves):
             RegisterUnknown: see `_load_gains`.
         """
         divisor = await self._load_gains()
-        if isinstance(motion, Motion):
+        if isinstance(motion, CountsMotion):
             target = motion.target_counts
             if target is not None and abs(target - self.state.offset_counts) > LARGEST_COUNT:
                 await self._set_counter_back(target)
-            in_counter: Motion | AnalogMotion | PwmOutput = _shifted(motion, self.state.offset_counts)
+            in_counter: CountsMotion | AnalogMotion | PwmOutput = _shifted(motion, self.state.offset_counts)
         else:
             in_counter = motion
         trajectory = trajectory_of(in_counter, divisor, self.profile)
@@ -560,7 +560,7 @@ class LdcnAxis(Moves):
             )
         log.info("position counter set back", axis=self.spec.name, counts=before)
 
-    async def _arm(self, motion: Motion | AnalogMotion | PwmOutput, home: HomeCapture | None) -> None:
+    async def _arm(self, motion: CountsMotion | AnalogMotion | PwmOutput, home: HomeCapture | None) -> None:
         """Arm the requested capture, or the one that stops the motion at the limit switch ahead, or none.
 
         It "can also be used as a safety shutoff" (PIC-SERVO manual, 5.2, "Set Homing Mode"). Only the drive's home
@@ -582,7 +582,9 @@ class LdcnAxis(Moves):
         self.state.homing_armed = bool(control)
         self.state.guard = guard
 
-    async def _guard(self, motion: Motion | AnalogMotion | PwmOutput, *, active: bool) -> tuple[HomingControl, str]:
+    async def _guard(
+        self, motion: CountsMotion | AnalogMotion | PwmOutput, *, active: bool
+    ) -> tuple[HomingControl, str]:
         """Return what stops a motion at the limit switches that it may run onto, and their name.
 
         Only switches ahead are armed: a capture comes with every change, also with that of leaving the other one. A
@@ -594,7 +596,7 @@ class LdcnAxis(Moves):
         status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
         reading = self.state.reading(status)
         ahead = _limits_ahead(motion, reading.position_counts)
-        onward = _limits_ahead(Motion(None, reading.velocity_counts_per_s, 1.0), reading.position_counts)
+        onward = _limits_ahead(CountsMotion(None, reading.velocity_counts_per_s, 1.0), reading.position_counts)
         levels = {HomeMethod.FORWARD_LIMIT: reading.forward_limit, HomeMethod.REVERSE_LIMIT: reading.reverse_limit}
         control = HomingControl(0)
         for method in ahead:

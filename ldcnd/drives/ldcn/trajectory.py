@@ -13,13 +13,13 @@ from enum import IntFlag, StrEnum
 from itertools import compress
 
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
-from ldcnd.drives.driver import NO_CEILING, AnalogMotion, Ceiling, Motion, PwmOutput
+from ldcnd.drives.driver import NO_CEILING, AnalogMotion, Ceiling, CountsMotion, PwmOutput
 from ldcnd.drives.ldcn.faults import SENSOR_BITS, SENSOR_LEAST, SENSOR_MOST
-from ldcnd.drives.ldcn.packet import POSITION, Field
+from ldcnd.drives.ldcn.packet import POSITION, RegisterField
 from ldcnd.drives.ldcn.profiles import CYCLE_CLOCKS, Profile
 from ldcnd.drives.ldcn.registers import FRACTION, MOST_DIVISOR, MOST_RATE, TRAJECTORY_CONTROL, TRAJECTORY_NAMES
 
-ACCELERATION = Field("acceleration", 4, 0, MOST_RATE)
+ACCELERATION = RegisterField("acceleration", 4, 0, MOST_RATE)
 MOST_PWM = 0xFF
 ROUNDING = 1e-9
 """Relative error of a conversion to floating point and back: it is no excess over a limit."""
@@ -148,21 +148,21 @@ def decode_trajectory(profile: Profile, data: bytes) -> Trajectory:
     )
 
 
-def _fields(profile: Profile, control: TrajectoryControl) -> tuple[Field | None, ...]:
+def _fields(profile: Profile, control: TrajectoryControl) -> tuple[RegisterField | None, ...]:
     """Return position, velocity, acceleration and PWM or target, None for those that the control byte leaves out."""
     position, velocity, acceleration, pwm_or_target = [int(control) & bit for bit in _BITS[:4]]
     return (
         POSITION if position else None,
-        Field("velocity", 4, 0, profile.most_velocity) if velocity else None,
+        RegisterField("velocity", 4, 0, profile.most_velocity) if velocity else None,
         ACCELERATION if acceleration else None,
         _pwm_or_target(profile, control) if pwm_or_target else None,
     )
 
 
-def _pwm_or_target(profile: Profile, control: TrajectoryControl) -> Field:
+def _pwm_or_target(profile: Profile, control: TrajectoryControl) -> RegisterField:
     if control & TrajectoryControl.SERVO and profile.analog_target:
-        return Field("analog target", profile.pwm_bytes, 0, (1 << profile.adc_bits) - 1)
-    return Field("PWM", profile.pwm_bytes, 0, MOST_PWM)
+        return RegisterField("analog target", profile.pwm_bytes, 0, (1 << profile.adc_bits) - 1)
+    return RegisterField("PWM", profile.pwm_bytes, 0, MOST_PWM)
 
 
 def trajectory_values(trajectory: Trajectory) -> dict[str, int]:
@@ -173,7 +173,7 @@ def trajectory_values(trajectory: Trajectory) -> dict[str, int]:
     }
 
 
-def quantised(motion: Motion, servo_divisor: int, profile: Profile, most: Ceiling = NO_CEILING) -> Motion:
+def quantised(motion: CountsMotion, servo_divisor: int, profile: Profile, most: Ceiling = NO_CEILING) -> CountsMotion:
     """Return the motion as the registers will hold it, rounded to the nearest that is not above the ceiling.
 
     Raises:
@@ -212,7 +212,7 @@ def _check_encoder_rate(counts_per_s: float, profile: Profile) -> None:
         )
 
 
-def trajectory_of(motion: Motion | AnalogMotion | PwmOutput, servo_divisor: int, profile: Profile) -> Trajectory:
+def trajectory_of(motion: CountsMotion | AnalogMotion | PwmOutput, servo_divisor: int, profile: Profile) -> Trajectory:
     """Return what Load Trajectory takes for a motion; it waits for Start Motion.
 
     Raises:
@@ -238,7 +238,7 @@ def trajectory_of(motion: Motion | AnalogMotion | PwmOutput, servo_divisor: int,
                 pwm_or_target=motion.target_counts,
                 mode=ProfileMode.VELOCITY,
             )
-        case Motion():
+        case CountsMotion():
             continuous = motion.target_counts is None
             return Trajectory(
                 position=motion.target_counts,

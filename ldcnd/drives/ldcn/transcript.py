@@ -9,9 +9,9 @@ from ldcnd.drives.ldcn.packet import (
     HEADER,
     MOST_DATA_BYTES,
     STATUS_BYTE_ONLY,
-    Status,
     StatusFlag,
     StatusItem,
+    StatusPacket,
     decode_status,
 )
 from ldcnd.drives.ldcn.pic_io import IoItem, IoStatus, decode_io_status
@@ -96,7 +96,7 @@ def _io_words(status: IoStatus) -> str:
     return ", ".join(words)
 
 
-def _status_words(status: Status) -> str:
+def _status_words(status: StatusPacket) -> str:
     values = ((field.name, getattr(status, field.name)) for field in fields(status) if field.name != "flags")
     flags = f"status {int(status.flags):02X} {_flag_names(status.flags)}".rstrip()
     return ", ".join((flags, *(f"{name} {value}" for name, value in values if value is not None)))

@@ -23,9 +23,9 @@ from ldcnd.drives.smartstep.monitors import Monitor
 from ldcnd.drives.smartstep.packet import (
     END,
     PACKET_CHARACTERS,
-    Command,
+    CommandPacket,
     Function,
-    Reply,
+    ReplyPacket,
     ResponseStatus,
     decode_reply,
     is_upper_hex,
@@ -34,7 +34,7 @@ from ldcnd.drives.smartstep.packet import (
 )
 from ldcnd.drives.smartstep.parameters import Parameter
 from ldcnd.drives.smartstep.profiles import RESPONSE_S, SMARTSTEP, CountUnit, SmartStepProfile, StringChecksum
-from ldcnd.line.exchange import Effect, Exchange, ReplyVerdict
+from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
 
 
 class RefusalReason(StrEnum):
@@ -102,7 +102,7 @@ def reference(unit: int, address: int) -> Exchange[int | Refusal]:
 
     Source: manual 2.2, data reference command.
     """
-    return _exchange(Command(unit, Function.REFERENCE, address), _word, repeatable=True)
+    return _exchange(CommandPacket(unit, Function.REFERENCE, address), _word, repeatable=True)
 
 
 def read_monitor(unit: int, monitor: Monitor) -> Exchange[int | Refusal]:
@@ -111,7 +111,7 @@ def read_monitor(unit: int, monitor: Monitor) -> Exchange[int | Refusal]:
     Source: manual 3.
     """
     return _exchange(
-        Command(unit, Function.REFERENCE, monitor.address),
+        CommandPacket(unit, Function.REFERENCE, monitor.address),
         lambda reply: monitor.value_of(reply.data),
         repeatable=True,
     )
@@ -123,7 +123,7 @@ def read_operating_mode(unit: int) -> Exchange[OperatingMode | int | Refusal]:
     Source: manual 4, settings 1 and 2.
     """
     return _exchange(
-        Command(unit, Function.REFERENCE, Register.OPERATING_MODE),
+        CommandPacket(unit, Function.REFERENCE, Register.OPERATING_MODE),
         lambda reply: operating_mode(reply.data),
         repeatable=True,
     )
@@ -137,7 +137,7 @@ def write_ram(unit: int, parameter: Parameter, value: int) -> Exchange[int | Ref
 
     Source: manual 2.2, note; 3.
     """
-    return _exchange(Command(unit, Function.SETTING, parameter.ram_address, value), _word, repeatable=True)
+    return _exchange(CommandPacket(unit, Function.SETTING, parameter.ram_address, value), _word, repeatable=True)
 
 
 def write_eeprom(unit: int, parameter: Parameter, value: int) -> Exchange[int | Refusal]:
@@ -151,7 +151,7 @@ def write_eeprom(unit: int, parameter: Parameter, value: int) -> Exchange[int | 
 
     Source: manual 2.2, note.
     """
-    return _exchange(Command(unit, Function.SETTING, parameter.eeprom_address, value), _word, repeatable=False)
+    return _exchange(CommandPacket(unit, Function.SETTING, parameter.eeprom_address, value), _word, repeatable=False)
 
 
 def write_trace_register(unit: int, register: TraceRegister, value: int) -> Exchange[int | Refusal]:
@@ -162,7 +162,7 @@ def write_trace_register(unit: int, register: TraceRegister, value: int) -> Exch
 
     Source: manual 4, "Data setting limit" and settings 3 to 8.
     """
-    return _exchange(Command(unit, Function.SETTING, register, value), _word, repeatable=True)
+    return _exchange(CommandPacket(unit, Function.SETTING, register, value), _word, repeatable=True)
 
 
 def set_operating_mode(unit: int, mode: OperatingMode) -> Exchange[int | Refusal]:
@@ -171,7 +171,7 @@ def set_operating_mode(unit: int, mode: OperatingMode) -> Exchange[int | Refusal
     Source: manual 4, settings 1; 5 (2); 6 (2).
     """
     # Membership, not the type: an IntEnum parameter accepts a bare number at run time.
-    command = Command(unit, Function.SETTING, Register.OPERATING_MODE, OperatingMode(mode))
+    command = CommandPacket(unit, Function.SETTING, Register.OPERATING_MODE, OperatingMode(mode))
     return _exchange(command, _word, repeatable=False)
 
 
@@ -180,7 +180,7 @@ def execute(unit: int) -> Exchange[int | Refusal]:
 
     Source: manual 4, settings 2; 5 (2); 6 (2).
     """
-    return _exchange(Command(unit, Function.SETTING, Register.OPERATION, EXECUTE), _word, repeatable=False)
+    return _exchange(CommandPacket(unit, Function.SETTING, Register.OPERATION, EXECUTE), _word, repeatable=False)
 
 
 def probe(unit: int) -> Exchange[None]:
@@ -191,8 +191,8 @@ def probe(unit: int) -> Exchange[None]:
 
     Source: manual 2.2, example 3.
     """
-    command = Command(unit, Function.REFERENCE, NEVER_VALID)
-    known = Reply(unit, ResponseStatus.REFERENCE_ADDRESS_ERROR, NEVER_VALID, 0).encode()
+    command = CommandPacket(unit, Function.REFERENCE, NEVER_VALID)
+    known = ReplyPacket(unit, ResponseStatus.REFERENCE_ADDRESS_ERROR, NEVER_VALID, 0).encode()
 
     def decode(packet: bytes) -> None:
         if packet != known:
@@ -207,7 +207,7 @@ def probe(unit: int) -> Exchange[None]:
         RESPONSE_S,
         repeatable=True,
         total_bytes=_packet_total,
-        effect=Effect.READS,
+        effect=PacketEffect.READS,
     )
 
 
@@ -229,7 +229,7 @@ def is_self_hearing(unit: int, stray: bytes) -> bool:
     return reply.unit == unit and reply.status is ResponseStatus.REFERENCE_DATA_ERROR
 
 
-def _word(reply: Reply) -> int:
+def _word(reply: ReplyPacket) -> int:
     return reply.data
 
 
@@ -237,7 +237,9 @@ def _packet_total(data: bytes) -> int | None:
     return piece_bytes(data, PACKET_CHARACTERS)
 
 
-def _exchange(command: Command, value_of: Callable[[Reply], ValueT], *, repeatable: bool) -> Exchange[ValueT | Refusal]:
+def _exchange(
+    command: CommandPacket, value_of: Callable[[ReplyPacket], ValueT], *, repeatable: bool
+) -> Exchange[ValueT | Refusal]:
     check = _checker(command)
 
     def decode(packet: bytes) -> ValueT | Refusal:
@@ -261,15 +263,15 @@ def _exchange(command: Command, value_of: Callable[[Reply], ValueT], *, repeatab
     )
 
 
-def _effect(command: Command) -> Effect:
+def _effect(command: CommandPacket) -> PacketEffect:
     if command.function is Function.REFERENCE:
-        return Effect.READS
+        return PacketEffect.READS
     if (command.address, command.data) == (Register.OPERATING_MODE, OperatingMode.NORMAL):
-        return Effect.RELIEVES  # it leaves a mode and does nothing else
-    return Effect.CHANGES
+        return PacketEffect.RELIEVES  # it leaves a mode and does nothing else
+    return PacketEffect.CHANGES
 
 
-def _checker(command: Command) -> Callable[[bytes], ReplyVerdict]:
+def _checker(command: CommandPacket) -> Callable[[bytes], ReplyVerdict]:
     """Return the judge of 14-character replies to a command: everything that is not an answer is foreign."""
     request = command.encode()
     start, address = request[:2], request[3:7]
@@ -359,7 +361,9 @@ def string_reference(
         )
     if address % 2:
         raise ValueOutOfRange(f"unit {unit}: string address {address:04X}H is odd", value=address)
-    command = Command(unit, Function.STRING_REFERENCE, address, _string_count(byte_count, profile.string_count_unit))
+    command = CommandPacket(
+        unit, Function.STRING_REFERENCE, address, _string_count(byte_count, profile.string_count_unit)
+    )
     allowed = _VARIANTS if profile.string_checksum is StringChecksum.AUTO else (profile.string_checksum,)
     longest = PACKET_CHARACTERS + 4 * command.data + TRAILER_CHARACTERS
     expected = PACKET_CHARACTERS + 2 * byte_count
@@ -374,7 +378,7 @@ def string_reference(
         profile.first_character_s,
         repeatable=True,
         total_bytes=lambda data: piece_bytes(data, longest),
-        effect=Effect.READS,
+        effect=PacketEffect.READS,
     )
 
 
@@ -388,7 +392,7 @@ def _string_count(byte_count: int, unit: CountUnit) -> int:
             return byte_count * 2
 
 
-def _is_refusal(command: Command, packet: bytes) -> bool:
+def _is_refusal(command: CommandPacket, packet: bytes) -> bool:
     try:
         reply = decode_reply(packet)
     except BadReply:
@@ -401,7 +405,7 @@ def _is_refusal(command: Command, packet: bytes) -> bool:
     )
 
 
-def _string_checker(command: Command, allowed: tuple[StringChecksum, ...]) -> Callable[[bytes], ReplyVerdict]:
+def _string_checker(command: CommandPacket, allowed: tuple[StringChecksum, ...]) -> Callable[[bytes], ReplyVerdict]:
     start = command.encode()[:11]
 
     def check(packet: bytes) -> ReplyVerdict:
@@ -434,7 +438,7 @@ def _fitting(packet: bytes, allowed: tuple[StringChecksum, ...], byte_count: int
 
 
 def _string_decoder(
-    command: Command, allowed: tuple[StringChecksum, ...], byte_count: int
+    command: CommandPacket, allowed: tuple[StringChecksum, ...], byte_count: int
 ) -> Callable[[bytes], StringReply | Refusal]:
     check = _string_checker(command, allowed)
 
@@ -453,7 +457,7 @@ def _string_decoder(
     return decode
 
 
-def _count_unit(command: Command, digits: int) -> CountUnit | None:
+def _count_unit(command: CommandPacket, digits: int) -> CountUnit | None:
     """Return the unit of the count that explains this number of data characters; None when nothing explains it."""
     for extra in (0, TRAILER_CHARACTERS):
         for unit, length in (
@@ -466,7 +470,7 @@ def _count_unit(command: Command, digits: int) -> CountUnit | None:
     return None
 
 
-def _wrong_length(command: Command, digits: int, byte_count: int) -> str:
+def _wrong_length(command: CommandPacket, digits: int, byte_count: int) -> str:
     return (
         f"unit {command.unit}: {digits} data characters came for {byte_count} bytes:"
         f" the count unit seems to be {_count_unit(command, digits)}"

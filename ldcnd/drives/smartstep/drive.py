@@ -29,7 +29,7 @@ from ldcnd.drives.smartstep.monitors import (
     NO_ALARM,
     OUTPUT_SIGNALS,
     SPEED_FEEDBACK,
-    Alarm,
+    AlarmCode,
     AlarmHistory,
     AlarmKind,
     DriverType,
@@ -240,6 +240,6 @@ class SmartStepAxis(PollsItself):
             self._poller.forget_position()
 
 
-def fault_of(known: Alarm) -> Fault:
+def fault_of(known: AlarmCode) -> Fault:
     """Return an alarm or a warning as a fault of the axis."""
     return Fault(f"alarm_{known.code:04x}", f"A.{known.code:02X}: {known.text}")

@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from ldcnd.drives.cost import Cost, LineTiming, cost_of
 from ldcnd.drives.driver import AxisSpec
-from ldcnd.drives.family import Demand, Family, HasParameters, Line, OpenLine, bus_settings
+from ldcnd.drives.family import Demand, Family, HasParameterFiles, OpenLine, UnopenedLine, bus_settings
 from ldcnd.drives.line_plan import Poll, Urgent
 from ldcnd.drives.smartstep.config import SmartStepAxisConfig, SmartStepBusConfig
 from ldcnd.drives.smartstep.costs import BAUD, price_list, words_of
@@ -35,7 +35,7 @@ ALARM_HISTORY_HZ = HISTORY_LENGTH / 60
 """One word a turn: an alarm that came and went between two readings of the state is found within a minute."""
 
 
-class SmartStepFamily(Family[SmartStepBusConfig], HasParameters):
+class SmartStepFamily(Family[SmartStepBusConfig], HasParameterFiles):
     """OMRON SmartStep."""
 
     name = "smartstep"
@@ -81,7 +81,7 @@ def open_smartstep_line(
     opener: Opener | None = None,
     *,
     ledger: EepromLedger | None = None,
-) -> Line:
+) -> UnopenedLine:
     """Return a line that is not open yet; what concerns the line is the same for all of its drives.
 
     Args:
@@ -105,7 +105,7 @@ def open_smartstep_line(
         )
         for axis in settings.axis
     )
-    return Line(bus, SmartStepNetwork(bus, specs))
+    return UnopenedLine(bus, SmartStepNetwork(bus, specs))
 
 
 def _port_opener(settings: SmartStepBusConfig, profile: SmartStepProfile) -> Opener:

@@ -178,7 +178,7 @@ class AlarmKind(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Alarm:
+class AlarmCode:
     """A code and the manual's words for it."""
 
     code: int
@@ -186,34 +186,34 @@ class Alarm:
     kind: AlarmKind = AlarmKind.ALARM
 
 
-ALARMS: tuple[Alarm, ...] = (
-    Alarm(0x0004, "Parameter setting error"),
-    Alarm(0x0010, "Overcurrent"),
-    Alarm(0x0030, "Regeneration error"),
-    Alarm(0x0032, "Regeneration overload"),
-    Alarm(0x0040, "Overvoltage/undervoltage"),
-    Alarm(0x0051, "Overspeed"),
-    Alarm(0x0070, "Overload"),
-    Alarm(0x0073, "Dynamic brake overload"),
-    Alarm(0x0074, "Inrush resistance overload"),
-    Alarm(0x007A, "Radiator overheating"),
-    Alarm(0x00BF, "System error"),
-    Alarm(0x00C1, "Runaway detected"),
-    Alarm(0x00C2, "Phase error detected"),
-    Alarm(0x00C3, "Encoder disconnection detected"),
-    Alarm(0x00D0, "Deviation counter over"),
-    Alarm(0x0091, "Overload alarm", AlarmKind.WARNING),
-    Alarm(0x0092, "Regeneration overload alarm", AlarmKind.WARNING),
-    Alarm(NO_ALARM, "Normal (No alarm)", AlarmKind.NONE),
+ALARMS: tuple[AlarmCode, ...] = (
+    AlarmCode(0x0004, "Parameter setting error"),
+    AlarmCode(0x0010, "Overcurrent"),
+    AlarmCode(0x0030, "Regeneration error"),
+    AlarmCode(0x0032, "Regeneration overload"),
+    AlarmCode(0x0040, "Overvoltage/undervoltage"),
+    AlarmCode(0x0051, "Overspeed"),
+    AlarmCode(0x0070, "Overload"),
+    AlarmCode(0x0073, "Dynamic brake overload"),
+    AlarmCode(0x0074, "Inrush resistance overload"),
+    AlarmCode(0x007A, "Radiator overheating"),
+    AlarmCode(0x00BF, "System error"),
+    AlarmCode(0x00C1, "Runaway detected"),
+    AlarmCode(0x00C2, "Phase error detected"),
+    AlarmCode(0x00C3, "Encoder disconnection detected"),
+    AlarmCode(0x00D0, "Deviation counter over"),
+    AlarmCode(0x0091, "Overload alarm", AlarmKind.WARNING),
+    AlarmCode(0x0092, "Regeneration overload alarm", AlarmKind.WARNING),
+    AlarmCode(NO_ALARM, "Normal (No alarm)", AlarmKind.NONE),
 )
 
 
-def alarm(word: int) -> Alarm:
+def alarm(word: int) -> AlarmCode:
     """Return what a drive means by an alarm word; a code that is not listed keeps its number."""
     for known in ALARMS:
         if known.code == word:
             return known
-    return Alarm(word, f"unlisted alarm code {word:04X}H", AlarmKind.UNKNOWN)
+    return AlarmCode(word, f"unlisted alarm code {word:04X}H", AlarmKind.UNKNOWN)
 
 
 class AlarmHistory:

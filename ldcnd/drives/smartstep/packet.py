@@ -55,7 +55,7 @@ class ResponseStatus(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Command:
+class CommandPacket:
     """A packet of the host.
 
     Attributes:
@@ -89,7 +89,7 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
-class Reply:
+class ReplyPacket:
     """A packet of a drive: every reply but that of a successful string reference."""
 
     unit: int
@@ -121,16 +121,16 @@ def sums_to_zero(digits: bytes) -> bool:
     return sum(unhexlify(digits)) & 0xFF == 0
 
 
-def decode_command(packet: bytes) -> Command | None:
+def decode_command(packet: bytes) -> CommandPacket | None:
     """Return the command, or None where a drive stays silent (manual 2.1): no error reply exists for a bad packet."""
     fields = _fields(packet)
     if fields is None or fields[1] > Function.STRING_REFERENCE:
         return None
     unit, function, address, data = fields
-    return Command(unit, Function(function), address, data)
+    return CommandPacket(unit, Function(function), address, data)
 
 
-def decode_reply(packet: bytes) -> Reply:
+def decode_reply(packet: bytes) -> ReplyPacket:
     """Decode the 14 characters of a reply.
 
     Raises:
@@ -144,7 +144,7 @@ def decode_reply(packet: bytes) -> Reply:
         status = ResponseStatus(code)
     except ValueError:
         raise BadReply(f"{packet!r} carries response status {code:X}, which the manual does not list") from None
-    return Reply(unit, status, address, data)
+    return ReplyPacket(unit, status, address, data)
 
 
 def _encode(unit: int, code: int, address: int, data: int) -> bytes:

@@ -23,7 +23,7 @@ from ldcnd.drives.smartstep.commands import Refusal, RefusalReason
 from ldcnd.drives.smartstep.packet import PACKET_CHARACTERS, ReplyReader
 from ldcnd.drives.smartstep.profiles import SmartStepProfile
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Effect, Exchange
+from ldcnd.line.exchange import Exchange, PacketEffect
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.line.queue import Lane
 
@@ -98,7 +98,7 @@ class Words:
                 value="self_hearing",
                 remedy="use four wires",
             )
-        if exchange.effect is Effect.CHANGES:
+        if exchange.effect is PacketEffect.CHANGES:
             await self.identify()
         answer = await self._bus.execute(commands.with_response_time(exchange, self._profile), lane)
         if isinstance(answer, Refusal):

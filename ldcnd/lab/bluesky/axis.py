@@ -25,7 +25,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import LinkState, Moving, PositionSample, Quality
 from ldcnd.lab.bluesky.status import Status
-from ldcnd.lab.bluesky.trace import Trace
+from ldcnd.lab.bluesky.trace import TraceDetector
 from ldcnd.lab.bluesky.values import SILENT_S, instant, number_key, reading, refuse_other_unit, text_key, within
 
 if TYPE_CHECKING:
@@ -43,7 +43,7 @@ ResultT = TypeVar("ResultT")
 
 @dataclass(frozen=True, slots=True)
 class Fly:
-    """A motion during which positions are recorded; what `Axis.prepare` takes.
+    """A motion during which positions are recorded; what `PlanAxis.prepare` takes.
 
     Attributes:
         start: where it begins, in axis units.
@@ -144,7 +144,7 @@ class ReadableAxis:
 
     def trace(
         self, *channels: str, samples: int = 500, interval_s: float | None = None, name: str | None = None
-    ) -> Trace:
+    ) -> TraceDetector:
         """Return a detector that takes a trace of this axis at each trigger.
 
         Args:
@@ -153,7 +153,7 @@ class ReadableAxis:
             interval_s: time between two of them; as fast as the line allows when missing.
             name: of the device.
         """
-        return Trace(name or f"{self.name}_trace", self._axis, channels, samples, interval_s, self._loop)
+        return TraceDetector(name or f"{self.name}_trace", self._axis, channels, samples, interval_s, self._loop)
 
     async def _reading(self) -> "dict[str, Reading[float]]":
         return self._of((await self._measured()).sample)
@@ -190,7 +190,7 @@ class ReadableAxis:
         return f"<{type(self).__name__} {self.name}: {self._axis!r}>"
 
 
-class Axis(ReadableAxis):
+class PlanAxis(ReadableAxis):
     """An axis that a plan moves, under a lease of its own; made by `Devices.control`.
 
     Attributes:

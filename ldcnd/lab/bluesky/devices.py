@@ -9,7 +9,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.client.rig import connect as connect_rig
 from ldcnd.contract.errors import UnknownAxis
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.lab.bluesky.axis import Axis, ReadableAxis, described
+from ldcnd.lab.bluesky.axis import PlanAxis, ReadableAxis, described
 from ldcnd.lab.bluesky.signal import Signal
 
 LEASE_S = 2.0
@@ -40,7 +40,7 @@ class Devices:
     @contextmanager
     def control(
         self, axis: str, *, client: str, name: str | None = None, lease_s: float = LEASE_S, force: bool = False
-    ) -> Iterator[Axis]:
+    ) -> Iterator[PlanAxis]:
         """Yield a device that moves an axis, under a lease of its own, until the context ends.
 
         Args:
@@ -55,10 +55,10 @@ class Devices:
             UnknownAxis: there is no such axis.
         """
         with self._loop.inside(self._rig.control(axis, client=client, lease_s=lease_s, force=force)) as held:
-            yield Axis(name or axis, held, self._known(axis), self._rig, self._loop)
+            yield PlanAxis(name or axis, held, self._known(axis), self._rig, self._loop)
 
     @contextmanager
-    def control_all(self, *axes: str, client: str, lease_s: float = LEASE_S) -> Iterator[tuple[Axis, ...]]:
+    def control_all(self, *axes: str, client: str, lease_s: float = LEASE_S) -> Iterator[tuple[PlanAxis, ...]]:
         """Yield a device for each of several axes, as `control` does."""
         with ExitStack() as held:
             yield tuple(held.enter_context(self.control(axis, client=client, lease_s=lease_s)) for axis in axes)

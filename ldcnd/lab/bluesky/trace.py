@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from event_model.documents import DataKey
 
 
-class Trace:
+class TraceDetector:
     """A detector whose readings are rows of numbers: times in seconds, and a row for each channel.
 
     `trigger` records while a plan does something else; where the drive did not say, a row has nan. Made by

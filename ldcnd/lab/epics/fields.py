@@ -49,17 +49,17 @@ Action = Callable[[Value], Awaitable[Put]]
 
 
 @dataclass(frozen=True, slots=True)
-class Alarm:
+class RecordAlarm:
     """The alarm of a field."""
 
     status: AlarmStatus = AlarmStatus.NO_ALARM
     severity: AlarmSeverity = AlarmSeverity.NO_ALARM
 
 
-NO_ALARM = Alarm()
+NO_ALARM = RecordAlarm()
 
 
-class Field(ChannelData):  # type: ignore[misc] # caproto has no types
+class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
     """A caproto channel whose puts go to an action; clients put with `write`, the gateway shows values with `show`."""
 
     action: Action | None = None
@@ -79,7 +79,7 @@ class Field(ChannelData):  # type: ignore[misc] # caproto has no types
         if put.end is not None:
             await put.end
 
-    async def show(self, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
+    async def show(self, value: Value, alarm: RecordAlarm = NO_ALARM, at_s: float | None = None) -> None:
         """Publish a value.
 
         Args:
@@ -87,12 +87,12 @@ class Field(ChannelData):  # type: ignore[misc] # caproto has no types
             alarm: what it is worth.
             at_s: when it was true, in seconds since 1970; now when missing.
         """
-        if at_s is None and (value, alarm) == (self.value, Alarm(self.status, self.severity)):
+        if at_s is None and (value, alarm) == (self.value, RecordAlarm(self.status, self.severity)):
             return
         stamp = {} if at_s is None else {"timestamp": at_s}
         await super().write(value, verify_value=False, status=alarm.status, severity=alarm.severity, **stamp)
 
-    async def redescribe(self, like: "Field") -> None:
+    async def redescribe(self, like: "RecordField") -> None:
         """Take unit, precision and limits from another field, and tell those who monitor them."""
         said = {name: getattr(like, name) for name in DESCRIPTION if hasattr(like, name)}
         if any(getattr(self, name) != value for name, value in said.items()):
@@ -103,7 +103,7 @@ class Field(ChannelData):  # type: ignore[misc] # caproto has no types
         return value.decode(self.string_encoding) if isinstance(value, bytes) else value
 
 
-class Number(Field, ChannelDouble):  # type: ignore[misc]
+class Number(RecordField, ChannelDouble):  # type: ignore[misc]
     """A number with a unit; a client may put it as a text, read as everywhere a person types one."""
 
     def native(self, value: Any) -> Value:  # noqa: ANN401
@@ -119,11 +119,11 @@ class Number(Field, ChannelDouble):  # type: ignore[misc]
         return number
 
 
-class Integer(Field, ChannelInteger):  # type: ignore[misc]
+class Integer(RecordField, ChannelInteger):  # type: ignore[misc]
     """A whole number."""
 
 
-class Choice(Field, ChannelEnum):  # type: ignore[misc]
+class ChoiceField(RecordField, ChannelEnum):  # type: ignore[misc]
     """One of some words."""
 
     def native(self, value: Any) -> Value:  # noqa: ANN401
@@ -142,18 +142,18 @@ class Choice(Field, ChannelEnum):  # type: ignore[misc]
         return str(self.enum_strings[int(word)])
 
 
-class String(Field, ChannelString):  # type: ignore[misc]
+class String(RecordField, ChannelString):  # type: ignore[misc]
     """A short text."""
 
-    async def show(self, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
+    async def show(self, value: Value, alarm: RecordAlarm = NO_ALARM, at_s: float | None = None) -> None:
         """Publish a text, cut to what an EPICS string holds."""
         await super().show(str(value)[:LONGEST_STRING], alarm, at_s)
 
 
-class Text(Field, ChannelChar):  # type: ignore[misc]
+class Text(RecordField, ChannelChar):  # type: ignore[misc]
     """A text longer than EPICS strings."""
 
-    async def show(self, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
+    async def show(self, value: Value, alarm: RecordAlarm = NO_ALARM, at_s: float | None = None) -> None:
         """Publish a text, cut to what the channel holds."""
         await super().show(str(value)[:LONGEST_TEXT], alarm, at_s)
 
@@ -179,9 +179,9 @@ def integer(value: int = 0) -> Integer:
     return Integer(value=value)
 
 
-def choice(value: str, *words: str) -> Choice:
+def choice(value: str, *words: str) -> ChoiceField:
     """Return one of some words."""
-    return Choice(value=value, enum_strings=words)
+    return ChoiceField(value=value, enum_strings=words)
 
 
 def string(value: str = "") -> String:

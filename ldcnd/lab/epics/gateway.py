@@ -11,7 +11,7 @@ from caproto.asyncio.server import Context
 from ldcnd.client.rig import Rig
 from ldcnd.contract.errors import LdcndError, UnknownAxis
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.lab.epics.fields import Field
+from ldcnd.lab.epics.fields import RecordField
 from ldcnd.lab.epics.motor import NO_HOLDER, MotorRecord, database
 from ldcnd.listen_address import ListenAddress
 
@@ -35,7 +35,7 @@ class Gateway:
     """
 
     def __init__(self, rig: Rig, group: asyncio.TaskGroup) -> None:
-        self.variables: dict[str, Field] = {}
+        self.variables: dict[str, RecordField] = {}
         self.circuits: set[object] = set()
         self._rig = rig
         self._group = group

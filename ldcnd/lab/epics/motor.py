@@ -40,7 +40,19 @@ from ldcnd.contract.samples import (
     TelemetryItem,
     VelocitySample,
 )
-from ldcnd.lab.epics.fields import NO_ALARM, Action, Alarm, Field, Put, Value, choice, integer, number, string, text
+from ldcnd.lab.epics.fields import (
+    NO_ALARM,
+    Action,
+    Put,
+    RecordAlarm,
+    RecordField,
+    Value,
+    choice,
+    integer,
+    number,
+    string,
+    text,
+)
 
 NO_HOLDER = "none"
 """Shown as who controls an axis while this gateway does not and was not refused."""
@@ -48,17 +60,17 @@ NO_LIMIT = 1e30
 """Stands for a missing limit when the other one is set; both 0 stand for none, as in the motor record."""
 REST_S = 10.0
 """Longest wait for the standstill after a motion that was ended early, in seconds."""
-SILENT = Alarm(AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM)
-UNDEFINED = Alarm(AlarmStatus.UDF, AlarmSeverity.INVALID_ALARM)
+SILENT = RecordAlarm(AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM)
+UNDEFINED = RecordAlarm(AlarmStatus.UDF, AlarmSeverity.INVALID_ALARM)
 QUALITIES = {
     Quality.GOOD: NO_ALARM,
-    Quality.UNCERTAIN: Alarm(AlarmStatus.SOFT, AlarmSeverity.MINOR_ALARM),
+    Quality.UNCERTAIN: RecordAlarm(AlarmStatus.SOFT, AlarmSeverity.MINOR_ALARM),
     Quality.BAD: SILENT,
 }
 ALARMS = {
     Severity.NONE: NO_ALARM,
-    Severity.MINOR: Alarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM),
-    Severity.MAJOR: Alarm(AlarmStatus.STATE, AlarmSeverity.MAJOR_ALARM),
+    Severity.MINOR: RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM),
+    Severity.MAJOR: RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MAJOR_ALARM),
     Severity.INVALID: SILENT,
 }
 INPUTS = ("forward_limit", "reverse_limit", "index", "stop_input", "amplifier_enable")
@@ -117,7 +129,7 @@ class MotorRecord:
         self._faults: FaultSample | None = None
         self._condition = assess(None)
         self._switches = 0  # bits of MSTA
-        self.fields: dict[str, Field] = self._made(info, *defaults)
+        self.fields: dict[str, RecordField] = self._made(info, *defaults)
         self._val = self["VAL"]
         self._defaults = defaults
         if moves:
@@ -126,18 +138,18 @@ class MotorRecord:
     # -- fields ------------------------------------------------------------------------------------------------------
 
     @staticmethod
-    def _made(info: AxisInfo, velocity: float, acceleration: float) -> dict[str, Field]:
+    def _made(info: AxisInfo, velocity: float, acceleration: float) -> dict[str, RecordField]:
         unit = info.unit
         low, high = info.limits.position_min, info.limits.position_max
         limits = (0.0, 0.0) if low is None and high is None else (_or(low, -NO_LIMIT), _or(high, NO_LIMIT))
         step = 1.0 / info.counts_per_unit if info.counts_per_unit else 1.0
         precision = max(0, min(9, len(f"{step:.9f}".rstrip("0").partition(".")[2])))
 
-        def here(value: float = 0.0, limits: tuple[float, float] = (0.0, 0.0)) -> Field:
+        def here(value: float = 0.0, limits: tuple[float, float] = (0.0, 0.0)) -> RecordField:
             return number(value, unit, precision=precision, limits=limits)
 
         target = here(limits=limits)
-        record: dict[str, Field] = {
+        record: dict[str, RecordField] = {
             "VAL": target,
             "DVAL": target,  # dial and user values are the same: OFF is 0 and DIR is Pos
             "RBV": here(),
@@ -242,7 +254,7 @@ class MotorRecord:
         if Verb.RESET in can and reset is not None:
             reset.action = self._explained(self._put_reset)
 
-    def __getitem__(self, field: str) -> Field:
+    def __getitem__(self, field: str) -> RecordField:
         return self.fields[f"{self.info.axis}.{field}"]
 
     async def describe(self, info: AxisInfo, defaults: tuple[float, float]) -> None:
@@ -271,7 +283,7 @@ class MotorRecord:
                 if name in described:
                     await channel.show(fresh[name].value)
 
-    def beside(self, name: str) -> Field | None:
+    def beside(self, name: str) -> RecordField | None:
         """Return a variable beside the record, such as `adc`."""
         return self.fields.get(f"{self.info.axis}:{name}")
 
@@ -342,7 +354,7 @@ class MotorRecord:
         await self._show_target()
         await self.show_motion()
 
-    async def _take_inputs(self, sample: InputsSample, alarm: Alarm, at_s: float) -> None:
+    async def _take_inputs(self, sample: InputsSample, alarm: RecordAlarm, at_s: float) -> None:
         """Show inputs, and the switches at both ends of the axis; a drive may not show them for a while."""
         active = ", ".join(name for name in INPUTS if getattr(sample, name))
         await self._show_beside("inputs", active, alarm, at_s)
@@ -397,7 +409,9 @@ class MotorRecord:
             if self._pending or self._wanted is not None or self._moving is not Moving.NO:
                 self._used_s = loop.time()
 
-    async def _show_beside(self, name: str, value: Value, alarm: Alarm = NO_ALARM, at_s: float | None = None) -> None:
+    async def _show_beside(
+        self, name: str, value: Value, alarm: RecordAlarm = NO_ALARM, at_s: float | None = None
+    ) -> None:
         field = self.beside(name)
         if field is not None:  # an empty one is false
             await field.show(value, alarm, at_s)
@@ -683,7 +697,7 @@ class MotorRecord:
         return axis
 
 
-def database(prefix: str, records: Mapping[str, MotorRecord]) -> dict[str, Field]:
+def database(prefix: str, records: Mapping[str, MotorRecord]) -> dict[str, RecordField]:
     """Return the process variables of some axes by name."""
     return {f"{prefix}{name}": field for record in records.values() for name, field in record.fields.items()}
 

@@ -10,7 +10,7 @@ from typing import Self
 
 from foxglove import Channel, Context, Schema, start_server
 
-from ldcnd.client.network import Sample, SampleKind
+from ldcnd.client.network import Publication, SampleKind
 from ldcnd.contract.codec import to_json
 from ldcnd.contract.errors import ConfigError, LdcndError
 from ldcnd.contract.frozen import Frozen
@@ -49,7 +49,7 @@ class LiveView:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self._server.stop()
 
-    def take(self, sample: Sample) -> None:
+    def take(self, sample: Publication) -> None:
         """Show one value to the subscribers of its topic."""
         if sample.kind is SampleKind.DELETE:
             return

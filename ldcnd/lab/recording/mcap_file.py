@@ -14,7 +14,7 @@ from mcap.writer import CompressionType, Writer
 
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
-from ldcnd.lab.recording.messages import Entry, schema_of
+from ldcnd.lab.recording.messages import RecordedValue, schema_of
 
 CHUNK_BYTES = 1024 * 1024
 """Maximum size that is compressed and written together; `McapFile.flush` ends a chunk earlier."""
@@ -48,7 +48,7 @@ class McapFile:
         """Add a description of the rig, in JSON."""
         self._writer.add_attachment(now_ns, now_ns, f"{name}.json", "application/json", document)
 
-    def add(self, key: str, entry: Entry, now_ns: int) -> None:
+    def add(self, key: str, entry: RecordedValue, now_ns: int) -> None:
         """Add a value that came at `now_ns`, UTC in ns since 1970."""
         channel = self._channels.get(key)
         if channel is None:

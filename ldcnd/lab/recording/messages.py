@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from pydantic import Field
 
-from ldcnd.client.network import Sample
+from ldcnd.client.network import Publication
 from ldcnd.contract.codec import decode_received, read_received, to_json
 from ldcnd.contract.events import CommandEvent, CommandStatus
 from ldcnd.contract.frozen import Frozen, schema_text
@@ -64,7 +64,7 @@ def axis_of(key: str) -> str | None:
     return None
 
 
-def decode_published(sample: Sample) -> Published | None:
+def decode_published(sample: Publication) -> Published | None:
     """Return the value that was published, or None when its key is not known.
 
     Raises:
@@ -97,7 +97,7 @@ LEVELS: Mapping[CommandStatus, LogLevel] = MappingProxyType(
 """All other statuses went as requested."""
 
 
-class Instant(Frozen):
+class Timestamp(Frozen):
     """A point in time, UTC since 1970."""
 
     sec: int = Field(ge=0)
@@ -109,7 +109,7 @@ class Instant(Frozen):
 class LogMessage(Frozen):
     """An event as a log message: what viewers show, and the event itself, whole."""
 
-    timestamp: Instant
+    timestamp: Timestamp
     """When it happened."""
     level: LogLevel
     """2 for what went as requested, 3 for what was refused or ended early, 4 for failures."""
@@ -125,7 +125,7 @@ class LogMessage(Frozen):
     """The event as it was published."""
 
 
-class Entry(NamedTuple):
+class RecordedValue(NamedTuple):
     """A value as a recording holds it.
 
     Attributes:
@@ -141,7 +141,7 @@ class Entry(NamedTuple):
     seq: int
 
 
-def entry_of(sample: Sample) -> Entry | None:
+def entry_of(sample: Publication) -> RecordedValue | None:
     """Return what is recorded of a sample, or None when its key is not known.
 
     What has exactly the fields that its key carries is recorded as it is: building its model would cost more than all
@@ -158,10 +158,10 @@ def entry_of(sample: Sample) -> Entry | None:
         if isinstance(value, dict) and value.keys() == fields:
             t, seq = value["t"], value["seq"]
             if type(t) is int and type(seq) is int:
-                return Entry(model, text, t, seq)
+                return RecordedValue(model, text, t, seq)
     published = decode_received(model, sample.payload, sample.encoding)
     message = message_of(published)
-    return Entry(type(message), to_json(message), published.t, published.seq)
+    return RecordedValue(type(message), to_json(message), published.t, published.seq)
 
 
 def message_of(value: Published) -> Frozen:
@@ -181,7 +181,7 @@ def _log_message(event: CommandEvent) -> LogMessage:
     why = f": {event.reason}" if event.reason else ""
     code = f" [{event.code}]" if event.code else ""
     return LogMessage(
-        timestamp=Instant(sec=sec, nsec=nsec),
+        timestamp=Timestamp(sec=sec, nsec=nsec),
         level=LEVELS.get(event.status, LogLevel.INFO),
         message=f"{event.axis}: {event.verb} {event.status} by {who} ({event.command_id}){why}{code}",
         name=event.axis,

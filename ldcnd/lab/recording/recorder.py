@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from ldcnd.client.network import Sample, SampleKind
+from ldcnd.client.network import Publication, SampleKind
 from ldcnd.contract.errors import LdcndError
 from ldcnd.lab.recording.mcap_file import Losses, McapFile
 from ldcnd.lab.recording.messages import entry_of
@@ -67,7 +67,7 @@ class Recorder:
         self._rotate_bytes = rotate_bytes
         self._describe = describe
         self._source = ""  # the session of the daemon that the descriptions are of
-        self._undescribed: deque[Sample] = deque(maxlen=KEPT_SAMPLES)
+        self._undescribed: deque[Publication] = deque(maxlen=KEPT_SAMPLES)
         self._stirred = asyncio.Event()
         self._over = False
         self._problem: OSError | None = None
@@ -121,7 +121,7 @@ class Recorder:
         if self._problem:
             raise self._problem
 
-    def take(self, sample: Sample) -> None:
+    def take(self, sample: Publication) -> None:
         """Record one value; deletions of keys are left out. An error ends `run`."""
         if sample.kind is SampleKind.DELETE or self._problem:
             return

@@ -20,7 +20,7 @@ from ldcnd.contract.samples import (
     VelocitySample,
 )
 from ldcnd.lab.ros2.cdr import DIAGNOSTIC_ARRAY, JOINT_STATE, DiagnosticArray, DiagnosticStatus, JointState
-from ldcnd.lab.ros2.graph import Node, Publisher, advertise
+from ldcnd.lab.ros2.graph import RosNode, RosPublisher, advertise
 
 SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "rev": math.tau}
 """Metres or radians in a unit; axes in other units have no joint."""
@@ -107,10 +107,10 @@ async def run_bridge(rig: Rig, session: Session, axes: tuple[str, ...], domain: 
     """
     infos = {info.axis: info for info in await rig.describe() if not axes or info.axis in axes}
     bridge = Bridge(rig.name, infos)
-    node = Node(domain, f"ldcnd_{rig.name}", secrets.token_hex(16))
+    node = RosNode(domain, f"ldcnd_{rig.name}", secrets.token_hex(16))
     async with AsyncExitStack() as declared:
         declared.push_async_callback((await session.declare_token(node.token)).close)
-        publishers: list[Publisher] = []
+        publishers: list[RosPublisher] = []
         for entity, (topic, message) in enumerate(
             (("/joint_states", JOINT_STATE), ("/diagnostics", DIAGNOSTIC_ARRAY)), 1
         ):
@@ -128,14 +128,14 @@ async def _descriptions(rig: Rig, bridge: Bridge, axes: tuple[str, ...]) -> None
         bridge.axes = {name: info for name, info in infos.items() if not axes or name in axes}
 
 
-async def _joints(rig: Rig, bridge: Bridge, publisher: Publisher) -> None:
+async def _joints(rig: Rig, bridge: Bridge, publisher: RosPublisher) -> None:
     async with rig.samples() as samples:
         async for axis, sample in samples:
             if axis in bridge.axes and (message := bridge.take(axis, sample)):
                 publisher.publish(message.payload, message.t)
 
 
-async def _diagnostics(bridge: Bridge, publisher: Publisher) -> None:
+async def _diagnostics(bridge: Bridge, publisher: RosPublisher) -> None:
     while True:
         await asyncio.sleep(PERIOD_S)
         now_ns = time.time_ns()

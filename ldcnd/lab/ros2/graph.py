@@ -18,7 +18,7 @@ GID_BYTES = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Node:
+class RosNode:
     """A node in the root namespace.
 
     Attributes:
@@ -49,7 +49,7 @@ class Node:
         return f"{self.domain}/{topic.strip('/')}/{message.name}/{message.type_hash}"
 
 
-class Publisher:
+class RosPublisher:
     """A publisher of one topic; made by `advertise`."""
 
     def __init__(self, session: Session, key: str, gid: bytes) -> None:
@@ -70,8 +70,8 @@ class Publisher:
 
 
 async def advertise(
-    session: Session, node: Node, entity: int, topic: str, message: MessageType
-) -> tuple[Publisher, Declaration]:
+    session: Session, node: RosNode, entity: int, topic: str, message: MessageType
+) -> tuple[RosPublisher, Declaration]:
     """Show a publisher in the graph; it vanishes with the declaration or the session.
 
     Args:
@@ -83,7 +83,7 @@ async def advertise(
     """
     token = await session.declare_token(node.publisher_token(entity, topic, message))
     gid = bytes.fromhex(node.session_id).rjust(GID_BYTES, b"\0")[: GID_BYTES - 1] + bytes([entity])
-    return Publisher(session, node.topic_key(topic, message), gid), token
+    return RosPublisher(session, node.topic_key(topic, message), gid), token
 
 
 def attachment_of(number: int, t: int, gid: bytes) -> bytes:

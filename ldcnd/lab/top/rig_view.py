@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
-from ldcnd.client.network import Sample, SampleKind
+from ldcnd.client.network import Publication, SampleKind
 from ldcnd.client.overview import seen_of
 from ldcnd.contract.codec import decode_received
-from ldcnd.contract.condition import SHARED, UNKNOWN_HOLDER, Kind, Severity, Trouble, assess, line_troubles
+from ldcnd.contract.condition import SHARED, UNKNOWN_HOLDER, Severity, Trouble, TroubleKind, assess, line_troubles
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import BusHealth, LaneHealth
 from ldcnd.contract.keys import Keys
@@ -57,7 +57,7 @@ def described(daemon: DaemonInfo, axes: list[AxisInfo], holders: HolderList) -> 
 class _Kept:
     """A sample and when it came, by the loop's clock."""
 
-    sample: Sample
+    sample: Publication
     at_s: float
 
 
@@ -76,7 +76,7 @@ class RigView:
         self._kept: dict[str, _Kept] = {}
         self._report_before: dict[str, BusHealth] = {}
 
-    def take(self, sample: Sample, now_s: float) -> None:
+    def take(self, sample: Publication, now_s: float) -> None:
         """Keep a sample in the place of the one before."""
         if sample.kind is SampleKind.DELETE:
             self._kept.pop(sample.key, None)
@@ -128,8 +128,8 @@ class RigView:
             state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent,
             holder=self._description.holders.get(info.axis, UNKNOWN_HOLDER) if self._description else UNKNOWN_HOLDER,
         )  # fmt: skip
-        control = next((each.short for each in condition.troubles if each.kind is Kind.CONTROL), None)
-        worst = next((each for each in condition.troubles if each.kind is not Kind.CONTROL), None)
+        control = next((each.short for each in condition.troubles if each.kind is TroubleKind.CONTROL), None)
+        worst = next((each for each in condition.troubles if each.kind is not TroubleKind.CONTROL), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(
             axis=info.axis,
@@ -162,7 +162,7 @@ class RigView:
         poll, stop = _lane(report, "poll"), _lane(report, "stop")
         return BusGlance(
             bus=report.bus,
-            cause=f"{Kind.LINE_DOWN}: {report.bus}" if down else f"{report.bus}: {trouble}",
+            cause=f"{TroubleKind.LINE_DOWN}: {report.bus}" if down else f"{report.bus}: {trouble}",
             up=report.up,
             utilisation=report.utilisation,
             exchanges_per_s=(report.exchanges - before.exchanges) / period_s if before and period_s > 0 else None,
@@ -187,8 +187,8 @@ def cause_of(worst: Trouble | None, bus: str) -> str:
     """Return what an axis has in common with others that is wrong; empty where its trouble is its own."""
     if worst is None:
         return ""
-    if worst.kind is Kind.LINE_DOWN:
-        return f"{Kind.LINE_DOWN}: {bus}"
+    if worst.kind is TroubleKind.LINE_DOWN:
+        return f"{TroubleKind.LINE_DOWN}: {bus}"
     return str(worst.kind) if worst.kind in SHARED else ""
 
 

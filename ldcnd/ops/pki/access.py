@@ -14,7 +14,7 @@ from enum import StrEnum
 from ldcnd.contract.keys import ALL_CLIENTS, ALL_COMMANDS, ALL_READABLE, ALL_STOPS
 
 
-class Role(StrEnum):
+class CertificateRole(StrEnum):
     """The purpose of a login."""
 
     VIEWER = "viewer"
@@ -81,18 +81,24 @@ CARRY = (
 )
 
 RULES = (*WATCH, *STOP, *COMMAND, *PRESENCE)
-PERMITTED: Mapping[Role, tuple[Rule, ...]] = {Role.VIEWER: (*WATCH, *STOP), Role.OPERATOR: RULES}
+PERMITTED: Mapping[CertificateRole, tuple[Rule, ...]] = {
+    CertificateRole.VIEWER: (*WATCH, *STOP),
+    CertificateRole.OPERATOR: RULES,
+}
 """At a daemon that people connect to."""
-PERMITTED_BEHIND_ROUTER: Mapping[Role, tuple[Rule, ...]] = {**PERMITTED, Role.ROUTER: CARRY}
+PERMITTED_BEHIND_ROUTER: Mapping[CertificateRole, tuple[Rule, ...]] = {**PERMITTED, CertificateRole.ROUTER: CARRY}
 """At a daemon that routers connect to as well: they have checked the client."""
-PERMITTED_AT_ROUTER: Mapping[Role, tuple[Rule, ...]] = {**PERMITTED_BEHIND_ROUTER, Role.DAEMON: CARRY}
+PERMITTED_AT_ROUTER: Mapping[CertificateRole, tuple[Rule, ...]] = {
+    **PERMITTED_BEHIND_ROUTER,
+    CertificateRole.DAEMON: CARRY,
+}
 """At a router. The rig of a daemon is not checked."""
 
 
 def access_control(
     subject: Subject,
-    logins: Mapping[Role, tuple[str, ...]],
-    permitted: Mapping[Role, tuple[Rule, ...]] = PERMITTED,
+    logins: Mapping[CertificateRole, tuple[str, ...]],
+    permitted: Mapping[CertificateRole, tuple[Rule, ...]] = PERMITTED,
 ) -> dict[str, object]:
     """Return the value of Zenoh's `access_control`: each login may do what its role permits, and nothing else.
 

@@ -20,7 +20,7 @@ from ldcnd.contract.frozen import Frozen
 from ldcnd.ops.pki.access import (
     PERMITTED_AT_ROUTER,
     PERMITTED_BEHIND_ROUTER,
-    Role,
+    CertificateRole,
     Rule,
     Subject,
     access_control,
@@ -39,7 +39,7 @@ class Login(Frozen):
 
     name: LoginName
     """The common name of its certificate, and of its files."""
-    role: Role
+    role: CertificateRole
     """Its permissions."""
     hosts: tuple[str, ...] = ()
     """Where a daemon or a router can be found: host names and IP addresses."""
@@ -53,7 +53,7 @@ class Roster(Frozen):
 
     logins: tuple[Login, ...] = ()
 
-    def names(self, role: Role) -> tuple[str, ...]:
+    def names(self, role: CertificateRole) -> tuple[str, ...]:
         """Return who has a role now."""
         return tuple(login.name for login in self.logins if login.role is role and not login.revoked)
 
@@ -85,7 +85,7 @@ def read_roster(folder: Path) -> Roster:
 PORT = 7447
 AUTHORITY = "ca"
 PRIVATE = 0o600
-LISTENERS = (Role.DAEMON, Role.ROUTER)
+LISTENERS = (CertificateRole.DAEMON, CertificateRole.ROUTER)
 
 
 class Site:
@@ -161,9 +161,9 @@ class Site:
         """Write the roster, and the access rules that follow from it."""
         _write(self._folder / FILE, roster.model_dump_json(indent=2).encode())
         self._roster = roster
-        for name in roster.names(Role.DAEMON):
+        for name in roster.names(CertificateRole.DAEMON):
             self._write_configuration(name, self._daemon(self._credentials(name)))
-        for name in roster.names(Role.ROUTER):
+        for name in roster.names(CertificateRole.ROUTER):
             self._write_configuration(name, self._router(self._credentials(name)))
 
     def _daemon(self, own: Credentials) -> dict[str, object]:
@@ -176,8 +176,10 @@ class Site:
             "connect": {"retry": {"period_init_ms": RETRY_MS[0], "period_max_ms": RETRY_MS[1]}},
         }
 
-    def _listener(self, own: Credentials, mode: str, permitted: Mapping[Role, tuple[Rule, ...]]) -> dict[str, object]:
-        logins = {role: self._roster.names(role) for role in Role}
+    def _listener(
+        self, own: Credentials, mode: str, permitted: Mapping[CertificateRole, tuple[Rule, ...]]
+    ) -> dict[str, object]:
+        logins = {role: self._roster.names(role) for role in CertificateRole}
         return {
             "mode": mode,
             "listen": {"endpoints": [f"tls/[::]:{PORT}"]},
@@ -187,7 +189,12 @@ class Site:
 
     def _client(self, own: Credentials) -> dict[str, object]:
         present = [login for login in self._roster.logins if not login.revoked]
-        listeners = [login for role in (Role.ROUTER, Role.DAEMON) for login in present if login.role is role]
+        listeners = [
+            login
+            for role in (CertificateRole.ROUTER, CertificateRole.DAEMON)
+            for login in present
+            if login.role is role
+        ]
         return {
             "mode": "client",
             "connect": {"endpoints": [f"tls/{_bracketed(login.hosts[0])}:{PORT}" for login in listeners]},
@@ -240,7 +247,7 @@ def set_up(folder: Path, name: str, now: dt.datetime) -> Site:
     return Site(folder)
 
 
-def new_login(name: str, role: Role, hosts: tuple[str, ...]) -> Login:
+def new_login(name: str, role: CertificateRole, hosts: tuple[str, ...]) -> Login:
     """Return a login.
 
     Raises:

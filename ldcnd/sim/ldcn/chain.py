@@ -28,7 +28,7 @@ from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import IoWiring, SimulatedIo, SimulatedOther
 from ldcnd.sim.ldcn.module import SimulatedModule
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.plant import MotorPlant
 
@@ -109,13 +109,13 @@ class ModuleSpec:
     plant: MotorPlant = field(default_factory=MotorPlant)
     settings: ModuleSettings | None = None
     adjust: Callable[[ModuleSettings], ModuleSettings] = _unchanged
-    conditions: frozenset[Condition] = frozenset()
+    conditions: frozenset[FaultCondition] = frozenset()
     wiring: IoWiring = field(default_factory=IoWiring)
     start_up: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
-class Line:
+class OutsideLevel:
     """The level of a PIC-I/O's line, 1 to 12, as it is driven from outside; `present` says high."""
 
     number: int
@@ -143,7 +143,7 @@ class TimedEvent:
 
     at_s: float
     place: int
-    what: Condition | Line | Analog | None
+    what: FaultCondition | OutsideLevel | Analog | None
     present: bool
 
 
@@ -194,13 +194,13 @@ def _happening(event: TimedEvent, module: SimulatedModule) -> Callable[[float], 
     match event.what, module:
         case None, _:
             return lambda at_s: module.power(on=event.present, at_s=at_s)
-        case Condition() as condition, SimulatedDrive() as drive:
+        case FaultCondition() as condition, SimulatedDrive() as drive:
             return lambda at_s: drive.set_condition(condition, present=event.present, at_s=at_s)
-        case Line(number), SimulatedIo() as io:
+        case OutsideLevel(number), SimulatedIo() as io:
             return lambda at_s: io.drive_line(number, high=event.present, at_s=at_s)
         case Analog(channel, value), SimulatedIo() as io:
             return lambda at_s: io.set_adc(channel, value, at_s)
-    lacking = "motor" if isinstance(event.what, Condition) else "terminals"
+    lacking = "motor" if isinstance(event.what, FaultCondition) else "terminals"
     raise ValueOutOfRange(f"module {event.place} has no {lacking} for {event.what}", value=event.place)
 
 

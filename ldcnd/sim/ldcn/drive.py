@@ -26,7 +26,7 @@ from ldcnd.drives.ldcn.controls import (
     StartUp,
     StopControl,
 )
-from ldcnd.drives.ldcn.packet import AuxFlag, Command, Status, StatusFlag, StatusItem, encode_status
+from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag, StatusItem, StatusPacket, encode_status
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_CMC_ADVANCED, Profile, at_clock
 from ldcnd.drives.ldcn.received import (
     AddPathPoints,
@@ -42,7 +42,7 @@ from ldcnd.drives.ldcn.received import (
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.sim.ldcn.module import SimulatedModule
-from ldcnd.sim.ldcn.power import Condition, LogosolPower, PicServoPower, PowerStage, ScPower
+from ldcnd.sim.ldcn.power import FaultCondition, LogosolPower, PicServoPower, PowerStage, ScPower
 from ldcnd.sim.ldcn.quirks import (
     ExcludedOptions,
     HalfPoint,
@@ -52,7 +52,7 @@ from ldcnd.sim.ldcn.quirks import (
     RelativeTo,
     ResetInMotion,
 )
-from ldcnd.sim.ldcn.servo import COUNTER_SPAN, HomeSearch, ServoLoop
+from ldcnd.sim.ldcn.servo import COUNTER_SPAN, ArmedSearch, ServoLoop
 from ldcnd.sim.plant import MotorPlant, Shaft
 
 SHORTS = range(-0x8000, 0x8000)
@@ -94,7 +94,7 @@ class SimulatedDrive(SimulatedModule):
         self.stage: PowerStage
         self.loop: ServoLoop
         self.saved: SavedConfiguration | None = None
-        self._conditions: set[Condition] = set()
+        self._conditions: set[FaultCondition] = set()
         self._overrun = False
         if settings.velocity_sign is not None:
             profile = replace(profile, velocity_sign=settings.velocity_sign)
@@ -107,16 +107,16 @@ class SimulatedDrive(SimulatedModule):
             self._compatible = replace(items, path_points=0)
         super().__init__(profile, settings)
 
-    def set_condition(self, condition: Condition, *, present: bool, at_s: float) -> None:
+    def set_condition(self, condition: FaultCondition, *, present: bool, at_s: float) -> None:
         """Let something go wrong around the drive, or be right again, at that instant of the line's clock."""
         self.catch_up(at_s)
         if present:
             self._conditions.add(condition)
         else:
             self._conditions.discard(condition)
-        self.shaft.stalled = Condition.STALLED in self._conditions
-        self.shaft.limits_actuated = Condition.LIMITS_ACTUATED in self._conditions
-        if Condition.SLOW_PROCESSOR in self._conditions:
+        self.shaft.stalled = FaultCondition.STALLED in self._conditions
+        self.shaft.limits_actuated = FaultCondition.LIMITS_ACTUATED in self._conditions
+        if FaultCondition.SLOW_PROCESSOR in self._conditions:
             self._overrun = True
         self.stage.check()
         self._obey_stage()
@@ -171,7 +171,7 @@ class SimulatedDrive(SimulatedModule):
                 self._renumber(loop.position - loop.home if relative_to_home else position)
             case LoadTrajectory(trajectory):
                 self._load(trajectory)
-            case PlainCommand(Command.START_MOTION):
+            case PlainCommand(CommandCode.START_MOTION):
                 self._start()
             case SetGain(gains, without_multiplier):
                 if without_multiplier and self.settings.gains_keep_multiplier:
@@ -185,9 +185,9 @@ class SimulatedDrive(SimulatedModule):
                 self._arm_homing(control)
             case AddPathPoints(points, half):
                 self._add_points(points, half)
-            case PlainCommand(Command.CLEAR_STICKY_BITS):
+            case PlainCommand(CommandCode.CLEAR_STICKY_BITS):
                 self._clear_sticky_bits()
-            case PlainCommand(Command.SAVE_CURRENT_POSITION_AS_HOME):
+            case PlainCommand(CommandCode.SAVE_CURRENT_POSITION_AS_HOME):
                 loop.home = loop.position
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
@@ -207,7 +207,7 @@ class SimulatedDrive(SimulatedModule):
         return encode_status(
             self.dialect,
             items,
-            Status(
+            StatusPacket(
                 flags,
                 position=_long(loop.position),
                 adc=loop.adc() if items & StatusItem.ADC else 0,
@@ -455,13 +455,13 @@ class SimulatedDrive(SimulatedModule):
     def _arm_homing(self, control: HomingControl) -> None:
         loop = self.loop
         sources = control & HomingControl(self.profile.homing_sources)
-        loop.search = HomeSearch.armed(control, loop.inputs) if sources else None
+        loop.search = ArmedSearch.armed(control, loop.inputs) if sources else None
 
     def _clear_sticky_bits(self) -> None:
         loop = self.loop
         loop.position_error = not loop.servo_on
         loop.wrapped = loop.overcurrent = False
-        self._overrun = Condition.SLOW_PROCESSOR in self._conditions
+        self._overrun = FaultCondition.SLOW_PROCESSOR in self._conditions
         self.stage.clear()
 
     def _close(self) -> None:

@@ -26,7 +26,7 @@ from ldcnd.drives.ldcn.pic_io import (
     IoStatus,
     SetDirection,
     SetOutput,
-    SetPwm,
+    SetPwmOutputs,
     SetSynchOutput,
     SetTimerMode,
     SynchInput,
@@ -139,7 +139,7 @@ class SimulatedIo(SimulatedModule):
         match command:
             case SetDirection(inputs):
                 self.outputs = ~inputs & ALL_LINES
-            case SetPwm(pwm1, pwm2):
+            case SetPwmOutputs(pwm1, pwm2):
                 self.pwm = (pwm1, pwm2)
             case SetOutput(levels):
                 self._set_latch(levels)

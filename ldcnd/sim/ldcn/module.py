@@ -22,7 +22,7 @@ from ldcnd.drives.ldcn.packet import (
     FRAME_BYTES,
     HEADER,
     MOST_DATA_BYTES,
-    Command,
+    CommandCode,
     Packet,
     PacketReader,
     StatusItem,
@@ -39,7 +39,7 @@ from ldcnd.drives.ldcn.received import (
     received_command,
 )
 from ldcnd.drives.ldcn.registers import RESET_BAUD, RESET_BAUD_CODE, actual_baud, module_baud
-from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, Reply
+from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, ModuleReply
 from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings, UnknownBaud
 
 EVERYBODY = 0xFF
@@ -134,7 +134,7 @@ class SimulatedModule(Module):
             if self._loses_commands:
                 self._buffer[: len(data) - FRAME_BYTES] = data[FRAME_BYTES - 1 : -1]
 
-    def advance(self, to_s: float) -> Reply | None:
+    def advance(self, to_s: float) -> ModuleReply | None:
         """Execute the packet that waits, at the end of the servo cycle, and begin the reply."""
         at_s = self.next_event_s
         if at_s > to_s:
@@ -148,7 +148,7 @@ class SimulatedModule(Module):
                 self._reply = reply
                 self.next_event_s = at_s + self.settings.reply_latency_s
                 return None
-        return Reply(reply, at_s, BITS_PER_BYTE / self.baud) if reply else None
+        return ModuleReply(reply, at_s, BITS_PER_BYTE / self.baud) if reply else None
 
     @property
     def dialect(self) -> Profile:
@@ -215,7 +215,7 @@ class SimulatedModule(Module):
     def _is_for_me(self, address: int, command: int) -> bool:
         if address in {self.address, self.group}:
             return True
-        return address == EVERYBODY and command == Command.HARD_RESET and self.settings.always_obeys_global_reset
+        return address == EVERYBODY and command == CommandCode.HARD_RESET and self.settings.always_obeys_global_reset
 
     def _pass_cycles(self, until: int) -> None:
         if until > self._cycles_done:
@@ -252,7 +252,7 @@ class SimulatedModule(Module):
                     self.save(start_up)
                 self._reset(at_s)
                 return None
-            case PlainCommand(Command.NO_OPERATION):
+            case PlainCommand(CommandCode.NO_OPERATION):
                 pass
             case command:
                 self.execute(command)

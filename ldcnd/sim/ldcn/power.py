@@ -9,7 +9,7 @@ from enum import Enum, StrEnum
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag
 
 
-class Condition(StrEnum):
+class FaultCondition(StrEnum):
     """Faults around a drive; set and cleared from outside while it runs."""
 
     STOP_INPUT = "stop_input"
@@ -50,12 +50,12 @@ class Trip(Enum):
 _DRIVER_STAYS = frozenset({None, Trip.POSITION_ERROR, Trip.SENSOR})
 """Causes that leave power_on set."""
 _TRIPS = (
-    (Condition.STOP_INPUT, Trip.STOP_INPUT),
-    (Condition.OVERVOLTAGE, Trip.SHORT_OR_OVERVOLTAGE),
-    (Condition.MOTOR_SHORT, Trip.SHORT_OR_OVERVOLTAGE),
-    (Condition.OVERHEAT, Trip.OVERHEAT),
-    (Condition.OVERCURRENT, Trip.OVERCURRENT),
-    (Condition.ENCODER_LOSS, Trip.ENCODER),
+    (FaultCondition.STOP_INPUT, Trip.STOP_INPUT),
+    (FaultCondition.OVERVOLTAGE, Trip.SHORT_OR_OVERVOLTAGE),
+    (FaultCondition.MOTOR_SHORT, Trip.SHORT_OR_OVERVOLTAGE),
+    (FaultCondition.OVERHEAT, Trip.OVERHEAT),
+    (FaultCondition.OVERCURRENT, Trip.OVERCURRENT),
+    (FaultCondition.ENCODER_LOSS, Trip.ENCODER),
 )
 
 
@@ -70,7 +70,7 @@ class PowerStage(ABC):
     """
 
     def __init__(self) -> None:
-        self.conditions: set[Condition] = set()
+        self.conditions: set[FaultCondition] = set()
         self.enabled = False
         self.drives = False
         self.allows_servo = False
@@ -114,7 +114,7 @@ class PicServoPower(PowerStage):
 
     def check(self) -> None:
         """Draw the consequences of the conditions."""
-        self.allows_servo = Condition.MOTOR_POWER_OFF not in self.conditions
+        self.allows_servo = FaultCondition.MOTOR_POWER_OFF not in self.conditions
         self.drives = self.enabled and self.allows_servo
 
     def trip(self, cause: Trip) -> None:
@@ -141,11 +141,11 @@ class ScPower(PicServoPower):
     def check(self) -> None:
         """Draw the consequences of the conditions."""
         super().check()
-        self.drives = self.drives and Condition.OVERVOLTAGE not in self.conditions
+        self.drives = self.drives and FaultCondition.OVERVOLTAGE not in self.conditions
 
     def flags(self, limits: StatusFlag) -> StatusFlag:
         """Return bits 3, 5 and 6 of the status byte."""
-        return super().flags(limits) if Condition.OVERVOLTAGE not in self.conditions else limits
+        return super().flags(limits) if FaultCondition.OVERVOLTAGE not in self.conditions else limits
 
 
 class LogosolPower(PowerStage):
@@ -202,10 +202,10 @@ class LogosolPower(PowerStage):
     def _standing(self) -> StatusFlag:
         """Return the diagnostic bits with Pic_ae = 0: set means healthy."""
         flags = StatusFlag(0)
-        if self.latched in _DRIVER_STAYS and Condition.OVERVOLTAGE not in self.conditions:
+        if self.latched in _DRIVER_STAYS and FaultCondition.OVERVOLTAGE not in self.conditions:
             flags |= StatusFlag.POWER_ON
-        if Condition.STOP_INPUT not in self.conditions:
+        if FaultCondition.STOP_INPUT not in self.conditions:
             flags |= StatusFlag.LIMIT1
-        if Condition.OVERHEAT not in self.conditions:
+        if FaultCondition.OVERHEAT not in self.conditions:
             flags |= StatusFlag.LIMIT2
         return flags

@@ -21,7 +21,7 @@ from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import HomingControl, IoOption
 from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.drives.ldcn.registers import FRACTION
-from ldcnd.sim.ldcn.power import Condition, PowerStage, Trip
+from ldcnd.sim.ldcn.power import FaultCondition, PowerStage, Trip
 from ldcnd.sim.ldcn.quirks import AnalogEnd, LimitInPath, ModuleSettings
 from ldcnd.sim.ldcn.trajectory import PathBuffer, ProfileGenerator
 from ldcnd.sim.plant import Shaft
@@ -47,7 +47,7 @@ class Inputs:
 
 
 @dataclass(frozen=True, slots=True)
-class HomeSearch:
+class ArmedSearch:
     """One armed search.
 
     Attributes:
@@ -61,7 +61,7 @@ class HomeSearch:
     index: bool | None = None
 
     @classmethod
-    def armed(cls, control: HomingControl, inputs: Inputs) -> "HomeSearch":
+    def armed(cls, control: HomingControl, inputs: Inputs) -> "ArmedSearch":
         """Return a search that begins with these levels."""
         watched = (HomingControl.LIMIT1, inputs.limit1), (HomingControl.LIMIT2, inputs.limit2), (
             HomingControl.INDEX, inputs.index
@@ -120,7 +120,7 @@ class ServoLoop:
         self.step_mode = False
         self.faulted = False
         self._steps = 0.0  # a part of a pulse is left
-        self.search: HomeSearch | None = None
+        self.search: ArmedSearch | None = None
         self.homed_on_limit = False
         self.position_error = True
         self.wrapped = False
@@ -143,7 +143,7 @@ class ServoLoop:
         self._arrived = False  # at the analog target
         shaft.limit_current(quirks.peak_current_a if profile.pic_ae_diagnostics else 0.0)
         if shaft.plant.encoder_disconnected:
-            stage.conditions.add(Condition.ENCODER_STUCK)
+            stage.conditions.add(FaultCondition.ENCODER_STUCK)
         self._zero = math.floor(shaft.position_counts)
         self._ticked_position = 0
         self._previous_error = 0
@@ -183,7 +183,7 @@ class ServoLoop:
         """Read the A/D converter: the potentiometer on Logosol drives, the current sense input on PIC-SERVO."""
         full_scale = (1 << self._profile.adc_bits) - 1
         if self._profile.analog_target:
-            lost = Condition.SENSOR_LOST in self.stage.conditions
+            lost = FaultCondition.SENSOR_LOST in self.stage.conditions
             return 0 if lost else round(self.shaft.potentiometer() * full_scale)
         sensed = round(abs(self.shaft.current_a(self._duty())) * self._quirks.sense_counts_per_a)
         falling = self.gains.cl != 0 and not self.gains.cl & 1
@@ -333,7 +333,7 @@ class ServoLoop:
         shaft, stage = self.shaft, self.stage
         pwm, error_sum, before, limited = self.pwm, self._error_sum, self.position, self._limited
         shaft.step(pwm / FULL_PWM if stage.drives else None)
-        if not stage.conditions or Condition.ENCODER_STUCK not in stage.conditions:
+        if not stage.conditions or FaultCondition.ENCODER_STUCK not in stage.conditions:
             position = math.floor(shaft.position_counts) - self._zero
             if abs(position - before) > self._most_counts:
                 position = self._lose_counts(position, before)
@@ -522,7 +522,7 @@ class ServoLoop:
         else:
             self.trajectory.stop_abruptly()
 
-    def _look_for_home(self, search: HomeSearch) -> None:
+    def _look_for_home(self, search: ArmedSearch) -> None:
         shaft = self.shaft
         limits = (shaft.on_reverse_limit, shaft.on_forward_limit)
         limit1, limit2 = reversed(limits) if self._profile.limit1_is_forward else limits
@@ -532,7 +532,7 @@ class ServoLoop:
         elif search.index is not None and shaft.on_index is not search.index:
             self._capture(search)
 
-    def _capture(self, search: HomeSearch) -> None:
+    def _capture(self, search: ArmedSearch) -> None:
         self.home = self.position
         self.search = None
         if not self._profile.stops_on_home:

@@ -14,9 +14,9 @@ from ldcnd.drives.ldcn.pic_io import LINES
 from ldcnd.drives.ldcn.profiles import PIC_IO, Support, identify
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import FaultPlan
-from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, Analog, ChainSpec, Line, ModuleSpec, TimedEvent
+from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, Analog, ChainSpec, ModuleSpec, OutsideLevel, TimedEvent
 from ldcnd.sim.ldcn.io import IoWiring
-from ldcnd.sim.ldcn.power import Condition
+from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.line_config import FaultyLineConfig, SimulatedFaultConfig
 from ldcnd.sim.plant import MotorPlant
@@ -129,7 +129,7 @@ class SimulatedModuleConfig(Frozen):
     """Constants of the machine."""
     behaviour: ModuleSettings = ModuleSettings()
     """Behaviour where the manuals allow variants."""
-    conditions: tuple[Condition, ...] = ()
+    conditions: tuple[FaultCondition, ...] = ()
     """Faults around the drive at power-up."""
     start_up: Byte | None = None
     """The byte of Hard Reset with which a PIC-SERVO SC was configured earlier; left out, its EEPROM is erased."""
@@ -186,16 +186,16 @@ class SimulatedModuleConfig(Frozen):
         )
 
 
-class SimulatedEventConfig(Frozen):
+class LdcnEventConfig(Frozen):
     """Something that happens to one module at a given time."""
 
     at_s: float = Field(ge=0)
     """Seconds after the line was opened first."""
     module: int = Field(ge=1, le=31)
     """Its place in the chain, from 1 on, in the order of addresses."""
-    begins: Condition | None = None
+    begins: FaultCondition | None = None
     """Fault condition that starts."""
-    ends: Condition | None = None
+    ends: FaultCondition | None = None
     """Fault condition that ends."""
     power: Literal["on", "off"] | None = None
     """Supply of the module; switched on, the module starts as after a reset."""
@@ -225,9 +225,9 @@ class SimulatedEventConfig(Frozen):
 
     def spec(self, starts_at_s: float) -> TimedEvent:
         """Return what the simulator plays."""
-        what: Condition | Line | Analog | None = self.begins or self.ends
+        what: FaultCondition | OutsideLevel | Analog | None = self.begins or self.ends
         if self.line is not None:
-            what = Line(self.line)
+            what = OutsideLevel(self.line)
         elif self.adc is not None and self.value is not None:
             what = Analog(self.adc, self.value)
         present = self.begins is not None or self.power == "on" or self.level == "high"
@@ -241,7 +241,7 @@ class SimulatedChainConfig(Frozen):
     """Seed of all random values."""
     module: tuple[SimulatedModuleConfig, ...] = Field(default=(), max_length=31)
     """In daisy-chain order."""
-    event: tuple[SimulatedEventConfig, ...] = ()
+    event: tuple[LdcnEventConfig, ...] = ()
     """Scheduled events."""
     fault: tuple[SimulatedFaultConfig, ...] = ()
     """Faults of the wires."""

@@ -13,7 +13,7 @@ from typing_extensions import override
 
 from ldcnd.drives.smartstep.packet import DAMAGED, add_parity, strip_parity
 from ldcnd.drives.smartstep.profiles import Framing, Wiring
-from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, Reply
+from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, ModuleReply
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.smartstep.unit import CHARACTER_S, SimulatedUnit, Transmission
 
@@ -120,14 +120,14 @@ class SimulatedSmartSteps(Module):
         self._look(at_s)
 
     @override
-    def advance(self, to_s: float) -> Reply | None:
+    def advance(self, to_s: float) -> ModuleReply | None:
         self._look(to_s)
         if not self._arriving:
             return None
         item = self._arriving.popleft()
         self._look(to_s)
         data = add_parity(item.characters) if self.framing is Framing.SOFT_PARITY else item.characters
-        return Reply(data, item.start_s, CHARACTER_S)
+        return ModuleReply(data, item.start_s, CHARACTER_S)
 
     def _heard(self, value: int | None) -> bytes:
         if value is None:

@@ -208,7 +208,7 @@ _DEVIATION_STEP = 256
 _POLE_PAIRS = 4
 
 
-class SimulatedDrive:
+class SimulatedSmartStep:
     """The state of a drive; every call that may change it says when.
 
     Attributes:

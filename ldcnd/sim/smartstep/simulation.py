@@ -29,7 +29,7 @@ from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
 
 
-class SimulatedEventConfig(Frozen):
+class SmartStepEventConfig(Frozen):
     """An event of a simulated drive at an instant."""
 
     at_s: float = Field(ge=0)
@@ -98,7 +98,7 @@ class SimulatedUnitConfig(Frozen):
     """Function selection switches, switch 1 in bit 0."""
     history: tuple[Annotated[int, Field(ge=0, le=WORD)], ...] = Field(default=(), max_length=10)
     """Alarm codes of its history, the newest first."""
-    event: tuple[SimulatedEventConfig, ...] = ()
+    event: tuple[SmartStepEventConfig, ...] = ()
     """Scheduled events."""
     variant: SimulatedVariantConfig = SimulatedVariantConfig()
     """How it behaves where the manual leaves room."""
@@ -161,7 +161,7 @@ def _unit(settings: SimulatedUnitConfig, now_s: float) -> SimulatedUnit:
     return unit
 
 
-def _happen(unit: SimulatedUnit, event: SimulatedEventConfig, at_s: float) -> None:
+def _happen(unit: SimulatedUnit, event: SmartStepEventConfig, at_s: float) -> None:
     if event.power is not None:
         (unit.power_on if event.power else unit.power_off)(at_s)
     if event.reset:

@@ -13,9 +13,9 @@ from ldcnd.drives.smartstep.monitors import FEEDBACK_COUNTER_LOW, INPUT_COUNTER_
 from ldcnd.drives.smartstep.packet import (
     END,
     PACKET_CHARACTERS,
-    Command,
+    CommandPacket,
     Function,
-    Reply,
+    ReplyPacket,
     ResponseStatus,
     checksum,
     decode_command,
@@ -23,7 +23,7 @@ from ldcnd.drives.smartstep.packet import (
 from ldcnd.drives.smartstep.parameters import Parameter
 from ldcnd.drives.smartstep.profiles import CountUnit, StringChecksum
 from ldcnd.drives.smartstep.trace_data import join_words
-from ldcnd.sim.smartstep.drive import SimulatedDrive
+from ldcnd.sim.smartstep.drive import SimulatedSmartStep
 from ldcnd.sim.smartstep.variant import SimulatedVariant
 
 CHARACTER_S = 10 / 9600
@@ -57,7 +57,7 @@ class SimulatedUnit:
 
     def __init__(self, variant: SimulatedVariant | None = None, stored: Mapping[Parameter, int] | None = None) -> None:
         self.variant = variant or SimulatedVariant()
-        self.drive = SimulatedDrive(self.variant, stored or {})
+        self.drive = SimulatedSmartStep(self.variant, stored or {})
         self._powered = True
         self._line = bytearray()
         self._deaf_until_s = 0.0
@@ -140,28 +140,28 @@ class SimulatedUnit:
         self.drive.advance(at_s)
         self._pending = Transmission(self._answer(command), at_s + self.variant.response_s)
 
-    def _answer(self, command: Command) -> bytes:
+    def _answer(self, command: CommandPacket) -> bytes:
         match command.function:
             case Function.REFERENCE:
                 return self._reference(command).encode()
             case Function.SETTING:
                 status = self.drive.write(command.address, command.data)
-                return Reply(command.unit, status, command.address, command.data).encode()
+                return ReplyPacket(command.unit, status, command.address, command.data).encode()
             case Function.STRING_REFERENCE:
                 return self._string(command)
 
-    def _reference(self, command: Command) -> Reply:
+    def _reference(self, command: CommandPacket) -> ReplyPacket:
         word = self.drive.read(command.address)
         if word is None:
-            return Reply(command.unit, ResponseStatus.REFERENCE_ADDRESS_ERROR, command.address, command.data)
+            return ReplyPacket(command.unit, ResponseStatus.REFERENCE_ADDRESS_ERROR, command.address, command.data)
         if command.data:
-            return Reply(command.unit, ResponseStatus.REFERENCE_DATA_ERROR, command.address, command.data)
-        return Reply(command.unit, ResponseStatus.REFERENCE, command.address, word)
+            return ReplyPacket(command.unit, ResponseStatus.REFERENCE_DATA_ERROR, command.address, command.data)
+        return ReplyPacket(command.unit, ResponseStatus.REFERENCE, command.address, word)
 
-    def _string(self, command: Command) -> bytes:
+    def _string(self, command: CommandPacket) -> bytes:
         data = self._memory(command.address, self._byte_count(command.data))
         if isinstance(data, ResponseStatus):
-            return Reply(command.unit, data, command.address, command.data).encode()
+            return ReplyPacket(command.unit, data, command.address, command.data).encode()
         return string_reply(command, data, self.variant.string_checksum)
 
     def _byte_count(self, count: int) -> int:
@@ -189,7 +189,7 @@ class SimulatedUnit:
         return ResponseStatus.STRING_ADDRESS_ERROR
 
 
-def string_reply(command: Command, data: bytes, variant: StringChecksum) -> bytes:
+def string_reply(command: CommandPacket, data: bytes, variant: StringChecksum) -> bytes:
     """Return the answer to a string reference in one of the ways that the manual allows."""
     body = data.hex().upper().encode("ascii")
     header = command.encode()[1:11]

@@ -13,7 +13,7 @@ import numpy as np
 
 from ldcnd.bench.tuning.ldcn.identify import Identified
 from ldcnd.bench.tuning.ldcn.plant import FULL_PWM, Plant
-from ldcnd.bench.tuning.ldcn.response import Figures, Move, Response, figures, simulate
+from ldcnd.bench.tuning.ldcn.response import Figures, Response, TrapezoidMove, figures, simulate
 from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import Profile
@@ -170,7 +170,7 @@ def _pid(
     return kp, kp * ratio, 256 * kp * integral_share * omega * tick_s
 
 
-def propose(profile: Profile, known: Identified, move: Move, bandwidth_hz: float | None = None) -> Proposal:
+def propose(profile: Profile, known: Identified, move: TrapezoidMove, bandwidth_hz: float | None = None) -> Proposal:
     """Return the gains with which the move settles soonest on the worst of the plants that this one may be.
 
     Args:
@@ -218,7 +218,7 @@ def stiff_gains(profile: Profile, known: Identified) -> Gains:
 def _better(
     profile: Profile,
     known: Identified,
-    move: Move,
+    move: TrapezoidMove,
     way: tuple[float, float, float],
     best: tuple[float, Proposal] | None,
 ) -> tuple[float, Proposal] | None:
@@ -265,20 +265,20 @@ def _edges(known: Identified) -> tuple[Plant, ...]:
     )
 
 
-def duration_s(move: Move) -> float:
+def duration_s(move: TrapezoidMove) -> float:
     """Return the time for a move and its settling, seconds."""
     way, rate = abs(move.distance_counts), move.acceleration_counts_per_s2
     peak = min(move.speed_counts_per_s, math.sqrt(way * rate))
     return way / peak + peak / rate + PREDICTED_S
 
 
-def figures_of(run: Response, move: Move) -> Figures:
+def figures_of(run: Response, move: TrapezoidMove) -> Figures:
     """Return the figures of a simulated move."""
     window = max(WINDOW_COUNTS, WINDOW_SHARE * abs(move.distance_counts))
     return figures(run.times_s, run.positions, run.commanded, window)
 
 
-def within_authority(plant: Plant, move: Move) -> Move:
+def within_authority(plant: Plant, move: TrapezoidMove) -> TrapezoidMove:
     """Return a move of the same distance that needs no more than half of the output."""
     spare = MOST_OUTPUT / 2 - plant.friction_pwm - abs(plant.load_pwm)
     if spare <= 0:

@@ -44,7 +44,7 @@ LOST_PWM = 0.5
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
+class SeenPosition:
     """One published position.
 
     Attributes:
@@ -103,10 +103,10 @@ class EffortMeter:
     def restart(self) -> None:
         """Begin anew: the loop was opened, or samples are missing; the drive's integral begins at 0 when it closes."""
         self._total = 0.0
-        self._rest = deque[tuple[Seen, float]]()  # the last samples at rest, with the integral sum
-        self._motion: list[tuple[Seen, float]] = []
+        self._rest = deque[tuple[SeenPosition, float]]()  # the last samples at rest, with the integral sum
+        self._motion: list[tuple[SeenPosition, float]] = []
         self._still = STILL_COUNTS
-        self._stood: tuple[Seen, float] | None = None  # since when it stands
+        self._stood: tuple[SeenPosition, float] | None = None  # since when it stands
 
     @property
     def resting_pwm(self) -> float | None:
@@ -122,7 +122,7 @@ class EffortMeter:
         ]
         return min(*map(abs, outputs), gains.ol)
 
-    def take(self, seen: Seen) -> Effort | None:
+    def take(self, seen: SeenPosition) -> Effort | None:
         """Take the next position with the loop closed; return what a motion has shown that has just ended."""
         before = self._motion[-1] if self._motion else self._rest[-1] if self._rest else None
         if before is not None:
@@ -154,7 +154,7 @@ class EffortMeter:
         motion, self._motion = self._motion, []
         return self._weighed(motion)
 
-    def _weighed(self, motion: list[tuple[Seen, float]]) -> Effort | None:
+    def _weighed(self, motion: list[tuple[SeenPosition, float]]) -> Effort | None:
         times = np.array([seen.t_s for seen, _ in motion])
         counts = np.array([seen.counts for seen, _ in motion], dtype=np.float64)
         error = np.array([seen.error_counts for seen, _ in motion])

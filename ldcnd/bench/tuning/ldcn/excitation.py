@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from ldcnd.bench.tuning.ldcn.plant import FULL_PWM
-from ldcnd.bench.tuning.ldcn.response import Move, Start
+from ldcnd.bench.tuning.ldcn.response import Start, TrapezoidMove
 from ldcnd.contract.errors import DriveFault, ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import Profile
@@ -89,9 +89,11 @@ class Bounds:
     velocity_counts_per_s: float = math.inf
     acceleration_counts_per_s2: float = math.inf
 
-    def move(self, distance_counts: int, velocity_counts_per_s: float, acceleration_counts_per_s2: float) -> Move:
+    def move(
+        self, distance_counts: int, velocity_counts_per_s: float, acceleration_counts_per_s2: float
+    ) -> TrapezoidMove:
         """Return a move no faster than this axis may go."""
-        return Move(
+        return TrapezoidMove(
             distance_counts,
             min(velocity_counts_per_s, self.velocity_counts_per_s),
             min(acceleration_counts_per_s2, self.acceleration_counts_per_s2),
@@ -112,13 +114,13 @@ class Trial:
 
     purpose: Purpose
     gains: Gains
-    move: Move
+    move: TrapezoidMove
     start: Start
     lasts_s: float
 
 
 @dataclass(frozen=True, slots=True)
-class Record:
+class MoveRecord:
     """The trace of one move that began at standstill.
 
     Attributes:
@@ -130,7 +132,7 @@ class Record:
     """
 
     gains: Gains
-    move: Move
+    move: TrapezoidMove
     start: Start
     times_s: tuple[float, ...]
     positions: tuple[int, ...]
@@ -147,7 +149,7 @@ class Record:
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class TrialOutcome:
     """What became of a trial.
 
     Attributes:
@@ -156,12 +158,12 @@ class Shown:
         rest_counts: where the axis came to rest, from where it stood before.
     """
 
-    record: Record
+    record: MoveRecord
     tripped: bool
     rest_counts: int
 
 
-Trials = Generator[Trial, Shown, tuple[Record, ...]]
+Trials = Generator[Trial, TrialOutcome, tuple[MoveRecord, ...]]
 
 
 class Excitation:
@@ -284,7 +286,7 @@ class Excitation:
                 el=reach * 4 // 3,
                 sr=1,
             )
-            records: list[Record] = []
+            records: list[MoveRecord] = []
             rests = True
             for distance in self._there_and_back(reach):
                 move = self._bounds.move(distance, 100.0 * reach, 100_000.0 * reach)
@@ -329,12 +331,12 @@ class Excitation:
             records.append(shown.record)
         return tuple(records)
 
-    def wanted(self) -> Move:
+    def wanted(self) -> TrapezoidMove:
         """Return the test move: half of the distance, as fast as the axis may go and a model still has to allow."""
         distance = self._bounds.within_counts // 2
         return self._bounds.move(distance, 40.0 * distance, 800.0 * distance)
 
-    def test(self, gains: Gains, move: Move, lasts_s: float) -> Trials:
+    def test(self, gains: Gains, move: TrapezoidMove, lasts_s: float) -> Trials:
         """Make the test move there and back; ends early where the drive gives up.
 
         Args:
@@ -358,7 +360,7 @@ class Excitation:
         first = -distance if self.offset_counts > 0 else distance
         return first, -first
 
-    def _trial(self, purpose: Purpose, gains: Gains, move: Move, lasts_s: float) -> Trial:
+    def _trial(self, purpose: Purpose, gains: Gains, move: TrapezoidMove, lasts_s: float) -> Trial:
         stands, ends = self.offset_counts, self.offset_counts + move.distance_counts
         if max(abs(stands), abs(ends)) > self._bounds.within_counts:
             raise DriveFault(
@@ -370,7 +372,7 @@ class Excitation:
             )
         return Trial(purpose, gains, move, Start(0, self._slack), lasts_s)
 
-    def _account(self, shown: Shown) -> int:
+    def _account(self, shown: TrialOutcome) -> int:
         """Note where the axis has been and is now; return how far it was from where it stood, signed."""
         positions = (*shown.record.positions, shown.rest_counts)
         gone = max(positions, key=abs)

@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ldcnd.bench.tuning.ldcn.excitation import Record
+from ldcnd.bench.tuning.ldcn.excitation import MoveRecord
 from ldcnd.bench.tuning.ldcn.plant import LEAST_DAMPING_PER_S, Plant
-from ldcnd.bench.tuning.ldcn.response import Floats, Move, simulate
+from ldcnd.bench.tuning.ldcn.response import Floats, TrapezoidMove, simulate
 from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.drives.ldcn.profiles import Profile
 
@@ -59,7 +59,7 @@ class Identified:
     left_counts: float
 
 
-def identify(profile: Profile, records: Sequence[Record], near: Plant | None = None) -> Identified:
+def identify(profile: Profile, records: Sequence[MoveRecord], near: Plant | None = None) -> Identified:
     """Return the plant under which the drive's law makes these records.
 
     Args:
@@ -84,10 +84,10 @@ def identify(profile: Profile, records: Sequence[Record], near: Plant | None = N
         plant, begun = _regression(profile, records)
     else:
         plant, begun = near, [begin_s(profile, near, record) for record in records]
-    return _Fit(profile, records).solve(plant, begun)
+    return _PlantFit(profile, records).solve(plant, begun)
 
 
-def begin_s(profile: Profile, plant: Plant, record: Record) -> float:
+def begin_s(profile: Profile, plant: Plant, record: MoveRecord) -> float:
     """Return when a move must have begun for this plant to follow it so."""
     span_s = record.times_s[-1] - record.times_s[0]
     run = simulate(profile, plant, record.gains, record.move, span_s, record.start)
@@ -102,7 +102,7 @@ def begin_s(profile: Profile, plant: Plant, record: Record) -> float:
 # -- the regression ------------------------------------------------------------------------------------------------
 
 
-def _regression(profile: Profile, records: Sequence[Record]) -> tuple[Plant, list[float]]:
+def _regression(profile: Profile, records: Sequence[MoveRecord]) -> tuple[Plant, list[float]]:
     """Return a first estimate, and when each move began on the clock of its record."""
     lates = [_offsets(record) for record in records]
     best: tuple[float, list[float], Floats] | None = None
@@ -152,14 +152,14 @@ def _solved(rows: Sequence[tuple[Floats, Floats, Floats]]) -> tuple[Floats, floa
         kept.remove(below[0])
 
 
-def _offsets(record: Record) -> list[float]:
+def _offsets(record: MoveRecord) -> list[float]:
     """Return when a move can have begun: before its first count, and not long before."""
     first = next(n for n, at in enumerate(record.positions) if abs(at - record.positions[0]) > 1)
     seen_s = record.times_s[first]
     return [seen_s - n * LATE_STEP_S for n in range(int(MOST_LATE_S / LATE_STEP_S))]
 
 
-def _rows(profile: Profile, record: Record, begun_s: float) -> tuple[Floats, Floats, Floats]:
+def _rows(profile: Profile, record: MoveRecord, begun_s: float) -> tuple[Floats, Floats, Floats]:
     """Return what acceleration, damping, friction and load add to the position until each instant, it, and these.
 
     They are of the way from the first visible motion to the farthest place: there the speed has one sign.
@@ -190,7 +190,7 @@ def _rows(profile: Profile, record: Record, begun_s: float) -> tuple[Floats, Flo
     return np.column_stack(columns), way, times[part] - times[part][0]
 
 
-def _command(times: Floats, move: Move) -> Floats:
+def _command(times: Floats, move: TrapezoidMove) -> Floats:
     """Return the commanded positions of a trapezoid, 0 before it."""
     way, top, rate = abs(move.distance_counts), move.speed_counts_per_s, move.acceleration_counts_per_s2
     peak = min(top, math.sqrt(way * rate))
@@ -206,7 +206,7 @@ def _command(times: Floats, move: Move) -> Floats:
 # -- the fit -------------------------------------------------------------------------------------------------------
 
 
-class _Fit:
+class _PlantFit:
     """Levenberg-Marquardt over the values of a plant and the begin of each record.
 
     Values: logarithms of acceleration and damping, friction, load, delay in servo cycles, backlash, then the begins.
@@ -215,7 +215,7 @@ class _Fit:
 
     steps = (0.03, 0.1, 0.2, 0.2, 0.5, 1.0)
 
-    def __init__(self, profile: Profile, records: Sequence[Record]) -> None:
+    def __init__(self, profile: Profile, records: Sequence[MoveRecord]) -> None:
         self._profile = profile
         self._records = records
         self._cycle_s = profile.servo_cycle_s
@@ -258,7 +258,7 @@ class _Fit:
             float(values[5]),
         )
 
-    def _each(self, values: Floats, what: Callable[[Record, Floats, Floats, float], Floats]) -> list[Floats]:
+    def _each(self, values: Floats, what: Callable[[MoveRecord, Floats, Floats, float], Floats]) -> list[Floats]:
         plant = self._plant(values)
         out = []
         for record, begun in zip(self._records, values[len(self.steps) :], strict=True):
@@ -268,7 +268,7 @@ class _Fit:
         return out
 
     def _differences(self, values: Floats) -> Floats:
-        def of(record: Record, times: Floats, positions: Floats, begun: float) -> Floats:
+        def of(record: MoveRecord, times: Floats, positions: Floats, begun: float) -> Floats:
             at = np.asarray(record.times_s) - begun
             return np.asarray(np.interp(at, times, positions, left=positions[0]) - record.positions)
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from ldcnd.bench.tuning.ldcn.plan import Plan
 from ldcnd.bench.tuning.ldcn.response import Figures, Floats
-from ldcnd.bench.tuning.ldcn.session import Findings, Verified, registers_of
+from ldcnd.bench.tuning.ldcn.session import Findings, VerifiedMove, registers_of
 from ldcnd.bench.tuning.ldcn.verdict import Measured, worst
 from ldcnd.contract.frozen import Frozen
 
@@ -122,7 +122,7 @@ def plan_reported(planned: Plan) -> TuningPlan:
     )
 
 
-def reported(found: Findings, verified: Verified | None = None) -> TuningReport:
+def reported(found: Findings, verified: VerifiedMove | None = None) -> TuningReport:
     """Return everything that was found out, as one document."""
     planned, plant, spread = found.plan, found.known.plant, found.known.interval
     info = planned.info
@@ -161,7 +161,7 @@ def reported(found: Findings, verified: Verified | None = None) -> TuningReport:
     )
 
 
-def curves_of(found: Findings, verified: Verified | None = None) -> tuple[MoveCurve, ...]:
+def curves_of(found: Findings, verified: VerifiedMove | None = None) -> tuple[MoveCurve, ...]:
     """Return the first way of each test move: measured with the old gains, with the new ones, predicted, commanded."""
     drawn = [("old gains, measured", move, move.positions) for move in found.before[:1]]
     for move in verified.after[:1] if verified else ():

@@ -21,7 +21,7 @@ REST_CYCLES = 40
 
 
 @dataclass(frozen=True, slots=True)
-class Move:
+class TrapezoidMove:
     """A trapezoidal move, as commanded.
 
     Attributes:
@@ -76,7 +76,7 @@ def simulate(
     profile: Profile,
     plant: Plant | MotorPlant,
     gains: Gains,
-    move: Move,
+    move: TrapezoidMove,
     duration_s: float,
     start: Start | None = None,
     coasting_s: float = 0.0,

@@ -12,10 +12,18 @@ from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 
 from ldcnd.bench.tuning.ldcn.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
-from ldcnd.bench.tuning.ldcn.excitation import MOST_ERROR_LIMIT, Excitation, Purpose, Record, Shown, Trial, Trials
+from ldcnd.bench.tuning.ldcn.excitation import (
+    MOST_ERROR_LIMIT,
+    Excitation,
+    MoveRecord,
+    Purpose,
+    Trial,
+    TrialOutcome,
+    Trials,
+)
 from ldcnd.bench.tuning.ldcn.identify import Identified, identify
 from ldcnd.bench.tuning.ldcn.plan import Plan, check_as_planned, check_off
-from ldcnd.bench.tuning.ldcn.response import Move, simulate
+from ldcnd.bench.tuning.ldcn.response import TrapezoidMove, simulate
 from ldcnd.bench.tuning.ldcn.verdict import MOST_MEASURED_OVERSHOOT, SAME_S, Measured, measured, objection, worst
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import (
@@ -83,13 +91,13 @@ class Findings:
     old: dict[str, int]
     known: Identified
     proposal: Proposal
-    move: Move
+    move: TrapezoidMove
     before: tuple[Measured, ...]
     farthest_counts: int
 
 
 @dataclass(frozen=True, slots=True)
-class Verified:
+class VerifiedMove:
     """The test move with the proposed gains.
 
     Attributes:
@@ -144,7 +152,7 @@ async def measure(client: RigClient, planned: Plan, bandwidth_hz: float | None, 
     return Findings(planned, kept.gains, known, proposal, move, before, farthest_counts)
 
 
-async def verify(client: RigClient, found: Findings, tell: Tell) -> Verified:
+async def verify(client: RigClient, found: Findings, tell: Tell) -> VerifiedMove:
     """Load the proposed gains and make the test move; they stay if it is at least as good as before.
 
     The axis is off afterwards, with the new gains or with the old ones.
@@ -165,7 +173,7 @@ async def verify(client: RigClient, found: Findings, tell: Tell) -> Verified:
             forget(kept)
         else:
             await restore(axis, kept)
-    return Verified(after, why, excitation.farthest_counts)
+    return VerifiedMove(after, why, excitation.farthest_counts)
 
 
 @asynccontextmanager
@@ -239,21 +247,21 @@ class _Trials:
         self._old = old
         self.interval_s = FIRST_INTERVAL_S
 
-    async def run(self, trials: Trials) -> tuple[Record, ...]:
+    async def run(self, trials: Trials) -> tuple[MoveRecord, ...]:
         """Carry out all trials of a kind; return what they lead to."""
         try:
             trial = next(trials)
             while True:
                 trial = trials.send(await self._try(trial))
         except StopIteration as end:
-            records: tuple[Record, ...] = end.value
+            records: tuple[MoveRecord, ...] = end.value
             return records
 
-    def measured(self, known: Identified, records: Sequence[Record]) -> tuple[Measured, ...]:
+    def measured(self, known: Identified, records: Sequence[MoveRecord]) -> tuple[Measured, ...]:
         """Return test moves beside what the model says."""
         return tuple(measured(self._plan.profile, known.plant, record) for record in records)
 
-    async def _try(self, trial: Trial) -> Shown:
+    async def _try(self, trial: Trial) -> TrialOutcome:
         axis, counts_per_unit = self._axis, self._plan.counts_per_unit
         from_counts = await self.rest_counts()
         await axis.set_gains(**registers_of(trial.gains, self._old), lent=True)
@@ -291,7 +299,7 @@ class _Trials:
             acceleration_counts_per_s2=per_unit * (motion.reply.acceleration or 0.0),
         )
         times, positions = _until_rest(trace, from_counts)
-        return Shown(Record(trial.gains, move, trial.start, times, positions), tripped, rest_counts)
+        return TrialOutcome(MoveRecord(trial.gains, move, trial.start, times, positions), tripped, rest_counts)
 
     async def offset_counts(self) -> int:
         """Return where the axis stands, from where it stood when this was planned and agreed to, in counts.
@@ -361,7 +369,7 @@ def _as_allowed(gains: Gains, old: dict[str, int]) -> Gains:
     return replace(gains, ol=min(gains.ol, old["ol"]), el=min(gains.el, MOST_ERROR_LIMIT))
 
 
-def _is_worth_a_try(profile: Profile, known: Identified, gains: Gains, move: Move) -> bool:
+def _is_worth_a_try(profile: Profile, known: Identified, gains: Gains, move: TrapezoidMove) -> bool:
     """Tell whether the model lets the old gains make the test move: a loop that rings is not tried on a machine."""
     run = simulate(profile, known.plant, replace(gains, cl=0), move, duration_s(move))
     shown = figures_of(run, move)

@@ -18,7 +18,7 @@ from enum import StrEnum
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from ldcnd.bench.tuning.ldcn.effort import LEAST_COUNTS, Effort, EffortMeter, Seen
+from ldcnd.bench.tuning.ldcn.effort import LEAST_COUNTS, Effort, EffortMeter, SeenPosition
 from ldcnd.bench.tuning.ldcn.plant import Plant
 from ldcnd.contract.samples import FigureRange
 from ldcnd.drives.driver import Gains
@@ -74,7 +74,7 @@ UNITS = {FigureName.FRICTION: "PWM steps", FigureName.INERTIA: "of the model's",
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
+class MotionFigure:
     """One figure of one motion.
 
     Attributes:
@@ -105,7 +105,7 @@ class Learnt:
         return self.value + self.per_speed * speed_counts_per_s
 
 
-class Alarm(FigureRange):
+class FigureAlarm(FigureRange):
     """A figure has left what was learnt, or is back."""
 
     figure: FigureName
@@ -127,12 +127,12 @@ class Alarm(FigureRange):
         return self.value > self.high or (self.low is not None and self.value < self.low)
 
 
-class Memory(BaseModel):
+class LearnedFigures(BaseModel):
     """What has been learnt of an axis, for as long as its plant and its gains are the same; it grows."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, validate_assignment=True)
 
-    teaching: dict[FigureName, list[Shown]] = Field(default_factory=dict)
+    teaching: dict[FigureName, list[MotionFigure]] = Field(default_factory=dict)
     """Figures of the motions that teach, until there are enough."""
     learnt: dict[FigureName, Learnt] = Field(default_factory=dict)
     """What followed from them."""
@@ -159,12 +159,12 @@ class Shadow:
         trend: the mean of each figure over the shorter window, with its limits.
     """
 
-    def __init__(self, profile: Profile, plant: Plant, gains: Gains, memory: Memory | None = None) -> None:
-        self.memory = memory or Memory()
+    def __init__(self, profile: Profile, plant: Plant, gains: Gains, memory: LearnedFigures | None = None) -> None:
+        self.memory = memory or LearnedFigures()
         self.motions = 0
         self.unlike = 0
-        self.standing: dict[FigureName, Alarm] = {}
-        self.trend: dict[FigureName, Alarm] = {}
+        self.standing: dict[FigureName, FigureAlarm] = {}
+        self.trend: dict[FigureName, FigureAlarm] = {}
         self._meter = EffortMeter(profile, plant, gains)
         self._friction_pwm = plant.friction_pwm
         self._needed_pwm = plant.friction_pwm + abs(plant.load_pwm)
@@ -180,7 +180,7 @@ class Shadow:
         """Whether any figure still has too few motions to be judged."""
         return len(self.memory.learnt) < len(OF_MOTIONS)
 
-    def take(self, seen: Seen) -> tuple[Alarm, ...]:
+    def take(self, seen: SeenPosition) -> tuple[FigureAlarm, ...]:
         """Take the next position with the loop closed; return what began or ended with it."""
         effort = self._meter.take(seen)
         stalled = self._stalled(seen)
@@ -191,7 +191,7 @@ class Shadow:
         self._meter.restart()
         self._before = None
 
-    def _stalled(self, seen: Seen) -> tuple[Alarm, ...]:
+    def _stalled(self, seen: SeenPosition) -> tuple[FigureAlarm, ...]:
         """Return an alarm for an output that should have moved the axis, at a place where none was before."""
         name, pwm = FigureName.OUTPUT_AT_REST, self._meter.resting_pwm
         if pwm is None or pwm < self._stalls_pwm:
@@ -201,7 +201,7 @@ class Shadow:
         places = standing.places if standing else ()
         if len(places) == MOST_PLACES or any(abs(seen.counts - place) < LEAST_COUNTS for place in places):
             return ()
-        alarm = Alarm(
+        alarm = FigureAlarm(
             figure=name,
             value=pwm,
             latest=pwm,
@@ -216,7 +216,7 @@ class Shadow:
         self.standing[name] = self.trend[name] = alarm
         return (alarm,)
 
-    def _moved(self) -> tuple[Alarm, ...]:
+    def _moved(self) -> tuple[FigureAlarm, ...]:
         """Return the end of such an alarm after enough motions without one."""
         self._since_stall += 1
         if FigureName.OUTPUT_AT_REST not in self.standing or self._since_stall < WINDOWS[0]:
@@ -225,7 +225,7 @@ class Shadow:
         alarm = self.standing.pop(FigureName.OUTPUT_AT_REST)
         return (alarm.model_copy(update={"over": True}),)
 
-    def _judged(self, effort: Effort) -> tuple[Alarm, ...]:
+    def _judged(self, effort: Effort) -> tuple[FigureAlarm, ...]:
         shown = {FigureName.INERTIA: effort.inertia, FigureName.MISFIT: effort.left_pwm}
         before, self._before = self._before, effort
         if before is not None and before.way_counts * effort.way_counts < 0:
@@ -242,10 +242,10 @@ class Shadow:
         if self.is_learning:
             memory.speeds = _widened(memory.speeds, effort.top_counts_per_s)
             memory.ways = _widened(memory.ways, way)
-        alarms = [self._take(name, Shown(value, effort.top_counts_per_s)) for name, value in shown.items()]
+        alarms = [self._take(name, MotionFigure(value, effort.top_counts_per_s)) for name, value in shown.items()]
         return (*self._moved(), *(alarm for alarm in alarms if alarm))
 
-    def _take(self, name: FigureName, shown: Shown) -> Alarm | None:
+    def _take(self, name: FigureName, shown: MotionFigure) -> FigureAlarm | None:
         learnt = self.memory.learnt.get(name)
         if learnt is None:
             teaching = self.memory.teaching.setdefault(name, [])
@@ -284,14 +284,14 @@ class Shadow:
             case _:
                 return LEAST_MISFIT_PWM
 
-    def _mean(self, name: FigureName, learnt: Learnt, window: int) -> Alarm:
+    def _mean(self, name: FigureName, learnt: Learnt, window: int) -> FigureAlarm:
         """Return the mean of the last motions with its limits."""
         off, usual = (float(np.mean(list(each)[-window:])) for each in (self._off[name], self._usual[name]))
         # what was learnt has an error of its own
         error = learnt.sigma * float(np.sqrt(NEIGHBOURS * (1 / window + 1 / LEARNT_MOTIONS)))
         limit = max(STANDARD_ERRORS * error, self._least(name))
         low = usual - limit if name is not FigureName.MISFIT else None
-        return Alarm(
+        return FigureAlarm(
             figure=name,
             value=usual + off,
             latest=float(np.median(self._latest[name])),
@@ -312,7 +312,7 @@ def _widened(taught: tuple[float, float], value: float) -> tuple[float, float]:
     return (min(taught[0] or value, value), max(taught[1], value))
 
 
-def _learnt(teaching: list[Shown]) -> Learnt:
+def _learnt(teaching: list[MotionFigure]) -> Learnt:
     """Return what is usual: a line over the speed, without what is far from it."""
     speeds = np.array([shown.speed_counts_per_s for shown in teaching])
     values = np.array([shown.value for shown in teaching])

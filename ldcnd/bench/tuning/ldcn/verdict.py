@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ldcnd.bench.tuning.ldcn.design import WINDOW_COUNTS, WINDOW_SHARE
-from ldcnd.bench.tuning.ldcn.excitation import BOTH_WAYS, Record
+from ldcnd.bench.tuning.ldcn.excitation import BOTH_WAYS, MoveRecord
 from ldcnd.bench.tuning.ldcn.identify import begin_s
 from ldcnd.bench.tuning.ldcn.plant import Plant
 from ldcnd.bench.tuning.ldcn.response import Figures, Floats, figures, simulate
@@ -36,7 +36,7 @@ class Measured:
     figures: Figures
 
 
-def measured(profile: Profile, plant: Plant, record: Record) -> Measured:
+def measured(profile: Profile, plant: Plant, record: MoveRecord) -> Measured:
     """Lay a trace beside the model's prediction of it."""
     begun_s = begin_s(profile, plant, record)
     times = np.asarray(record.times_s) - begun_s

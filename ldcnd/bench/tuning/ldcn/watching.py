@@ -7,10 +7,10 @@ from pathlib import Path
 import pydantic
 
 from ldcnd import durable
-from ldcnd.bench.tuning.ldcn.effort import FEWEST_SAMPLES, Seen
+from ldcnd.bench.tuning.ldcn.effort import FEWEST_SAMPLES, SeenPosition
 from ldcnd.bench.tuning.ldcn.plant import Plant
 from ldcnd.bench.tuning.ldcn.report import TuningReport
-from ldcnd.bench.tuning.ldcn.shadow import LEARNT_MOTIONS, Alarm, FigureName, Memory, Shadow
+from ldcnd.bench.tuning.ldcn.shadow import LEARNT_MOTIONS, FigureAlarm, FigureName, LearnedFigures, Shadow
 from ldcnd.client.kept_gains import file_of, gains_in
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import ReportShadow
@@ -35,7 +35,7 @@ Show = Callable[["ShadowAlarm"], None]
 Tell = Callable[[str], None]
 
 
-class ShadowAlarm(Alarm):
+class ShadowAlarm(FigureAlarm):
     """What `ldcnd shadow` says when an axis takes more or less than it has learnt, and when that is over."""
 
     axis: str
@@ -46,7 +46,7 @@ class ShadowAlarm(Alarm):
     """What may be behind it."""
 
 
-class KeptMemory(Memory):
+class KeptMemory(LearnedFigures):
     """What was learnt of an axis, as it is on the disk."""
 
     rig: str
@@ -209,7 +209,7 @@ class WatchedAxis:
         was_learning = shadow.is_learning
         error_counts = sample.following_error * self._counts_per_unit
         self._latest_t = sample.t
-        for alarm in shadow.take(Seen(sample.t / 1e9, sample.counts, error_counts)):
+        for alarm in shadow.take(SeenPosition(sample.t / 1e9, sample.counts, error_counts)):
             self._show(self._reported(alarm, sample.t))
         if was_learning and (not shadow.is_learning or shadow.motions >= self._kept_at + KEEP_MOTIONS):
             self._kept_at = shadow.motions
@@ -252,7 +252,7 @@ class WatchedAxis:
             t=self._latest_t, learning=shadow.is_learning, judged=shadow.motions, figures=tuple(figures)
         )
 
-    def _reported(self, alarm: Alarm, t: int) -> ShadowAlarm:
+    def _reported(self, alarm: FigureAlarm, t: int) -> ShadowAlarm:
         more = alarm.latest >= alarm.usual
         return ShadowAlarm(
             axis=self.name, t=t, meaning=meaning(alarm.figure, more=more, places=alarm.places), **dict(alarm)
