@@ -20,13 +20,14 @@ SUBJECTS = (
         "bus", "line", "poller", "proof", "queue", "resync", "settings", "transaction", "wire",
     )),
     *(f"ldcnd/drives/ldcn/{name}.py" for name in (
-        "addressing", "adoption", "commands", "controls", "faults", "groups", "io_module", "network", "packet", "path",
-        "received", "record", "registers", "servo", "trajectory",
+        "addressing", "adoption", "commands", "controls", "faults", "gathering", "groups", "io_module", "network",
+        "packet", "path", "received", "record", "registers", "servo", "trajectory",
     )),
     *(f"ldcnd/drives/smartstep/{name}.py" for name in (
         "commands", "drive", "ledger", "modes", "monitors", "network", "packet", "parameter_store", "parameters",
         "trace", "trace_check", "trace_result", "transfer", "words",
     )),
+    "ldcnd/client/own_samples.py", "ldcnd/contract/condition.py", "ldcnd/contract/number_text.py",
     "ldcnd/net/hand_over.py", "ldcnd/net/reads.py",
 )  # fmt: skip
 """Admission, authority, ledger, guards, planner, tracker, policies, procedures, lines, status decoding, parameters."""
