@@ -633,12 +633,7 @@ class AxisTracker:
         """The active command is over: done, settled or not, or ended as `error` says."""
         error = error or self._failure
         self._end(CommandStatus.FAILED if error else CommandStatus.DONE, error, settled=settled)
-        self._rests()
-
-    def _rests(self) -> None:
-        """Show that nothing is commanded; only `cleared` leads out of error_stop."""
-        if self.state is not AxisState.ERROR_STOP:
-            self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
+        self.state = AxisState.STANDSTILL if self.enabled else AxisState.DISABLED
 
     def latch_stop(self) -> None:
         """Latch a stop: nothing moves again before reset."""
@@ -696,7 +691,8 @@ class AxisTracker:
         self._end(CommandStatus.ABORTED, "aborted by power")
         self.enabled = on
         self._rest.forget(rests=True if on else None, commanded=on)
-        self._rests()
+        if self.state is not AxisState.ERROR_STOP:
+            self.state = AxisState.STANDSTILL if on else AxisState.DISABLED
 
     def switched(self, *, on: bool, now_s: float) -> None:
         """The loop was opened or closed in the course of a command, which goes on."""

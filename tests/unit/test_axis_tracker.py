@@ -156,15 +156,6 @@ def test_a_drive_fault_ends_the_move_and_keeps_the_first_cause(moving):
     assert (moving.first_fault.code, moving.first_fault.since) == ("overheat", 111)
 
 
-@pytest.mark.parametrize("error", [None, "the line failed"])
-def test_no_end_of_a_command_leads_out_of_error_stop(moving, error):
-    moving.observed(replace(OFF, faults=(OVERHEAT,)), at(2.5), 111)
-
-    moving.finished(error)
-
-    assert moving.state is AxisState.ERROR_STOP
-
-
 def test_a_loop_that_opens_by_itself_is_a_fault(moving):
     moving.observed(OFF, at(2.5), 0)
 
