@@ -374,18 +374,15 @@ class Addressing:
         for _ in range(2):
             await self._bus.execute(reset)
 
-    async def address_all(
-        self, expected: int, check: Callable[[Mapping[int, Identity]], object] | None = None
-    ) -> dict[int, Identity]:
+    async def address_all(self, expected: int) -> dict[int, Identity]:
         """Give the modules addresses 1, 2, ... in the order of the chain, after a reset; return who is where.
 
         Each first gets a waiting address. Only when all of these answer after the last of them was given out, each is
         held by one module, in the order of the chain: one that has restarted meanwhile left its waiting address.
 
         Args:
-            expected: number of configured modules; they are waited for as long as they may take to restart.
-            check: raises if these are not the modules of the chain. They keep their waiting addresses then: behind one
-                without power the next one is the first that answers, and would get the address of another place.
+            expected: number of configured modules; they are waited for as long as they may take to restart. Fewer keep
+                their waiting addresses: behind one without power the next one that receives is not the next place.
         """
         self.had_address.clear()
         count, until_s = 0, asyncio.get_running_loop().time() + self.rate.reset_s
@@ -397,10 +394,10 @@ class Addressing:
         for number in range(1, count + 1):
             identity = await self.rate.who_is(waiting_address(number), patient=True)
             if identity is None:
-                break
+                return modules
             modules[number] = identity
-        if check:
-            check(modules)
+        if count < expected:
+            return modules
         for number in modules:
             if not await self.move(waiting_address(number), number):
                 return {address: modules[address] for address in range(1, number)}

@@ -330,7 +330,7 @@ class LdcnNetwork(Network):
             NetworkMismatch: they are not those of the configuration.
         """
         await self._addressing.reset_all()
-        modules = await self._addressing.address_all(len(self._expected), self._compare)
+        modules = await self._addressing.address_all(len(self._expected))
         return modules, self._compare(modules)
 
     async def _all_wait(self) -> bool:
