@@ -5,13 +5,12 @@ import json
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.drives.ldcn.commands import Command
-from ldcnd.drives.ldcn.packet import PacketReader
+from ldcnd.drives.ldcn.packet import CommandCode, PacketReader
 from ldcnd.line.flight_recorder import WireEvent
 from tests.support.command_line import run_here, virtual_rig
 from tests.support.commissioning import rig_text
 
-MOVING = {Command.LOAD_TRAJECTORY, Command.START_MOTION, Command.STOP_MOTOR, Command.SET_GAIN}
+MOVING = {CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION, CommandCode.STOP_MOTOR, CommandCode.SET_GAIN}
 """Commands by which an axis could begin to move, or its loop be closed or changed."""
 
 
@@ -40,7 +39,7 @@ def sent(rig):
     for record in records:
         if record.event is WireEvent.SENT and set(record.data) != {0}:
             reader = PacketReader()
-            found += [Command(received.packet.command) for received in map(reader.feed, record.data) if received]
+            found += [CommandCode(received.packet.command) for received in map(reader.feed, record.data) if received]
     return found
 
 

@@ -9,8 +9,8 @@ ENDS = {
     "poll": ("line/line.py Line.data_received", "net/publisher.py Topic.publish"),
     "move": QUERY,
     "move of the console": (
-        "console/gate.py Gate.__call__",
-        "console/gate.py Gate.__call__.<locals>.send_with_headers",
+        "console/gate.py RequestGate.__call__",
+        "console/gate.py RequestGate.__call__.<locals>.send_with_headers",
     ),
     "trace": QUERY,
     "trace of a SmartStep": QUERY,

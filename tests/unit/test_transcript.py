@@ -56,7 +56,7 @@ def test_a_pic_io_is_not_read_as_a_servo():
     reply = transcript.describe(received(bytes.fromhex("00 f7 0f 80 86")))
 
     assert direction == "node 2: SetDirection(inputs=4087)"
-    assert pwm == "node 2: SetPwm(pwm1=128, pwm2=64)"
+    assert pwm == "node 2: SetPwmOutputs(pwm1=128, pwm2=64)"
     assert reply == "status, levels FF7, adc1 128"
 
 
