@@ -3,6 +3,7 @@
 import asyncio
 import json
 import os
+import shlex
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
@@ -12,10 +13,11 @@ from pathlib import Path
 from typing import NoReturn, TypeVar
 
 import click
+from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 from pydantic import ValidationError
 
-from ldcnd.cli.output import show_lines
+from ldcnd.cli.output import OPTIONS_TYPED, show_lines
 from ldcnd.client.lease import inherited_lease
 from ldcnd.client.rig_client import RigClient, find_rigs, on_each_rig
 from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis
@@ -185,11 +187,24 @@ def with_target(work: Callable[..., None]) -> Callable[..., None]:
     @_target_options
     @wraps(work)
     def command(**options: object) -> None:
+        OPTIONS_TYPED.set(_options_typed(click.get_current_context()))
         # click has converted the five options to the types of the fields
         target = Target(**{name: options.pop(name) for name in Target.__slots__})  # type: ignore[arg-type]
         work(target, **options)
 
     return command
+
+
+def _options_typed(context: click.Context) -> str:
+    """Return the options that name daemon and rig, as they were typed; those of the environment reach every command."""
+    words = []
+    for name, option in (("connect", "-e"), ("listen", "-l"), ("config", "--config"), ("rig", "--rig")):
+        if context.get_parameter_source(name) is ParameterSource.COMMANDLINE:
+            given = context.params[name]
+            words += [
+                f" {option} {shlex.quote(str(each))}" for each in (given if isinstance(given, tuple) else (given,))
+            ]
+    return "".join(words)
 
 
 def no_rig_answers(settings: ZenohSettings) -> SessionError:

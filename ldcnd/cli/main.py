@@ -11,7 +11,7 @@ from typing import Any, NoReturn
 
 import click
 
-from ldcnd.cli.output import DONE, EXIT_CODES, exit_code, print_under_any_encoding
+from ldcnd.cli.output import DONE, EXIT_CODES, OPTIONS_TYPED, exit_code, print_under_any_encoding
 from ldcnd.contract.errors import LdcndError
 
 _NEGATIVE = re.compile(r"^-(?=[.,]?[0-9])")
@@ -157,6 +157,7 @@ def main() -> NoReturn:
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     _pause_collector()
     print_under_any_encoding()
+    OPTIONS_TYPED.set("")
     try:
         cli.main(standalone_mode=False)
         sys.stdout.flush()

@@ -8,6 +8,7 @@ import sys
 import termios
 from collections.abc import Callable
 from contextlib import suppress
+from contextvars import ContextVar
 
 import click
 
@@ -31,6 +32,8 @@ TYPED = {
     "events": "events",
 }
 """How a command that a remedy names is typed; what is missing is `axis VERB AXIS`."""
+OPTIONS_TYPED: ContextVar[str] = ContextVar("options that name daemon and rig", default="")
+"""Those of the command that runs, as they were typed: without them what a remedy names would reach another rig."""
 
 
 def typed(step: RemedyCommand, axis: str | None) -> str:
@@ -41,8 +44,9 @@ def typed(step: RemedyCommand, axis: str | None) -> str:
         axis: what it is about; None when it is not about one axis.
     """
     words = TYPED.get(step.verb, f"axis {step.verb.replace('_', '-')} {{axis}}").format(axis=axis or "AXIS")
-    force = words.replace(" -- ", " --force -- ") if step.arguments.get("force") else words
-    return f"ldcnd {force}"
+    words, separator, program = words.partition(" -- ")
+    force = " --force" if step.arguments.get("force") else ""
+    return f"ldcnd {words}{force}{OPTIONS_TYPED.get()}{separator}{program}"
 
 
 DONE = 0

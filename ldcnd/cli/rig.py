@@ -21,18 +21,24 @@ from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.rig_commands import Rehearse, SetSpeedOverride
 from ldcnd.contract.samples import AxisState, StateSample, TelemetryItem
 
+NOT_STOPPED = "NOT stopped, use the emergency stop: "
+
 
 def stop_rig(target: Target, axis: str | None) -> None:
     """Stop one axis or all, on every rig that can be reached or the one named; say which drives have confirmed it."""
-    replies = target.run_on_each(lambda client: client.stop(axis, client=NAME))
+    try:
+        replies = target.run_on_each(lambda client: client.stop(axis, client=NAME))
+    except SessionError as error:
+        show_error(error, NOT_STOPPED)
+        sys.exit(UNREACHABLE)
     # of several rigs most have no axis of this name
     concerned = {rig: reply for rig, reply in replies.items() if not isinstance(reply, UnknownAxis)} or replies
     codes = set[int]()
     for rig, reply in concerned.items():
-        whose = f"{rig}: " if len(replies) > 1 else ""
+        whose = f"{rig}: "  # also of one: another rig, at another endpoint, has not been stopped
         if isinstance(reply, LdcndError):
             codes.add(UNREACHABLE if isinstance(reply, SessionError) else FAILED)
-            show_error(reply, f"{whose}NOT stopped, use the emergency stop: ")
+            show_error(reply, f"{whose}{NOT_STOPPED}")
             continue
         unconfirmed = sorted(set(reply.axes) - set(reply.confirmed))
         target.show(reply, f"{whose}stopped and latched: {', '.join(reply.confirmed) or 'none'}", rig=rig)
@@ -52,8 +58,8 @@ def stop_rig(target: Target, axis: str | None) -> None:
 def stop(target: Target, axis: str | None) -> None:
     """Stop AXIS, or every axis, and latch: nothing moves again before `ldcnd reset`.
 
-    Without --rig it stops on every rig that can be reached. It needs no lease and works in any state. It is no
-    emergency stop. The exit code is 0 only when all drives have confirmed it.
+    Without --rig it stops on every rig that this endpoint reaches, and names them. It needs no lease and works in any
+    state. It is no emergency stop. The exit code is 0 only when all drives have confirmed it.
     """
     stop_rig(target, axis)
 

@@ -1,6 +1,8 @@
 """What takes energy out asks no question where several rigs can be reached, on the jumping clock."""
 
 import json
+import subprocess
+import sys
 
 import pytest
 
@@ -8,6 +10,7 @@ from ldcnd.config.rig import load_config
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.samples import LinkState
 from tests.support.command_line import virtual_rig
+from tests.support.process import free_port
 from tests.support.rig import SIMULATED, running_rig
 
 
@@ -64,7 +67,7 @@ def test_a_rig_that_is_named_is_stopped_alone(two_rigs):
 
     ran = here.run("stop --rig mill")
 
-    assert (ran.code, said(ran)) == (0, ["stopped and latched: x, y, z, c"])
+    assert (ran.code, said(ran)) == (0, ["mill: stopped and latched: x, y, z, c"])
     assert [state.stop_latched for state in states(here, mill)] == [False, True]
 
 
@@ -99,3 +102,28 @@ def test_what_puts_energy_in_still_needs_the_name_of_its_rig(two_rigs):
 
     assert ran.code == 1
     assert "several rigs answer" in ran.errors
+
+
+def test_what_a_remedy_names_is_typed_with_the_options_that_led_to_its_rig(two_rigs):
+    here, mill = two_rigs
+    here.wait(mill.client.stop("x"))
+    here.wait(mill.until("x", lambda state: state.moving == "no"))
+
+    asked, refused = here.run("why x --rig mill"), here.run("axis move x 1 --rig mill")
+
+    assert "ldcnd axis reset x --rig mill" in asked.printed
+    assert "ldcnd axis reset x --rig mill" in refused.errors
+    assert here.run("axis reset x --rig mill").code == 0
+    assert [state.stop_latched for state in states(here, mill)] == [False, False]
+    assert here.wait(here.rig.client.state("x")).moving == "yes"
+
+
+@pytest.mark.real_time
+def test_a_stop_that_reaches_no_daemon_says_that_nothing_was_stopped():
+    ran = subprocess.run(  # noqa: S603
+        (sys.executable, "-m", "ldcnd", "stop", "-e", f"tcp/127.0.0.1:{free_port()}"),
+        capture_output=True, text=True, timeout=30, check=False,
+    )  # fmt: skip
+
+    assert ran.returncode == 3
+    assert ran.stderr.startswith("NOT stopped, use the emergency stop: ")

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import ldcnd
-from ldcnd.cli.output import typed
+from ldcnd.cli.output import OPTIONS_TYPED, typed
 from ldcnd.contract.codec import error_reply, rebuild_error
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import LeaseHeld, Remedy, step
@@ -28,7 +28,7 @@ PLACEHOLDERS = {
 
 
 def texts():
-    files = (path for part in ("daemon", "drivers", "client") for path in (SOURCES / part).rglob("*.py"))
+    files = (path for part in ("axis", "client", "daemon", "drives") for path in (SOURCES / part).rglob("*.py"))
     return [path.read_text(encoding="utf-8") for path in files]
 
 
@@ -65,3 +65,13 @@ def test_steps_travel_with_an_error_and_are_said_by_each_face():
         "wait until it is released, or ldcnd lease hold --axis x --force -- COMMAND"
     )
     assert typed(step("power", on=True), "x") == "ldcnd axis power x on"
+
+
+def test_options_of_the_command_stand_before_a_program_of_the_remedy():
+    token = OPTIONS_TYPED.set(" -e tcp/127.0.0.1:7448")
+    try:
+        held = typed(step("acquire", force=True), "x")
+    finally:
+        OPTIONS_TYPED.reset(token)
+
+    assert held == "ldcnd lease hold --axis x --force -e tcp/127.0.0.1:7448 -- COMMAND"
