@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 
-from ldcnd.sim.faults import FaultInjector, FaultPlan
+from ldcnd.sim.faults import FaultInjector, FaultPlan, LineFault
 
 BITS_PER_BYTE = 10
 """Start, eight data, stop (or seven data and parity)."""
@@ -203,6 +203,9 @@ class Chain:
         self.on_remark: Callable[[str], None] | None = None
         for number, module in enumerate(self.modules, 1):
             module.remark = partial(self._remark, number)
+        self._reached = self.modules
+        self._mute: set[Module] = set()
+        self._unheard: set[Module] = set()
         self._baud_check = baud_check
         self._delivery = delivery
         self._injector = FaultInjector(faults or FaultPlan())
@@ -269,6 +272,34 @@ class Chain:
         if self.on_remark:
             self.on_remark(f"module {number}: {text}")
 
+    # -- the cable ---------------------------------------------------------------------------------------------------
+
+    def cut_behind(self, place: int) -> None:
+        """Cut the cable: modules behind that place, 0 for the host's end, neither hear nor are heard, and run on."""
+        self._reached = self.modules[:place]
+        self._unheard = self._mute | set(self.modules[place:])
+
+    def join(self) -> None:
+        """Let the cable reach every module again."""
+        self.cut_behind(len(self.modules))
+
+    def mute(self, place: int, *, on: bool) -> None:
+        """Let the transmitter of the module at that place, from 1 on, fail, or work again: it hears and obeys."""
+        module = self.modules[place - 1]
+        if on:
+            self._mute.add(module)
+        else:
+            self._mute.discard(module)
+        self.cut_behind(len(self._reached))
+
+    def begin(self, fault: LineFault) -> None:
+        """Let something more go wrong on the wires, as its probability and its instants say."""
+        self._injector.begin(fault)
+
+    def end(self, fault: LineFault) -> None:
+        """Take back what `begin` or the plan has brought."""
+        self._injector.end(fault)
+
     # -- the adapter -------------------------------------------------------------------------------------------------
 
     def plugged(self, now_s: float) -> bool:
@@ -320,7 +351,7 @@ class Chain:
         self._interrupt(at_s)
         slowest, fastest = self._understood_bauds()
         hears = True
-        for module in self.modules:
+        for module in self._reached:
             if hears or module.latched:
                 module.hear(value if slowest <= module.baud <= fastest else None, at_s)
             hears = module.address_out
@@ -334,13 +365,13 @@ class Chain:
         if None in request.values:
             return False
         data = bytes(value for value in request.values if value is not None)
-        for module in self.modules:
+        for module in self._reached:
             if not (slowest <= module.baud <= fastest and module.takes_whole(data)):
                 return False
         self._requests.popleft()
         self._interrupt(request.next_at_s)
         hears = True
-        for module in self.modules:
+        for module in self._reached:
             if hears or module.latched:
                 module.hear_all(data, request.starts_at_s, request.byte_s)
             hears = module.address_out
@@ -362,6 +393,8 @@ class Chain:
         self._sweep()
 
     def _begin(self, reply: ModuleReply, module: Module) -> None:
+        if module in self._unheard:
+            return
         self.wire_busy_s += len(reply.data) * reply.byte_s
         slowest, fastest = self._understood_bauds()
         data, byte_s = reply.data, reply.byte_s

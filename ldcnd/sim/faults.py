@@ -82,6 +82,14 @@ class FaultInjector:
         self._faults = plan.faults
         self._dice = random.Random(plan.seed)  # noqa: S311 - reproducible on purpose
 
+    def begin(self, fault: LineFault) -> None:
+        """Add something to the plan."""
+        self._faults = (*self._faults, fault)
+
+    def end(self, fault: LineFault) -> None:
+        """Take it off the plan; safe to call twice."""
+        self._faults = tuple(each for each in self._faults if each is not fault)
+
     def request(self, data: bytes, at_s: float) -> FaultyRequest:
         """Return the request after its faults."""
         if not self._faults:

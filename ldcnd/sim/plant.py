@@ -81,19 +81,32 @@ class Shaft:
         velocity_counts: counts per step.
         stalled: something holds it.
         limits_actuated: both limit switches are, whatever their places.
+        reverse_stuck: the reverse limit switch stays closed (True) or open; None where it works. Likewise
+            forward_stuck, index_stuck.
         current_limited: the motor would have drawn more current in the last step than the amplifier gives.
         slack_counts: how far the motor has turned forward within the backlash, 0 to all of it.
         delay_steps: largest number of steps for which the motor goes on with the previous output.
     """
 
     def __init__(self, plant: MotorPlant, step_s: float) -> None:
-        self.plant = plant
         self.position_counts = 0.0
         self.velocity_counts = 0.0
         self.stalled = False
         self.limits_actuated = False
+        self.reverse_stuck: bool | None = None
+        self.forward_stuck: bool | None = None
+        self.index_stuck: bool | None = None
         self.current_limited = False
         self.slack_counts = 0.0
+        self._step_s = step_s
+        self._peak_a = 0.0
+        self._dice = random.Random(plant.seed)  # noqa: S311 - reproducible on purpose
+        self.become(plant)
+
+    def become(self, plant: MotorPlant) -> None:
+        """Let the machine have other constants from now on; it stays where it is and goes on as fast as it does."""
+        self.plant = plant
+        step_s = self._step_s
         self.delay_steps = math.ceil(plant.delay_s / step_s)
         whole = int(plant.delay_s / step_s)
         self._late_share = plant.delay_s / step_s - whole
@@ -101,9 +114,6 @@ class Shaft:
         self._backlash = plant.backlash_counts
         self._sixths_per_count = 6 * plant.pole_pairs / plant.counts_per_rev if plant.phase_lost else 0.0
         self._supply_v = -plant.supply_v if plant.motor_reversed else plant.supply_v
-        self._peak_v = math.inf
-        self._peak_change = 0.0
-        self._dice = random.Random(plant.seed)  # noqa: S311 - reproducible on purpose
         radians_per_count = math.tau / plant.counts_per_rev
         torque, resistance, inertia = plant.torque_nm_per_a, plant.resistance_ohm, plant.inertia_kg_m2
         counts_per_step = step_s / radians_per_count
@@ -119,9 +129,11 @@ class Shaft:
         self._change_per_a = torque / inertia * step_s * counts_per_step
         self._lowest = float(plant.reverse_limit_counts - plant.stop_margin_counts)
         self._highest = float(plant.forward_limit_counts + plant.stop_margin_counts)
+        self.limit_current(self._peak_a)
 
     def limit_current(self, peak_a: float) -> None:
         """Let the amplifier give no more than this current; 0 for no limit."""
+        self._peak_a = peak_a
         self._peak_v = peak_a * self.plant.resistance_ohm if peak_a else math.inf
         self._peak_change = peak_a * self._change_per_a
 
@@ -192,16 +204,22 @@ class Shaft:
     @property
     def on_reverse_limit(self) -> bool:
         """Whether the reverse limit switch is actuated."""
+        if self.reverse_stuck is not None:
+            return self.reverse_stuck
         return self.limits_actuated or self.position_counts <= self.plant.reverse_limit_counts
 
     @property
     def on_forward_limit(self) -> bool:
         """Whether the forward limit switch is actuated."""
+        if self.forward_stuck is not None:
+            return self.forward_stuck
         return self.limits_actuated or self.position_counts >= self.plant.forward_limit_counts
 
     @property
     def on_index(self) -> bool:
         """Whether the encoder's index is in its pulse."""
+        if self.index_stuck is not None:
+            return self.index_stuck
         plant = self.plant
         spacing = plant.index_spacing_counts or plant.counts_per_rev
         return (math.floor(self.position_counts) - plant.index_at_counts) % spacing < plant.index_width_counts
