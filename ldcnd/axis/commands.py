@@ -4,8 +4,8 @@ import math
 from dataclasses import replace
 
 from ldcnd.axis import guards
-from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import NEVER_S, Procedure
 from ldcnd.axis.procedures.analog import AnalogMove
 from ldcnd.axis.procedures.approach import ApproachMove

@@ -10,15 +10,9 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.guards import (
-    Permit,
-    QuietDrive,
-    check_acceleration,
-    check_does_not_coast,
-    check_position,
-    check_speed,
-    check_velocity,
-)
+from ldcnd.axis.guards import check_acceleration, check_does_not_coast, check_position, check_speed, check_velocity
+from ldcnd.axis.permit import Permit
+from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.state import ActiveCommand, AxisTracker, Completion, Settling, window_counts
 from ldcnd.axis.straight import LineAxis

@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 
-from ldcnd.axis.guards import Permit
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.state import AxisTracker
 from ldcnd.contract.commands import CommandReply
 from ldcnd.drives.driver import AxisReading

@@ -115,9 +115,11 @@ def build_daemon(
         for driver in bus.network.io.values()
     )
     rig = OwnedRig(config.rig, buses, groups, modules)
-    latches = LatchKeeper(kept, {name: axis.tracker for name, axis in rig.axes.items() if axis.stoppable}, clock.now_ns)
+    latches = LatchKeeper(
+        kept, {name: axis.tracker for name, axis in rig.axes.items() if axis.stops.possible}, clock.now_ns
+    )
     for each in rig.axes.values():
-        each.latches = latches
+        each.stops.latches = latches
     authority = Authority(rig.axes, required=config.authority == "leased", next_token=next_token)
     dispatcher = Dispatcher(rig, authority, ledger, events, clock, instance)
 

@@ -138,7 +138,7 @@ class Daemon:
             leases.group = group
             requests = Requests(self.rig, self._keys, group, self._dispatcher)
             for each in self.rig.axes.values():
-                each.returned = partial(self._returned, each, group)
+                each.readings.returned = partial(self._returned, each, group)
             serving: list[asyncio.Task[None]] = []
             try:
                 await self._declare_stops(declared, requests)

@@ -12,7 +12,7 @@ from functools import partial
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.guards import UNCONDITIONAL, Permit, Right
+from ldcnd.axis.permit import UNCONDITIONAL, Permit, Right
 from ldcnd.contract.catalogue import BY_VERB, RENAMED
 from ldcnd.contract.codec import decode, encode, reply_encoding, to_json, understand
 from ldcnd.contract.commands import (
@@ -243,7 +243,7 @@ class Requests:
         except Exception:
             log.exception("stop not recorded", key=query.key)  # it is carried out all the same
         confirmed = await self._stop_once(names, query)
-        kept = tuple(each for each in names if self._rig.axes[each].latch_is_kept)
+        kept = tuple(each for each in names if self._rig.axes[each].stops.latch_is_kept)
         return StopReply(axes=names, confirmed=confirmed, kept=kept)
 
     async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
@@ -260,7 +260,7 @@ class Requests:
                 return confirmed
             # a reset that was under way has taken the latch from this stop
         for axis in (self._rig.axes[name] for name in names):
-            if axis.stoppable:
+            if axis.stops.possible:
                 axis.tracker.latch_stop()  # at once, for requests of this same loop iteration
         own: asyncio.Future[tuple[str, ...]] = asyncio.get_running_loop().create_future()
         under_way.append(own)
@@ -290,7 +290,7 @@ class Requests:
 
     def _are_latched(self, names: tuple[str, ...]) -> bool:
         axes = (self._rig.axes[name] for name in names)
-        return all(axis.tracker.stop_latched or not axis.stoppable for axis in axes)
+        return all(axis.tracker.stop_latched or not axis.stops.possible for axis in axes)
 
     def _refuse(self, query: Query, error: LdcndError) -> None:
         if query.answered:
@@ -460,7 +460,7 @@ class Dispatcher:
         """
         for name in names:
             status, reason = CommandStatus.DONE, None
-            if not self._rig.axes[name].stoppable:
+            if not self._rig.axes[name].stops.possible:
                 status, reason = CommandStatus.REFUSED, "its drive cannot be stopped over its line"
             elif name not in confirmed:
                 status, reason = (

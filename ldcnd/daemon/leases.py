@@ -371,4 +371,4 @@ async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> Non
     if policy is LossPolicy.RUN_TO_TARGET or tracker.moving is Moving.NO:
         return
     log.warning("loss policy", axis=axis.config.name, policy=policy.value, cause=cause)
-    await axis.bring_to_rest(STOP_MODES[policy])
+    await axis.stops.bring_to_rest(STOP_MODES[policy])

@@ -68,7 +68,7 @@ class BusService:
         self._baud: int | None = None  # at which the line was up last
         self._stop_wanted = asyncio.Event()
         for axis in axes:
-            axis.stop_wanted = self._stop_wanted
+            axis.stops.wanted = self._stop_wanted
         bus.resync = network.resync
 
     async def run(self) -> None:
@@ -111,7 +111,7 @@ class BusService:
         self.check_up()
         instant = await self.network.snapshot(self._check_registers)
         t, t_error_ns = clock.stamp_between(instant.from_s, instant.until_s)
-        positions = tuple(axis.frozen_at(instant.counts[axis.config.name]) for axis in self.axes)
+        positions = tuple(axis.readings.frozen_at(instant.counts[axis.config.name]) for axis in self.axes)
         io = tuple(
             CapturedInputs(module=each.name, levels=each.levels, counter=each.counter, proven=each.proven)
             for each in instant.io
@@ -177,9 +177,9 @@ class BusService:
                 self._restarted(name)
             for axis in self.axes:
                 if report.reset:
-                    axis.cannot_move()
+                    axis.stops.note_power_loss()
                 elif axis.config.name in report.open_loops:
-                    axis.switch_off()  # nothing in the drive ends a raw duty that an earlier host has left
+                    axis.stops.switch_off()  # nothing in the drive ends a raw duty that an earlier host has left
                 else:
                     axis.taken_over()
             await self._send_pending_stops()
@@ -193,7 +193,7 @@ class BusService:
             self._up.clear()
             self._down.set()
             for axis in self.axes:
-                axis.line_up = False
+                axis.stops.line_up = False
                 axis.disconnected()
 
     def _not_up(self, error: LdcndError) -> None:
@@ -308,9 +308,9 @@ class BusService:
         """A drive has lost power and is about to answer again: it is disabled, whatever its axis was doing."""
         log.warning("drive lost power", axis=name, bus=self.bus.settings.name)
         axis = self._axis(name)
-        axis.restarted()
+        axis.readings.report_restart()
         axis.disconnected()
-        axis.cannot_move()
+        axis.stops.note_power_loss()
         axis.tracker.powered(on=False, now_s=asyncio.get_running_loop().time())
         axis.tracker.finished()
 
@@ -339,13 +339,15 @@ class BusService:
         if previous := self._pollers.get(axis.config.name):
             self.bus.remove_poller(previous)
         poller: Poller[Any]
-        drive = axis.driver
+        drive, taken = axis.driver, axis.readings
         if isinstance(drive, PollsItself):
-            poller = drive.own_poller(now_s, ReadingListeners(axis.observed, axis.monitored, axis.missed, axis.alarmed))
+            poller = drive.own_poller(
+                now_s, ReadingListeners(taken.take, taken.take_monitor, taken.miss, taken.take_alarm)
+            )
         elif isinstance(drive, Readable):
             rates_hz = axis.config.rates.wanted_hz(adc=bool(drive.adc_full_scale))
-            poller = AxisPoller(drive, rates_hz, now_s, axis.judged, axis.missed, self.bus.add_poller)
-            axis.ask_at = poller.ask_at
+            poller = AxisPoller(drive, rates_hz, now_s, taken.judge, taken.miss, self.bus.add_poller)
+            taken.ask_at = poller.ask_at
         else:
             raise TypeError(f"axis {axis.config.name}: its drive can be read in no way")
         poller.priority = Priority[axis.config.priority.upper()]

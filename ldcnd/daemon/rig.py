@@ -94,7 +94,7 @@ class OwnedRig:
                 closed = frozenset(axis.config.name for axis in bus.axes if axis in chosen and axis.tracker.enabled)
                 if len(closed) > 1:
                     group.create_task(bus.stop_together(mode, closed), name=f"stop line {bus.bus.settings.name}")
-            stops = {name: group.create_task(self.axes[name].stop(mode), name=f"stop {name}") for name in names}
+            stops = {name: group.create_task(self.axes[name].stops.stop(mode), name=f"stop {name}") for name in names}
         return tuple(name for name, stop in stops.items() if stop.result())
 
 

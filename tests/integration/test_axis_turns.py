@@ -3,7 +3,7 @@
 import asyncio
 from typing import Any
 
-from ldcnd.axis.axis import QUEUED_COMMANDS
+from ldcnd.axis.turns import QUEUED_COMMANDS
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config

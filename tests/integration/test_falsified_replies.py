@@ -75,7 +75,7 @@ async def test_relative_moves_go_as_far_as_they_are_told():
 async def test_an_encoder_that_slips_on_a_standing_axis_is_a_fault_that_takes_the_reference():
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.moving == "no")
-        take = rig.daemon.rig.axes["x"].judged
+        take = rig.daemon.rig.axes["x"].readings.judge
 
         def slipped(reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
             """Stands in for the encoder: the simulated one cannot slip."""

@@ -170,7 +170,7 @@ async def test_a_buffered_move_does_not_start_after_a_loss_policy_has_stopped_th
         waiting = asyncio.create_task(rig.rig.client.command(AXIS, request, 30.0))
         await asyncio.sleep(0.3)
         axis = rig.rig.daemon.rig.axes[AXIS]
-        await axis.bring_to_rest(StopMode.SMOOTH)
+        await axis.stops.bring_to_rest(StopMode.SMOOTH)
         assert await rig.rig.refusal(await waiting) == "aborted"
         await asyncio.sleep(1.0)
         assert rig.position_mm < 9.0

@@ -173,7 +173,7 @@ async def test_a_drive_that_had_no_power_meanwhile_has_nothing_to_confirm():
     async with jogging(chain) as rig:
         axis = rig.daemon.rig.axes["x"]
         axis.tracker.stop_unconfirmed(0)
-        axis.cannot_move()
+        axis.stops.note_power_loss()
         assert not axis.tracker.stop_pending
 
 

@@ -14,7 +14,7 @@ from typing_extensions import override
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.guards import UNCONDITIONAL, Right
+from ldcnd.axis.permit import UNCONDITIONAL, Right
 from ldcnd.axis.state import ActiveCommand
 from ldcnd.axis.telemetry import Arrival
 from ldcnd.contract.codec import Encoding
@@ -237,7 +237,7 @@ class AxisBench:
         """Let the axis see what the drive reads from now on."""
         self.drive.shown = replace(self.drive.shown, **changes)
         now_s = asyncio.get_running_loop().time()
-        self.axis.observed(self.drive.shown, frozenset(), Timing(now_s, now_s, now_s, now_s))
+        self.axis.readings.take(self.drive.shown, frozenset(), Timing(now_s, now_s, now_s, now_s))
 
     async def pass_s(self, seconds: float, **changes: Any) -> None:
         """Let time pass, then show the drive's reading, and let the axis act upon it."""
@@ -267,7 +267,7 @@ class AxisBench:
 
     async def stop(self) -> None:
         """Stop, as a client does."""
-        await self.axis.stop(StopMode.SMOOTH)
+        await self.axis.stops.stop(StopMode.SMOOTH)
 
 
 def raising(error: BaseException) -> Happening:

@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.axis.axis import QUEUED_COMMANDS, STOP_ROUNDS
-from ldcnd.axis.guards import Right
+from ldcnd.axis.permit import Right
 from ldcnd.axis.plausibility import ROUNDS
+from ldcnd.axis.stopping import STOP_ROUNDS
+from ldcnd.axis.turns import QUEUED_COMMANDS
 from ldcnd.contract.commands import (
     BufferMode,
     Halt,
@@ -146,13 +147,13 @@ async def test_a_stop_is_sent_a_few_times_and_then_stays_pending_until_the_drive
             raise LOST
 
         stop, bench.drive.stop = bench.drive.stop, lost
-        assert not await bench.axis.stop(StopMode.ABRUPT)
+        assert not await bench.axis.stops.stop(StopMode.ABRUPT)
         assert sent == [StopMode.ABRUPT] * STOP_ROUNDS
         assert bench.tracker.stop_pending
-        assert bench.axis.stop_wanted.is_set()
+        assert bench.axis.stops.wanted.is_set()
         assert [fault.code for fault in bench.tracker.active_faults] == ["stop_unconfirmed"]
 
-        await bench.axis.bring_to_rest(StopMode.SMOOTH)
+        await bench.axis.stops.bring_to_rest(StopMode.SMOOTH)
         await bench.axis.send_pending_stop()
         assert sent[-1] is StopMode.ABRUPT  # the stronger one is still owed
         assert len(sent) == 2 * STOP_ROUNDS + 1
@@ -174,11 +175,13 @@ async def test_of_two_stops_the_stronger_one_is_sent_while_it_is_owed():
         await moving(bench)
         bench.bus.is_open = False
         bench.drive.during["stop"] = raising(BusDown("the port is gone"))
-        assert not await bench.axis.stop(StopMode.OFF)
+        assert not await bench.axis.stops.stop(StopMode.OFF)
         assert bench.drive.calls == ["stop"]  # no further round on a closed line
 
         bench.bus.is_open = True
-        assert await bench.axis.bring_to_rest(StopMode.SMOOTH)  # it may be off already: a weaker one would close it
+        assert await bench.axis.stops.bring_to_rest(
+            StopMode.SMOOTH
+        )  # it may be off already: a weaker one would close it
 
         assert bench.drive.told[-1] == ("stop", StopMode.OFF)
         assert bench.tracker.state is AxisState.DISABLED
@@ -194,7 +197,7 @@ async def test_a_drive_that_was_switched_off_instead_is_disabled():
         await moving(bench)
         bench.drive.stop = switched_off
 
-        assert await bench.axis.stop(StopMode.SMOOTH)
+        assert await bench.axis.stops.stop(StopMode.SMOOTH)
 
         assert (bench.tracker.state, bench.tracker.enabled) == (AxisState.DISABLED, False)
         assert not bench.tracker.stop_pending
@@ -203,23 +206,23 @@ async def test_a_drive_that_was_switched_off_instead_is_disabled():
 async def test_a_stop_while_the_line_is_down_is_not_sent_and_waits_for_it():
     async with axis_bench() as bench:
         await moving(bench)
-        bench.axis.line_up = False
+        bench.axis.stops.line_up = False
 
-        assert not await bench.axis.stop(StopMode.SMOOTH)
+        assert not await bench.axis.stops.stop(StopMode.SMOOTH)
 
         assert bench.drive.calls == []
         assert bench.bus.withdrawn == []
         assert bench.tracker.stop_pending
-        bench.axis.cannot_move()  # it had no power
+        bench.axis.stops.note_power_loss()  # it had no power
         assert not bench.tracker.stop_pending
         assert not bench.tracker.stop_pending
 
 
 async def test_an_axis_that_was_never_seen_is_read_before_a_pending_stop_is_sent():
     async with axis_bench(powered=False) as bench:
-        bench.axis.line_up = False
-        await bench.axis.stop(StopMode.SMOOTH)
-        bench.axis.line_up = True
+        bench.axis.stops.line_up = False
+        await bench.axis.stops.stop(StopMode.SMOOTH)
+        bench.axis.stops.line_up = True
         bench.bus.during = raising(LOST)
 
         await bench.axis.send_pending_stop()
@@ -252,7 +255,7 @@ async def test_a_line_that_is_taken_over_again_changes_nothing_that_was_seen():
 
 async def test_a_motor_that_must_be_off_first_is_switched_off():
     async with axis_bench() as bench:
-        bench.axis.switch_off()
+        bench.axis.stops.switch_off()
         assert bench.tracker.stop_pending
 
         await bench.axis.send_pending_stop()
@@ -263,22 +266,24 @@ async def test_a_motor_that_must_be_off_first_is_switched_off():
 
 async def test_a_reading_from_a_drive_that_owes_a_confirmation_calls_for_the_stop():
     async with axis_bench() as bench:
-        bench.axis.judged(bench.drive.shown, frozenset(), now())
-        bench.axis.switch_off()
-        bench.axis.stop_wanted.clear()
+        bench.axis.readings.judge(bench.drive.shown, frozenset(), now())
+        bench.axis.stops.switch_off()
+        bench.axis.stops.wanted.clear()
 
-        assert bench.axis.judged(_reading(bench, position_counts=60_000), frozenset(), now())  # not believed yet
+        assert bench.axis.readings.judge(
+            _reading(bench, position_counts=60_000), frozenset(), now()
+        )  # not believed yet
 
-        assert bench.axis.stop_wanted.is_set()
+        assert bench.axis.stops.wanted.is_set()
 
 
 async def test_a_drive_that_takes_no_stop_over_its_line_is_neither_latched_nor_told_anything():
     async with axis_bench() as bench:
-        bench.axis.stoppable = False
+        bench.axis.stops.possible = False
 
-        assert not await bench.axis.stop(StopMode.SMOOTH)
-        assert not await bench.axis.bring_to_rest(StopMode.SMOOTH)
-        bench.axis.switch_off()
+        assert not await bench.axis.stops.stop(StopMode.SMOOTH)
+        assert not await bench.axis.stops.bring_to_rest(StopMode.SMOOTH)
+        bench.axis.stops.switch_off()
 
         assert (bench.tracker.stop_latched, bench.tracker.stop_pending, bench.drive.calls) == (False, False, [])
 
@@ -315,7 +320,7 @@ async def test_a_buffered_move_does_not_begin_after_a_policy_has_brought_the_axi
         async with asyncio.TaskGroup() as group:
             waiting = group.create_task(outcome(in_turn(bench, buffered())), name="next")
             await asyncio.sleep(0.1)
-            await bench.axis.bring_to_rest(StopMode.SMOOTH)
+            await bench.axis.stops.bring_to_rest(StopMode.SMOOTH)
             await asyncio.sleep(0.001)
             assert isinstance(waiting.result(), CommandAborted)  # at once, not when the axis stands
             await bench.settled()
@@ -447,7 +452,7 @@ async def test_a_command_is_late_only_until_its_motion_has_begun():
 async def test_a_drive_that_answers_again_after_it_was_away_is_reported_once():
     async with axis_bench() as bench:
         returned = []
-        bench.axis.returned = lambda: returned.append(bench.tracker.link)
+        bench.axis.readings.returned = lambda: returned.append(bench.tracker.link)
         bench.show()
         bench.axis.disconnected()
         bench.show()
@@ -459,7 +464,7 @@ async def test_a_drive_that_answers_again_after_it_was_away_is_reported_once():
 async def test_the_first_reading_of_an_axis_is_no_return():
     async with axis_bench(powered=False) as bench:
         returned = []
-        bench.axis.returned = lambda: returned.append("returned")
+        bench.axis.readings.returned = lambda: returned.append("returned")
         bench.show()
 
     assert returned == []
@@ -468,7 +473,7 @@ async def test_the_first_reading_of_an_axis_is_no_return():
 async def test_a_jump_without_a_command_is_a_fault_and_takes_the_reference_away():
     async with axis_bench() as bench:
         for counts in (0, 0, *[500_000] * ROUNDS):
-            asks_again = bench.axis.judged(_reading(bench, position_counts=counts), frozenset(), now())
+            asks_again = bench.axis.readings.judge(_reading(bench, position_counts=counts), frozenset(), now())
             await asyncio.sleep(0.05)
 
         assert not asks_again
@@ -481,7 +486,7 @@ async def test_a_jump_during_a_command_ends_it_costs_the_reference_and_has_the_m
         await moving(bench)
         for counts in (0, 0, *[500_000] * ROUNDS):
             slow = _reading(bench, position_counts=counts, velocity_counts_per_s=0.0)
-            bench.axis.judged(slow, frozenset(), now())
+            bench.axis.readings.judge(slow, frozenset(), now())
             await asyncio.sleep(0.05)
 
         assert bench.tracker.state is AxisState.ERROR_STOP
@@ -494,15 +499,15 @@ async def test_a_jump_during_a_command_ends_it_costs_the_reference_and_has_the_m
 async def test_a_drive_that_was_moved_while_it_was_out_of_reach_has_not_jumped(gap):
     async with axis_bench() as bench:
         for _ in range(2):
-            bench.axis.judged(bench.drive.shown, frozenset(), now())
+            bench.axis.readings.judge(bench.drive.shown, frozenset(), now())
             await asyncio.sleep(0.05)
         if gap == "disconnected":
             bench.axis.disconnected()
         else:
             for _ in range(3):
-                bench.axis.missed(LOST)
+                bench.axis.readings.miss(LOST)
         for counts in [500_000] * ROUNDS:
-            bench.axis.judged(_reading(bench, position_counts=counts), frozenset(), now())
+            bench.axis.readings.judge(_reading(bench, position_counts=counts), frozenset(), now())
             await asyncio.sleep(0.05)
 
         assert "position_jump" not in [fault.code for fault in bench.tracker.active_faults]
@@ -512,7 +517,8 @@ async def test_a_drive_that_was_moved_while_it_was_out_of_reach_has_not_jumped(g
 async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_the_end_has_the_motor_stopped():
     async with axis_bench() as bench:
         verdicts = [
-            bench.axis.judged(_reading(bench, position_counts=90_000 * step), frozenset(), now()) for step in range(5)
+            bench.axis.readings.judge(_reading(bench, position_counts=90_000 * step), frozenset(), now())
+            for step in range(5)
         ]
 
         assert verdicts == [False, True, True, True, False]
@@ -532,7 +538,7 @@ async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_t
 async def test_nothing_is_planned_from_two_readings_that_agree_where_no_motion_can_have_led(command):
     async with axis_bench() as bench:
         for _ in range(2):
-            bench.axis.judged(bench.drive.shown, frozenset(), now())
+            bench.axis.readings.judge(bench.drive.shown, frozenset(), now())
         origin = bench.axis.telemetry.origin_counts
         bench.drive.shown = _reading(bench, position_counts=60_000)
 
@@ -547,12 +553,12 @@ async def test_nothing_is_planned_from_two_readings_that_agree_where_no_motion_c
 
 async def test_a_shaft_that_is_turned_by_hand_is_believed_where_its_velocity_leads():
     async with axis_bench() as bench:
-        bench.axis.judged(bench.drive.shown, frozenset(), now())
+        bench.axis.readings.judge(bench.drive.shown, frozenset(), now())
         verdicts = []
         for counts in (100, 300, 500):
             await asyncio.sleep(0.01)
             turned = _reading(bench, velocity_counts_per_s=20_000.0, position_counts=counts)
-            verdicts.append(bench.axis.judged(turned, frozenset(), now()))
+            verdicts.append(bench.axis.readings.judge(turned, frozenset(), now()))
 
         assert (bench.tracker.command, bench.tracker.at_rest) == (None, False)
         assert verdicts == [True, False, False]  # so sudden a velocity is asked for again, once
@@ -561,11 +567,11 @@ async def test_a_shaft_that_is_turned_by_hand_is_believed_where_its_velocity_lea
 async def test_what_only_the_first_of_two_readings_was_asked_for_is_published_as_well():
     both = frozenset({TelemetryItem.POSITION, TelemetryItem.VELOCITY})
     async with axis_bench() as bench:
-        bench.axis.judged(bench.drive.shown, frozenset(), now())
+        bench.axis.readings.judge(bench.drive.shown, frozenset(), now())
         changed = _reading(bench, profile_done=False, asked=both)
-        assert bench.axis.judged(changed, both, now())
+        assert bench.axis.readings.judge(changed, both, now())
         assert bench.published(TelemetryItem.VELOCITY) is None
-        assert not bench.axis.judged(changed, frozenset({TelemetryItem.POSITION}), now())
+        assert not bench.axis.readings.judge(changed, frozenset({TelemetryItem.POSITION}), now())
 
         assert bench.published(TelemetryItem.VELOCITY)
         assert bench.published(TelemetryItem.POSITION).seq == 0
@@ -577,11 +583,11 @@ async def test_a_drive_that_replies_with_nothing_that_can_be_used_is_not_silent_
     async with axis_bench() as bench:
         await moving(bench)
         for _ in range(2):
-            bench.axis.missed(error)
+            bench.axis.readings.miss(error)
         assert (bench.tracker.link, bench.tracker.stop_pending) == (LinkState.DEGRADED, False)
 
         for _ in range(8):
-            bench.axis.missed(error)
+            bench.axis.readings.miss(error)
 
         assert (bench.tracker.link, bench.tracker.moving) == (LinkState.DEGRADED, Moving.UNKNOWN)
         assert bench.tracker.quality is Quality.UNCERTAIN
@@ -628,14 +634,14 @@ async def bench_refusal(bench: AxisBench) -> LdcndError:
 async def test_misses_take_an_axis_down_only_in_a_row():
     async with axis_bench() as bench:
         for _ in range(10):
-            bench.axis.missed(LOST)
-            bench.axis.missed(LOST)
+            bench.axis.readings.miss(LOST)
+            bench.axis.readings.miss(LOST)
             bench.show()
         assert bench.tracker.link is LinkState.UP
         assert bench.tracker.referenced
 
         for _ in range(3):
-            bench.axis.missed(LOST)
+            bench.axis.readings.miss(LOST)
         assert bench.tracker.link is LinkState.DOWN
         assert not bench.tracker.referenced
 

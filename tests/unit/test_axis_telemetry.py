@@ -22,7 +22,7 @@ CHUNK = TraceChunk(
 
 
 def poll(bench: AxisBench, *asked: TelemetryItem, **changes: object) -> None:
-    bench.axis.observed(replace(bench.drive.shown, **changes), frozenset(asked), TIMING)
+    bench.axis.readings.take(replace(bench.drive.shown, **changes), frozenset(asked), TIMING)
 
 
 @pytest.mark.parametrize("item", [POSITION, VELOCITY, ADC])
@@ -88,7 +88,7 @@ async def test_what_a_drive_that_is_gone_has_shown_is_published_once_more_as_bad
     async with axis_bench() as bench:
         poll(bench, POSITION, VELOCITY, ADC, position_counts=5, adc_counts=7)
         before = [bench.published(item) for item in (POSITION, VELOCITY, ADC)]
-        bench.axis.missed(None)
+        bench.axis.readings.miss(None)
         assert [bench.published(item).quality for item in (POSITION, VELOCITY, ADC)] == [Quality.UNCERTAIN] * 3
         bench.axis.disconnected()
         after = [bench.published(item) for item in (POSITION, VELOCITY, ADC)]
@@ -114,7 +114,7 @@ async def test_a_counter_that_had_to_be_corrected_is_uncertain_and_one_of_a_lost
     async with axis_bench() as bench:
         if away:
             bench.axis.disconnected()
-        bench.axis.monitored(value, TIMING)
+        bench.axis.readings.take_monitor(value, TIMING)
         sample = bench._publisher.last[KEYS.monitor("x", MonitorName.SPEED_FEEDBACK)]
 
     assert (sample.value, sample.unit, sample.quality) == (100, "rpm", quality)

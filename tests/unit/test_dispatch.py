@@ -99,7 +99,7 @@ class Commanded:
         self.dispatcher.leases.group = group
         self.requests = Requests(self.rig, KEYS, group, self.dispatcher)
         for bench in (x, y):
-            bench.axis._arrivals._on_ended = ledger.ended
+            bench.axis.readings._arrivals._on_ended = ledger.ended
         self.answers: list[dict] = []
 
     async def send(self, command, axis: str = "x", login: str | None = None):

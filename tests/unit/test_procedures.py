@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.axis.guards import Right
+from ldcnd.axis.permit import Right
 from ldcnd.axis.procedures.group import GroupMoveRequest, Meeting
 from ldcnd.contract.commands import (
     Home,
@@ -437,7 +437,7 @@ async def test_a_step_of_a_drive_that_does_not_answer_is_taken_again_more_slowly
     async with axis_bench() as bench:
         await bench.send(INDEX.model_copy(update={"timeout_s": 1.0}), "home")
         await bench.pass_s(0.5, **SEARCHING)
-        bench.axis.missed(LOST)
+        bench.axis.readings.miss(LOST)
         bench.drive.during["stop"] = raising(LOST)
         await asyncio.sleep(0.6)
         assert bench.drive.calls.count("stop") == 1

@@ -38,7 +38,11 @@ class SlowRig:
     wire_log: Mock = field(default_factory=Mock)
 
     def __post_init__(self) -> None:
-        axis = SimpleNamespace(tracker=Tracker(), stoppable=True, latch_is_kept=False, config=SimpleNamespace(name="x"))
+        axis = SimpleNamespace(
+            tracker=Tracker(),
+            stops=SimpleNamespace(possible=True, latch_is_kept=False),
+            config=SimpleNamespace(name="x"),
+        )
         self.axes = {"x": axis}
         self.buses = (SimpleNamespace(bus=SimpleNamespace(wire_log=self.wire_log), axes=tuple(self.axes.values())),)
 

@@ -7,8 +7,8 @@ limit switches stop it in the drive, where they are armed.
 
 from typing_extensions import override
 
-from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
 from ldcnd.axis.state import Completion
 from ldcnd.contract.commands import CommandReply, MoveAnalog

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 from typing_extensions import override
 
-from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion, MotionPlan, both_s
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.state import Completion
 from ldcnd.contract.commands import CommandReply, MoveAbsolute, MoveRelative

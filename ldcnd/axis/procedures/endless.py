@@ -8,8 +8,8 @@ from abc import abstractmethod
 
 from typing_extensions import override
 
-from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import NEVER_S, Procedure
 from ldcnd.axis.state import AxisTracker
 from ldcnd.contract.errors import PositionLimit

@@ -11,8 +11,8 @@ from collections.abc import Mapping
 
 from typing_extensions import override
 
-from ldcnd.axis.guards import Permit, start_together
 from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.permit import Permit, start_together
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.state import Completion
 from ldcnd.axis.straight import straight_line

@@ -10,10 +10,11 @@ from enum import Enum
 from typing_extensions import override
 
 from ldcnd.axis import guards
-from ldcnd.axis.guards import Permit, QuietDrive, homing
 from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.probe import check_index_is_seen
+from ldcnd.axis.quiet_drive import QuietDrive, homing
 from ldcnd.axis.state import Completion
 from ldcnd.contract.commands import CommandReply, Home, HomeMethod, HomeStop
 from ldcnd.contract.errors import MalformedRequest, NotSupported

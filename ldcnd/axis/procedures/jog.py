@@ -12,8 +12,8 @@ from enum import Enum
 
 from typing_extensions import override
 
-from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.velocity import COUNTER_SHARE
 from ldcnd.axis.state import Completion

@@ -10,11 +10,12 @@ from dataclasses import dataclass
 
 from typing_extensions import override
 
-from ldcnd.axis.guards import Permit, start_path, walking
 from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.permit import Permit, start_path
 from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.group import Rendezvous
+from ldcnd.axis.quiet_drive import walking
 from ldcnd.axis.state import Completion
 from ldcnd.contract.commands import CommandReply, MoveAbsolute
 from ldcnd.contract.errors import (

@@ -7,9 +7,10 @@ target, so it ends in the drive also when no input comes and this host is dead.
 import math
 
 from ldcnd.axis import guards
-from ldcnd.axis.guards import Permit, homing
 from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
+from ldcnd.axis.quiet_drive import homing
 from ldcnd.axis.state import Completion
 from ldcnd.contract.commands import CommandReply, HomeMethod, Probe, ProbeStop
 from ldcnd.contract.errors import MalformedRequest, NotSupported, VelocityLimit

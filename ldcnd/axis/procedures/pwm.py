@@ -6,8 +6,8 @@ the axis must be configured for it.
 
 from typing_extensions import override
 
-from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
 from ldcnd.axis.state import AxisTracker, Completion
 from ldcnd.contract.commands import CommandReply, SetPwm

@@ -3,8 +3,8 @@
 from typing_extensions import override
 
 from ldcnd.axis import guards
-from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.state import Completion
 from ldcnd.contract.commands import CommandReply, Track, Verb

@@ -8,8 +8,8 @@ that are armed do so without it. PIC-SERVO SC takes a new trapezoid at any time:
 
 from typing_extensions import override
 
-from ldcnd.axis.guards import Permit
 from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.state import Completion
 from ldcnd.contract.commands import CommandReply, MoveVelocity

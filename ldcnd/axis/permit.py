@@ -1,0 +1,325 @@
+"""Permission to move one axis: the gate that makes it and makes it void, and the only way to send a motion.
+
+A `Permit` is made when a command is admitted and travels with it, from its turn in the queue of its axis to its last
+step. The rest of the daemon holds a `QuietDrive`, which has no call that can move; those are methods of the permit.
+Each of them checks permission directly before its first packet, and the bus checks again when the turn of each such
+packet comes. So a move that waited (for its turn, for the motion ahead of it, for the other members of its group, for a
+step of a homing, for the line) is judged by the state at its start, not by the state at its arrival.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+from ldcnd.axis.guards import TO_MOVE, TO_POWER, Guard, check
+from ldcnd.axis.state import AxisTracker
+from ldcnd.contract.commands import PinMode, Verb
+from ldcnd.contract.errors import CommandAborted, Remedy, RequestRefused, ShuttingDown, StopLatched, step
+from ldcnd.contract.samples import AxisState
+from ldcnd.drives.driver import (
+    AnalogMotion,
+    CountsMotion,
+    Gains,
+    HomeCapture,
+    Moves,
+    PathStatus,
+    PwmOutput,
+    StopMode,
+    cannot,
+)
+from ldcnd.drives.network import Network
+from ldcnd.line.transaction import Condition, only_while
+
+
+def always() -> None:
+    """Forbid nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class Right:
+    """Conditions on the sender of a command, besides the state of the axis.
+
+    Attributes:
+        holds: checked before every motion of the command: its lease, no other daemon.
+        in_time: checked until its first motion has begun: its `not_after`.
+    """
+
+    holds: Condition = always
+    in_time: Condition = always
+
+    def also(self, condition: Condition) -> "Right":
+        """Return this right with one more condition, checked before every motion."""
+
+        def both() -> None:
+            self.holds()
+            condition()
+
+        return replace(self, holds=both)
+
+
+UNCONDITIONAL = Right()
+"""Right of commands that bring an axis to rest, and of callers inside the daemon."""
+
+
+class Permit:
+    """Permission of one command, with all its steps, to move the drive of its axis; made by `Gate`.
+
+    Attributes:
+        command_id: names the command everywhere.
+        verb: what it is.
+    """
+
+    def __init__(self, gate: "Gate", command_id: str, verb: Verb, right: Right) -> None:
+        self.command_id = command_id
+        self.verb = verb
+        self._gate = gate
+        self._right = right
+        self._epoch = gate.epoch
+        self._begun = False
+
+    def still_wanted(self) -> None:
+        """Raise when the command was overtaken.
+
+        Raises:
+            StopLatched, CommandAborted: a stop has come since, or another command.
+            ShuttingDown: the daemon ends.
+        """
+        if self._gate.closed:
+            raise self._gate.ending()
+        if self._epoch != self._gate.epoch:
+            raise self._gate.overtaken(self.verb)
+
+    def renew(self) -> None:
+        """Go on after a stop that this command has requested itself."""
+        self._epoch = self._gate.epoch
+
+    def ask(self) -> None:
+        """Raise when the command must not be carried out any more.
+
+        Raises:
+            StopLatched, ShuttingDown: see `still_wanted`.
+            RequestRefused: its sender has lost the right to it, or it comes too late.
+        """
+        self._ask(begun=self._begun)
+
+    def _ask(self, *, begun: bool) -> None:
+        self.still_wanted()
+        self._right.holds()
+        if not begun:
+            self._right.in_time()
+
+    def check_state(self, *, follows: bool = False) -> None:
+        """Raise when the state of the axis forbids to begin this command; see `Needs.to_begin`.
+
+        Args:
+            follows: it may follow what the axis does, without a standstill in between.
+        """
+        check(self.verb, self._gate.tracker, follows=follows)
+
+    def ask_to_move(self) -> None:
+        """Raise when nothing of this command may move the axis now.
+
+        Raises:
+            CommandAborted,
+        DriveFault,
+            LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop, and a
+                speed override of 0.
+        """
+        self.to_move()()
+
+    def to_move(self) -> Condition:
+        """Return the condition that `ask_to_move` checks, to be checked again when a packet's turn comes."""
+        return self._condition(TO_MOVE)
+
+    def _condition(self, guards: tuple[Guard, ...]) -> Condition:
+        begun, tracker = self._begun, self._gate.tracker
+
+        def condition() -> None:
+            self._ask(begun=begun)
+            for guard in guards:
+                guard(tracker)
+
+        return condition
+
+    # -- what can move -----------------------------------------------------------------------------------------------
+
+    async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
+        """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator."""
+        self.ask_to_move()
+        self._gate.expect(motion)
+        with only_while(self.to_move()):
+            await self._gate.driver.load(motion, home=home)
+
+    async def start(self, *, stays: bool = False) -> None:
+        """Start what was loaded; see `Moves.start`.
+
+        Args:
+            stays: what was loaded ends where the axis stands, so the motion of the command has yet to begin.
+        """
+        condition = self.to_move()
+        if not stays:
+            self.begin()
+        with only_while(condition):
+            await self._gate.driver.start()
+
+    async def track(self, position_counts: int) -> None:
+        """Go to a position at once; see `Moves.track`."""
+        drive = self._gate.driver
+        if Verb.TRACK not in drive.capabilities:
+            raise cannot(drive.spec, "track")
+        condition = self.to_move()
+        self.begin()
+        self._gate.expect(CountsMotion(position_counts, math.inf, math.inf))
+        with only_while(condition):
+            await drive.track(position_counts)
+
+    async def add_points(self, steps: Sequence[int]) -> PathStatus:
+        """Fill the drive's buffer of path points; see `Moves.add_points`. A motion begins only with `start_path`."""
+        self.ask_to_move()
+        with only_while(self.to_move()):
+            return await self._gate.driver.add_points(steps)
+
+    async def power_on(self) -> None:
+        """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
+        condition = self._condition(TO_POWER)
+        condition()
+        was_on = self._gate.tracker.enabled
+        try:
+            self.begin()
+            with only_while(condition):
+                await self._gate.driver.power(on=True)
+            self.still_wanted()
+        except RequestRefused:
+            if not was_on:
+                await self._gate.driver.stop(StopMode.OFF)
+            raise
+
+    async def set_gains(self, gains: Gains) -> None:
+        """Load the registers of the loop, which act at once; see `Moves.set_gains`."""
+        self.ask()
+        with only_while(self.ask):
+            await self._gate.driver.set_gains(gains)
+
+    async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
+        """Use limit switch pins as outputs or inputs; see `Moves.set_outputs`."""
+        with only_while(self.ask):
+            await self._gate.driver.set_outputs(limit1, limit2)
+
+    def announce(self, motion: CountsMotion, *, anywhere: bool = False) -> None:
+        """Have readings judged by a motion that the network is about to start; see `PlausibilityGate.expect`."""
+        self._gate.expect(motion, anywhere=anywhere)
+
+    def begin(self) -> None:
+        """Note that the next packet begins the motion: conditions made from now on do not ask `not_after`."""
+        self._begun = True
+
+
+class Expect(Protocol):
+    """See `PlausibilityGate.expect`."""
+
+    def __call__(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, anywhere: bool = False) -> None:
+        """Take a motion that is about to be loaded."""
+
+
+class Gate:
+    """The gate of one axis: makes permits, and makes them void.
+
+    Attributes:
+        driver: of the drive; nothing but permits and the axis's stops uses it.
+        tracker: of its state.
+        expect: takes each motion that is about to be loaded.
+        epoch: number of stops so far; a permit of an earlier epoch is void.
+        closed: the daemon ends; no permit holds.
+    """
+
+    def __init__(self, driver: Moves, tracker: AxisTracker, expect: Expect) -> None:
+        self.driver = driver
+        self.tracker = tracker
+        self.expect = expect
+        self.epoch = 0
+        self._cause = ""
+        self.closed = False
+
+    def permit(self, command_id: str, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
+        """Return the permit of a command, valid until the next stop."""
+        return Permit(self, command_id, verb, right)
+
+    def overtake(self, by: Permit | None, cause: str) -> None:
+        """Make all permits void, except the caller's; the refusals of the others name the cause."""
+        self.epoch += 1
+        self._cause = cause
+        if by is not None:
+            by.renew()
+
+    def close(self) -> None:
+        """Make all permits void permanently."""
+        self.closed = True
+
+    def ending(self) -> ShuttingDown:
+        """Return the refusal of a daemon that ends."""
+        name = self.tracker.name
+        return ShuttingDown(f"axis {name}: the daemon is stopping", axis=name)
+
+    def overtaken(self, what: str) -> StopLatched | CommandAborted:
+        """Return the refusal of a command that a stop has overtaken, or the latest cause that latches nothing."""
+        tracker = self.tracker
+        if tracker.stop_latched:
+            return StopLatched(
+                f"axis {tracker.name}: {what} was overtaken by a stop",
+                axis=tracker.name,
+                remedy=Remedy("{}", step("reset")),
+            )
+        in_error = tracker.state is AxisState.ERROR_STOP
+        return CommandAborted(
+            f"axis {tracker.name}: {what} was overtaken by {self._cause}",
+            axis=tracker.name,
+            remedy=Remedy("{}", step("reset")) if in_error else "send it again",
+        )
+
+
+async def start_path(network: Network, names: frozenset[str], permits: Sequence[Permit]) -> None:
+    """Start axes on their paths; every member's permission is checked directly before the packet that starts.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_path`.
+    """
+    conditions = [permit.to_move() for permit in permits]
+
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    for permit in permits:
+        permit.begin()
+    with only_while(ask_all):
+        await network.start_path(names, ask_all)
+
+
+async def start_together(
+    network: Network, motions: Mapping[str, CountsMotion], permits: Sequence[Permit], announce: Callable[[], None]
+) -> None:
+    """Start axes in the same servo cycle; every member's permission is checked directly before the packet that starts.
+
+    Args:
+        network: of their line.
+        motions: by axis name.
+        permits: of all members.
+        announce: called between the last check and the first packet.
+
+    Raises:
+        LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_group`.
+    """
+
+    def about_to_start() -> None:
+        ask_all()
+        announce()
+
+    def ask_all() -> None:
+        for condition in conditions:
+            condition()
+
+    conditions = [permit.to_move() for permit in permits]
+    ask_all()
+    with only_while(ask_all):
+        await network.start_group(motions, about_to_start)

@@ -1,0 +1,284 @@
+"""The readings of one axis: judged, digested, published; and what it means when a poll brings none.
+
+A reading that cannot be true never leaves this module. One that shows what this daemon has neither done nor commanded
+is reported, and what is not understood any more is stopped.
+"""
+
+import math
+from collections.abc import Callable
+
+from ldcnd.axis.clock import Clock
+from ldcnd.axis.commands import AxisCommands
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.plausibility import ROUNDS, CounterStep, PlausibilityGate, ReadingVerdict, agree
+from ldcnd.axis.state import DRIVE_CHANGED, DRIVE_RESET
+from ldcnd.axis.stopping import AxisStops
+from ldcnd.axis.telemetry import Arrivals, AxisTelemetry, Note
+from ldcnd.axis.turns import CommandQueue
+from ldcnd.contract import events
+from ldcnd.contract.errors import BadReply, BusError, PacketRejected
+from ldcnd.contract.events import ALARM_HISTORY, CommandStatus
+from ldcnd.contract.rig_commands import FrozenPosition
+from ldcnd.contract.samples import LinkState, TelemetryItem
+from ldcnd.drives.driver import AxisReading, Fault, Moves
+from ldcnd.drives.parameter_access import MonitorValue
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Timing
+from ldcnd.log import get_logger
+
+log = get_logger("axis")
+
+END_ITEMS = frozenset({TelemetryItem.POSITION, TelemetryItem.VELOCITY})
+"""Items published with the reading that ends a command, besides those requested."""
+
+
+class ReadingOutOfTurn:
+    """Reads the state of a drive out of turn, until two readings agree."""
+
+    def __init__(
+        self, drive: Moves, bus: Bus, plausibility: PlausibilityGate, telemetry: AxisTelemetry, unit: str, clock: Clock
+    ) -> None:
+        self._drive = drive
+        self._bus = bus
+        self._plausibility = plausibility
+        self._telemetry = telemetry
+        self._unit = unit
+        self._clock = clock
+
+    async def __call__(self) -> AxisReading:
+        """Return the second of two readings that agree.
+
+        Raises:
+            BadReply: they do not, or agree on a place that no motion can have led to, as late replies of another drive.
+            BusError: the line failed.
+        """
+        name, exchange = self._drive.spec.name, self._drive.reading(frozenset())
+        before = await self._bus.execute(exchange)
+        for _ in range(ROUNDS):
+            reading = await self._bus.execute(exchange)
+            if agree(before, reading):
+                if not self._plausibility.is_out_of_reach(reading, self._clock.now_s()):
+                    return reading
+                self._bus.distrust()
+                place = self._telemetry.position(reading.position_counts)
+                raise BadReply(
+                    f"axis {name}: it shows {place:g} {self._unit}, where no motion can have led since its last"
+                    " reading; nothing was started",
+                    axis=name,
+                    value=place,
+                    remedy="send it again; if that fails as well, look for an adapter that holds replies back",
+                )
+            before = reading
+        raise BadReply(
+            f"axis {name}: its readings contradict each other; nothing was started",
+            axis=name,
+            remedy="check the line for noise, then send it again",
+        )
+
+
+class AxisReadings:
+    """Digests the readings of one axis.
+
+    Attributes:
+        returned: called when the drive replies again after it was out of reach, once its state is known.
+        ask_at: has the drive read at an instant of the loop's clock, besides its ordinary polls.
+    """
+
+    def __init__(
+        self,
+        motion: AxisMotion,
+        bus: Bus,
+        plausibility: PlausibilityGate,
+        queue: CommandQueue,
+        commands: AxisCommands,
+        stops: AxisStops,
+        arrivals: Arrivals,
+        note: Note,
+    ) -> None:
+        self.returned: Callable[[], None] | None = None
+        self.ask_at: Callable[[float], None] | None = None
+        self._motion = motion
+        self._name = name = motion.tracker.name
+        self._proof = bus.proofs.expect(motion.driver.spec.address, f"axis {name}", name)
+        self._tracker = motion.tracker
+        self._telemetry = motion.telemetry
+        self._clock = motion.clock
+        self._bus = bus
+        self._plausibility = plausibility
+        self._queue = queue
+        self._commands = commands
+        self._stops = stops
+        self._arrivals = arrivals
+        self._note = note
+
+    @property
+    def seen(self) -> bool:
+        """Whether the drive was read at all."""
+        return self._motion.reading is not None
+
+    @property
+    def are_of_the_drive(self) -> bool:
+        """Whether what is read is known to come from the drive that is meant."""
+        return self._proof.holds
+
+    # -- what polls bring --------------------------------------------------------------------------------------------
+
+    def judge(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
+        """Take a reading if the drive can have got there; true when it has to be read again first."""
+        tracker = self._tracker
+        if tracker.stop_pending:
+            self._stops.wanted.set()  # it replies again, whatever it says
+        if not self._proof.holds:
+            self._count_miss()  # from its drive: who answers was not identified
+            return False
+        # a command that waits has sent nothing yet
+        standing = tracker.command is None and tracker.at_rest and not self._queue.at_work.locked()
+        judged = self._plausibility.judge(reading, timing, standing=standing)
+        if judged.verdict is ReadingVerdict.BELIEVED:
+            if judged.confirmed:
+                if judged.step:
+                    self._take_step(judged.step, reading)
+                # items that only the first of two readings has are valid as well
+                first, first_timing = judged.confirmed
+                self._digest(first, first.asked - asked, first_timing)
+            self._digest(reading, asked, timing)
+            return False
+        if judged.verdict is ReadingVerdict.CONTRADICTS:
+            now_ns = self._clock.now_ns()
+            if tracker.contradicted(now_ns):
+                log.error("readings contradict each other", axis=self._name, counts=reading.position_counts)
+                self._stops.stop_what_is_not_understood(self._motion.config.loss.bus)
+            self._queue.changed.set()
+            self._telemetry.stale(now_ns)
+        if judged.foreign:
+            self._bus.distrust()  # another drive's reply that came late would be followed by others
+        return judged.verdict is ReadingVerdict.ASK_AGAIN
+
+    def take(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
+        """Process an accepted reading; that of a drive which was not identified says nothing about the axis."""
+        if self._proof.holds:
+            self._digest(reading, asked, timing)
+        else:
+            self._count_miss()  # from its drive: who answers was not identified
+
+    def miss(self, error: BusError) -> None:
+        """Take note that a poll brought nothing, or nothing that can be used."""
+        if not (self._proof.holds and isinstance(error, PacketRejected | BadReply)):
+            self._count_miss()
+            return
+        now_ns = self._clock.now_ns()
+        if self._tracker.replied_in_vain(now_ns):
+            log.error("replies cannot be used", axis=self._name, reason=error.message)
+            self._stops.stop_what_is_not_understood(self._motion.config.loss.bus)
+            self._queue.changed.set()
+        self._telemetry.stale(now_ns)
+
+    def take_monitor(self, value: MonitorValue, timing: Timing) -> None:
+        """Take a monitor from the family's own poller."""
+        t, t_error_ns = self._clock.stamp(timing)
+        self._telemetry.monitor(value, t, t_error_ns)
+
+    def take_alarm(self, alarm: Fault) -> None:
+        """Take an alarm that the drive has entered in its own history."""
+        reason = f"{alarm.text}: new in the alarm history of the drive"
+        self._note(self._name, ALARM_HISTORY, CommandStatus.FAILED, reason, alarm.code)
+
+    def ask_soon(self) -> None:
+        """Have the drive read in time for what the axis does now; see `_ask_in_time`."""
+        self._ask_in_time(self._clock.now_s())
+
+    def frozen_at(self, counts: int) -> FrozenPosition:
+        """Return a position that was frozen in the drive, as the reply to a snapshot has it."""
+        return FrozenPosition(
+            axis=self._name,
+            position=self._telemetry.within_turn(self._telemetry.position(counts))[0],
+            counts=counts,
+            unit=self._tracker.unit,
+            referenced=self._tracker.referenced,
+        )
+
+    # -- what the line says ------------------------------------------------------------------------------------------
+
+    def disconnect(self) -> None:
+        """The drive is out of reach, or has lost power."""
+        self._plausibility.after_gap()
+        self._tracker.disconnected(self._clock.now_ns())
+        self._telemetry.stale(self._clock.now_ns())
+
+    def report_restart(self) -> None:
+        """Its drive has lost power or was reset, and is about to answer again."""
+        self._report_change(DRIVE_RESET, "it has lost power or was reset, and gets its address again")
+
+    # -- digesting ---------------------------------------------------------------------------------------------------
+
+    def _digest(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
+        tracker, arrivals, before = self._tracker, self._arrivals, self._motion.reading
+        was_away = before is not None and tracker.link is LinkState.DOWN
+        had_lost_reference = tracker.reference_lost
+        if tracker.command:
+            arrivals.reading = reading
+        altered = before.altered if before else ""
+        if reading.altered != altered or not reading.profile_done:  # a call less for each poll of what stands
+            self._audit(reading, timing, altered)
+        t, t_error_ns = self._clock.stamp(timing)
+        tracker.observed(reading, timing, t)
+        if was_away and self.returned:
+            self.returned()
+        if tracker.reference_lost and not had_lost_reference:
+            log.warning("reference lost", axis=self._name, faults=[fault.code for fault in reading.faults])
+        self._queue.changed.set()
+        self._motion.reading = reading
+        if self._commands.procedure is not None:
+            self._commands.observed(reading, timing)
+            if self._commands.step_due:
+                self._queue.wake()
+        if self._stops.inherited:
+            self._stops.watch_inherited(reading, timing.sent_at_s)
+        if arrivals.over:
+            asked |= END_ITEMS
+        self._telemetry.reading(reading, asked, t, t_error_ns)
+        if arrivals.reading:
+            arrivals.report()
+            self._ask_in_time(timing.sent_at_s)
+            self._motion.reference.woken.set()
+
+    def _audit(self, reading: AxisReading, timing: Timing, altered: str) -> None:
+        """Report changes of the drive that this daemon has not made; the tracker has not seen the reading yet."""
+        tracker = self._tracker
+        if reading.altered != altered:
+            if reading.altered:
+                self._report_change(DRIVE_CHANGED, reading.altered)
+        elif reading.profile_done or not reading.enabled or not self._stops.possible:
+            return
+        elif tracker.at_rest and not tracker.command and self._queue.free and tracker.concerns(timing):
+            tracker.changed_by_another(DRIVE_CHANGED)
+            self._report_change(DRIVE_CHANGED, "it began to move without a command of this daemon")
+
+    def _take_step(self, step: CounterStep, reading: AxisReading) -> None:
+        """No motion has led to where the drive is: its counter was set, or the encoder slips."""
+        if step is CounterStep.ZEROED:
+            self._tracker.changed_by_another(DRIVE_RESET)
+            self._report_change(DRIVE_RESET, "its position counter has restarted at 0")
+        else:
+            log.error("position jumped", axis=self._name, counts=reading.position_counts)
+            self._tracker.jumped()
+        self._stops.stop_what_is_not_understood(self._motion.config.loss.bus)
+
+    def _report_change(self, fault: Fault, what: str) -> None:
+        log.warning("drive was reset or changed by another program", axis=self._name, what=what)
+        self._note(self._name, events.DRIVE_CHANGED, CommandStatus.FAILED, what, fault.code)
+
+    def _count_miss(self) -> None:
+        before = self._tracker.link
+        self._tracker.missed(self._clock.now_ns())
+        if self._tracker.link is not before:
+            log.warning("drive does not answer", axis=self._name, link=self._tracker.link.value)
+            if self._tracker.link is LinkState.DOWN:
+                self._plausibility.after_gap()
+            self._telemetry.stale(self._clock.now_ns())
+
+    def _ask_in_time(self, at_s: float) -> None:
+        """Have the drive read when the motion under way should end, and while it settles, whatever the rates."""
+        read_at_s = min(self._tracker.next_reading_s(at_s) or math.inf, at_s + self._commands.watch_s)
+        if self.ask_at and not math.isinf(read_at_s):
+            self.ask_at(read_at_s)

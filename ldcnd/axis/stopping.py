@@ -1,0 +1,224 @@
+"""How one axis is brought to rest, whatever its state, its link, a latch or what waits: nothing in here may refuse it.
+
+A stop never waits for commands: it makes their permits void, withdraws what is still queued, and whatever a command
+does next finds that the epoch has moved on. A stop that no drive has confirmed stays to be sent: its line sends it
+again, before anything else to this drive.
+"""
+
+import asyncio
+from collections.abc import Callable
+
+from ldcnd.axis.commands import AxisCommands
+from ldcnd.axis.latches import LatchKeeper
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.permit import Gate, Permit
+from ldcnd.axis.state import REST_COUNTS
+from ldcnd.axis.telemetry import Note
+from ldcnd.axis.turns import CommandQueue
+from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Power, QuickStop, Stop, Verb
+from ldcnd.contract.errors import BusError, CommandAborted, StopLatched
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import Moving
+from ldcnd.drives.axis_config import LossPolicy
+from ldcnd.drives.driver import AxisReading, StopMode
+from ldcnd.line.bus import Bus
+from ldcnd.log import get_logger
+
+log = get_logger("axis")
+
+STOP_ROUNDS = 5
+"""Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
+SETTLES_WITHIN_S = 0.25
+"""Time within which a shaft follows its finished profile, seconds."""
+OVERTAKES = {Verb.POWER: "power off"}
+"""What is said of a command that overtakes others, where it is not its name."""
+UNDERSTOOD_NO_MORE = {LossPolicy.QUICK_STOP: StopMode.ABRUPT, LossPolicy.POWER_OFF: StopMode.OFF}
+"""How a motion is stopped that is not understood any more, by `loss.bus`; smoothly otherwise."""
+
+
+def takes_energy_out(command: AxisCommand[CommandReply]) -> StopMode | None:
+    """Return how a command brings its motor to rest; None for a command that does anything else."""
+    match command:
+        case Stop() | Halt():
+            return StopMode.SMOOTH
+        case QuickStop():
+            return StopMode.ABRUPT
+        case Power(on=False):
+            return StopMode.OFF
+        case _:
+            return None
+
+
+class AxisStops:
+    """Brings one axis to rest.
+
+    Attributes:
+        possible: the drive takes stops over its line.
+        wanted: set when a stop waits to be sent again; its line sees to that.
+        inherited: a motion that an earlier host has left may still run.
+        line_up: its line is ready for stops; while it is not, they wait for it.
+        latches: keeps what forbids the axis to move; a stop is answered when that is kept.
+    """
+
+    def __init__(
+        self,
+        motion: AxisMotion,
+        bus: Bus,
+        gate: Gate,
+        queue: CommandQueue,
+        commands: AxisCommands,
+        next_command_id: Callable[[], str],
+        note: Note,
+    ) -> None:
+        self.possible = Verb.STOP in motion.driver.capabilities
+        self.wanted = asyncio.Event()
+        self.inherited = False
+        self.line_up = False
+        self.latches: LatchKeeper | None = None
+        self._name = motion.tracker.name
+        self._drive = motion.driver
+        self._tracker = motion.tracker
+        self._telemetry = motion.telemetry
+        self._clock = motion.clock
+        self._bus = bus
+        self._gate = gate
+        self._queue = queue
+        self._commands = commands
+        self._next_command_id = next_command_id
+        self._note = note
+        self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
+
+    async def stop(self, mode: StopMode) -> bool:
+        """Stop at once, whatever the state, and latch; return whether the drive confirmed it.
+
+        The latch and the new epoch hold from this call on, confirmed or not. A drive that takes no stop over its line
+        is not latched either: nothing could clear that, and nothing here moves it.
+        """
+        if not self.possible:
+            log.warning("this drive cannot be stopped over its line", axis=self._name)
+            return False
+        self._tracker.latch_stop()
+        log.info("stop", axis=self._name, mode=mode.value)
+        confirmed = await self.bring_to_rest(mode, Verb.STOP)
+        if self.latches:
+            await self.latches.settled()
+        return confirmed
+
+    @property
+    def latch_is_kept(self) -> bool:
+        """Whether the stop that is latched is on the disk, so that it outlasts the daemon."""
+        return self.latches is not None and self.latches.holds(self._name)
+
+    async def bring_to_rest(
+        self, mode: StopMode, verb: Verb = Verb.HALT, by: Permit | None = None, command_id: str | None = None
+    ) -> bool:
+        """Stop at once, before anything that waits; return whether the drive confirmed it.
+
+        Args:
+            mode: how.
+            verb: the command, for the events.
+            by: permit of the command that goes on afterwards; all others are void.
+            command_id: of the command that asks for it; the next one of the daemon when missing.
+        """
+        if not self.possible:
+            return False
+        overtaken = self.overtake(by, by.verb if by else OVERTAKES.get(verb, verb))
+        mode = self._tracker.stop_sent(mode)
+        try:
+            if not self.line_up:
+                return False  # its line is being brought up, or is down: it is the first thing that is sent then
+            self._bus.withdraw(self._drive.spec.address, overtaken)
+            return await self._send(mode, verb, STOP_ROUNDS, command_id)
+        finally:
+            if self._tracker.unconfirmed is not None:
+                self.require(self._tracker.unconfirmed)
+            self._telemetry.state(self._clock.now_ns())
+
+    def overtake(self, by: Permit | None, cause: str) -> StopLatched | CommandAborted:
+        """Make all queued commands and permits void, except the caller's; return the refusal, which names the cause."""
+        self._gate.overtake(by, cause)
+        overtaken = self._gate.overtaken("a queued command")
+        self._queue.refuse(overtaken)
+        return overtaken
+
+    def require(self, mode: StopMode) -> None:
+        """Have a stop sent by the line, before anything else to this drive, until the drive confirms it."""
+        self._tracker.stop_unconfirmed(self._clock.now_ns(), mode)
+        self.wanted.set()
+
+    def stop_what_is_not_understood(self, policy: LossPolicy) -> None:
+        """Have a motor that may have voltage stopped at once; its line sends that again until the drive confirms it."""
+        if not self._tracker.energised or not self.possible:
+            return
+        self.overtake(None, "the stop of a motion that is not understood")
+        self.require(UNDERSTOOD_NO_MORE.get(policy, StopMode.SMOOTH))
+
+    async def send_pending(self) -> None:
+        """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
+        mode = self._tracker.unconfirmed
+        if mode is None:
+            return  # such a stop was confirmed while the axis was read
+        if await self._send(mode, Verb.STOP, rounds=1):
+            log.warning("stop confirmed late", axis=self._name)
+            self._note(self._name, Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again", None)
+        self._telemetry.state(self._clock.now_ns())
+
+    def switch_off(self) -> None:
+        """Have the motor switched off by the first packet to its drive."""
+        if self.possible:
+            self._tracker.stop_unconfirmed(self._clock.now_ns(), StopMode.OFF)
+
+    def inherit(self) -> None:
+        """Its drive is as another host has left it: what moves in it without an end is to be brought to rest."""
+        self.inherited = self.possible
+
+    def note_power_loss(self) -> None:
+        """Note that the drive was reset or had no power: the motion to be stopped has ended."""
+        self.inherited = False
+        self._tracker.stop_confirmed()
+
+    def watch_inherited(self, reading: AxisReading, at_s: float) -> None:
+        """Have a motion stopped that an earlier host has left, if its profile is done and yet it goes on.
+
+        So does velocity mode as soon as its velocity is reached; a trapezoid is done when it stands, and settles.
+        """
+        tracker, position = self._tracker, reading.position_counts
+        if tracker.command is not None or tracker.at_rest:
+            self.inherited, self._done = False, None
+        elif not (reading.enabled and reading.profile_done):
+            self._done = None
+        elif self._done is None:
+            self._done = (at_s, position, False)
+        else:
+            since_s, was_at, settled = self._done
+            if at_s - since_s < SETTLES_WITHIN_S:
+                return
+            if not settled or abs(position - was_at) <= REST_COUNTS:
+                self._done = (at_s, position, True)
+                return
+            self.inherited, self._done = False, None
+            log.warning("motion without an end found", axis=self._name)
+            self.require(StopMode.SMOOTH)
+
+    async def _send(self, mode: StopMode, verb: Verb, rounds: int, command_id: str | None = None) -> bool:
+        """Send a stop, in rounds, until the drive confirms it; return whether it has."""
+        tracker = self._tracker
+        if not tracker.energised:
+            mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
+        stands = verb is Verb.HALT and tracker.command is None and tracker.moving is Moving.NO
+        for _ in range(rounds):
+            try:
+                mode = await self._drive.stop(mode)
+            except BusError as error:
+                log.error("stop not confirmed", axis=self._name, reason=error.message)
+                if self._bus.is_open:
+                    continue
+                return False
+            if mode is StopMode.OFF:
+                self._commands.switched_off()
+                tracker.powered(on=False, now_s=self._clock.now_s())
+            elif not stands:  # what was proven to stand is not watched coming to rest, and keeps its target
+                self._commands.brought_to_rest(command_id or self._next_command_id(), verb)
+            tracker.stop_confirmed(mode)
+            return True
+        return False
