@@ -22,6 +22,4 @@ def line_of(rig: RigConfig, settings: BusConfig) -> UnopenedLine:
         ConfigError: it is simulated, and there is no simulator.
     """
     opener = simulator().opener_of(settings, rig.sim) if settings.simulated else None
-    line = FAMILIES[settings.family].open_lines(None)(settings, opener)
-    line.bus.resync = line.network.resync
-    return line
+    return FAMILIES[settings.family].open_lines(None)(settings, opener)

@@ -69,7 +69,6 @@ class BusService:
         self._stop_wanted = asyncio.Event()
         for axis in axes:
             axis.stops.wanted = self._stop_wanted
-        bus.resync = network.resync
 
     async def run(self) -> None:
         """Serve the line until cancelled."""

@@ -14,7 +14,6 @@ from ldcnd.drives.driver import CountsMotion, Drive, StopMode
 from ldcnd.line.exchange import Timing
 from ldcnd.line.poller import Poller
 from ldcnd.line.proof import Proof
-from ldcnd.line.resync import Resync
 
 
 class StartPolicy(StrEnum):
@@ -193,12 +192,10 @@ class Network(ABC):
 
     Attributes:
         axes: by axis name.
-        resync: how the bus gets this line back in step.
         io: its I/O modules that have a name, by name.
     """
 
     axes: Mapping[str, Drive]
-    resync: Resync
     io: Mapping[str, IoDriver] = MappingProxyType({})
 
     @property

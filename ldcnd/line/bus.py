@@ -131,11 +131,11 @@ class Bus(Users):
         proofs: who is known to be at which address; what changes anything is sent to no other.
     """
 
-    def __init__(self, settings: BusSettings, opener: Opener) -> None:
+    def __init__(self, settings: BusSettings, opener: Opener, resync: Resync | None = None) -> None:
         self.settings = settings
         self.statistics = BusStatistics()
         self.wire_log = WireLog(settings.recorded_s, settings.recorded_bytes)
-        self.resync = Resync()
+        self._resync = resync or Resync()
         self.proofs = Proofs()
         self._opener = opener
         self._loop = asyncio.get_running_loop()
@@ -214,7 +214,7 @@ class Bus(Users):
         Raises:
             BusDown, ReplyTimeout, PacketRejected, BadReply: as `execute`; the probe is not repeated.
         """
-        exchange = self.resync.probe(self._mute.failing())
+        exchange = self._resync.probe(self._mute.failing())
         if exchange is None or self._line is None or not self._queue.takes_probe():
             return
         future: asyncio.Future[Any] = self._loop.create_future()
@@ -324,9 +324,9 @@ class Bus(Users):
     @property
     def quarantine_s(self) -> float:
         """Duration of a resynchronisation after a lost reply, in seconds."""
-        probe = self.resync.probe(self._mute.failing())
-        flush_s = len(self.resync.flush) * self.settings.bits_per_byte / self.baud
-        return self.resync.quiet_s + flush_s + self.resync.settle_s + (self.longest_s(probe) if probe else 0.0)
+        probe = self._resync.probe(self._mute.failing())
+        flush_s = len(self._resync.flush) * self.settings.bits_per_byte / self.baud
+        return self._resync.quiet_s + flush_s + self._resync.settle_s + (self.longest_s(probe) if probe else 0.0)
 
     async def _submit(
         self,
@@ -404,7 +404,7 @@ class Bus(Users):
         self.statistics.openings += 1
         self.wire_log.add(self._loop.time(), WireEvent.OPENED)
         self._mute.forget()
-        self._line = line = Line(self.settings, transport, self, self.resync, self.statistics, self.wire_log)
+        self._line = line = Line(self.settings, transport, self, self._resync, self.statistics, self.wire_log)
         self._closed.clear()
         self._opened.set()
         try:

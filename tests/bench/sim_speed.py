@@ -23,10 +23,9 @@ from pathlib import Path
 from ldcnd.drives.driver import AxisSpec, CountsMotion, Gains, Moves
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.network import LdcnNetwork
+from ldcnd.drives.ldcn.network import ldcn_line
 from ldcnd.drives.ldcn.packet import StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP
-from ldcnd.line.bus import Bus
 from ldcnd.line.settings import BusSettings
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import build_chain
@@ -92,10 +91,8 @@ def _chain(modules: int) -> Chain:
 
 async def _virtual(modules: int) -> tuple[float, float, float]:
     chain = _chain(modules)
-    bus = Bus(BusSettings("bench", 19_200), lambda: open_simulated_line(chain))
     specs = tuple(AxisSpec(f"a{number}", number, LS_182AP.name, GAINS) for number in range(1, modules + 1))
-    network = LdcnNetwork(bus, specs, BAUD)
-    bus.resync = network.resync
+    bus, network = ldcn_line(BusSettings("bench", 19_200), lambda: open_simulated_line(chain), specs, BAUD)
     async with asyncio.TaskGroup() as group:
         running = group.create_task(bus.run(), name="bus")
         await bus.wait_opened()

@@ -37,7 +37,6 @@ async def examined(chain: Chain, holding: Holding = AT_ONCE) -> dict[str, Findin
     config = slow_config()
     line = open_ldcn_line(config.bus[0], Plug(chain, holding).open)
     bus, network = line.bus, line.network
-    bus.resync = network.resync
     async with asyncio.TaskGroup() as group:
         owner = group.create_task(bus.run(), name="bus")
         await bus.wait_opened()

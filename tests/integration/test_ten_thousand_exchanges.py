@@ -10,7 +10,7 @@ from ldcnd.contract.errors import BusError, OutcomeUnknown, ReplyTimeout
 from ldcnd.drives.driver import AxisSpec, CountsMotion, Gains
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.network import LdcnNetwork
+from ldcnd.drives.ldcn.network import ldcn_line
 from ldcnd.drives.ldcn.packet import StatusItem
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.line.bus import Bus
@@ -76,9 +76,7 @@ async def test_every_caller_gets_one_outcome_and_no_value_of_another_node(seed):
             outcomes[type(error).__name__] += 1
 
     async with asyncio.TaskGroup() as group:
-        bus = Bus(BusSettings("a", 19_200), lambda: open_simulated_line(chain))
-        network = LdcnNetwork(bus, specs, 115_200)
-        bus.resync = network.resync
+        bus, network = ldcn_line(BusSettings("a", 19_200), lambda: open_simulated_line(chain), specs, 115_200)
         running = group.create_task(bus.run(), name="bus")
         await bus.wait_opened()
         await network.bring_up()

@@ -155,8 +155,7 @@ class UnrulyLine(RuleBasedStateMachine):
 
     async def _open(self) -> None:
         self.opener = ScriptedOpener(self._answer)
-        self.bus = Bus(self.settings, self.opener)
-        self.bus.resync = toy.RESYNC
+        self.bus = Bus(self.settings, self.opener, toy.RESYNC)
         # the owner lives across many runs of the loop, so no group of one run can hold it
         self.owner = asyncio.get_running_loop().create_task(self.bus.run(), name="bus")
         await self.bus.wait_opened()

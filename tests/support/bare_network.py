@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from ldcnd.drives.driver import AxisSpec, Gains
-from ldcnd.drives.ldcn.network import LdcnNetwork
+from ldcnd.drives.ldcn.network import LdcnNetwork, ldcn_line
 from ldcnd.drives.ldcn.packet import Packet, PacketReader
 from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.drives.network import LineSpec
@@ -59,9 +59,7 @@ async def bare_network(
         return transport
 
     async with asyncio.TaskGroup() as group:
-        bus = Bus(BusSettings("a", fixed_baud or RESET_BAUD), opener)
-        network = LdcnNetwork(bus, axes, baud, line)
-        bus.resync = network.resync
+        bus, network = ldcn_line(BusSettings("a", fixed_baud or RESET_BAUD), opener, axes, baud, line)
         running = group.create_task(bus.run(), name="bus")
         await bus.wait_opened()
         try:

@@ -23,8 +23,7 @@ class Rig:
 
     def __init__(self, script: Script = toy.answer, settings: BusSettings = SETTINGS):
         self.opener = ScriptedOpener(script)
-        self.bus = Bus(settings, self.opener)
-        self.bus.resync = toy.RESYNC
+        self.bus = Bus(settings, self.opener, toy.RESYNC)
 
     @property
     def line(self) -> ScriptedLine:

@@ -5,10 +5,9 @@ import contextlib
 
 from ldcnd.contract.errors import NetworkMismatch
 from ldcnd.drives.driver import AxisSpec
-from ldcnd.drives.ldcn.network import LdcnNetwork
+from ldcnd.drives.ldcn.network import ldcn_line
 from ldcnd.drives.ldcn.profiles import Support
 from ldcnd.drives.network import BringUpReport, LineSpec, ModuleEntry
-from ldcnd.line.bus import Bus
 from ldcnd.line.settings import BusSettings
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.module import SimulatedModule
@@ -29,9 +28,9 @@ async def bring_up(chain: Chain, baud: int = 115_200, attempts: int = 1) -> Brin
             drives.append(AxisSpec(f"a{address}", address, name, None, identity))
         else:
             others.append(ModuleEntry(address, name, identity))
-    bus = Bus(BusSettings("clean", 19_200), lambda: open_simulated_line(chain))
-    network = LdcnNetwork(bus, tuple(drives), baud, LineSpec(modules=tuple(others)))
-    bus.resync = network.resync
+    line = LineSpec(modules=tuple(others))
+    settings = BusSettings("clean", 19_200)
+    bus, network = ldcn_line(settings, lambda: open_simulated_line(chain), tuple(drives), baud, line)
     async with asyncio.TaskGroup() as group:
         running = group.create_task(bus.run(), name="bus")
         try:

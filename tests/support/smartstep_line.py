@@ -12,6 +12,7 @@ from ldcnd.drives.smartstep.addresses import NEVER_VALID
 from ldcnd.drives.smartstep.drive import SmartStepAxis, UnitSpec
 from ldcnd.drives.smartstep.ledger import EepromLedger
 from ldcnd.drives.smartstep.network import BAUD, SmartStepNetwork, smartstep_opener
+from ldcnd.drives.smartstep.network import smartstep_line as line_of
 from ldcnd.drives.smartstep.packet import decode_command
 from ldcnd.drives.smartstep.parameter_store import EepromRules
 from ldcnd.drives.smartstep.parameters import PN000, Parameter
@@ -128,17 +129,13 @@ async def smartstep_line(
         framing: of the simulated port.
     """
     chain = smartstep_chain(units, wiring, framing, faults=faults)
-    bus = Bus(
-        BusSettings("steps", BAUD, margin_s=0.01),
-        smartstep_opener(lambda: open_simulated_line(chain), profile),
-    )
     rules = EepromRules(EepromLedger(ledger) if ledger else None, budget)
     specs = tuple(
         UnitSpec(AxisSpec(f"u{number}", number, "smartstep", None), profile, eeprom=rules)
         for number in (numbers if numbers is not None else [unit.drive.unit for unit in units])
     )
-    network = SmartStepNetwork(bus, specs)
-    bus.resync = network.resync
+    opener = smartstep_opener(lambda: open_simulated_line(chain), profile)
+    bus, network = line_of(BusSettings("steps", BAUD, margin_s=0.01), opener, specs)
     for spec in specs:  # as after a bring-up
         bus.proofs.expect(spec.axis.address, spec.axis.name).prove()
     async with asyncio.TaskGroup() as group:

@@ -40,7 +40,6 @@ from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
 from ldcnd.line.flight_recorder import WireRecord
 from ldcnd.line.port_url import port_opener
-from ldcnd.line.resync import Resync
 from ldcnd.line.transport import Opener
 
 BAUD = 57_600
@@ -173,7 +172,6 @@ class ToyNetwork(Network):
         self._bus = bus
         self._stages = {spec.name: ToyStage(spec, bus) for spec in specs}
         self.axes: Mapping[str, Drive] = self._stages
-        self.resync = Resync()
 
     @override
     async def bring_up(self) -> BringUpReport:

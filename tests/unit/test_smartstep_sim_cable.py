@@ -111,8 +111,8 @@ def received(chain: Chain, request: bytes, at_s: float = 1.0) -> list[tuple[floa
 
 @asynccontextmanager
 async def bus_on(chain: Chain, *, echo: bool = False) -> AsyncIterator[Bus]:
-    bus = Bus(BusSettings("steps", 9600, echo=echo), lambda: open_simulated_line(chain))
-    bus.resync = Resync(flush=FLUSH, quiet_s=0.02, probe=lambda _: probe(1))
+    resync = Resync(flush=FLUSH, quiet_s=0.02, probe=lambda _: probe(1))
+    bus = Bus(BusSettings("steps", 9600, echo=echo), lambda: open_simulated_line(chain), resync)
     for number in (1, 2):
         bus.proofs.expect(number, f"unit {number}").prove()
     with suppress(asyncio.CancelledError):

@@ -52,8 +52,8 @@ class SmartStepBench(BenchFamily[SmartStepBusConfig]):
     @override
     def scan(self, port: str, *, give_addresses: bool, opener: Opener | None = None) -> Scan:
         opener = opener or smartstep_opener(port_opener(port, BAUD, "8n1"), SOFT_PARITY)
-        bus = Bus(BusSettings("scan", BAUD, margin_s=0.01, attempts=1), opener)
-        bus.resync = Resync(flush=FLUSH, quiet_s=SOFT_PARITY.gap_s, settle_s=SOFT_PARITY.quiet_s, probe=lambda _: None)
+        resync = Resync(flush=FLUSH, quiet_s=SOFT_PARITY.gap_s, settle_s=SOFT_PARITY.quiet_s)
+        bus = Bus(BusSettings("scan", BAUD, margin_s=0.01, attempts=1), opener, resync)
         drives: list[ScannedDrive] = []
 
         def found(unit: int, text: str) -> None:
@@ -100,7 +100,6 @@ rates = {{ position = 0.5, velocity = 1, state = 1 }}
         except ValueError as error:
             raise ConfigError(f"{port}, units {units}: {error}") from error
         line = open_smartstep_line(settings, opener)
-        line.bus.resync = line.network.resync
         return LineTrial(line.bus, self.examine(line, settings), settings)
 
 

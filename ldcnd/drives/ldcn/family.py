@@ -15,7 +15,7 @@ from ldcnd.drives.family import Demand, Family, OpenLine, UnopenedLine, bus_sett
 from ldcnd.drives.ldcn.config import LdcnBusConfig
 from ldcnd.drives.ldcn.costs import price_list
 from ldcnd.drives.ldcn.io_module import poll_io
-from ldcnd.drives.ldcn.network import PERIOD_S, LdcnNetwork, watch_module
+from ldcnd.drives.ldcn.network import PERIOD_S, ldcn_line, watch_module
 from ldcnd.drives.ldcn.profiles import CYCLE_CLOCKS, PROFILES
 from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud, baud_at_reset, baud_divisor
 from ldcnd.drives.ldcn.transcript import LdcnTranscript
@@ -23,7 +23,6 @@ from ldcnd.drives.line_plan import Poll, Urgent
 from ldcnd.drives.price_list import PriceList
 from ldcnd.drives.response_times import PeriodicTask
 from ldcnd.drives.transcript import Describe
-from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
 from ldcnd.line.port_url import SOCKET, port_opener
 from ldcnd.line.settings import ServoCycle
@@ -67,13 +66,14 @@ LDCN = LdcnFamily()
 def open_ldcn_line(settings: LdcnBusConfig, opener: Opener | None = None) -> UnopenedLine:
     """Return a line that is not open yet, which is opened by its port or by `opener`."""
     baud = settings.baud if settings.port.startswith(SOCKET) else baud_at_reset(settings.clock_hz)
-    bus = Bus(
+    line = ldcn_line(
         bus_settings(settings, baud, cycle=servo_cycle(settings), coalesce_s=settings.coalesce_ms / 1000),
         opener or port_opener(settings.port, baud, working_baud=settings.baud, rs485=settings.rs485),
+        tuple(axis.spec() for axis in settings.axis),
+        settings.baud,
+        settings.spec(),
     )
-    return UnopenedLine(
-        bus, LdcnNetwork(bus, tuple(axis.spec() for axis in settings.axis), settings.baud, settings.spec())
-    )
+    return UnopenedLine(*line)
 
 
 # -- the load of a line ----------------------------------------------------------------------------------------------

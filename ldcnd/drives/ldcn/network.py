@@ -52,6 +52,8 @@ from ldcnd.line.exchange import Exchange, Timing
 from ldcnd.line.poller import Poller, next_on_grid
 from ldcnd.line.proof import bringing_up
 from ldcnd.line.resync import Resync
+from ldcnd.line.settings import BusSettings
+from ldcnd.line.transport import Opener
 from ldcnd.log import get_logger
 
 PERIOD_S = 1.0
@@ -99,11 +101,35 @@ RATE_ATTEMPTS = 2
 """Attempts at Set Baud to the whole line: it is not answered, and one lost packet must not decide on the rate."""
 
 
-class LdcnNetwork(Network):
-    """The chain of modules on one line."""
+def ldcn_line(
+    settings: BusSettings, opener: Opener, specs: tuple[AxisSpec, ...], baud: int, line: LineSpec | None = None
+) -> tuple[Bus, "LdcnNetwork"]:
+    """Return a bus that is not open yet, and its network; see `LdcnNetwork`."""
+    identities: dict[int, Identity] = {}
 
-    def __init__(self, bus: Bus, specs: tuple[AxisSpec, ...], baud: int, line: LineSpec | None = None) -> None:
-        line = line or LineSpec()
+    def probe(avoid: AbstractSet[int]) -> Exchange[Any] | None:
+        # the identity of a module is known beforehand, and no poll has a reply of its length
+        candidates = [address for address in identities if address not in avoid] or list(identities)
+        return read_identity(candidates[0], identities[candidates[0]]) if candidates else None
+
+    bus = Bus(settings, opener, Resync(flush=NULLS, quiet_s=0.005, settle_s=NULLS_SETTLE_S, probe=probe))
+    return bus, LdcnNetwork(bus, specs, baud, line or LineSpec(), identities)
+
+
+class LdcnNetwork(Network):
+    """The chain of modules on one line.
+
+    Args:
+        bus: the line.
+        specs: its axes.
+        baud: the rate to work at.
+        line: what else the configuration says of it.
+        identities: gets those of the modules that are found; a resynchronisation asks for one of them.
+    """
+
+    def __init__(
+        self, bus: Bus, specs: tuple[AxisSpec, ...], baud: int, line: LineSpec, identities: dict[int, Identity]
+    ) -> None:
         self._bus = bus
         self._baud = baud
         self._line = line
@@ -111,7 +137,7 @@ class LdcnNetwork(Network):
             spec.address: LdcnAxis(spec, at_clock(PROFILES[spec.model], line.clock_hz), bus) for spec in specs
         }
         self._names = {spec.address: spec.name for spec in specs}
-        self._identities: dict[int, Identity] = {}
+        self._identities = identities
         self._watches: dict[int, ModuleWatch | IoModule] = {}
         self._was_up = False
         self._restarted: set[int] = set()  # given their addresses again, on a line that has not come up since
@@ -143,7 +169,6 @@ class LdcnNetwork(Network):
         self.axes: Mapping[str, Drive] = drives
         self._groups = Groups(bus, plan, self._addressing, drives, tuple(self._io.values()), snapshots=line.snapshot)
         self.io: Mapping[str, IoDriver] = {module.name: module for module in self._io.values()}
-        self.resync = Resync(flush=NULLS, quiet_s=0.005, settle_s=NULLS_SETTLE_S, probe=self._probe)
 
     # -- bring-up ----------------------------------------------------------------------------------------------------
 
@@ -225,7 +250,8 @@ class LdcnNetwork(Network):
         )
 
     def _up(self, modules: Mapping[int, Identity], remarks: tuple[str, ...], *, reset: bool) -> BringUpReport:
-        self._identities = dict(modules)
+        self._identities.clear()
+        self._identities.update(modules)
         self._gathering.places = self._expected + tuple(
             Expected(address, "module", found.profile or PIC_STEP, found)
             for address, found in sorted(modules.items())
@@ -508,13 +534,6 @@ class LdcnNetwork(Network):
             status=watch.status if watch else None,
             name=self._io[address].name if address in self._io else None,
         )
-
-    def _probe(self, avoid: AbstractSet[int]) -> Exchange[Any] | None:
-        """See `Resync`: the identity of a module is known beforehand, and no poll has a reply of this length."""
-        candidates = [address for address in self._identities if address not in avoid] or list(self._identities)
-        if not candidates:
-            return None
-        return read_identity(candidates[0], self._identities[candidates[0]])
 
 
 def _expected(specs: tuple[AxisSpec, ...], line: LineSpec) -> tuple[Expected, ...]:

@@ -16,7 +16,7 @@ from ldcnd.drives.smartstep.costs import BAUD, price_list, words_of
 from ldcnd.drives.smartstep.drive import UnitSpec
 from ldcnd.drives.smartstep.ledger import EepromLedger
 from ldcnd.drives.smartstep.monitors import HISTORY_LENGTH
-from ldcnd.drives.smartstep.network import SmartStepNetwork, smartstep_opener
+from ldcnd.drives.smartstep.network import smartstep_line, smartstep_opener
 from ldcnd.drives.smartstep.packet import SmartStepTranscript
 from ldcnd.drives.smartstep.parameter_store import EepromRules
 from ldcnd.drives.smartstep.parameters import PARAMETERS, digit_texts
@@ -25,7 +25,6 @@ from ldcnd.drives.smartstep.profiles import SMARTSTEP as PROFILE
 from ldcnd.drives.smartstep.profiles import Echo, Framing, SmartStepProfile
 from ldcnd.drives.smartstep.transfer import check_values, listed
 from ldcnd.drives.transcript import Describe
-from ldcnd.line.bus import Bus
 from ldcnd.line.port_url import port_opener
 from ldcnd.line.serial_port import Framing as SerialFraming
 from ldcnd.line.transport import Opener
@@ -90,12 +89,6 @@ def open_smartstep_line(
         ledger: counts EEPROM writes.
     """
     profile = settings.profile(settings.axis[0])
-    bus = Bus(
-        bus_settings(
-            settings, BAUD, margin_s=profile.quiet_s, attempts=profile.attempts, echo=profile.echo is Echo.EXPECT
-        ),
-        opener or smartstep_opener(_port_opener(settings, profile), profile),
-    )
     specs = tuple(
         UnitSpec(
             AxisSpec(axis.name, axis.address, axis.model, None),
@@ -105,7 +98,14 @@ def open_smartstep_line(
         )
         for axis in settings.axis
     )
-    return UnopenedLine(bus, SmartStepNetwork(bus, specs))
+    line = smartstep_line(
+        bus_settings(
+            settings, BAUD, margin_s=profile.quiet_s, attempts=profile.attempts, echo=profile.echo is Echo.EXPECT
+        ),
+        opener or smartstep_opener(_port_opener(settings, profile), profile),
+        specs,
+    )
+    return UnopenedLine(*line)
 
 
 def _port_opener(settings: SmartStepBusConfig, profile: SmartStepProfile) -> Opener:

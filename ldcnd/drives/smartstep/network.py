@@ -30,6 +30,7 @@ from ldcnd.drives.smartstep.words import stray_packets
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
 from ldcnd.line.resync import Resync
+from ldcnd.line.settings import BusSettings
 from ldcnd.line.transport import Opener, Receiver, Transport
 from ldcnd.log import get_logger
 
@@ -135,19 +136,39 @@ def smartstep_opener(opener: Opener, profile: SmartStepProfile) -> Opener:
 log = get_logger("smartstep")
 
 
-class SmartStepNetwork(Network):
-    """The units of one line."""
+def smartstep_line(
+    settings: BusSettings, opener: Opener, specs: tuple[UnitSpec, ...]
+) -> tuple[Bus, "SmartStepNetwork"]:
+    """Return a bus that is not open yet, and its network."""
+    answering: list[int] = []
 
-    def __init__(self, bus: Bus, specs: tuple[UnitSpec, ...]) -> None:
+    def probe(avoid: AbstractSet[int]) -> Exchange[Any] | None:
+        # no other command's reply carries the address of the probe
+        candidates = [number for number in answering if number not in avoid] or answering
+        return commands.probe(candidates[0]) if candidates else None
+
+    bus = Bus(settings, opener, Resync(flush=commands.FLUSH, quiet_s=SMARTSTEP.gap_s, settle_s=0.005, probe=probe))
+    return bus, SmartStepNetwork(bus, specs, answering)
+
+
+class SmartStepNetwork(Network):
+    """The units of one line.
+
+    Args:
+        bus: the line.
+        specs: the units.
+        answering: gets the units that answer; a resynchronisation asks one of them.
+    """
+
+    def __init__(self, bus: Bus, specs: tuple[UnitSpec, ...], answering: list[int]) -> None:
         self._bus = bus
         names = {spec.axis.address: spec.axis.name for spec in specs}
         self._units = {
             number: SmartStepAxis(spec, bus, {other: name for other, name in names.items() if other != number})
             for number, spec in ((spec.axis.address, spec) for spec in specs)
         }
-        self._answering: list[int] = []
+        self._answering = answering
         self.axes: Mapping[str, Drive] = {unit.spec.name: unit for unit in self._units.values()}
-        self.resync = Resync(flush=commands.FLUSH, quiet_s=SMARTSTEP.gap_s, settle_s=0.005, probe=self._probe)
 
     async def bring_up(self) -> BringUpReport:
         """See `Network`: read the identity of every unit; only reads.
@@ -225,11 +246,6 @@ class SmartStepNetwork(Network):
         if FunctionSwitch.PARAMETERS_RULE not in function_switches(await words.read(Register.FUNCTION_SWITCHES)):
             remarks.append(f"{who}: its switches seem to overrule parameters (switch 6 is off)")
         return remarks
-
-    def _probe(self, avoid: AbstractSet[int]) -> Exchange[Any] | None:
-        """See `Resync`: no other command's reply carries the address of the probe."""
-        candidates = [number for number in self._answering if number not in avoid] or self._answering
-        return commands.probe(candidates[0]) if candidates else None
 
 
 async def hears_itself(bus: Bus, unit: SmartStepAxis) -> bool:
