@@ -13,7 +13,7 @@ from hypothesis import settings
 from pytest_asyncio import is_async_test
 from structlog._config import BoundLoggerLazyProxy
 
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 
 # one run is like the other, so more examples find nothing new; `make soak` looks at what was never tried, and prints
 # how to repeat what it finds

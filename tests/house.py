@@ -37,8 +37,8 @@ from ldcnd.contract.fault_pages import FOLDER
 from ldcnd.contract.parameters import ReadAlarms
 from ldcnd.contract.traces import TakeTrace
 from ldcnd.sim.smartstep.variant import SimulatedVariant
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.console_rig import open_page, running_console
-from tests.support.jumping_loop import JumpingLoop
 from tests.support.pages import ROOT, pages
 from tests.support.rig import SIMULATED, RunningRig, running_rig
 from tests.support.trace_rig import trace_config

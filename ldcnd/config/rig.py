@@ -167,6 +167,13 @@ def _names(rig: RigConfig) -> str:
     return ", ".join(bus.name for bus in rig.bus)
 
 
+def example(name: str) -> Path:
+    """Return a configuration that ldcnd brings along: a wheel has copies of them, a checkout has them beside it."""
+    package = Path(__file__).parents[1]
+    folder = package / "examples"
+    return (folder if folder.is_dir() else package.parent / "config") / name
+
+
 def load_config(path: Path) -> RigConfig:
     """Read and validate a rig's configuration.
 

@@ -26,7 +26,7 @@ from ldcnd.contract.commands import MoveRelative, Power
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.net.session import Qos
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig
 
 if TYPE_CHECKING:

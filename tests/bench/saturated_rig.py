@@ -5,7 +5,7 @@ from collections.abc import Awaitable, Callable
 from typing import TypeVar
 
 from ldcnd.config.rig import RigConfig
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig
 
 ResultT = TypeVar("ResultT")

@@ -13,7 +13,7 @@ from ldcnd.contract.events import ReadOutcome
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.driver import AxisReading
 from ldcnd.line.exchange import Timing
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig
 
 DISTANCES = {"x": 5.0, "y": 5.0, "z": 5.0, "c": 90.0}

@@ -31,7 +31,7 @@ from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import build_chain
 from ldcnd.sim.ldcn.simulation import SimulatedModuleConfig, SimulationConfig
 from ldcnd.sim.line import open_simulated_line
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.rough_host import enumeration, frame, jog, powered
 
 COUNTS = (1, 8, 31)

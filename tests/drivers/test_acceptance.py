@@ -21,8 +21,8 @@ from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.pty import PtyLine
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.simulation import SimulatedUnitConfig, simulated_units
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.chain_rig import drive, rig_on, simulated_config
-from tests.support.jumping_loop import JumpingLoop
 from tests.support.plugged_rig import MODELS
 from tests.support.recorded_line import Replay
 from tests.support.serial_adapter import Plug

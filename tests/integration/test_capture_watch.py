@@ -8,8 +8,8 @@ import pytest
 
 from ldcnd.config.rig import CapturesConfig, load_config
 from ldcnd.line.capture import parse_capture
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.captures import FOLDER, replayed
-from tests.support.jumping_loop import JumpingLoop
 from tests.support.process import LDCND, answering, free_port
 from tests.support.rig import running_rig
 

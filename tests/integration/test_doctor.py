@@ -9,8 +9,8 @@ from ldcnd.cli.examine import examine_line
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import BusDown
 from ldcnd.contract.health import Finding, Verdict
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.command_line import run_here
-from tests.support.jumping_loop import JumpingLoop
 
 MIXED = Path(__file__).parents[2] / "config" / "mixed.toml"
 

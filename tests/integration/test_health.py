@@ -18,7 +18,7 @@ from ldcnd.line.wire import bucket_limit_s
 from ldcnd.net.hand_over import PENDING_QUERIES
 from ldcnd.net.session import SampleKind
 from ldcnd.sim.ldcn.chain import build_chain
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.rig import SIMULATED, running_rig
 
 KEYS = Keys("sim")

@@ -33,7 +33,7 @@ from ldcnd.drives.axis_config import ApproachConfig
 from ldcnd.drives.ldcn.profiles import LS_182AP
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.plant import MotorPlant
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.rig import SIMULATED, running_rig
 
 CONFIGURED = {"kp": 350, "kd": 3000, "ki": 400, "il": 400, "ol": 250, "el": 4000, "sr": 1, "deadband": 0}

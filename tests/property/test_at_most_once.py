@@ -22,7 +22,7 @@ from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 
 SCHEDULES = 120
 """Of a batch; `make test` lives through the first third of the first one."""

@@ -16,8 +16,8 @@ from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
 from ldcnd.line.queue import Lane
 from ldcnd.line.settings import BusSettings
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support import toy_family as toy
-from tests.support.jumping_loop import JumpingLoop
 from tests.support.scripted_line import Say, ScriptedOpener
 
 FIRST_NUMBER = 0x8000

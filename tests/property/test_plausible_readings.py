@@ -28,8 +28,8 @@ from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.plant import MotorPlant
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.chain_rig import ChainRig, drive, rig_on
-from tests.support.jumping_loop import JumpingLoop
 
 MODELS = {"ls-182ap": "ls182ap", "pic-servo-v4": "picservo-v4", "pic-servo-sc": "picservo-sc"}
 COUNTS, EL, NOISE = 1000, 4000, 16

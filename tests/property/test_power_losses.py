@@ -17,8 +17,8 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.samples import LinkState
 from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.chain_rig import rig_on
-from tests.support.jumping_loop import JumpingLoop
 
 MODELS = ("ls-182ap", "ls-182ap", "ls-182ap", "pic-servo-v4", "pic-servo-v4", "pic-servo-sc", "pic-io")
 BACK_WITHIN_S = 8.0

@@ -34,8 +34,8 @@ from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply, FaultyReques
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.chain_rig import ChainRig, rig_on
-from tests.support.jumping_loop import JumpingLoop
 
 MODELS = ("pic-servo-v1", "pic-servo-v3", "pic-servo-v4", "pic-servo-cmc", "pic-servo-sc", "ls-173ap", "ls-182ap")
 DIVISORS = (1, 2, 10)

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support import rough_host as rough
 from tests.support.clean_host import bring_up
-from tests.support.jumping_loop import JumpingLoop
 
 CHAINS = (
     ("ls182ap", "picio", "picservo-v4"),

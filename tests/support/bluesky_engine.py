@@ -18,7 +18,7 @@ from ldcnd.lab.bluesky import Devices, PlanAxis
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig, two_axes
 
 with suppress(ImportError):

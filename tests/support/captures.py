@@ -17,7 +17,7 @@ from ldcnd.daemon.capture import config_of, lines_of
 from ldcnd.line.capture import Capture
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.session import Publication
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.replay import play, published_line, virtual_time
 
 FOLDER = Path(__file__).parents[1] / "captures"

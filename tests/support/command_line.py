@@ -23,7 +23,7 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.sim.chain import Chain
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.rig import RunningRig, running_rig
 
 ResultT = TypeVar("ResultT")

@@ -16,7 +16,7 @@ from typing import Any, NoReturn, TypeVar
 from pydantic import BaseModel
 from typing_extensions import override
 
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 
 ResultT = TypeVar("ResultT")
 LONGEST_LIFE_S = 600

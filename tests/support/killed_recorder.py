@@ -11,7 +11,7 @@ import signal
 from pathlib import Path
 
 from ldcnd.lab.recording.mcap_file import McapFile
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.recordings import recorded_rig, thirty_one_axes
 
 MOST_AXES = 31

@@ -13,8 +13,8 @@ from ldcnd.contract.rig_commands import AxisMove, MoveTogether, PreviewTogether
 from ldcnd.contract.samples import LinkState
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.chain_rig import drive, rig_on, simulated_config
-from tests.support.jumping_loop import JumpingLoop
 
 TO = {"x": 40.0, "y": 15.0}
 SPEEDS = (2.0, 10.0, 20.0)

@@ -23,7 +23,7 @@ from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from ldcnd.line.port_url import SOCKET
 from ldcnd.net.memory_session import MemoryBroker, MemorySession
 from ldcnd.net.session import Publication
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.recorded_line import Replay, ReplayDeviation
 
 Take = Callable[[Publication], None]

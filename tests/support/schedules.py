@@ -51,7 +51,7 @@ from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.shaft_judge import Held, ShaftJudge, now_ns
 
 RIG, LINE = "sim", "a"

@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 
 
 async def test_an_hour_takes_no_time():

@@ -9,7 +9,7 @@ from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
-from tests.support.jumping_loop import JumpingLoop
+from ldcnd.testing.jumping_loop import JumpingLoop
 
 SET_ADDRESS_1 = bytes.fromhex("aa 00 21 01 ff 21")
 SET_ADDRESS_2 = bytes.fromhex("aa 00 21 02 ff 22")

@@ -22,7 +22,7 @@ LONGEST_NAP_S = 0.5
 """Where the next known instant is farther away, a timer is on time."""
 
 
-class Arrival:
+class Happening:
     """Something that comes from outside at a given instant, until it is cancelled."""
 
     def __init__(self, callback: Callable[[], None]) -> None:
@@ -47,7 +47,7 @@ class _JumpingSelector(selectors.SelectSelector):
         self.signalled = False
         self.now_s = now_s
         self.awake_at_s = sorted(awake_at_s)
-        self.arrivals: list[tuple[float, int, Arrival]] = []
+        self.arrivals: list[tuple[float, int, Happening]] = []
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         ready: list[tuple[selectors.SelectorKey, int]] = []
@@ -116,9 +116,9 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         """Let time pass as if the callback that runs now had taken so long."""
         self._jumping.now_s = _whole_s(self._jumping.now_s + duration_s)
 
-    def arrive_at(self, at_s: float, callback: Callable[[], None]) -> Arrival:
+    def arrive_at(self, at_s: float, callback: Callable[[], None]) -> Happening:
         """Have something come from outside: like bytes at a port it goes before timers that are late."""
-        arrival = Arrival(callback)
+        arrival = Happening(callback)
         heapq.heappush(self._jumping.arrivals, (max(at_s, self.time()), next(self._numbers), arrival))
         return arrival
 

@@ -1,0 +1,19 @@
+"""Rehearse programs that move machines: a whole daemon, its lines and its drives inside a test, on a clock that jumps.
+
+    async def test_the_scan_stops_where_something_jams(ldcnd_rig):
+        ldcnd_rig.faults.jam("x", at=7.5)
+        with pytest.raises(ldcnd.DriveFault):
+            await my_scan(ldcnd_rig.client)
+        assert ldcnd_rig.truth("x").at_rest
+
+With pytest the fixtures `ldcnd_rig` and `ldcnd_endpoint` are there as soon as ldcnd is installed; without it, `run` and
+`simulated_rig` do the same.
+"""
+
+from ldcnd.testing.faults import RigFault, RigFaults
+from ldcnd.testing.jumping_loop import JumpingLoop
+from ldcnd.testing.lines import simulated_config
+from ldcnd.testing.rig import SimulatedRig, run, simulated_rig
+from ldcnd.testing.truth import Truth
+
+__all__ = ["JumpingLoop", "RigFault", "RigFaults", "SimulatedRig", "Truth", "run", "simulated_config", "simulated_rig"]

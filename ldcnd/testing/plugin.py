@@ -1,0 +1,88 @@
+"""The plugin for pytest: the fixture `ldcnd_rig`, and what a failed test with it shows.
+
+Loaded by pytest wherever ldcnd is installed, so it imports nothing of ldcnd before a test asks for a rig.
+"""
+
+import asyncio
+import inspect
+import tempfile
+from collections.abc import AsyncIterator, Callable, Generator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pytest
+
+if TYPE_CHECKING:
+    from ldcnd.testing.rig import SimulatedRig
+
+RIG = "ldcnd_rig"
+EXAMPLE = "simulated.toml"
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Name the marker."""
+    config.addinivalue_line("markers", "ldcnd_rig(file, seed=None): the configuration on which `ldcnd_rig` rehearses")
+
+
+@pytest.hookimpl(wrapper=True, trylast=True)
+def pytest_pycollect_makeitem() -> Generator[None, Any, Any]:
+    """Let tests on a rig be run by pytest-asyncio, also where it runs only what is marked."""
+    made = yield
+    for item in made if isinstance(made, list) else [made]:
+        if isinstance(item, pytest.Function) and RIG in item.fixturenames and inspect.iscoroutinefunction(item.obj):
+            item.add_marker(pytest.mark.asyncio)
+    return made
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_asyncio_loop_factories(item: pytest.Item) -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
+    """Let tests on a rig run on its clock, and all others as they did."""
+    if RIG not in getattr(item, "fixturenames", ()):
+        return {"asyncio": asyncio.new_event_loop}
+    from ldcnd.testing.jumping_loop import JumpingLoop  # noqa: PLC0415 - see above
+
+    return {"jumping": JumpingLoop}
+
+
+def _async_fixture(function: Callable[..., AsyncIterator[Any]]) -> Any:  # noqa: ANN401 - a fixture is of no public type
+    try:
+        import pytest_asyncio  # noqa: PLC0415 - an extra
+    except ModuleNotFoundError:
+
+        @pytest.fixture(name=RIG)
+        def missing() -> None:
+            pytest.fail("the fixture ldcnd_rig needs pytest-asyncio 1.4 or later: pip install 'ldcnd[testing]'")
+
+        return missing
+    return pytest_asyncio.fixture(name=RIG)(function)
+
+
+async def _rig(request: pytest.FixtureRequest) -> "AsyncIterator[SimulatedRig]":
+    """Rehearse on the rig that `@pytest.mark.ldcnd_rig("rig.toml")` names, beside the test, or on one of four axes."""
+    from ldcnd.config.rig import example  # noqa: PLC0415 - see above
+    from ldcnd.testing.rig import simulated_rig  # noqa: PLC0415
+
+    marker = request.node.get_closest_marker(RIG)
+    file = request.path.parent / marker.args[0] if marker and marker.args else example(EXAMPLE)
+    async with simulated_rig(file, seed=marker.kwargs.get("seed") if marker else None) as rig:
+        request.node.stash[RIG_OF_TEST] = rig
+        yield rig
+
+
+ldcnd_rig = _async_fixture(_rig)
+RIG_OF_TEST = pytest.StashKey["SimulatedRig"]()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
+    """Show what happened on the rig of a test that failed."""
+    report = yield
+    rig = item.stash.get(RIG_OF_TEST, None)
+    if rig is not None and report.when == "call" and report.failed:
+        lines = [str(rig.timeline)]
+        name = "".join(letter if letter.isalnum() else "_" for letter in item.name)
+        picture = rig.timeline.draw(Path(tempfile.mkdtemp(prefix="ldcnd-")) / f"{name}.png")
+        if picture:
+            lines.append(f"positions over time: {picture}")
+        report.sections.append(("what happened on the rig", "\n".join(lines)))
+    return report

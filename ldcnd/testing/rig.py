@@ -1,0 +1,349 @@
+"""A whole rig in the process of a test: its daemon, its simulated lines, a client, and a network between them."""
+
+import asyncio
+import contextlib
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
+from contextlib import AsyncExitStack, asynccontextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+from typing_extensions import override
+
+from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.contract.errors import NotSupported, OutcomeUnknown, UnknownAxis
+from ldcnd.contract.samples import LinkState
+from ldcnd.daemon.assembly import build_daemon
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.line.transport import Opener, Receiver, Transport
+from ldcnd.net.hand_over import Answer
+from ldcnd.net.memory_session import MemoryBroker, MemorySession
+from ldcnd.net.session import NO_PARAMETERS, QUERY_TIMEOUT_S, Publication
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.known import SIMULATED, opener_of
+from ldcnd.testing.faults import Processes, RigFaults
+from ldcnd.testing.jumping_loop import JumpingLoop
+from ldcnd.testing.lines import simulated_config
+from ldcnd.testing.timeline import Timeline
+from ldcnd.testing.truth import Machine, Truth
+
+ResultT = TypeVar("ResultT")
+
+BEGINS_NS = 1_700_000_000_000_000_000
+"""The wall clock at the beginning of every rehearsal, UTC in ns since 1970: what is repeated is the same to the bit."""
+UP_WITHIN_S = 60.0
+LOOK_S = 0.01
+"""How often a condition is looked at, in seconds of the jumping clock."""
+
+
+def run(program: Coroutine[Any, Any, ResultT]) -> ResultT:
+    """Run a program on a clock that jumps from timer to timer: minutes of a rig in a second; as `asyncio.run`.
+
+    Everything that the program waits for must be in this process. A program that waits for what never comes ends with
+    RuntimeError and the word deadlock.
+    """
+    with asyncio.Runner(loop_factory=JumpingLoop) as runner:
+        return runner.run(program)
+
+
+class _MortalPort(Transport):
+    """A port of a daemon that can be killed: from then on nothing passes in either direction."""
+
+    def __init__(self, port: Transport, life: "_Life") -> None:
+        self._port = port
+        self._life = life
+        self.fixed_baud, self.lag_s, self.pushes = port.fixed_baud, port.lag_s, port.pushes
+
+    @override
+    def attach(self, receiver: Receiver) -> None:
+        self._port.attach(receiver)
+
+    @override
+    def write(self, data: bytes) -> None:
+        if self._life.alive:
+            self._port.write(data)
+
+    @override
+    def push(self) -> None:
+        self._port.push()
+
+    @override
+    def expect(self, reply_bytes: int) -> None:
+        self._port.expect(reply_bytes)
+
+    @override
+    def collect(self) -> None:
+        self._port.collect()
+
+    @override
+    def discard_input(self) -> None:
+        self._port.discard_input()
+
+    @override
+    def set_baud(self, baud: int) -> None:
+        if self._life.alive:
+            self._port.set_baud(baud)
+
+    @override
+    async def close(self) -> None:
+        await self._port.close()
+
+
+class _Life:
+    """Of one daemon, from its start until it ends or is killed."""
+
+    def __init__(self) -> None:
+        self.alive = True
+
+    def opener(self, open_port: Opener) -> Opener:
+        async def open_mortal() -> Transport:
+            return _MortalPort(await open_port(), self)
+
+        return open_mortal
+
+
+class _ClientSession(MemorySession):
+    """The session of the rig's own client, which can be cut off: then nothing comes back."""
+
+    cut = False
+
+    @override
+    async def query(
+        self,
+        key: str,
+        payload: bytes = b"",
+        *,
+        encoding: str = "",
+        parameters: Mapping[str, str] = NO_PARAMETERS,
+        timeout_s: float = QUERY_TIMEOUT_S,
+        urgent: bool = False,
+        everyone: bool = False,
+    ) -> list[Answer]:
+        if self.cut:
+            await asyncio.sleep(timeout_s)
+            raise OutcomeUnknown(f"{key}: no answer within {timeout_s:g} s; it may be carried out all the same")
+        return await super().query(
+            key,
+            payload,
+            encoding=encoding,
+            parameters=parameters,
+            timeout_s=timeout_s,
+            urgent=urgent,
+            everyone=everyone,
+        )
+
+
+class SimulatedRig:
+    """A rig that is rehearsed on; made by `simulated_rig`.
+
+    Attributes:
+        config: of the daemon.
+        client: the rig as a program sees it, the same as `ldcnd.connect` gives.
+        faults: what may go wrong, by name.
+        timeline: what has happened.
+        lines: the simulated lines, by name of the bus.
+        broker: the network; others can join it.
+    """
+
+    def __init__(self, config: RigConfig, broker: MemoryBroker, lines: Mapping[str, Chain]) -> None:
+        self.config = config
+        self.broker = broker
+        self.lines = lines
+        self.client: Rig
+        self.timeline = Timeline(lambda: self.now_s, BEGINS_NS)
+        self._session: _ClientSession
+        self._loop = asyncio.get_running_loop()
+        self._zero_s = self._loop.time()
+        self._daemon: Daemon | None = None
+        self._life = _Life()
+        self._serving: asyncio.Task[None] | None = None
+        self._runs = 0
+        self._errands: set[asyncio.Task[None]] = set()
+        self._machines = {
+            axis.name: Machine(axis, bus.name, lines[bus.name], place)
+            for bus in config.bus
+            for axis in bus.axis
+            for place in [sorted(bus.models).index(axis.address) + 1]
+        }
+        processes = Processes(
+            kill_daemon=(lambda _: self._later(self.kill_daemon()), lambda _: self._later(self.start_daemon())),
+            lose_client=(lambda _: self._cut(on=True), lambda _: self._cut(on=False)),
+        )
+        self.faults = RigFaults(self._machine, lines, self.truth, self._loop, processes, self.timeline.note)
+
+    @property
+    def now_s(self) -> float:
+        """Seconds since the rig was made, on its own clock."""
+        return self._loop.time() - self._zero_s
+
+    @property
+    def daemon(self) -> Daemon:
+        """The daemon that runs.
+
+        Raises:
+            NotSupported: none does; it was killed.
+        """
+        if self._daemon is None:
+            raise NotSupported("no daemon runs: it was killed", remedy="await rig.start_daemon()")
+        return self._daemon
+
+    def truth(self, axis: str) -> Truth:
+        """Return what is really so with an axis, whatever the daemon says of it.
+
+        Raises:
+            UnknownAxis: there is no such axis.
+        """
+        machine, daemon = self._machine(axis), self._daemon
+        place_of = daemon.rig.axes[axis].telemetry.position if daemon else None
+        return machine.look(self._loop.time(), place_of)
+
+    async def until(self, condition: Callable[[], bool], within_s: float = 60.0) -> None:
+        """Wait until something is so; it is asked every 10 ms of the rig's clock.
+
+        Raises:
+            TimeoutError: it was not within so many seconds.
+        """
+        async with asyncio.timeout(within_s):
+            while not condition():  # noqa: ASYNC110 - on the jumping clock, looking again costs nothing
+                await asyncio.sleep(LOOK_S)
+
+    async def at_rest(self, *axes: str, within_s: float = 60.0) -> None:
+        """Wait until axes stand, all of them if none is named.
+
+        Raises:
+            TimeoutError: one of them still moves.
+        """
+        names = axes or tuple(self._machines)
+        await self.until(lambda: all(self.truth(name).at_rest for name in names), within_s)
+
+    async def start_daemon(self) -> None:
+        """FaultStart a daemon on the same lines, and wait until they are up.
+
+        Raises:
+            TimeoutError: they do not come up within a minute of the rig's clock.
+        """
+        self._runs += 1
+        self.timeline.note(f"daemon {self._runs} starts")
+        made: asyncio.Future[Daemon] = self._loop.create_future()
+        self._life = _Life()
+        self._serving = asyncio.create_task(self._serve(self._life, made), name=f"daemon {self._runs}")
+        up = asyncio.create_task(self._up(made), name="lines up")
+        await asyncio.wait((self._serving, up), return_when=asyncio.FIRST_COMPLETED)
+        if not up.done():
+            up.cancel()
+            await self._serving
+        await up
+
+    async def _up(self, made: "asyncio.Future[Daemon]") -> None:
+        async with asyncio.timeout(UP_WITHIN_S):
+            await (await made).wait_up()
+
+    async def kill_daemon(self) -> None:
+        """Kill the daemon, as SIGKILL does: not one packet of it follows, and the drives go on with what they do."""
+        self.timeline.note(f"daemon {self._runs} is killed")
+        self._life.alive = False
+        if self._serving:
+            self._serving.cancel()
+        await self._ended()
+
+    async def end_daemon(self) -> None:
+        """Let the daemon end in order, as SIGTERM does: it brings to rest what the configuration says."""
+        self.timeline.note(f"daemon {self._runs} ends")
+        self.daemon.end()
+        await self._ended()
+
+    async def _ended(self) -> None:
+        if self._serving:
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._serving
+        self._serving = self._daemon = None
+
+    async def _serve(self, life: _Life, made: "asyncio.Future[Daemon]") -> None:
+        config = self.config
+        openers = {
+            bus.name: life.opener(opener_of(bus, config.sim, self.lines[bus.name])) for bus in config.bus
+        }  # fmt: skip
+        async with self.broker.session(overhear=self._overheard) as session:
+            self._daemon = build_daemon(
+                config, session, self._now_ns, f"run{self._runs}", openers, lambda: f"lease-{self._loop.time():.9f}"
+            )
+            made.set_result(self._daemon)
+            await self._daemon.run()
+
+    def _overheard(self, sample: Publication) -> None:
+        self.timeline.take(sample)
+
+    def _now_ns(self) -> int:
+        return BEGINS_NS + round(self.now_s * 1e9)
+
+    def _cut(self, *, on: bool) -> None:
+        self._session.cut = on
+
+    def _machine(self, axis: str) -> Machine:
+        if axis not in self._machines:
+            raise UnknownAxis(f"there is no axis {axis!r}; there are {', '.join(self._machines)}", value=axis)
+        return self._machines[axis]
+
+    def _later(self, errand: Awaitable[None]) -> None:
+        task = asyncio.ensure_future(errand)
+        self._errands.add(task)
+        task.add_done_callback(self._errands.discard)
+
+    async def join(self, session: "_ClientSession") -> None:
+        """Connect the rig's own client, and wait until every drive answers."""
+        self._session = session
+        client = RigClient(session, self.config.rig)
+        self.client = Rig(client, await client.daemon())
+        async with asyncio.timeout(UP_WITHIN_S):
+            while not await self._all_answer(client):  # noqa: ASYNC110 - as above
+                await asyncio.sleep(LOOK_S)
+
+    async def _all_answer(self, client: RigClient) -> bool:
+        states = await client.states()
+        return all(name in states and states[name].link is LinkState.UP for name in self._machines)
+
+    async def close(self) -> None:
+        """End everything; what a test has left moving is halted as the configuration says."""
+        for errand in tuple(self._errands):
+            errand.cancel()
+        if self._daemon:
+            self._daemon.end()
+        await self._ended()
+
+
+@asynccontextmanager
+async def simulated_rig(config: RigConfig | Path | str, *, seed: int | None = None) -> AsyncIterator[SimulatedRig]:
+    """Rehearse on a rig until the context ends; its lines are up when the context begins.
+
+    Ports become simulated lines, see `simulated_config`; nothing leaves the process, nothing is written.
+
+    Args:
+        config: the rig, or its file.
+        seed: of everything that is drawn; the same seed gives the same bytes on the line.
+
+    Raises:
+        ConfigError: the file is none of a rig.
+        NotSupported: the program does not run on the jumping clock.
+    """
+    if not isinstance(asyncio.get_running_loop(), JumpingLoop):
+        raise NotSupported(
+            "a rehearsal needs the jumping clock, and this program runs on the wall clock",
+            remedy="run it by ldcnd.testing.run, or as a test that asks for the fixture ldcnd_rig",
+        )
+    found = config if isinstance(config, RigConfig) else load_config(Path(config))
+    settings = simulated_config(found, seed=seed)
+    now_s = asyncio.get_running_loop().time()
+    simulated = {line.name: line for line in settings.sim}
+    lines = {
+        bus.name: SIMULATED[bus.family].chain(simulated[bus.simulated], bus, now_s) for bus in settings.bus
+    }  # fmt: skip
+    broker = MemoryBroker()
+    rig = SimulatedRig(settings, broker, lines)
+    async with AsyncExitStack() as stack:
+        session = _ClientSession(broker)
+        stack.push_async_callback(session.close)
+        stack.push_async_callback(rig.close)
+        await rig.start_daemon()
+        await rig.join(session)
+        yield rig

@@ -1,0 +1,139 @@
+"""What is really so on a simulated rig, whatever the daemon says: where shafts are, how they move, what drives hold."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from ldcnd.contract.errors import NotSupported
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.smartstep.parameters import PARAMETERS
+from ldcnd.sim.chain import Chain, Module
+from ldcnd.sim.ldcn.drive import SimulatedDrive
+from ldcnd.sim.smartstep.cable import SimulatedSmartSteps
+from ldcnd.sim.smartstep.drive import SimulatedSmartStep
+from ldcnd.sim.smartstep.unit import SimulatedUnit
+
+REST_COUNTS_PER_S = 200.0
+"""A closed loop settles and hunts by a few counts: below this speed an axis rests."""
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """One axis as it is at an instant.
+
+    Attributes:
+        position: of the encoder, in axis units: what a daemon that knew everything would publish.
+        counts: of the encoder, from where the axis stood when its drive was switched on first.
+        load_position: of the load, in axis units: behind the encoder by what the coupling has slipped.
+        velocity: in axis units a second, positive forward.
+        at_rest: whether it stands, but for the hunting of a closed loop.
+        energised: whether the motor gets voltage.
+        output: of the drive to the motor, -1 to 1 of full; None of a drive that shows none.
+        registers: what the drive holds: its gains by the names of the configuration, of a SmartStep its parameters by
+            their numbers.
+    """
+
+    position: float
+    counts: float
+    load_position: float
+    velocity: float
+    at_rest: bool
+    energised: bool
+    output: float | None
+    registers: Mapping[str, int]
+
+
+class Machine:
+    """One simulated drive and what is on its shaft.
+
+    Attributes:
+        axis: its name.
+        config: of the axis.
+        chain: the line.
+        line: the name of the line.
+        place: of the drive on the line, from 1 on.
+        slipped_counts: how far the load is behind the encoder.
+    """
+
+    def __init__(self, config: AxisConfig, line: str, chain: Chain, place: int) -> None:
+        self.axis = config.name
+        self.config = config
+        self.chain = chain
+        self.line = line
+        self.place = place
+        self.slipped_counts = 0.0
+
+    @property
+    def module(self) -> Module:
+        """The module of the line."""
+        return self.chain.modules[self.place - 1]
+
+    @property
+    def servo(self) -> SimulatedDrive:
+        """The drive with its shaft.
+
+        Raises:
+            NotSupported: it is none with a shaft that can be reached.
+        """
+        module = self.module
+        if not isinstance(module, SimulatedDrive):
+            raise NotSupported(f"axis {self.axis}: the simulated {self.config.model} has no shaft that can be changed")
+        return module
+
+    @property
+    def unit(self) -> SimulatedUnit:
+        """The SmartStep.
+
+        Raises:
+            NotSupported: it is none.
+        """
+        module = self.chain.modules[0]
+        if not isinstance(module, SimulatedSmartSteps):
+            raise NotSupported(f"axis {self.axis}: a simulated {self.config.model} is no SmartStep")
+        return next(unit for unit in module.cable.units if unit.drive.unit == self.config.address)
+
+    def look(self, now_s: float, place_of: Callable[[float], float] | None) -> Truth:
+        """Return what is so at an instant of the line's clock.
+
+        Args:
+            now_s: the instant.
+            place_of: turns the drive's counter into a published position; None where no daemon knows the axis.
+        """
+        self.chain.advance(now_s)
+        module = self.module
+        if isinstance(module, SimulatedDrive):
+            module.catch_up(now_s)
+            return self._of_servo(module, place_of)
+        return self._of_smartstep(self.unit.drive, now_s)
+
+    def _of_servo(self, drive: SimulatedDrive, place_of: Callable[[float], float] | None) -> Truth:
+        loop, shaft, scale = drive.loop, drive.shaft, self.config.signed_counts_per_unit
+        position = place_of(loop.position) if place_of else shaft.position_counts / scale
+        speed = shaft.velocity_counts / drive.profile.servo_cycle_s
+        energised = drive.stage.drives and (loop.servo_on or loop.pwm != 0)
+        gains = loop.gains
+        names = ("kp", "kd", "ki", "il", "ol", "cl", "el", "sr", "deadband")
+        return Truth(
+            position=position,
+            counts=shaft.position_counts,
+            load_position=position - self.slipped_counts / scale,
+            velocity=speed / scale,
+            at_rest=abs(speed) < REST_COUNTS_PER_S,
+            energised=energised,
+            output=loop.pwm / 255 if drive.stage.drives else 0.0,
+            registers={name: getattr(gains, name) for name in names},
+        )
+
+    def _of_smartstep(self, drive: SimulatedSmartStep, now_s: float) -> Truth:
+        drive.advance(now_s)
+        motor, scale = drive.motor, self.config.signed_counts_per_unit
+        position = drive.feedback_counter / scale
+        return Truth(
+            position=position,
+            counts=motor.position,
+            load_position=position,
+            velocity=motor.speed / scale,
+            at_rest=abs(motor.speed) < REST_COUNTS_PER_S,
+            energised=motor.servo_on,
+            output=None,
+            registers={f"Pn{each.number:03X}": drive.memory.active(each) for each in PARAMETERS},
+        )

@@ -1,0 +1,203 @@
+"""Programs that move machines, tried on a rig in the process of a test."""
+
+import asyncio
+from dataclasses import dataclass
+
+import pytest
+
+import ldcnd
+from ldcnd.contract.errors import NotSupported, ValueOutOfRange
+from ldcnd.testing import run, simulated_rig
+from tests.support.rig import SIMULATED
+
+
+async def scan(rig, places=range(1, 11)):
+    found = []
+    async with rig.control("x", client="scan") as x:
+        await x.power(on=True)
+        for place in places:
+            move = await x.move_absolute(place)
+            await move.done()
+            found.append(x.position.value)
+    return found
+
+
+async def test_a_program_moves_a_rig_that_does_not_exist(ldcnd_rig):
+    places = await scan(ldcnd_rig.client)
+    assert places == pytest.approx(range(1, 11), abs=0.02)
+    assert ldcnd_rig.truth("x").position == pytest.approx(10, abs=0.02)
+    assert ldcnd_rig.truth("x").at_rest
+
+
+async def test_a_jam_ends_the_program_where_it_is(ldcnd_rig):
+    ldcnd_rig.faults.jam("x", at=7.5)
+    with pytest.raises(ldcnd.LdcndError, match="move_absolute"):
+        await scan(ldcnd_rig.client)
+    assert ldcnd_rig.truth("x").at_rest
+    assert ldcnd_rig.truth("x").position == pytest.approx(7.5, abs=0.02)
+
+
+@dataclass
+class Case:
+    """A fault that comes in the middle of a motion to 20, and what is then so."""
+
+    begin: object
+    goes_on: bool = False
+    """The program notices nothing."""
+    arrives: bool | None = None
+    """Whether the axis does; by itself, as the program says."""
+    says: str = ""
+    """What an active fault or an event of x says."""
+    axis: str = "x"
+
+
+CASES = {
+    "jam": Case(lambda faults: faults.jam("x", at=10), says="position_error"),
+    "slip": Case(lambda faults: faults.slip("x", 0.5, at=10), goes_on=True),
+    "friction": Case(lambda faults: faults.friction("x", 5, at=10), goes_on=True),
+    "load": Case(lambda faults: faults.load("x", 0.05, at=10), goes_on=True),
+    "phase_lost": Case(lambda faults: faults.phase_lost("x", at=10), goes_on=True, says="unsettled"),
+    "limit_closed": Case(lambda faults: faults.limit_closed("x", "forward", at=10), goes_on=True),
+    "limit_stuck": Case(lambda faults: faults.limit_stuck("x", "forward"), goes_on=True),
+    "index_lost": Case(lambda faults: faults.index_lost("x"), goes_on=True),
+    "encoder_lost": Case(lambda faults: faults.encoder_lost("x", at=10), says="encoder"),
+    "encoder_stuck": Case(lambda faults: faults.encoder_stuck("x", at=10)),
+    "overheat": Case(lambda faults: faults.overheat("x", at=10), says="overheat"),
+    "overcurrent": Case(lambda faults: faults.overcurrent("x", at=10), says="overcurrent"),
+    "motor_short": Case(lambda faults: faults.motor_short("x", at=10), says="short"),
+    "overvoltage": Case(lambda faults: faults.overvoltage("x", at=10), says="overvoltage"),
+    "motor_supply_lost": Case(lambda faults: faults.motor_supply_lost("z", at=10), axis="z", says="power"),
+    "stop_input": Case(lambda faults: faults.stop_input("x", at=10), says="stop_input"),
+    "power_loss": Case(lambda faults: faults.power_loss("x", at=10, for_s=1.0), says="reset"),
+    "mute": Case(lambda faults: faults.mute("x", at=10, for_s=2.0), says="link_lost"),
+    "cable_cut": Case(lambda faults: faults.cable_cut("x", at=10, for_s=2.0), goes_on=True, says="link_lost"),
+    "noise": Case(lambda faults: faults.noise(0.05, after_s=0.5, for_s=1.0), goes_on=True),
+    "late_replies": Case(lambda faults: faults.late_replies(0.004, after_s=0.5, for_s=1.0), goes_on=True),
+    "lost_replies": Case(lambda faults: faults.lost_replies(0.05, after_s=0.5, for_s=1.0), goes_on=True),
+    "unplug": Case(lambda faults: faults.unplug(after_s=0.5, for_s=1.0), arrives=True, says="lost"),
+    "reset_by_another": Case(lambda faults: faults.reset_by_another(after_s=0.5), says="reset"),
+    "daemon_killed": Case(lambda faults: faults.daemon_killed(after_s=0.5, for_s=0.3)),
+    "client_lost": Case(lambda faults: faults.client_lost(after_s=0.5), says="lease"),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+async def test_every_fault_does_to_the_machine_what_its_name_says(ldcnd_rig, name):
+    case = CASES[name]
+    fault = case.begin(ldcnd_rig.faults)
+    arrived = False
+    try:
+        async with ldcnd_rig.client.control(case.axis, client="test") as axis, asyncio.timeout(60):
+            await axis.power(on=True)
+            await (await axis.move_absolute(20, velocity=10)).done()
+            arrived = True
+    except ldcnd.LdcndError as error:
+        ldcnd_rig.timeline.note(f"the program ends: {error}")
+    await asyncio.sleep(4)
+    told = str(ldcnd_rig.timeline)
+    print(told)
+    assert fault.begun or name in ("limit_stuck", "index_lost")
+    assert arrived == case.goes_on
+    truth = ldcnd_rig.truth(case.axis)
+    assert (abs(truth.position - 20) < 0.05) == (case.goes_on if case.arrives is None else case.arrives)
+    assert case.says in told
+
+
+def bytes_of(rig):
+    """Have all that the host writes from now on kept."""
+    written = bytearray()
+    for chain in rig.lines.values():
+        write = chain.write
+
+        def keep(now_s, data, write=write):
+            written.extend(data)
+            write(now_s, data)
+
+        chain.write = keep
+    return written
+
+
+async def scanned(seed):
+    async with simulated_rig(SIMULATED, seed=seed) as rig:
+        rig.faults.noise(0.02)
+        written = bytes_of(rig)
+        await scan(rig.client, (1, -1))
+        return bytes(written)
+
+
+def test_the_same_seed_gives_the_same_bytes_without_pytest_too():
+    first, second, other = run(scanned(7)), run(scanned(7)), run(scanned(8))
+    assert len(first) > 300
+    assert first == second != other
+
+
+REAL = """
+rig = "real"
+state_dir = "state"
+
+[[bus]]
+name = "a"
+port = "/dev/serial/by-id/nothing"
+baud = 115200
+module = [{ address = 3, model = "pic-io", name = "cell", outputs = [1] }]
+
+[[bus.axis]]
+name = "x"
+address = 1
+model = "ls-182ap"
+unit = "mm"
+counts_per_unit = 400
+direction = "reverse"
+velocity = 200
+acceleration = 2000
+limits = { position_min = -5, position_max = 300, velocity = 250, acceleration = 2500 }
+gains = { kp = 35, kd = 700, ki = 20, il = 100, ol = 200, el = 2000 }
+home = { method = "reverse_limit", velocity = 20, position = 310, move_to = 290 }
+
+[[bus.axis]]
+name = "y"
+address = 2
+model = "pic-servo-sc"
+velocity = 9000
+reference = "at_reset"
+acceleration = 90000
+gains = { kp = 1200, kd = 9000, el = 3000 }
+
+[[bus]]
+name = "b"
+family = "smartstep"
+port = "/dev/serial/by-id/else"
+axis = [{ name = "feed", address = 1, model = "smartstep" }]
+"""
+
+
+async def test_a_rig_with_ports_is_rehearsed_without_them_and_leaves_nothing_behind(tmp_path):
+    file = tmp_path / "rig.toml"
+    file.write_text(REAL)
+    async with simulated_rig(file) as rig, rig.client.control("x", "y", client="test") as (x, y):
+        await x.power(on=True)
+        await y.power(on=True)
+        await (await x.home()).done()
+        await (await x.move_absolute(0)).done()
+        await (await y.move_absolute(5000)).done()
+        await rig.at_rest()
+        assert rig.truth("x").position == pytest.approx(0, abs=0.1)
+        assert rig.truth("y").position == pytest.approx(5000, abs=20)
+        assert rig.truth("feed").registers["Pn102"] == 40
+        with pytest.raises(NotSupported, match="axis feed"):
+            rig.faults.slip("feed", 1)
+    assert list(tmp_path.iterdir()) == [file]
+
+
+@pytest.mark.parametrize("start", [{"after_s": 1.0, "at": 2.0}, {"at": 1.0, "when": lambda truth: truth.at_rest}])
+async def test_a_fault_begins_in_one_way(ldcnd_rig, start):
+    with pytest.raises(ValueOutOfRange, match="give one of them"):
+        ldcnd_rig.faults.jam("x", **start)
+
+
+@pytest.mark.real_time
+async def test_no_rehearsal_on_the_wall_clock():
+    with pytest.raises(NotSupported, match="jumping clock") as found:
+        async with simulated_rig(SIMULATED):
+            pass
+    assert "ldcnd_rig" in found.value.remedy
