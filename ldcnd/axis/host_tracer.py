@@ -24,8 +24,7 @@ from ldcnd.drives.tracer import (
     TriggerWatch,
 )
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.poller import NO_DEADLINE_S, Poller, Priority, next_on_grid
+from ldcnd.line.exchange import NO_DEADLINE_S, Exchange, Poller, Priority, Timing, next_on_grid
 
 GRACE_S = 10.0
 SLACK = 10.0

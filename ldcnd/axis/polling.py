@@ -7,8 +7,7 @@ from typing_extensions import override
 from ldcnd.contract.errors import BusError
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.driver import AxisReading, Readable
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.poller import Poller, next_on_grid
+from ldcnd.line.exchange import Exchange, Poller, Timing, next_on_grid
 
 Deliver = Callable[[AxisReading, frozenset[TelemetryItem], Timing], bool]
 """Takes a reading; true when it is not accepted before the drive was read again."""

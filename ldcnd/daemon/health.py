@@ -18,7 +18,7 @@ from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import OwnedRig
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane
 from ldcnd.net.hand_over import Load
 from ldcnd.net.publisher import Publisher, Topic
 

@@ -15,8 +15,8 @@ from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import PollsItself, Readable, ReadingListeners, StopMode
 from ldcnd.drives.network import BringUpReport, Network
 from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Poller, Priority
 from ldcnd.line.flight_recorder import WireEvent
-from ldcnd.line.poller import Poller, Priority
 from ldcnd.log import get_logger
 
 log = get_logger("bus")

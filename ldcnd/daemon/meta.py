@@ -21,7 +21,7 @@ from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.driver import Drive
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane
 from ldcnd.net.hand_over import Answer, Query
 from ldcnd.net.publisher import Publisher
 

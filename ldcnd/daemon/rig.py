@@ -12,7 +12,7 @@ from ldcnd.daemon.line import BusService
 from ldcnd.drives.driver import StopMode
 from ldcnd.drives.network import IoDriver
 from ldcnd.line.exchange import Timing
-from ldcnd.line.transaction import Condition, only_while, until_begun
+from ldcnd.line.proof import Condition, only_while, until_begun
 from ldcnd.log import get_logger
 from ldcnd.net.publisher import Publisher
 

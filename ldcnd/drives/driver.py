@@ -17,8 +17,7 @@ from ldcnd.contract.meta import RegisterInfo
 from ldcnd.contract.samples import MonitorName, TelemetryItem
 from ldcnd.drives.parameter_access import MonitorValue, ParameterAccess
 from ldcnd.drives.tracer import Tracer
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.poller import Poller
+from ldcnd.line.exchange import Exchange, Poller, Timing
 
 LARGEST_COUNT = 0x7FFF_FFFF
 """Of a position counter of 32 bits, in either direction."""

@@ -11,8 +11,7 @@ from ldcnd.contract.errors import NotSupported
 from ldcnd.contract.meta import ModuleInfo
 from ldcnd.contract.samples import IoReading
 from ldcnd.drives.driver import CountsMotion, Drive, StopMode
-from ldcnd.line.exchange import Timing
-from ldcnd.line.poller import Poller
+from ldcnd.line.exchange import Poller, Timing
 from ldcnd.line.proof import Proof
 
 

@@ -7,17 +7,14 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, BusDown, BusError, LdcndError, NotSupported, PacketRejected, TransportLost
 from ldcnd.line.adapter import LineErrors
-from ldcnd.line.exchange import Exchange, PacketEffect, Timing
-from ldcnd.line.flight_recorder import WireEvent, WireLog
+from ldcnd.line.exchange import Exchange, Lane, PacketEffect, Poller, Resync, Timing
+from ldcnd.line.flight_recorder import BusStatistics, WireEvent, WireLog
 from ldcnd.line.line import Line, Phase, Users
-from ldcnd.line.poller import Poller
 from ldcnd.line.proof import ALWAYS_SENT, Proofs
-from ldcnd.line.queue import POLL, ExchangeQueue, Lane, PhaseOrder
-from ldcnd.line.resync import Resync
+from ldcnd.line.queue import POLL, ExchangeQueue, PhaseOrder
 from ldcnd.line.settings import BusSettings
 from ldcnd.line.transaction import Job, StopProbe, Transaction
 from ldcnd.line.transport import Opener, Transport
-from ldcnd.line.wire import BusStatistics
 from ldcnd.log import get_logger
 
 MISSES_BEFORE_BACKOFF = 3

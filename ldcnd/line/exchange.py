@@ -1,13 +1,22 @@
-"""One packet out, at most one back: the seam between the codecs and the bus.
+"""What drivers give the bus: exchanges, pollers, and how their line gets back in step.
 
-A codec builds an `Exchange`; the bus runs it without knowing what the bytes mean. An exchange is a value: it holds no
-state, can be prepared once and run any number of times.
+A codec builds an `Exchange`, one packet out and at most one back; the bus runs it without knowing what the bytes mean.
+An exchange is a value: it holds no state, can be prepared once and run any number of times.
+
+The bus takes the next exchange of a poller only when the line is free for it, so an overloaded line delays polls but
+never queues several of one poller.
 """
 
-from collections.abc import Callable
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
-from enum import Enum
-from typing import Generic, TypeVar
+from enum import Enum, IntEnum
+from types import MappingProxyType
+from typing import Any, Generic, TypeVar
+
+from ldcnd.contract.errors import BusError
+from ldcnd.contract.samples import TelemetryItem
 
 ReplyT = TypeVar("ReplyT")
 
@@ -68,6 +77,14 @@ class Exchange(Generic[ReplyT]):
     total_bytes: Callable[[bytes], int | None] | None = None
     effect: PacketEffect = PacketEffect.CHANGES
 
+    def longest_s(self, byte_s: float) -> float:
+        """Return how long it occupies the line at most when nothing is lost, first bit to last, in seconds.
+
+        Args:
+            byte_s: how long a byte takes.
+        """
+        return (len(self.request) + self.reply_bytes) * byte_s + self.response_s
+
 
 @dataclass(frozen=True, slots=True)
 class Timing:
@@ -84,3 +101,99 @@ class Timing:
     true_from_s: float
     true_until_s: float
     received_at_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Resync:
+    """The resynchronisation between a lost reply and the next request.
+
+    The bus waits until the line has been quiet for `quiet_s`, sends `flush`, waits `settle_s`, discards the input,
+    and runs the probe: an exchange whose reply is known beforehand and has an unusual length, so that a late reply
+    cannot pass for it.
+
+    Attributes:
+        flush: bytes that end any half-received packet and draw no reply.
+        quiet_s: silence after which no late reply can come any more.
+        settle_s: pause after the flush.
+        probe: returns such an exchange with a node outside the given ones if it can, None when there is no node. Its
+            `decode` raises `BadReply` when the reply is not the known one.
+    """
+
+    flush: bytes = b""
+    quiet_s: float = 0.005
+    settle_s: float = 0.0
+    probe: Callable[[AbstractSet[int]], Exchange[Any] | None] = lambda _avoid: None
+
+    def longest_s(self, byte_s: float, avoid: AbstractSet[int]) -> float:
+        """Return how long it takes when nothing is lost, in seconds.
+
+        Args:
+            byte_s: how long a byte takes.
+            avoid: nodes that do not reply.
+        """
+        probe = self.probe(avoid)
+        probe_s = probe.longest_s(byte_s) if probe else 0.0
+        return self.quiet_s + len(self.flush) * byte_s + self.settle_s + probe_s
+
+
+class Lane(IntEnum):
+    """Priorities of exchanges, highest first."""
+
+    STOP = 0
+    COMMAND = 1
+    POLL = 2
+    BACKGROUND = 3
+
+
+NO_DEADLINE_S = float("inf")
+"""Deadline of a poll that only uses time left by all other polls; it is never late."""
+
+
+def next_on_grid(due_s: float, period_s: float, now_s: float) -> float:
+    """Return the first due time after `now_s` that is whole periods, at least one, behind `due_s`."""
+    behind = max(0, int((now_s - due_s) / period_s))
+    return due_s + (behind + 1) * period_s
+
+
+class Priority(IntEnum):
+    """Order of polls on a line that has fallen behind, highest first."""
+
+    HIGH = 0
+    NORMAL = 1
+    LOW = 2
+
+
+class Poller(ABC, Generic[ReplyT]):
+    """One periodic user of the line; every method runs on the event loop, returns at once and never raises.
+
+    Attributes:
+        node: the node that it polls; one that does not reply is polled less and less often.
+        due_at_s: when its next slot is due, in loop time; read by the bus after each slot.
+        deadline_at_s: when that slot should be over; of those that are due, the earliest deadline goes first.
+        priority: its rank while the line cannot carry all polls; does not change while it waits for a slot.
+        rates_hz: rate at which it reads each telemetry item; empty for one that reads none.
+        slow_to_deliver: processing a reply takes long, so the next request is sent first, and several may be processed
+            together; see `Line`.
+    """
+
+    node: int
+    due_at_s: float
+    deadline_at_s: float = 0.0
+    priority: Priority = Priority.NORMAL
+    rates_hz: Mapping[TelemetryItem, float] = MappingProxyType({})
+    slow_to_deliver: bool = False
+
+    def prepare(self, at_s: float) -> None:
+        """Prepare the next exchange, which takes time; the next slot is expected at about that instant."""
+
+    @abstractmethod
+    def next_exchange(self, now_s: float) -> Exchange[ReplyT]:
+        """Return the exchange to run now and move `due_at_s` on."""
+
+    @abstractmethod
+    def deliver(self, reply: ReplyT, timing: Timing) -> None:
+        """Take the decoded reply; the next request is on the wire already."""
+
+    @abstractmethod
+    def missed(self, error: BusError) -> None:
+        """Note that this slot brought no reply."""

@@ -1,4 +1,4 @@
-"""The last seconds of one line, always on, and their form as text.
+"""The last seconds of one line, always on, and their form as text; and what is counted on a line.
 
 Every byte is kept once, with the instant at which it was written or delivered, so that a log can be played back. One
 line of text is one record: seconds, event, bytes in hexadecimal, and a remark behind a number sign; of a command its
@@ -9,12 +9,13 @@ from array import array
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import accumulate, islice
 from operator import itemgetter
 
 from ldcnd.contract.errors import MalformedRequest
+from ldcnd.contract.health import LineCounters
 
 KEPT_S = 300.0
 KEPT_BYTES = 16_000_000
@@ -229,3 +230,70 @@ class WireLog:
     def entries(self) -> WireEntries:
         """Return what `WireRecord` is made of, for each record: quick also for a long log."""
         return WireEntries(self._blocks, self._latest, self._kept_s)
+
+
+BUCKETS = 20
+"""Latency buckets double from 64 us; the last one takes everything above 16 s."""
+
+
+def bucket_limit_s(bucket: int) -> float:
+    """Return the upper limit of a latency bucket, in seconds."""
+    return 64e-6 * 2.0**bucket
+
+
+class LatencyHistogram:
+    """Durations in buckets that double; constant size, constant cost."""
+
+    __slots__ = ("counts", "longest_s", "total_s")
+
+    def __init__(self) -> None:
+        self.counts = [0] * BUCKETS
+        self.total_s = 0.0
+        self.longest_s = 0.0
+
+    def add(self, duration_s: float) -> None:
+        """Count one duration, in seconds, not negative."""
+        bucket = int(duration_s * 15625).bit_length()
+        self.counts[bucket if bucket < BUCKETS else -1] += 1
+        self.total_s += duration_s
+        self.longest_s = max(self.longest_s, duration_s)
+
+    def quantile_s(self, fraction: float) -> float:
+        """Return an upper bound for the given quantile (0 to 1) in seconds; 0 when nothing was counted."""
+        up_to = tuple(accumulate(self.counts))
+        wanted = fraction * up_to[-1]
+        if not wanted:
+            return 0.0
+        bucket = bisect_left(up_to, wanted)
+        # the last bucket has no limit of its own
+        return self.longest_s if bucket >= len(up_to) - 1 else min(bucket_limit_s(bucket), self.longest_s)
+
+
+@dataclass(slots=True)
+class BusStatistics:
+    """Counters since the daemon started; only the bus writes them."""
+
+    exchanges: int = 0
+    replies: int = 0
+    timeouts: int = 0
+    corrupt_replies: int = 0
+    rejected_packets: int = 0
+    resent: int = 0
+    resynchronisations: int = 0
+    stray_bytes: int = 0
+    openings: int = 0
+    losses: int = 0
+    bytes_out: int = 0
+    bytes_in: int = 0
+    wire_busy_s: float = 0.0
+    """Time that requests and replies spent on the wire, servo wait and turn-around not counted."""
+    stop_wait: LatencyHistogram = field(default_factory=LatencyHistogram)
+    """From queueing a probe of the stop lane to its first bit."""
+    latency: dict[int, LatencyHistogram] = field(
+        default_factory=lambda: {lane: LatencyHistogram() for lane in range(4)}
+    )
+    """By lane: from queueing (polls: from their due time) to the last reply byte."""
+
+    def counters(self) -> dict[str, int]:
+        """Return what is published of the line; slotted here, because every exchange counts."""
+        return {name: getattr(self, name) for name in LineCounters.model_fields}

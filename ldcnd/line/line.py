@@ -17,14 +17,14 @@ from typing import Protocol
 from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, BusError, ReplyTimeout, TransportLost
-from ldcnd.line.exchange import ReplyVerdict, Timing
-from ldcnd.line.flight_recorder import WireEvent, WireLog
+from ldcnd.line.exchange import ReplyVerdict, Resync, Timing
+from ldcnd.line.flight_recorder import BusStatistics, WireEvent, WireLog
 from ldcnd.line.queue import POLL
-from ldcnd.line.resync import Quarantine, Resync, ResyncExchange
+from ldcnd.line.resync import Quarantine, ResyncExchange
 from ldcnd.line.settings import LINGER_S, BusSettings
 from ldcnd.line.transaction import AT_ONCE, LANES, Transaction
 from ldcnd.line.transport import Receiver, Transport
-from ldcnd.line.wire import CLOCK_TOLERANCE, NEVER_S, BusStatistics, CompleteReply, Pieces, Watchdog, Wire
+from ldcnd.line.wire import CLOCK_TOLERANCE, NEVER_S, CompleteReply, Pieces, Watchdog, Wire
 
 
 class Phase(Enum):

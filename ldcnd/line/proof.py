@@ -6,18 +6,56 @@ To the others goes only what reads and what takes energy out.
 """
 
 import asyncio
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextvars import ContextVar
 from typing import Any
 
 from ldcnd.contract.errors import AxisUnreachable, LdcndError, NotIdentified
-from ldcnd.line.exchange import Exchange, PacketEffect
-from ldcnd.line.queue import Lane
-from ldcnd.line.transaction import Condition, condition_in_force
+from ldcnd.line.exchange import Exchange, Lane, PacketEffect
 
 MISSES_UNTIL_LOST = 3
 """Exchanges in a row without a reply after which another module may be at the address."""
 ALWAYS_SENT = frozenset({PacketEffect.READS, PacketEffect.RELIEVES})
+
+
+Condition = Callable[[], None]
+"""Raises what forbids a motion; returns when nothing does."""
+_condition: ContextVar[Condition | None] = ContextVar("condition", default=None)
+
+
+class only_while:  # noqa: N801 - read as a statement
+    """Let what changes anything, when queued in this context, be sent only if the condition holds when its turn comes.
+
+    A queue may be long: the condition is checked between it and the wire. Stops are not subject to any condition.
+    """
+
+    __slots__ = ("_own", "_token")
+
+    def __init__(self, condition: Condition) -> None:
+        self._own = condition
+
+    def __enter__(self) -> None:
+        self._token = _condition.set(self._own)
+
+    def __exit__(self, *_raised: object) -> None:
+        _condition.reset(self._token)
+
+
+def until_begun(condition: Condition) -> Condition:
+    """Return a condition that is checked until its first packet is sent: what has begun is carried out whole.
+
+    For several packets that only make sense together, and of which none moves a motor: outputs that have become outputs
+    get their levels.
+    """
+    begun = False
+
+    def check() -> None:
+        nonlocal begun
+        if not begun:
+            condition()
+            begun = True
+
+    return check
 
 
 class bringing_up:  # noqa: N801 - read as a statement
@@ -159,7 +197,7 @@ class Proofs:
 
         That is its proof, and the permission of a command (`only_while`), which a stop does not need.
         """
-        permission = condition_in_force() if lane is not Lane.STOP else None
+        permission = _condition.get() if lane is not Lane.STOP else None
         passes = _pass.get() if exchange.effect is PacketEffect.ARRANGES else None
 
         def condition() -> None:

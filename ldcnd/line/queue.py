@@ -8,13 +8,11 @@ for nearly a whole cycle. Phase and length of each cycle are measured from the r
 import heapq
 from collections import deque
 from collections.abc import Callable, Sequence
-from enum import IntEnum
 from itertools import count
 from typing import Any, Generic, Protocol, TypeVar
 
 from ldcnd.contract.errors import BusBusy
-from ldcnd.line.exchange import Timing
-from ldcnd.line.poller import NO_DEADLINE_S, Poller, Priority
+from ldcnd.line.exchange import NO_DEADLINE_S, Lane, Poller, Priority, Timing
 from ldcnd.line.settings import ServoCycle
 
 CHOICE = 16
@@ -234,15 +232,6 @@ class PollQueue:
             return ranks[0]
         self._passed = 0
         return min(lower, key=lambda rank: rank.since_s)
-
-
-class Lane(IntEnum):
-    """Priorities, highest first."""
-
-    STOP = 0
-    COMMAND = 1
-    POLL = 2
-    BACKGROUND = 3
 
 
 STOP, COMMAND, POLL, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and turns are taken between two packets

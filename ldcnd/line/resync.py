@@ -1,40 +1,11 @@
 """How a line gets back in step after a lost or damaged reply."""
 
-from collections.abc import Callable
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
 from typing import Any
 
 from ldcnd.contract.errors import BadReply, BusError
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Exchange, Lane, Resync, Timing
 from ldcnd.line.transaction import Transaction
-
-
-def _no_probe(_avoid: AbstractSet[int]) -> None:
-    return None
-
-
-@dataclass(frozen=True, slots=True)
-class Resync:
-    """The resynchronisation between a lost reply and the next request; the family's driver supplies it.
-
-    The bus waits until the line has been quiet for `quiet_s`, sends `flush`, waits `settle_s`, discards the input,
-    and runs the probe: an exchange whose reply is known beforehand and has an unusual length, so that a late reply
-    cannot pass for it.
-
-    Attributes:
-        flush: bytes that end any half-received packet and draw no reply.
-        quiet_s: silence after which no late reply can come any more.
-        settle_s: pause after the flush.
-        probe: returns such an exchange with a node outside the given ones if it can, None when there is no node. Its
-            `decode` raises `BadReply` when the reply is not the known one.
-    """
-
-    flush: bytes = b""
-    quiet_s: float = 0.005
-    settle_s: float = 0.0
-    probe: Callable[[AbstractSet[int]], Exchange[Any] | None] = _no_probe
 
 
 class ResyncExchange(Transaction):

@@ -25,7 +25,6 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import TransportLost
 from ldcnd.line.adapter import LineErrors, line_errors
-from ldcnd.line.incoming import Incoming
 from ldcnd.line.line_discipline import (
     STANDARD_BAUDS,
     PortFault,
@@ -36,7 +35,7 @@ from ldcnd.line.line_discipline import (
     switch_direction,
 )
 from ldcnd.line.terminal_link import why_not_served
-from ldcnd.line.transport import Receiver, Transport
+from ldcnd.line.transport import Incoming, Receiver, Transport
 
 OPEN_TIME_S = 5.0
 DRAIN_TIME_S = 1.0

@@ -12,8 +12,7 @@ import socket
 from typing_extensions import override
 
 from ldcnd.contract.errors import NotSupported, TransportLost
-from ldcnd.line.incoming import Incoming
-from ldcnd.line.transport import Receiver, Transport
+from ldcnd.line.transport import Incoming, Receiver, Transport
 
 CLOSE_TIME_S = 1.0
 UNACKNOWLEDGED_MS = 5000

@@ -2,66 +2,19 @@
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from contextvars import ContextVar
 from typing import Any
 
 from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, BusError, LdcndError, OutcomeUnknown, PacketRejected, ReplyTimeout
-from ldcnd.line.exchange import Exchange, Timing
+from ldcnd.line.exchange import Exchange, Lane, Timing
 from ldcnd.line.flight_recorder import AT_ONCE_REMARK
-from ldcnd.line.queue import Lane
+from ldcnd.line.proof import Condition
 
 LANES = tuple(lane.name.lower() for lane in Lane)
 """Remarks of the wire log about packets, by lane."""
 AT_ONCE = tuple(f"{lane}{AT_ONCE_REMARK}" for lane in LANES)
 """The same for packets that waited for the reply before them."""
-
-
-Condition = Callable[[], None]
-"""Raises what forbids a motion; returns when nothing does."""
-_condition: ContextVar[Condition | None] = ContextVar("condition", default=None)
-
-
-class only_while:  # noqa: N801 - read as a statement
-    """Let what changes anything, when queued in this context, be sent only if the condition holds when its turn comes.
-
-    A queue may be long: the condition is checked between it and the wire. Stops are not subject to any condition.
-    """
-
-    __slots__ = ("_own", "_token")
-
-    def __init__(self, condition: Condition) -> None:
-        self._own = condition
-
-    def __enter__(self) -> None:
-        self._token = _condition.set(self._own)
-
-    def __exit__(self, *_raised: object) -> None:
-        _condition.reset(self._token)
-
-
-def until_begun(condition: Condition) -> Condition:
-    """Return a condition that is checked until its first packet is sent: what has begun is carried out whole.
-
-    For several packets that only make sense together, and of which none moves a motor: outputs that have become outputs
-    get their levels.
-    """
-    begun = False
-
-    def check() -> None:
-        nonlocal begun
-        if not begun:
-            condition()
-            begun = True
-
-    return check
-
-
-def condition_in_force() -> Condition | None:
-    """Return the condition of the context in which this is called, if there is one."""
-    return _condition.get()
 
 
 class Transaction(ABC):

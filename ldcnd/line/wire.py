@@ -1,85 +1,16 @@
 """One open transport: its rate, the bytes that pass over it, and the record of them."""
 
 import asyncio
-from bisect import bisect_left
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from itertools import accumulate
+from dataclasses import dataclass
 from typing import Any
 
 from ldcnd.contract.errors import TransportLost
-from ldcnd.contract.health import LineCounters
 from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.flight_recorder import WireEvent, WireLog
+from ldcnd.line.flight_recorder import BusStatistics, WireEvent, WireLog
 from ldcnd.line.settings import BusSettings
 from ldcnd.line.transaction import Transaction
 from ldcnd.line.transport import Transport
-
-BUCKETS = 20
-"""Latency buckets double from 64 us; the last one takes everything above 16 s."""
-
-
-def bucket_limit_s(bucket: int) -> float:
-    """Return the upper limit of a latency bucket, in seconds."""
-    return 64e-6 * 2.0**bucket
-
-
-class LatencyHistogram:
-    """Durations in buckets that double; constant size, constant cost."""
-
-    __slots__ = ("counts", "longest_s", "total_s")
-
-    def __init__(self) -> None:
-        self.counts = [0] * BUCKETS
-        self.total_s = 0.0
-        self.longest_s = 0.0
-
-    def add(self, duration_s: float) -> None:
-        """Count one duration, in seconds, not negative."""
-        bucket = int(duration_s * 15625).bit_length()
-        self.counts[bucket if bucket < BUCKETS else -1] += 1
-        self.total_s += duration_s
-        self.longest_s = max(self.longest_s, duration_s)
-
-    def quantile_s(self, fraction: float) -> float:
-        """Return an upper bound for the given quantile (0 to 1) in seconds; 0 when nothing was counted."""
-        up_to = tuple(accumulate(self.counts))
-        wanted = fraction * up_to[-1]
-        if not wanted:
-            return 0.0
-        bucket = bisect_left(up_to, wanted)
-        # the last bucket has no limit of its own
-        return self.longest_s if bucket >= len(up_to) - 1 else min(bucket_limit_s(bucket), self.longest_s)
-
-
-@dataclass(slots=True)
-class BusStatistics:
-    """Counters since the daemon started; only the bus writes them."""
-
-    exchanges: int = 0
-    replies: int = 0
-    timeouts: int = 0
-    corrupt_replies: int = 0
-    rejected_packets: int = 0
-    resent: int = 0
-    resynchronisations: int = 0
-    stray_bytes: int = 0
-    openings: int = 0
-    losses: int = 0
-    bytes_out: int = 0
-    bytes_in: int = 0
-    wire_busy_s: float = 0.0
-    """Time that requests and replies spent on the wire, servo wait and turn-around not counted."""
-    stop_wait: LatencyHistogram = field(default_factory=LatencyHistogram)
-    """From queueing a probe of the stop lane to its first bit."""
-    latency: dict[int, LatencyHistogram] = field(
-        default_factory=lambda: {lane: LatencyHistogram() for lane in range(4)}
-    )
-    """By lane: from queueing (polls: from their due time) to the last reply byte."""
-
-    def counters(self) -> dict[str, int]:
-        """Return what is published of the line; slotted here, because every exchange counts."""
-        return {name: getattr(self, name) for name in LineCounters.model_fields}
 
 
 class PendingEcho:

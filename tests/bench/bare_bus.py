@@ -14,8 +14,7 @@ from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.poller import Poller
+from ldcnd.line.exchange import Exchange, Poller, Timing
 from ldcnd.line.port_url import port_opener
 from ldcnd.line.settings import BusSettings
 

@@ -13,8 +13,8 @@ from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.health import _Rate
 from ldcnd.drives.smartstep.family import LEDGER_FILE
-from ldcnd.line.queue import Lane
-from ldcnd.line.wire import bucket_limit_s
+from ldcnd.line.exchange import Lane
+from ldcnd.line.flight_recorder import bucket_limit_s
 from ldcnd.net.hand_over import PENDING_QUERIES
 from ldcnd.net.session import SampleKind
 from ldcnd.sim.ldcn.chain import build_chain

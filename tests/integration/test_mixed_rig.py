@@ -39,7 +39,7 @@ from ldcnd.contract.samples import (
     VelocitySample,
 )
 from ldcnd.drives.smartstep.parameters import PN100
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from tests.support.rig import RunningRig, running_rig

@@ -19,7 +19,7 @@ from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.profiles import PROFILES
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane
 from tests.bench.virtual_time import smartsteps_busy
 from tests.support.rig import SIMULATED, running_rig
 

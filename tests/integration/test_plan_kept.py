@@ -8,7 +8,7 @@ import pytest
 from ldcnd.config.plan import require_plan
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.plan import BusPlan
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import rig_on
 from tests.support.late_host import open_late_host

@@ -14,7 +14,7 @@ from ldcnd.drives.ldcn.network import ldcn_line
 from ldcnd.drives.ldcn.packet import StatusItem
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.line.bus import Bus
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane
 from ldcnd.line.settings import BusSettings
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

@@ -13,8 +13,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from ldcnd.contract.errors import BadReply, BusBusy, BusDown, BusError, OutcomeUnknown, PacketRejected, ReplyTimeout
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Exchange, Lane
 from ldcnd.line.settings import BusSettings
 from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support import toy_family as toy

@@ -6,9 +6,8 @@ from types import SimpleNamespace
 from typing import TypeVar
 
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, PacketReader
-from ldcnd.line.exchange import Exchange
+from ldcnd.line.exchange import Exchange, Lane
 from ldcnd.line.proof import Proofs
-from ldcnd.line.queue import Lane
 from tests.support.simulated_host import SimulatedHost
 
 ReplyT = TypeVar("ReplyT")

@@ -4,14 +4,11 @@ import asyncio
 from collections import deque
 
 from ldcnd.contract.errors import BusError
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.flight_recorder import WireLog
+from ldcnd.line.exchange import Exchange, Lane, Resync, Timing
+from ldcnd.line.flight_recorder import BusStatistics, WireLog
 from ldcnd.line.line import Line
-from ldcnd.line.queue import Lane
-from ldcnd.line.resync import Resync
 from ldcnd.line.settings import BusSettings
 from ldcnd.line.transaction import Transaction
-from ldcnd.line.wire import BusStatistics
 from tests.support import toy_family as toy
 from tests.support.scripted_line import Say, ScriptedLine
 

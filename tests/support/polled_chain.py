@@ -15,8 +15,7 @@ from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.poller import Poller
+from ldcnd.line.exchange import Exchange, Poller, Timing
 from ldcnd.line.settings import BusSettings, ServoCycle
 from ldcnd.line.transport import Transport
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

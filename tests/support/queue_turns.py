@@ -2,7 +2,7 @@
 
 from typing import Any, TypeVar
 
-from ldcnd.line.poller import Poller
+from ldcnd.line.exchange import Poller
 from ldcnd.line.queue import ExchangeQueue, Queueable
 
 JobT = TypeVar("JobT", bound=Queueable)

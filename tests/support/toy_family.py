@@ -9,9 +9,7 @@ from collections.abc import Set as AbstractSet
 from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, BusError
-from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict, Timing
-from ldcnd.line.poller import Poller
-from ldcnd.line.resync import Resync
+from ldcnd.line.exchange import Exchange, PacketEffect, Poller, ReplyVerdict, Resync, Timing
 from tests.support.scripted_line import Say, Script
 
 REQUEST_BYTES = 6

@@ -11,9 +11,9 @@ from ldcnd.contract.errors import (
     NotSupported,
     WrongState,
 )
-from ldcnd.line.exchange import PacketEffect
-from ldcnd.line.queue import LANE_LIMITS, Lane
-from ldcnd.line.transaction import only_while
+from ldcnd.line.exchange import Lane, PacketEffect
+from ldcnd.line.proof import only_while
+from ldcnd.line.queue import LANE_LIMITS
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
 from tests.support.toy_family import ToyPoller

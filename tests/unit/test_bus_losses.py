@@ -11,7 +11,7 @@ from ldcnd.contract.errors import (
     ReplyTimeout,
 )
 from ldcnd.line.bus import LONGEST_REOPEN_S
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, Rig, outcome, running, scripted
 from tests.support.scripted_line import Say

@@ -4,8 +4,8 @@ import asyncio
 
 from ldcnd.contract.errors import TransportLost
 from ldcnd.line.bus import LONGEST_OPENING_S, LONGEST_REOPEN_S, Bus
+from ldcnd.line.exchange import Lane
 from ldcnd.line.line import LATE_S, Phase
-from ldcnd.line.queue import Lane
 from ldcnd.line.transport import Transport
 from tests.support import toy_family as toy
 from tests.support.bus_rig import SETTINGS, Rig, outcome, running

@@ -9,9 +9,8 @@ import pytest
 from typing_extensions import override
 
 from ldcnd.contract.errors import BusError
-from ldcnd.line.exchange import Exchange, PacketEffect, Timing
-from ldcnd.line.queue import Lane
-from ldcnd.line.transaction import only_while
+from ldcnd.line.exchange import Exchange, Lane, PacketEffect, Timing
+from ldcnd.line.proof import only_while
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
 from tests.support.scripted_line import Say

@@ -4,8 +4,8 @@ from itertools import pairwise
 import pytest
 
 from ldcnd.contract.errors import BusBusy
-from ldcnd.line.poller import Poller
-from ldcnd.line.queue import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, ExchangeQueue, Lane
+from ldcnd.line.exchange import Lane, Poller
+from ldcnd.line.queue import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, ExchangeQueue
 from tests.support.queue_turns import take
 from tests.support.toy_family import ToyPoller
 

@@ -12,7 +12,7 @@ from ldcnd.drives.ldcn.controls import HomingControl, LimitPins
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_V4
 from ldcnd.drives.ldcn.servo import LdcnAxis
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.plant import MotorPlant

@@ -1,8 +1,8 @@
 import pytest
 
+from ldcnd.line.exchange import Lane, Resync
 from ldcnd.line.line import Phase
-from ldcnd.line.queue import Lane
-from ldcnd.line.resync import LONGEST_QUARANTINE, Resync
+from ldcnd.line.resync import LONGEST_QUARANTINE
 from tests.support import toy_family as toy
 from tests.support.line_bench import BYTE_S, FENCE_S, MARGIN_S, REPLY_S, REQUEST_S, Bench, settle
 from tests.support.scripted_line import Say

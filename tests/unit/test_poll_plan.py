@@ -8,7 +8,7 @@ import pytest
 from ldcnd.drives.cost import Cost
 from ldcnd.drives.line_plan import Poll, Urgent, largest, plan_line
 from ldcnd.drives.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
-from ldcnd.line.poller import Poller, Priority
+from ldcnd.line.exchange import Poller, Priority
 from ldcnd.line.queue import Choose, ExchangeQueue
 from tests.support.queue_turns import take
 

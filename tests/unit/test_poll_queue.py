@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.line.poller import NO_DEADLINE_S, Poller, Priority
+from ldcnd.line.exchange import NO_DEADLINE_S, Poller, Priority
 from ldcnd.line.queue import POLLS_PER_LOWER, Choose, PollQueue
 from tests.support.toy_family import ToyPoller
 

@@ -6,9 +6,8 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.contract.errors import AxisUnreachable, LdcndError, NotIdentified
-from ldcnd.line.exchange import PacketEffect
+from ldcnd.line.exchange import Lane, PacketEffect
 from ldcnd.line.proof import MISSES_UNTIL_LOST, bringing_up
-from ldcnd.line.queue import Lane
 from tests.support import toy_family as toy
 from tests.support.bus_rig import Rig, running
 from tests.support.scripted_line import Say

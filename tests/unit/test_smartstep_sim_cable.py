@@ -12,7 +12,7 @@ from ldcnd.drives.smartstep.packet import DAMAGED, ResponseStatus, add_parity, s
 from ldcnd.drives.smartstep.parameters import PN000, PN100, PN102
 from ldcnd.drives.smartstep.profiles import Framing, TraceWordLayout, Wiring
 from ldcnd.line.bus import Bus
-from ldcnd.line.resync import Resync
+from ldcnd.line.exchange import Resync
 from ldcnd.line.settings import BusSettings
 from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault

@@ -27,8 +27,8 @@ from ldcnd.drives.smartstep.profiles import (
     StringChecksum,
 )
 from ldcnd.drives.smartstep.trace_upload import TraceUpload
+from ldcnd.line.exchange import Lane
 from ldcnd.line.flight_recorder import WireEvent
-from ldcnd.line.queue import Lane
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant

@@ -2,8 +2,8 @@ import random
 
 import pytest
 
-from ldcnd.line.queue import Lane
-from ldcnd.line.wire import BUCKETS, BusStatistics, LatencyHistogram, bucket_limit_s
+from ldcnd.line.exchange import Lane
+from ldcnd.line.flight_recorder import BUCKETS, BusStatistics, LatencyHistogram, bucket_limit_s
 
 
 def test_limits_double_from_64_microseconds():

@@ -20,8 +20,8 @@ from ldcnd.drives.smartstep.family import SMARTSTEP, open_smartstep_line
 from ldcnd.drives.smartstep.network import smartstep_opener
 from ldcnd.drives.smartstep.profiles import Framing, SmartStepProfile
 from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Resync
 from ldcnd.line.port_url import port_opener
-from ldcnd.line.resync import Resync
 from ldcnd.line.settings import BusSettings
 from ldcnd.line.transport import Opener
 

@@ -28,8 +28,7 @@ from ldcnd.drives.ldcn.pic_io import LINES, IoStatus
 from ldcnd.drives.ldcn.servo import STOP_CONTROLS, LdcnAxis
 from ldcnd.drives.network import CapturedIo, Instant
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import PacketEffect
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane, PacketEffect
 from ldcnd.log import get_logger
 
 log = get_logger("ldcn")

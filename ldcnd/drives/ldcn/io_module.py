@@ -36,8 +36,7 @@ from ldcnd.drives.ldcn.pic_io import (
 from ldcnd.drives.ldcn.registers import TAKEN_OVER, RegisterBook
 from ldcnd.drives.network import IoDriver, ModuleEntry
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.poller import Poller, next_on_grid
+from ldcnd.line.exchange import Exchange, Poller, Timing, next_on_grid
 
 CAPTURED = IoItem.CAPTURED_LEVELS | IoItem.CAPTURED_COUNTER
 DIRECTIONS = {line: f"direction {line}" for line in range(1, LINES + 1)}

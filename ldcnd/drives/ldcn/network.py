@@ -48,10 +48,8 @@ from ldcnd.drives.network import (
     StartPolicy,
 )
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.poller import Poller, next_on_grid
+from ldcnd.line.exchange import Exchange, Poller, Resync, Timing, next_on_grid
 from ldcnd.line.proof import bringing_up
-from ldcnd.line.resync import Resync
 from ldcnd.line.settings import BusSettings
 from ldcnd.line.transport import Opener
 from ldcnd.log import get_logger

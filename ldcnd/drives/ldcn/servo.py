@@ -69,8 +69,7 @@ from ldcnd.drives.ldcn.trajectory import (
     trajectory_values,
 )
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Exchange, Lane
 from ldcnd.log import get_logger
 
 SOURCES = MappingProxyType(

@@ -48,8 +48,7 @@ from ldcnd.drives.smartstep.profiles import SMARTSTEP, SmartStepProfile
 from ldcnd.drives.smartstep.trace import SmartStepTracer
 from ldcnd.drives.smartstep.words import Words
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Timing
-from ldcnd.line.poller import Poller
+from ldcnd.line.exchange import Poller, Timing
 from ldcnd.log import get_logger
 
 

@@ -28,8 +28,7 @@ from ldcnd.drives.smartstep.poller import STRAY_WAIT_S
 from ldcnd.drives.smartstep.profiles import SMARTSTEP, Framing, SmartStepProfile
 from ldcnd.drives.smartstep.words import stray_packets
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange
-from ldcnd.line.resync import Resync
+from ldcnd.line.exchange import Exchange, Resync
 from ldcnd.line.settings import BusSettings
 from ldcnd.line.transport import Opener, Receiver, Transport
 from ldcnd.log import get_logger

@@ -34,8 +34,7 @@ from ldcnd.drives.smartstep.parameters import PARAMETERS
 from ldcnd.drives.smartstep.profiles import SmartStepProfile
 from ldcnd.drives.smartstep.words import stray_packets
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, Timing
-from ldcnd.line.poller import Poller, next_on_grid
+from ldcnd.line.exchange import Exchange, Poller, Timing, next_on_grid
 from ldcnd.log import get_logger
 
 log = get_logger("smartstep")

@@ -84,7 +84,7 @@ from ldcnd.drives.tracer import (
     TriggerWatch,
 )
 from ldcnd.line.bus import Bus
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Lane
 from ldcnd.log import get_logger
 
 log = get_logger("smartstep")

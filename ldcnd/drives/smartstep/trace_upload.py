@@ -18,8 +18,7 @@ from ldcnd.drives.smartstep.profiles import SmartStepProfile, StringChecksum
 from ldcnd.drives.smartstep.trace_data import Chunk, chunk_plan, split_words
 from ldcnd.drives.smartstep.words import Words
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange
-from ldcnd.line.queue import Lane
+from ldcnd.line.exchange import Exchange, Lane
 
 ROUNDS = 4
 """Maximum readings of a piece until two agree, and maximum time-outs of one reading."""

@@ -23,9 +23,8 @@ from ldcnd.drives.smartstep.commands import Refusal, RefusalReason
 from ldcnd.drives.smartstep.packet import PACKET_CHARACTERS, ReplyReader
 from ldcnd.drives.smartstep.profiles import SmartStepProfile
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, PacketEffect
+from ldcnd.line.exchange import Exchange, Lane, PacketEffect
 from ldcnd.line.flight_recorder import WireEvent
-from ldcnd.line.queue import Lane
 
 
 def drive_error(axis: str, refusal: Refusal, mode: OperatingMode | int = OperatingMode.NORMAL) -> DriveFault:
