@@ -13,7 +13,7 @@ from functools import lru_cache
 from ldcnd.contract.errors import BusError
 from ldcnd.drives.cost import Cost
 from ldcnd.line.exchange import Exchange, Poller, ReplyVerdict, Timing, next_on_grid
-from ldcnd.line.queue import PhaseOrder, PollQueue
+from ldcnd.line.schedule import PhaseOrder, PollQueue
 from ldcnd.line.settings import ServoCycle
 
 LEARNING = 10

@@ -1,110 +1,30 @@
-"""One bus: owns the port, reopens it after a loss, and schedules the exchanges of its users on the line."""
+"""One bus: owns the port, reopens it after a loss, and queues the exchanges of its users for the line."""
 
 import asyncio
 from typing import Any, TypeVar
 
 from typing_extensions import override
 
-from ldcnd.contract.errors import BadReply, BusDown, BusError, LdcndError, NotSupported, PacketRejected, TransportLost
+from ldcnd.contract.errors import (
+    BadReply,
+    BusDown,
+    BusError,
+    LdcndError,
+    NotSupported,
+    OutcomeUnknown,
+    PacketRejected,
+    ReplyTimeout,
+    TransportLost,
+)
 from ldcnd.line.adapter import LineErrors
-from ldcnd.line.exchange import Exchange, Lane, PacketEffect, Poller, Resync, Timing
-from ldcnd.line.flight_recorder import BusStatistics, WireEvent, WireLog
-from ldcnd.line.line import Line, Phase, Users
-from ldcnd.line.proof import ALWAYS_SENT, Proofs
-from ldcnd.line.queue import POLL, ExchangeQueue, PhaseOrder
+from ldcnd.line.exchange import Exchange, Lane, Poller, Resync, Timing
+from ldcnd.line.flight_recorder import BusStatistics, LatencyHistogram, WireEvent, WireLog
+from ldcnd.line.line import Line, Phase, Transaction
+from ldcnd.line.proof import ALWAYS_SENT, Condition, Proofs
+from ldcnd.line.schedule import Schedule
 from ldcnd.line.settings import BusSettings
-from ldcnd.line.transaction import Job, StopProbe, Transaction
 from ldcnd.line.transport import Opener, Transport
 from ldcnd.log import get_logger
-
-MISSES_BEFORE_BACKOFF = 3
-MUTE_SHARE = 0.005
-"""Fraction of the line's time that polls without a reply may take, so that mute nodes cost the others little."""
-FIRST_BACKOFF_S = 0.05
-LONGEST_BACKOFF_S = 5.0
-"""Longest pause between two polls of a mute node, seconds, whatever fraction of the line they take."""
-
-
-class MuteNodes:
-    """The nodes that do not reply.
-
-    Attributes:
-        misses: consecutive exchanges without a reply, by node; nodes that reply are absent.
-    """
-
-    def __init__(self) -> None:
-        self.misses: dict[int, int] = {}
-        self._backed_off: set[int] = set()
-
-    def failing(self) -> set[int]:
-        """Return the nodes that did not reply to their last exchange."""
-        return set(self.misses)
-
-    def missed(self, node: int) -> None:
-        """Count an exchange without a reply."""
-        self.misses[node] = self.misses.get(node, 0) + 1
-
-    def pause_s(self, node: int, lost_s: float) -> float:
-        """Return how long to pause polling a node whose poll has just been lost, in seconds.
-
-        Args:
-            node: its miss was counted.
-            lost_s: time that a poll without a reply takes on the line.
-        """
-        beyond = self.misses[node] - MISSES_BEFORE_BACKOFF
-        if beyond < 0:
-            return 0.0
-        self._backed_off.add(node)
-        many = len(self._backed_off)
-        doubled_s = many * FIRST_BACKOFF_S * 2.0 ** min(10, beyond)
-        return min(doubled_s, many * lost_s / MUTE_SHARE, LONGEST_BACKOFF_S)
-
-    def answered(self, node: int) -> int | None:
-        """Note a reply; return another node to poll at once, if this one was backed off.
-
-        A common cause, such as a connector or the supply of one node, often ends for all mute nodes together.
-        """
-        if self.misses.pop(node, None) is None or node not in self._backed_off:
-            return None
-        self._backed_off.discard(node)
-        return min(self._backed_off, key=lambda other: (other < node, other), default=None)  # the chain, once round
-
-    def forget(self) -> None:
-        """Clear all misses: the line was opened."""
-        self.misses.clear()
-        self._backed_off.clear()
-
-
-class PollTransaction(Transaction):
-    """A poll; it is never sent again, because the next poll comes soon enough."""
-
-    __slots__ = ("poller",)
-
-    def __init__(self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float) -> None:
-        self.exchange, self.lane, self.wanted_at_s = exchange, POLL, wanted_at_s  # one call less for each poll
-        self.then_baud = self.at_baud = None
-        self.slow_to_deliver = poller.slow_to_deliver
-        self.poller = poller
-
-    @override
-    def completed(self, reply: bytes, timing: Timing) -> None:
-        try:
-            value = self.exchange.decode(reply)
-        except BadReply as error:
-            self.poller.missed(error)
-            return
-        self.poller.deliver(value, timing)
-
-    @override
-    def lost(self, error: BusError) -> bool:
-        self.poller.missed(error)
-        return False
-
-    @override
-    def rejected(self) -> bool:
-        self.poller.missed(PacketRejected(f"node {self.exchange.node} received a damaged packet"))
-        return False
-
 
 ReplyT = TypeVar("ReplyT")
 
@@ -118,10 +38,117 @@ LONGEST_OPENING_S = 10.0
 """Upper bound of closing a lost port and opening it again, seconds; both are bounded by themselves."""
 
 
-READS = PacketEffect.READS  # looked up slowly in its class
+class Job(Transaction):
+    """An exchange that a caller waits for; its future gets exactly one outcome, `timing` says when that was.
+
+    Args:
+        exchange: request and expected reply.
+        lane: the lane in which it waits.
+        loop: the bus's.
+        attempts: how often it is sent in all, if it may be repeated.
+        condition: see `Transaction`.
+    """
+
+    __slots__ = ("attempts", "attempts_left", "condition", "future", "timing")
+
+    def __init__(
+        self,
+        exchange: Exchange[Any],
+        lane: Lane,
+        loop: asyncio.AbstractEventLoop,
+        attempts: int,
+        condition: Condition | None = None,
+    ) -> None:
+        super().__init__(exchange, lane, loop.time())
+        self.condition: Condition | None = condition
+        self.future: asyncio.Future[Any] = loop.create_future()
+        self.timing: Timing | None = None
+        self.attempts = self.attempts_left = attempts
+
+    @property
+    @override
+    def abandoned(self) -> bool:
+        return self.future.done()
+
+    @override
+    def may_go(self, now_s: float) -> bool:
+        if self.condition:
+            try:
+                self.condition()
+            except LdcndError as error:
+                self.fail(error)
+                return False
+        self.attempts_left -= 1
+        return True
+
+    def fail(self, error: LdcndError) -> None:
+        """Give the caller the error, unless it has gone."""
+        if not self.future.done():
+            self.future.set_exception(error)
+
+    @override
+    def completed(self, reply: bytes, timing: Timing) -> None:
+        if self.future.done():
+            return
+        try:
+            value = self.exchange.decode(reply)
+        except BadReply as error:
+            self.fail(error)
+            return
+        self.timing = timing
+        self.future.set_result(value)
+
+    @override
+    def lost(self, error: BusError) -> bool:
+        exchange = self.exchange
+        if not exchange.repeatable:
+            self.fail(
+                OutcomeUnknown(
+                    f"{error.message}; the packet {exchange.request.hex(' ')} must not be repeated and may or may not"
+                    " have been executed",
+                    remedy="read the axis state before anything else",
+                )
+            )
+            return False
+        if self.attempts_left > 0:
+            return True
+        self.fail(
+            ReplyTimeout(
+                f"no intact reply in {self.attempts} attempts: {error.message}",
+                remedy="check the drive's power and address, and the cable",
+            )
+        )
+        return False
+
+    @override
+    def rejected(self) -> bool:
+        if self.attempts_left > 0:
+            return True
+        self.fail(
+            PacketRejected(
+                f"node {self.exchange.node} received {self.attempts} damaged packets and executed none of them",
+                remedy="check cable, termination and baud rate",
+            )
+        )
+        return False
 
 
-class Bus(Users):
+class StopProbe(Job):
+    """A harmless exchange in the place of a stop, to measure how long a stop would wait; it is not repeated."""
+
+    __slots__ = ("_waits",)
+
+    def __init__(self, exchange: Exchange[Any], loop: asyncio.AbstractEventLoop, waits: LatencyHistogram) -> None:
+        super().__init__(exchange, Lane.STOP, loop, 1)
+        self._waits = waits
+
+    @override
+    def may_go(self, now_s: float) -> bool:
+        self._waits.add(now_s - self.wanted_at_s)
+        return super().may_go(now_s)
+
+
+class Bus:
     """The owner of one line; every method runs on the event loop that `run` runs on.
 
     Attributes:
@@ -136,10 +163,7 @@ class Bus(Users):
         self.proofs = Proofs()
         self._opener = opener
         self._loop = asyncio.get_running_loop()
-        self._order = PhaseOrder(settings.cycle) if settings.cycle else None
-        self._queue: ExchangeQueue[Job] = ExchangeQueue(self._order.choose if self._order else None)
-        self._pollers: set[Poller[Any]] = set()  # also those whose poll is on the wire
-        self._mute = MuteNodes()
+        self._schedule: Schedule[Transaction] = Schedule(settings.cycle, self.proofs)
         self._line: Line | None = None  # None while the port is not open
         self._opened = asyncio.Event()
         self._closed = asyncio.Event()
@@ -169,7 +193,9 @@ class Bus(Users):
             AxisUnreachable, NotIdentified: not proven to be who is meant; nothing was sent.
             LdcndError: as the condition refused it; nothing was sent.
         """
-        return await self._submit(exchange, lane, once=once)
+        job = self._submit(exchange, lane, 1 if once else self.settings.attempts)
+        reply: ReplyT = await job.future
+        return reply
 
     async def execute_timed(self, exchange: Exchange[ReplyT]) -> tuple[ReplyT, Timing]:
         """Run one command exchange; return the decoded reply, and when it happened.
@@ -177,8 +203,8 @@ class Bus(Users):
         Raises:
             As `execute`.
         """
-        job = self._job(exchange, Lane.COMMAND)
-        reply: ReplyT = await self._queued(job)
+        job = self._submit(exchange)
+        reply: ReplyT = await job.future
         if job.timing is None:
             raise AssertionError("a reply without the instant at which it came")
         return reply, job.timing
@@ -190,7 +216,8 @@ class Bus(Users):
             As `execute`; NotSupported when the transport cannot change to this rate.
         """
         self._require_changeable(baud)
-        return await self._submit(exchange, Lane.COMMAND, then_baud=baud)
+        reply: ReplyT = await self._submit(exchange, then_baud=baud).future
+        return reply
 
     async def execute_at(self, baud: int, exchange: Exchange[ReplyT]) -> ReplyT:
         """Run one command exchange at another rate than the line's, which it has back before anything else is sent.
@@ -201,7 +228,8 @@ class Bus(Users):
             As `execute`; NotSupported when the transport cannot change to this rate.
         """
         self._require_changeable(baud)
-        return await self._submit(exchange, Lane.COMMAND, at_baud=baud)
+        reply: ReplyT = await self._submit(exchange, at_baud=baud).future
+        return reply
 
     async def probe_stop_wait(self) -> None:
         """Measure how long a single stop would have to wait now, with a harmless exchange in its place.
@@ -211,27 +239,26 @@ class Bus(Users):
         Raises:
             BusDown, ReplyTimeout, PacketRejected, BadReply: as `execute`; the probe is not repeated.
         """
-        exchange = self._resync.probe(self._mute.failing())
-        if exchange is None or self._line is None or not self._queue.takes_probe():
+        exchange = self._resync.probe(self._schedule.mute.failing())
+        if exchange is None or self._line is None or not self._schedule.takes_probe():
             return
-        future: asyncio.Future[Any] = self._loop.create_future()
-        self._queue.push_probe(StopProbe(exchange, Lane.STOP, self._loop.time(), future, attempts=1))
-        self._kick()
-        await future
+        probe = StopProbe(exchange, self._loop, self.statistics.stop_wait)
+        self._schedule.push_probe(probe)
+        self._line.kick()
+        await probe.future
 
     def add_poller(self, poller: Poller[Any]) -> None:
         """Let a poller take part from its `due_at_s` on; adding it again only moves its turn.
 
         All pollers are removed when the line is lost; they are added again when the network is initialised again.
         """
-        self._pollers.add(poller)
-        self._queue.schedule(poller, poller.due_at_s)
-        self._kick()
+        self._schedule.add(poller)
+        if self._line:
+            self._line.kick()
 
     def remove_poller(self, poller: Poller[Any]) -> None:
         """Stop polling; a poll on the wire is still delivered."""
-        self._pollers.discard(poller)
-        self._queue.unschedule(poller)
+        self._schedule.remove(poller)
 
     def drop(self, reason: str) -> None:
         """Give the line up as if it had been lost; it is opened again as after any loss."""
@@ -245,13 +272,13 @@ class Bus(Users):
 
     def withdraw(self, node: int, error: LdcndError) -> None:
         """Fail every command that still waits for this node; what is on the wire runs on. Stops are not touched."""
-        for job in self._queue.waiting(Lane.COMMAND):
+        for job in self._schedule.waiting(Lane.COMMAND):
             if job.exchange.node == node:
                 job.fail(error)
 
     def waiting(self, lane: Lane) -> int:
         """Return how many exchanges wait in a lane; polls are scheduled, not queued."""
-        return 0 if lane is Lane.POLL else len(self._queue.waiting(lane))
+        return len(self._schedule.waiting(lane))
 
     @property
     def loss_reason(self) -> str:
@@ -277,20 +304,20 @@ class Bus(Users):
     @property
     def baud(self) -> int:
         """The rate in use, or the rate of the next opening."""
-        return self._line.wire.baud if self._line else self.settings.baud
+        return self._line.baud if self._line else self.settings.baud
 
     @property
     def fixed_baud(self) -> bool:
         """Whether the port cannot change its rate."""
-        return self._line is not None and self._line.wire.fixed_baud
+        return self._line is not None and self._line.transport.fixed_baud
 
     def offers(self, baud: int) -> bool:
         """Tell whether the port can be set to a rate; without an open port nothing says that it cannot."""
-        return self._line is None or self._line.wire.transport.offers(baud)
+        return self._line is None or self._line.transport.offers(baud)
 
     def line_errors(self) -> LineErrors | None:
         """Return what the port's driver has counted since it was loaded; None without a port that counts."""
-        return self._line.wire.transport.line_errors() if self._line else None
+        return self._line.transport.line_errors() if self._line else None
 
     async def wait_opened(self) -> None:
         """Return as soon as the line is open."""
@@ -302,12 +329,11 @@ class Bus(Users):
 
     def misses(self, node: int) -> int:
         """Return how many exchanges in a row this node has left unanswered."""
-        return self._mute.misses.get(node, 0)
+        return self._schedule.mute.misses.get(node, 0)
 
     def longest_s(self, exchange: Exchange[Any]) -> float:
         """Return how long an exchange occupies the line at most when nothing is lost, in seconds."""
-        byte_s = self.settings.bits_per_byte / self.baud
-        return (len(exchange.request) + exchange.reply_bytes) * byte_s + exchange.response_s
+        return exchange.longest_s(self._byte_s)
 
     def _require_changeable(self, baud: int) -> None:
         if self.fixed_baud:
@@ -321,40 +347,30 @@ class Bus(Users):
     @property
     def quarantine_s(self) -> float:
         """Duration of a resynchronisation after a lost reply, in seconds."""
-        probe = self._resync.probe(self._mute.failing())
-        flush_s = len(self._resync.flush) * self.settings.bits_per_byte / self.baud
-        return self._resync.quiet_s + flush_s + self._resync.settle_s + (self.longest_s(probe) if probe else 0.0)
+        return self._resync.longest_s(self._byte_s, self._schedule.mute.failing())
 
-    async def _submit(
+    @property
+    def _byte_s(self) -> float:
+        return self.settings.bits_per_byte / self.baud
+
+    def _submit(
         self,
-        exchange: Exchange[ReplyT],
-        lane: Lane,
+        exchange: Exchange[Any],
+        lane: Lane = Lane.COMMAND,
+        attempts: int | None = None,
         *,
         then_baud: int | None = None,
         at_baud: int | None = None,
-        once: bool = False,
-    ) -> ReplyT:
-        job = self._job(exchange, lane, once=once)
-        job.then_baud, job.at_baud = then_baud, at_baud
-        reply: ReplyT = await self._queued(job)
-        return reply
-
-    def _job(self, exchange: Exchange[Any], lane: Lane, *, once: bool = False) -> Job:
-        attempts = 1 if once else self.settings.attempts
+    ) -> Job:
+        """Queue an exchange; the outcome is that of the job's future."""
         condition = None if exchange.effect in ALWAYS_SENT else self.proofs.condition(exchange, lane)
-        future: asyncio.Future[Any] = self._loop.create_future()
-        return Job(exchange, lane, self._loop.time(), future, attempts=attempts, condition=condition)
-
-    def _queued(self, job: Job) -> "asyncio.Future[Any]":
+        job = Job(exchange, lane, self._loop, attempts or self.settings.attempts, condition)
+        job.then_baud, job.at_baud = then_baud, at_baud
         if self._line is None:
             raise self._down()
-        self._queue.push(job, job.lane)
-        self._kick()
-        return job.future
-
-    def _kick(self) -> None:
-        if self._line:
-            self._line.kick()
+        self._schedule.push(job, lane)
+        self._line.kick()
+        return job
 
     def _down(self) -> BusDown:
         return BusDown(
@@ -400,8 +416,10 @@ class Bus(Users):
         """Serve the line until it is lost or the caller is cancelled; then every caller has its outcome."""
         self.statistics.openings += 1
         self.wire_log.add(self._loop.time(), WireEvent.OPENED)
-        self._mute.forget()
-        self._line = line = Line(self.settings, transport, self, self._resync, self.statistics, self.wire_log)
+        self._schedule.mute.forget()
+        self._line = line = Line(
+            self.settings, transport, self._schedule, self._resync, self.statistics, self.wire_log, self._note_loss
+        )
         self._closed.clear()
         self._opened.set()
         try:
@@ -411,96 +429,13 @@ class Bus(Users):
             line.close("the bus was closed", for_good=True)
             await transport.close()
 
-    # -- for the line (see `Users`) ----------------------------------------------------------------------------------
-
-    @override
-    def take(self, now_s: float) -> Transaction | None:
-        while job := self._queue.take_job(now_s):
-            if job.condition and self._line and self._line.undelivered:
-                self._line.deliver()  # permission is asked of all that the drives have said by now
-            if job.may_go():
-                break
-        if job is None:
-            poller = self._queue.polls.take(now_s)
-            if poller is None:
-                return None
-            wanted_at_s, exchange = poller.due_at_s, poller.next_exchange(now_s)
-            if exchange.effect is not READS:
-                raise AssertionError(f"the poll {exchange.request.hex(' ')} does not say that it only reads")
-            return PollTransaction(poller, exchange, wanted_at_s)
-        job.attempts_left -= 1
-        if isinstance(job, StopProbe):
-            self.statistics.stop_wait.add(now_s - job.wanted_at_s)
-        return job
-
-    @override
-    def sent(self, transaction: Transaction) -> None:
-        if isinstance(transaction, PollTransaction) and (poller := transaction.poller) in self._pollers:
-            self._queue.polls.schedule(poller, poller.due_at_s)
-
-    @override
-    def prepare_next(self, transaction: Transaction, asked_at_s: float, byte_s: float) -> None:
-        # to choose a poll and its items takes longer than all else between two packets
-        exchange = transaction.exchange
-        reply_s = exchange.reply_bytes * byte_s
-        at_s = self._order.free_at_s(exchange.node, asked_at_s, reply_s) if self._order else asked_at_s + reply_s
-        if poller := self._queue.polls.choose_ahead(at_s):
-            poller.prepare(at_s)
-
-    @override
-    def next_due_s(self) -> float:
-        return self._queue.next_due_s()
-
-    @override
-    def stop_waits(self) -> bool:
-        return self._queue.stop_waits()
-
-    @override
-    def failing(self) -> set[int]:
-        return self._mute.failing()
-
-    @override
-    def answered(self, transaction: Transaction, timing: Timing | None = None) -> None:
-        exchange, mute = transaction.exchange, self._mute
-        if self._order and timing and transaction.lane is POLL:
-            self._order.observe(exchange.node, timing)
-        if not exchange.reply_bytes or exchange.node not in mute.misses:
-            return
-        self.proofs.answered(exchange.node)
-        if (also := mute.answered(exchange.node)) is not None:
-            for poller in self._pollers:
-                if poller.node == also:
-                    self._queue.schedule(poller, poller.due_at_s)
-
-    @override
-    def missed(self, transaction: Transaction, now_s: float) -> None:
-        node = transaction.exchange.node
-        self._mute.missed(node)
-        self.proofs.missed(node, self._mute.misses[node])
-        if isinstance(transaction, PollTransaction):
-            pause_s = self._mute.pause_s(
-                node, self.longest_s(transaction.exchange) + self.settings.margin_s + self.quarantine_s
-            )
-            self._schedule(transaction.poller, max(transaction.poller.due_at_s, now_s + pause_s))
-
-    def _schedule(self, poller: Poller[Any], at_s: float) -> None:
-        """Give a poller its next turn, unless it was removed while its poll was on the wire."""
-        if poller in self._pollers:
-            self._queue.schedule(poller, at_s)
-
-    @override
-    def again(self, transaction: Transaction) -> None:
-        if isinstance(transaction, Job):
-            self._queue.push_front(transaction, transaction.lane)
-
-    @override
-    def line_lost(self, reason: str) -> None:
+    def _note_loss(self, reason: str) -> None:
+        """Take note that the line is lost: every exchange that waits has its outcome."""
         self._line = None
         self._tried_at_s = self._loop.time()
         self._loss_reason = reason
         self._opened.clear()
         self._closed.set()
-        self._pollers.clear()
         self.proofs.lose_all(f"the line was lost ({reason})")
-        for waiting in self._queue.drain():
+        for waiting in self._schedule.drain():
             waiting.fail(BusDown(f"bus {self.settings.name} was lost ({reason}) before the exchange was complete"))

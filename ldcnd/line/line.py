@@ -6,25 +6,181 @@ delivered several at a time (`BusSettings.coalesce_s`), in order, and before any
 
 No reply is ever credited to a later request. Replies of these lines carry no sequence number, so the line relies on
 three facts: bytes that arrive sooner than the wire can carry them belong to something older; nothing but the reply may
-follow a request; after any loss the line is resynchronised (`Quarantine`) before it is used again.
+follow a request; after any loss the line is resynchronised (`Resync`) before it is used again.
 """
 
 import asyncio
+from abc import ABC, abstractmethod
 from collections import deque
+from collections.abc import Callable
 from enum import Enum
-from typing import Protocol
+from typing import Any
 
 from typing_extensions import override
 
-from ldcnd.contract.errors import BadReply, BusError, ReplyTimeout, TransportLost
-from ldcnd.line.exchange import ReplyVerdict, Resync, Timing
-from ldcnd.line.flight_recorder import BusStatistics, WireEvent, WireLog
-from ldcnd.line.queue import POLL
-from ldcnd.line.resync import Quarantine, ResyncExchange
+from ldcnd.contract.errors import BadReply, BusError, LdcndError, PacketRejected, ReplyTimeout, TransportLost
+from ldcnd.line.exchange import Exchange, Lane, PacketEffect, Poller, ReplyVerdict, Resync, Timing
+from ldcnd.line.flight_recorder import AT_ONCE_REMARK, BusStatistics, WireEvent, WireLog
+from ldcnd.line.proof import Condition
+from ldcnd.line.schedule import POLL, Schedule
 from ldcnd.line.settings import LINGER_S, BusSettings
-from ldcnd.line.transaction import AT_ONCE, LANES, Transaction
 from ldcnd.line.transport import Receiver, Transport
-from ldcnd.line.wire import CLOCK_TOLERANCE, NEVER_S, CompleteReply, Pieces, Watchdog, Wire
+
+LANES = tuple(lane.name.lower() for lane in Lane)
+"""Remarks of the wire log about packets, by lane."""
+AT_ONCE = tuple(f"{lane}{AT_ONCE_REMARK}" for lane in LANES)
+"""The same for packets that waited for the reply before them."""
+
+
+class Transaction(ABC):
+    """One exchange on its way over the wire; exactly one of the outcomes is reported for each time it is sent.
+
+    Attributes:
+        exchange: request and expected reply.
+        lane: the lane in which it waited.
+        wanted_at_s: when it was queued or due, in loop time.
+        then_baud: the rate to use from the end of this exchange on; None for the present one.
+        at_baud: the rate of this exchange alone; None for the line's.
+        slow_to_deliver: processing the reply takes long, and can wait for those after it.
+        condition: raises what forbids to send it, when its turn has come; None where nothing can.
+        poller: whose poll it is; None for all else.
+        proves: the content of the reply proves that the line is in step.
+    """
+
+    __slots__ = ("at_baud", "exchange", "lane", "slow_to_deliver", "then_baud", "wanted_at_s")
+    condition: Condition | None = None
+    poller: Poller[Any] | None = None
+    proves = False
+
+    def __init__(self, exchange: Exchange[Any], lane: Lane, wanted_at_s: float) -> None:
+        self.exchange = exchange
+        self.lane = lane
+        self.wanted_at_s = wanted_at_s
+        self.then_baud: int | None = None
+        self.at_baud: int | None = None
+        self.slow_to_deliver = False
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether no caller waits for the outcome."""
+        return False
+
+    def may_go(self, now_s: float) -> bool:  # noqa: ARG002 - the general answer
+        """Check the condition directly before sending; if it fails, that is the outcome."""
+        return True
+
+    def fail(self, error: LdcndError) -> None:  # noqa: B027 - polls and probes are asked for by no caller
+        """Give the caller the error, if there is one who waits."""
+
+    @abstractmethod
+    def completed(self, reply: bytes, timing: Timing) -> None:
+        """Take the intact reply (empty when none was due); the next request is on the wire already."""
+
+    @abstractmethod
+    def lost(self, error: BusError) -> bool:
+        """Note that no reply is valid any more; return whether to send the exchange again."""
+
+    @abstractmethod
+    def rejected(self) -> bool:
+        """Note that the node did not execute the packet; return whether to send it again."""
+
+
+class PollTransaction(Transaction):
+    """A poll; it is never sent again, because the next poll comes soon enough."""
+
+    __slots__ = ("poller",)
+
+    def __init__(self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float) -> None:
+        self.exchange, self.lane, self.wanted_at_s = exchange, POLL, wanted_at_s  # one call less for each poll
+        self.then_baud = self.at_baud = None
+        self.slow_to_deliver = poller.slow_to_deliver
+        self.poller: Poller[Any] = poller
+
+    @override
+    def completed(self, reply: bytes, timing: Timing) -> None:
+        try:
+            value = self.exchange.decode(reply)
+        except BadReply as error:
+            self.poller.missed(error)
+            return
+        self.poller.deliver(value, timing)
+
+    @override
+    def lost(self, error: BusError) -> bool:
+        self.poller.missed(error)
+        return False
+
+    @override
+    def rejected(self) -> bool:
+        self.poller.missed(PacketRejected(f"node {self.exchange.node} received a damaged packet"))
+        return False
+
+
+class ResyncExchange(Transaction):
+    """The line's own exchange at the end of a resynchronisation; the line repeats it by itself."""
+
+    __slots__ = ()
+    proves = True
+
+    @override
+    def completed(self, reply: bytes, timing: Timing) -> None:
+        pass
+
+    @override
+    def lost(self, error: BusError) -> bool:
+        return False
+
+    @override
+    def rejected(self) -> bool:
+        return False  # an intact refusal proves nothing
+
+
+NEVER_S = float("inf")
+
+
+class Watchdog:
+    """Calls back once the deadline has passed.
+
+    Moving the deadline later costs an assignment: the timer fires at the old time, compares, and is set again. So a
+    line that answers in time creates a few timers a second, not one per exchange.
+    """
+
+    def __init__(self, loop: asyncio.AbstractEventLoop, expired: Callable[[float], None]) -> None:
+        self._loop = loop
+        self._expired = expired
+        self._deadline_s = NEVER_S
+        self._timer: asyncio.TimerHandle | None = None
+        self._timer_at_s = NEVER_S
+
+    @property
+    def deadline_s(self) -> float:
+        """The deadline, in loop time; infinity when there is none."""
+        return self._deadline_s
+
+    def set(self, at_s: float) -> None:
+        """Move the deadline, in loop time; infinity for none."""
+        self._deadline_s = at_s
+        if at_s < self._timer_at_s:
+            if self._timer:
+                self._timer.cancel()
+            self._timer_at_s = at_s
+            self._timer = self._loop.call_at(at_s, self._check_deadline)
+
+    def cancel(self) -> None:
+        """Cancel the deadline and the timer."""
+        self._deadline_s = self._timer_at_s = NEVER_S
+        if self._timer:
+            self._timer.cancel()
+            self._timer = None
+
+    def _check_deadline(self) -> None:
+        self._timer, self._timer_at_s = None, NEVER_S
+        now_s = self._loop.time()
+        if now_s >= self._deadline_s:
+            self._deadline_s = NEVER_S
+            self._expired(now_s)
+        elif self._deadline_s < NEVER_S:
+            self.set(self._deadline_s)
 
 
 class Phase(Enum):
@@ -38,49 +194,9 @@ class Phase(Enum):
     """After a request that draws no reply."""
     QUARANTINE = "quarantine"
     """Waiting for late bytes to stop."""
-    SETTLE = "settle"
+    FLUSH = "flush"
     """The flush is on its way."""
     CLOSED = "closed"
-
-
-class Users(Protocol):
-    """The interface of the bus that the line uses: its queue and its state of the nodes."""
-
-    def take(self, now_s: float) -> Transaction | None:
-        """Remove and return the next transaction, or None when nothing is due."""
-
-    def sent(self, transaction: Transaction) -> None:
-        """Note that a transaction that was taken is on the wire."""
-
-    def prepare_next(self, transaction: Transaction, asked_at_s: float, byte_s: float) -> None:
-        """Prepare the next transaction, while there is time.
-
-        Args:
-            transaction: on the wire.
-            asked_at_s: when the last bit of its request leaves, in loop time.
-            byte_s: how long a byte takes now.
-        """
-
-    def next_due_s(self) -> float:
-        """Return when the next exchange is due, in loop time."""
-
-    def stop_waits(self) -> bool:
-        """Tell whether a stop is queued."""
-
-    def failing(self) -> set[int]:
-        """Return the nodes that did not reply to their last exchange."""
-
-    def answered(self, transaction: Transaction, timing: Timing | None = None) -> None:
-        """Note that the transaction's node replied, and when if the reply is accepted, or that no reply was due."""
-
-    def missed(self, transaction: Transaction, now_s: float) -> None:
-        """Note that the transaction's node did not reply; called before the transaction's own `lost`."""
-
-    def again(self, transaction: Transaction) -> None:
-        """Give the transaction back to the front of its lane."""
-
-    def line_lost(self, reason: str) -> None:
-        """Note the loss of the line; called once, after every transaction on it has its outcome."""
 
 
 NOT_PLAIN = 0
@@ -88,15 +204,33 @@ NOT_PLAIN = 0
 ANY = 1  # byte to expect where every byte counts
 LATE_S = 1.0
 """Longest delay of the next planned action, seconds; a line that is later counts as stuck."""
+CLOCK_TOLERANCE = 0.9
+"""A drive's baud clock may be 3 % fast and a time stamp a little early: bytes count as too early below this share."""
+PROBE_ROUNDS = 3
+LONGEST_QUARANTINE = 20
+"""Longest wait for silence, in multiples of `quiet_s`; a line that is never silent is flushed after that."""
+READS = PacketEffect.READS  # looked up slowly in its class
 _FLAWS = {ReplyVerdict.CORRUPT: "is damaged", ReplyVerdict.REJECTED: "packet rejected"}
 
 
 class Line(Receiver):
     """One open transport with its exchange; a `Receiver`, created at every opening.
 
+    Args:
+        settings: the line's.
+        transport: the open port.
+        schedule: what goes on the wire next; learns who replies.
+        resync: how the line gets back in step.
+        statistics: counts what passes.
+        wire_log: records what passes.
+        report_loss: called once with the reason when the line is lost or closed, after every transaction on it has
+            its outcome.
+
     Attributes:
         phase: its state.
-        wire: its end on the host.
+        transport: the open port.
+        baud: the rate of all exchanges that have none of their own.
+        byte_s: how long a byte takes now, in seconds.
         undelivered: replies to polls that wait to be delivered with those after them, oldest first.
     """
 
@@ -104,27 +238,33 @@ class Line(Receiver):
         self,
         settings: BusSettings,
         transport: Transport,
-        users: Users,
+        schedule: Schedule[Transaction],
         resync: Resync,
         statistics: BusStatistics,
         wire_log: WireLog,
+        report_loss: Callable[[str], None],
     ) -> None:
         self.phase = Phase.IDLE
+        self.transport = transport
+        self.baud, self.byte_s = settings.baud, settings.bits_per_byte / settings.baud
         self._settings = settings
-        self.wire = Wire(settings, transport, statistics, wire_log)
-        self._transport, self._log = transport, wire_log
-        self._users = users
+        self._schedule = schedule
         self._resync = resync
-        self._quarantine = Quarantine(resync)
         self._statistics = statistics
+        self._log = wire_log
+        self._report_loss = report_loss
         self._loop = asyncio.get_running_loop()
         self._watchdog = Watchdog(self._loop, self._expired)
-        self._transaction: Transaction | None = None
-        self._distrusted = False
+        self._transaction: Transaction | None = None  # on the wire
         self._sent_at_s = 0.0
-        self._pieces = Pieces()
+        self._echo = bytearray()  # bytes of ours that are still to come back
+        # the reply so far: when its bytes can be here at the earliest, those that are, and whether some came sooner
+        self._earliest_s, self._held, self._early = 0.0, b"", False
         self._missing, self._whole_from_s = NOT_PLAIN, NEVER_S  # bytes that complete the reply to a plain transaction
         self._kept = (b"", 0.0)  # the reply that is lingered over, and when it came
+        self._distrusted = False  # the reply on the wire may be to something older
+        self._in_step = True  # nothing makes it uncertain to which request a reply belongs
+        self._probes_left, self._quarantined_s = 0, 0.0
         self.undelivered: deque[tuple[Transaction, bytes, Timing]] = deque()
         self._coalesce_s, self._deliver_by_s = settings.coalesce_s, NEVER_S
         transport.attach(self)
@@ -132,15 +272,15 @@ class Line(Receiver):
     def on_time(self, now_s: float) -> bool:
         """Tell whether the line acts on time: the time of its next action is always set, and is not past."""
         if self.phase is Phase.IDLE:
-            return not self._users.stop_waits() and now_s <= self._users.next_due_s() + LATE_S
+            return not self._schedule.stop_waits() and now_s <= self._schedule.polls.next_due_s() + LATE_S
         due_s = self._watchdog.deadline_s
         return due_s < NEVER_S and now_s <= due_s + LATE_S
 
     def kick(self) -> None:
-        """Check the queue: something was added to it."""
+        """Check the schedule: something was added to it."""
         if self.phase is Phase.IDLE:
             self._next()
-        elif self.phase is Phase.QUARANTINE and self._users.stop_waits():
+        elif self.phase is Phase.QUARANTINE and self._schedule.stop_waits():
             self._watchdog.set(self._loop.time())
 
     def distrust(self) -> None:
@@ -153,7 +293,7 @@ class Line(Receiver):
             transaction = self.undelivered.popleft()[0]
             transaction.lost(BadReply(f"node {transaction.exchange.node}: the reply may be to something older"))
         if self.phase is Phase.IDLE:
-            self._quarantine.require()
+            self._require_probe()
             self._begin_quarantine(self._loop.time())
         elif self.phase is Phase.REPLY and self._transaction and self._transaction.exchange.repeatable:
             self._distrusted, self._missing = True, NOT_PLAIN
@@ -183,10 +323,113 @@ class Line(Receiver):
         if transaction and transaction.lost(
             ReplyTimeout(f"node {transaction.exchange.node}: {reason} before the reply came")
         ):
-            self._users.again(transaction)
-        self._users.line_lost(reason)
+            self._schedule.requeue(transaction, transaction.lane)
+        self._report_loss(reason)
 
-    # -- receiver ----------------------------------------------------------------------------------------------------
+    # -- sending -----------------------------------------------------------------------------------------------------
+
+    def _next(self, remarks: tuple[str, ...] = LANES) -> None:
+        """Put the next exchange on the wire, with its lane's remark in the log, or sleep until one is due."""
+        if self.phase is not Phase.IDLE:
+            return
+        now_s = self._loop.time()
+        if not (self._in_step or self._schedule.stop_waits()):
+            self._begin_quarantine(now_s)  # only a stop may use a line that is not proven to be in step
+        elif transaction := self._take(now_s):
+            self._send(transaction, now_s, remarks[transaction.lane])
+        else:
+            self.transport.expect(ANY)
+            self._watchdog.set(self._schedule.polls.next_due_s())
+
+    def _take(self, now_s: float) -> Transaction | None:
+        """Remove and return what goes on the wire now, or None: this is the only gate between queue and wire.
+
+        A queue may be long, so who is at the address and whether the motion is still permitted is asked here.
+        """
+        schedule = self._schedule
+        if not (self._in_step or schedule.stop_waits()):
+            return None
+        while job := schedule.take_job(now_s):
+            if job.condition and self.undelivered:
+                self.deliver()  # permission is asked of all that the drives have said by now
+            if job.may_go(now_s):
+                return job
+        poller = schedule.polls.take(now_s)
+        if poller is None:
+            return None
+        wanted_at_s, exchange = poller.due_at_s, poller.next_exchange(now_s)
+        if exchange.effect is not READS:
+            raise AssertionError(f"the poll {exchange.request.hex(' ')} does not say that it only reads")
+        return PollTransaction(poller, exchange, wanted_at_s)
+
+    def _send(self, transaction: Transaction, now_s: float, remark: str) -> None:
+        if transaction.at_baud:
+            self._transaction = transaction
+            self._tune(transaction.at_baud, for_good=False)
+            if self.phase is Phase.CLOSED:
+                return
+        self._await_reply(transaction, remark, self._write_request(transaction, now_s))
+
+    def _write_request(self, transaction: Transaction, now_s: float) -> str:
+        """Write a request and do nothing else; return why the line was lost over it, if it was."""
+        self._transaction, self._sent_at_s = transaction, now_s
+        self.phase = Phase.REPLY if transaction.exchange.reply_bytes else Phase.QUIET
+        try:
+            self.transport.write(transaction.exchange.request)
+        except TransportLost as error:
+            return error.message
+        return ""
+
+    def _await_reply(self, transaction: Transaction, remark: str, failure: str, *, early: bool = False) -> None:
+        """Note a request that has just been written, and prepare for its reply.
+
+        When processing takes long, the line is woken one byte `early`, so that caches are warm.
+        """
+        exchange, settings, statistics, byte_s = transaction.exchange, self._settings, self._statistics, self.byte_s
+        request, expected, sent_at_s = exchange.request, exchange.reply_bytes, self._sent_at_s
+        request_s = len(request) * byte_s
+        self._held, self._early = b"", False
+        self._earliest_s = earliest_s = sent_at_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S
+        self._whole_from_s = earliest_s + CLOCK_TOLERANCE * byte_s * expected
+        # a whole intact reply is all that it takes to go on to the next transaction
+        goes_on = exchange.repeatable and not (
+            exchange.total_bytes or transaction.then_baud or transaction.at_baud or transaction.proves
+        )
+        self._missing = missing = expected if goes_on and self._in_step and not settings.echo else NOT_PLAIN
+        self.transport.expect(missing - early if missing > early else ANY)
+        # the drive's own time-out: a servo cycle (PIC-SERVO manual, 4.1), 0.2 s (SmartStep serial manual, 2.1)
+        over_s = sent_at_s + request_s + exchange.response_s
+        if expected:
+            over_s += expected * byte_s + settings.margin_s + self.transport.lag_s
+        self._watchdog.set(over_s)
+        statistics.exchanges += 1
+        statistics.bytes_out += len(request)
+        self._log.add(sent_at_s, WireEvent.SENT, request, remark)
+        if settings.echo:
+            self._echo += request
+        if poller := transaction.poller:
+            self._schedule.reschedule(poller, poller.due_at_s)
+        if failure:
+            self.transport_lost(failure)
+
+    def _release(self, transaction: Transaction, then_baud: int | None = None) -> None:
+        """Free the line, at the rate that it has from now on."""
+        self._transaction, self.phase = None, Phase.IDLE
+        if then_baud or transaction.at_baud:
+            self._tune(then_baud or self.baud)
+
+    def _tune(self, baud: int, *, for_good: bool = True) -> None:
+        try:
+            self.transport.set_baud(baud)
+        except TransportLost as error:
+            self.transport_lost(error.message)
+            return
+        self._log.add(self._loop.time(), WireEvent.BAUD, note=str(baud))
+        self.byte_s = self._settings.bits_per_byte / baud
+        if for_good:
+            self.baud = baud
+
+    # -- receiving ---------------------------------------------------------------------------------------------------
 
     @override
     def transport_lost(self, reason: str) -> None:
@@ -194,96 +437,115 @@ class Line(Receiver):
         if self.phase is Phase.CLOSED:
             return
         self._statistics.losses += 1
-        self.wire.note(WireEvent.LOST, self._loop.time(), remark=reason)
+        self._log.add(self._loop.time(), WireEvent.LOST, note=reason)
         self.close(reason)
 
     @override
     def data_received(self, data: bytes) -> None:
         now_s, transaction = self._loop.time(), self._transaction
         if transaction and len(data) == self._missing and now_s >= self._whole_from_s:
-            reply = self._pieces.held + data
+            reply = self._held + data
             if transaction.exchange.check(reply) is ReplyVerdict.INTACT:
-                self._complete_plain(transaction, reply, data, now_s)
+                self._complete(transaction, reply, now_s, data)
                 return
-        self._take_apart(data, now_s)
+        self._parse_input(data, now_s)
 
-    def _take_apart(self, data: bytes, now_s: float) -> None:
+    def _parse_input(self, data: bytes, now_s: float) -> None:
         """Sort bytes that need not be one whole reply."""
         was_plain, self._missing = self._missing, NOT_PLAIN
         self._statistics.bytes_in += len(data)
-        own_taken_off = self.wire.without_echo(data, now_s)
-        if own_taken_off is None:
-            self._collided(data, now_s)
-            return
-        data = own_taken_off
-        if (transaction := self._transaction) and data and self.phase is Phase.LINGER:
-            self.wire.note(WireEvent.RECEIVED, now_s, data, "follows a reply")
-            self._distrust(transaction, self._kept[0] + data, "was followed by another one", now_s)
+        if self._echo:
+            # our own bytes are taken off by count, because a reply may equal its request
+            own, data = data[: len(self._echo)], data[len(self._echo) :]
+            if not self._echo.startswith(own):
+                self._echo.clear()
+                self._handle_collision(own + data, now_s)
+                return
+            del self._echo[: len(own)]
+            self._log.add(now_s, WireEvent.ECHO, own)
+        transaction = self._transaction
+        if transaction and data and self.phase is Phase.LINGER:
+            self._log.add(now_s, WireEvent.RECEIVED, data, "follows a reply")
+            self._discard_reply(transaction, self._kept[0] + data, "was followed by another one", now_s)
             return
         if data and (transaction is None or self.phase is not Phase.REPLY):
-            self._stray(data, now_s)
+            self._handle_stray(data, now_s)
             return
         while transaction and data:
-            whole = self._pieces.add(transaction.exchange, data, now_s)
-            if whole is None:
-                self.wire.note(WireEvent.PART, now_s, data)
-                if was_plain and not self._pieces.early:
-                    self._missing = transaction.exchange.reply_bytes - len(self._pieces.held)
-                self._transport.expect(max(ANY, self._missing))
+            exchange, reply = transaction.exchange, self._held + data
+            self._early = self._early or now_s < self._earliest_s + CLOCK_TOLERANCE * self.byte_s * len(reply)
+            total = exchange.total_bytes(reply) if exchange.total_bytes else exchange.reply_bytes
+            if total is None or len(reply) < total:
+                self._held = reply
+                self._log.add(now_s, WireEvent.PART, data)
+                if was_plain and not self._early:
+                    self._missing = exchange.reply_bytes - len(reply)
+                self.transport.expect(max(ANY, self._missing))
                 return
-            verdict = transaction.exchange.check(whole.reply)
+            reply, surplus = reply[:total], reply[total:]
+            verdict = exchange.check(reply)
             if verdict is not ReplyVerdict.FOREIGN:
-                self._judge(transaction, whole, verdict, data, now_s)
+                self._judge(transaction, reply, surplus, verdict, data, now_s)
                 return
-            self.wire.stray(data[: len(data) - len(whole.surplus)], now_s, "foreign reply")
-            data = whole.surplus
+            self._note_stray(data[: len(data) - len(surplus)], now_s, "foreign reply")
+            self._held, self._early, data = b"", False, surplus
 
     def _judge(
-        self, transaction: Transaction, whole: CompleteReply, verdict: ReplyVerdict, arrived: bytes, now_s: float
+        self,
+        transaction: Transaction,
+        reply: bytes,
+        surplus: bytes,
+        verdict: ReplyVerdict,
+        arrived: bytes,
+        now_s: float,
     ) -> None:
         """Accept a reply, wait for a better one, or reject it."""
-        flaw = "came too early" if whole.early else _FLAWS.get(verdict, "")
-        why = "came with surplus bytes" if whole.surplus else flaw
-        self.wire.note(WireEvent.RECEIVED, now_s, arrived, why)
+        why = "came with surplus bytes" if surplus else "came too early" if self._early else _FLAWS.get(verdict, "")
+        self._log.add(now_s, WireEvent.RECEIVED, arrived, why)
         if self._distrusted:
-            self._distrust(transaction, whole.reply, "may be to something older", now_s)
-        elif whole.surplus or whole.early or verdict is ReplyVerdict.CORRUPT:
-            self._distrust(transaction, whole.reply + whole.surplus, why, now_s)
+            self._discard_reply(transaction, reply, "may be to something older", now_s)
+        elif surplus or self._early or verdict is ReplyVerdict.CORRUPT:
+            self._discard_reply(transaction, reply + surplus, why, now_s)
         elif not transaction.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(transaction)):
             # not accepted before no other reply can come
-            self.phase, self._kept = Phase.LINGER, (whole.reply, now_s)
+            self.phase, self._kept = Phase.LINGER, (reply, now_s)
             self._watchdog.set(until_s)
-        elif verdict is ReplyVerdict.REJECTED:
-            self._rejected(transaction)
         else:
-            self._complete(transaction, whole.reply, now_s)
+            self._accept(transaction, reply, verdict, now_s)
 
     def _true_reply_by_s(self, transaction: Transaction) -> float:
         """Return until when the node's own reply may still arrive after another one; minus infinity when unpaced."""
         if not self._settings.paced:
             return -NEVER_S
-        return self._sent_at_s + self.wire.longest_s(transaction.exchange) + LINGER_S
+        return self._sent_at_s + transaction.exchange.longest_s(self.byte_s) + LINGER_S
 
-    def _settle(self, transaction: Transaction, reply: bytes, now_s: float) -> None:
-        if transaction.exchange.check(reply) is ReplyVerdict.REJECTED:
-            self._rejected(transaction)
+    def _accept(self, transaction: Transaction, reply: bytes, verdict: ReplyVerdict, now_s: float) -> None:
+        if verdict is ReplyVerdict.REJECTED:
+            self._handle_rejection(transaction)
+        elif isinstance(transaction, ResyncExchange):
+            self._judge_probe(transaction, reply, now_s)
         else:
             self._complete(transaction, reply, now_s)
 
-    def _complete_plain(self, transaction: Transaction, reply: bytes, arrived: bytes, now_s: float) -> None:
-        """Write the next request before anything else: until then the wire is idle, afterwards there is time."""
-        sent_at_s, failure, users, slow = self._sent_at_s, "", self._users, transaction.slow_to_deliver
-        following = users.take(now_s)
-        if following is not None and not following.at_baud:
-            failure = self._put(following, self._loop.time())
-            if slow and self._transport.pushes:
-                self._transport.push()
-        else:
-            self._transaction, self.phase = None, Phase.IDLE
-        self._statistics.bytes_in += len(arrived)
-        self._log.add(now_s, WireEvent.RECEIVED, arrived)
-        timing = self.wire.replied(transaction, reply, sent_at_s, now_s)
-        users.answered(transaction, timing)
+    def _complete(self, transaction: Transaction, reply: bytes, now_s: float, arrived: bytes = b"") -> None:
+        """Write the next request before anything else: until then the wire is idle, afterwards there is time.
+
+        Args:
+            transaction: which is complete.
+            reply: to it.
+            now_s: when its last byte came, in loop time.
+            arrived: those of its bytes that are not noted yet.
+        """
+        slow, sent_at_s, byte_s = transaction.slow_to_deliver, self._sent_at_s, self.byte_s
+        if transaction.then_baud or transaction.at_baud:
+            self._release(transaction, transaction.then_baud)
+        following, failure = self._write_next(now_s, push=slow)
+        if arrived:
+            self._statistics.bytes_in += len(arrived)
+            self._log.add(now_s, WireEvent.RECEIVED, arrived)
+        timing = self._count_reply(transaction, reply, sent_at_s, byte_s, now_s)
+        is_poll = transaction.lane is POLL
+        self._schedule.record_reply(transaction.exchange, timing if is_poll else None)
         undelivered, waits = self.undelivered, False
         if not undelivered:
             self._deliver_by_s = now_s + self._coalesce_s
@@ -296,42 +558,48 @@ class Line(Receiver):
         else:
             # the next reply should come in about the time that this one took
             waits = slow and following.lane is POLL and now_s + now_s - sent_at_s < self._deliver_by_s
-            self._attend(following, AT_ONCE[following.lane], failure, early=slow and not self._coalesce_s)
+            self._await_reply(following, AT_ONCE[following.lane], failure, early=slow and not self._coalesce_s)
         if not joins:
             transaction.completed(reply, timing)
         elif not waits:
             self.deliver()
-        if self._missing and transaction.lane is POLL and (following := self._transaction):
+        if self._missing and is_poll and (following := self._transaction):
             # callers that wait for a reply got it first
-            byte_s = self.wire.byte_s
-            users.prepare_next(following, self._sent_at_s + len(following.exchange.request) * byte_s, byte_s)
+            exchange, byte_s = following.exchange, self.byte_s
+            asked_at_s = self._sent_at_s + len(exchange.request) * byte_s
+            self._schedule.prepare(exchange.node, asked_at_s, exchange.reply_bytes * byte_s)
 
-    def _complete(self, transaction: Transaction, reply: bytes, now_s: float) -> None:
-        """Free the line, start the next exchange, and only then let this one be decoded and delivered."""
-        timing = self.wire.replied(transaction, reply, self._sent_at_s, now_s)
-        if isinstance(transaction, ResyncExchange):
-            self._probed(transaction, reply, timing, now_s)
-            return
-        self._release(transaction, transaction.then_baud)
-        self._next(AT_ONCE)
-        self._users.answered(transaction, timing)
-        if self.undelivered:  # only polls follow those that wait, so it is one
-            self.undelivered.append((transaction, reply, timing))
-            self.deliver()
-        else:
-            transaction.completed(reply, timing)
+    def _write_next(self, now_s: float, *, push: bool) -> tuple[Transaction | None, str]:
+        """Write the next request, and `push` it; return it, and why the line was lost over it, if it was.
 
-    def _release(self, transaction: Transaction, then_baud: int | None = None) -> None:
-        """Free the line, at the rate that it has from now on."""
-        self._transaction, self.phase = None, Phase.IDLE
-        if then_baud or transaction.at_baud:
-            self._tune(then_baud or self.wire.baud)
+        One that has a rate of its own is not written yet.
+        """
+        following, failure = self._take(now_s), ""
+        if following is not None and not following.at_baud:
+            failure = self._write_request(following, self._loop.time())
+            if push and self.transport.pushes:
+                self.transport.push()
+        elif self.phase is not Phase.CLOSED:
+            self._transaction, self.phase = None, Phase.IDLE
+        return following, failure
 
-    def _rejected(self, transaction: Transaction) -> None:
-        """The node did not execute our packet: the line is in step, and sending again is always safe."""
+    def _count_reply(
+        self, transaction: Transaction, reply: bytes, sent_at_s: float, byte_s: float, now_s: float
+    ) -> Timing:
+        """Count an intact reply; return when it was true."""
+        statistics = self._statistics
+        request_s, reply_s = len(transaction.exchange.request) * byte_s, len(reply) * byte_s
+        over_s, begun_s, late_s = sent_at_s + request_s, now_s - reply_s, now_s - transaction.wanted_at_s
+        statistics.replies += 1
+        statistics.wire_busy_s += request_s + reply_s
+        statistics.latency[transaction.lane].add(max(0.0, late_s))
+        return Timing(sent_at_s, over_s, max(over_s, begun_s), now_s)
+
+    def _handle_rejection(self, transaction: Transaction) -> None:
+        """Go on after a node did not execute our packet: the line is in step, and sending again is always safe."""
         self._statistics.rejected_packets += 1
         self.deliver()
-        self._users.answered(transaction)
+        self._schedule.record_reply(transaction.exchange)
         if transaction.rejected():
             self._send_again(transaction)
         self._release(transaction)
@@ -339,16 +607,20 @@ class Line(Receiver):
 
     # -- losses ------------------------------------------------------------------------------------------------------
 
-    def _distrust(self, transaction: Transaction, reply: bytes, why: str, now_s: float) -> None:
+    def _discard_reply(self, transaction: Transaction, reply: bytes, why: str, now_s: float) -> None:
         self._statistics.corrupt_replies += 1
         self._lose(transaction, BadReply(f"node {transaction.exchange.node}: reply {reply.hex(' ')} {why}"), now_s)
 
     def _lose(self, transaction: Transaction, error: BusError, now_s: float) -> None:
-        """Settle the transaction whose reply cannot be valid any more, and resynchronise the line."""
+        """End the transaction whose reply cannot be valid any more, and resynchronise the line."""
         self.deliver()
-        self._users.missed(transaction, now_s)
+        self._schedule.record_loss(transaction.exchange.node)
+        if poller := transaction.poller:
+            lost_s = transaction.exchange.longest_s(self.byte_s) + self._settings.margin_s
+            lost_s += self._resync.longest_s(self.byte_s, self._schedule.mute.failing())
+            self._schedule.put_off(poller, now_s, lost_s)
         if not isinstance(transaction, ResyncExchange):
-            self._quarantine.require()
+            self._require_probe()
         # before the resynchronisation, which a stop that is sent again cuts short
         if transaction.lost(error):
             self._send_again(transaction)
@@ -357,173 +629,127 @@ class Line(Receiver):
 
     def _send_again(self, transaction: Transaction) -> None:
         self._statistics.resent += 1
-        self._users.again(transaction)
+        self._schedule.requeue(transaction, transaction.lane)
 
-    def _collided(self, data: bytes, now_s: float) -> None:
+    def _handle_collision(self, data: bytes, now_s: float) -> None:
         """Handle an echo that differs from what was sent."""
         if self._transaction and self.phase is Phase.REPLY:
             why = "follows an echo that differs: collision"
-            self.wire.note(WireEvent.RECEIVED, now_s, data, why)
-            self._distrust(self._transaction, data, why, now_s)
+            self._log.add(now_s, WireEvent.RECEIVED, data, why)
+            self._discard_reply(self._transaction, data, why, now_s)
         else:
-            self._stray(data, now_s)
+            self._handle_stray(data, now_s)
 
-    def _stray(self, data: bytes, now_s: float) -> None:
+    def _note_stray(self, data: bytes, now_s: float, why: str = "") -> None:
+        self._statistics.stray_bytes += len(data)
+        self._log.add(now_s, WireEvent.STRAY, data, why)
+
+    def _handle_stray(self, data: bytes, now_s: float) -> None:
         """Handle bytes outside a reply: late ones in a resynchronisation, otherwise a sign of being out of step."""
-        self.wire.stray(data, now_s)
-        if self.phase is Phase.QUARANTINE and not self._users.stop_waits():
-            self._watchdog.set(self._quarantine.disturbed(now_s))
+        self._note_stray(data, now_s)
+        if self.phase is Phase.QUARANTINE and not self._schedule.stop_waits():
+            quiet_s = self._resync.quiet_s
+            self._watchdog.set(min(now_s + quiet_s, self._quarantined_s + LONGEST_QUARANTINE * quiet_s))
         elif self.phase is Phase.IDLE:
-            self._quarantine.require()
+            self._require_probe()
             self._begin_quarantine(now_s)
 
+    # -- resynchronisation: silence, flush, and a reply that is known beforehand --------------------------------------
+
+    def _require_probe(self) -> None:
+        self._probes_left, self._in_step = PROBE_ROUNDS, False
+
     def _begin_quarantine(self, now_s: float) -> None:
+        """Wait until no late reply can come any more; a stop waits for the flush alone."""
         if self.phase is Phase.CLOSED:
             return
-        self._distrusted = False
+        self.phase, self._quarantined_s, self._distrusted = Phase.QUARANTINE, now_s, False
         self._statistics.resynchronisations += 1
-        self.wire.note(WireEvent.RESYNC, now_s)
-        self.phase = Phase.QUARANTINE
-        self._transport.expect(ANY)
-        self.wire.forget_echo()
-        silent_s = self._quarantine.raised(now_s)
-        self._watchdog.set(now_s if self._users.stop_waits() else silent_s)
+        self._log.add(now_s, WireEvent.RESYNC)
+        self.transport.expect(ANY)
+        self._echo.clear()
+        self._watchdog.set(now_s if self._schedule.stop_waits() else now_s + self._resync.quiet_s)
 
     def _flush(self, now_s: float) -> None:
-        self.phase = Phase.SETTLE
-        flush = self._resync.flush
-        echo_s = self._settings.margin_s if self._settings.echo else 0.0
-        self._watchdog.set(now_s + len(flush) * self.wire.byte_s + self._resync.settle_s + echo_s)
-        if flush:
-            self.wire.sent(flush, now_s, "flush")
-            if failure := self.wire.write(flush):
-                self.transport_lost(failure)
+        """Fill up any half-received packet: with nulls (PIC-SERVO manual, 4.1) or an end of line (SmartStep)."""
+        self.phase = Phase.FLUSH
+        flush, echo_s = self._resync.flush, self._settings.margin_s if self._settings.echo else 0.0
+        self._watchdog.set(now_s + len(flush) * self.byte_s + self._resync.settle_s + echo_s)
+        if not flush:
+            return
+        self._log.add(now_s, WireEvent.SENT, flush, "flush")
+        self._statistics.bytes_out += len(flush)
+        if self._settings.echo:
+            self._echo += flush
+        try:
+            self.transport.write(flush)
+        except TransportLost as error:
+            self.transport_lost(error.message)
 
-    def _flushed(self, now_s: float) -> None:
+    def _probe(self, now_s: float) -> None:
         """After the flush: prove with a known reply that the line is in step, unless a stop cannot wait for that."""
-        self.wire.discard_input()
+        self.transport.discard_input()
+        self._echo.clear()
         self.phase = Phase.IDLE
-        probe = None if self._users.stop_waits() else self._quarantine.probe(self._users.failing(), now_s)
-        if probe:
-            self._send(probe, now_s, "probe")
+        if self._in_step or self._schedule.stop_waits():
+            self._next()
+            return
+        exchange = self._resync.probe(self._schedule.mute.failing())
+        self._probes_left = self._probes_left - 1 if exchange else 0
+        self._in_step = self._probes_left == 0  # silence and flush have to do where no node proves it
+        if exchange:
+            self._send(ResyncExchange(exchange, Lane.STOP, now_s), now_s, "probe")
         else:
             self._next()
 
-    def _probed(self, probe: ResyncExchange, reply: bytes, timing: Timing, now_s: float) -> None:
-        probe.completed(reply, timing)
-        if not probe.passed:
+    def _judge_probe(self, probe: ResyncExchange, reply: bytes, now_s: float) -> None:
+        self._count_reply(probe, reply, self._sent_at_s, self.byte_s, now_s)
+        try:
+            probe.exchange.decode(reply)
+        except BadReply:
             why = "is not the known one"
-            self.wire.note(WireEvent.RECEIVED, now_s, remark=why)
-            self._distrust(probe, reply, why, now_s)
+            self._log.add(now_s, WireEvent.RECEIVED, note=why)
+            self._discard_reply(probe, reply, why, now_s)
             return
-        self._quarantine.proven()
-        self._users.answered(probe)
+        self._probes_left, self._in_step = 0, True
+        self._schedule.record_reply(probe.exchange)
         self._release(probe)
         self._next()
-
-    # -- sending -----------------------------------------------------------------------------------------------------
-
-    def _next(self, remarks: tuple[str, ...] = LANES) -> None:
-        """Put the next exchange on the wire, with its lane's remark in the log, or sleep until one is due."""
-        if self.phase is not Phase.IDLE:
-            return
-        now_s = self._loop.time()
-        if not (self._quarantine.in_step or self._users.stop_waits()):
-            self._begin_quarantine(now_s)  # only a stop may use a line that is not proven to be in step
-            return
-        if transaction := self._users.take(now_s):
-            self._send(transaction, now_s, remarks[transaction.lane])
-        else:
-            self._transport.expect(ANY)
-            self._watchdog.set(self._users.next_due_s())
-
-    def _send(self, transaction: Transaction, now_s: float, remark: str) -> None:
-        if transaction.at_baud:
-            self._transaction = transaction
-            self._tune(transaction.at_baud, for_good=False)
-            if self.phase is Phase.CLOSED:
-                return
-        self._attend(transaction, remark, self._put(transaction, now_s))
-
-    def _put(self, transaction: Transaction, now_s: float) -> str:
-        """Write a request and do nothing else; return why the line was lost over it, if it was."""
-        self._transaction, self._sent_at_s = transaction, now_s
-        self.phase = Phase.REPLY if transaction.exchange.reply_bytes else Phase.QUIET
-        try:
-            self._transport.write(transaction.exchange.request)
-        except TransportLost as error:
-            return error.message
-        return ""
-
-    def _attend(self, transaction: Transaction, remark: str, failure: str, *, early: bool = False) -> None:
-        """Note a request that has just been written, and prepare for its reply.
-
-        When processing takes long, the line is woken one byte `early`, so that caches are warm.
-        """
-        exchange, settings, wire, statistics = transaction.exchange, self._settings, self.wire, self._statistics
-        request, expected, byte_s, sent_at_s = exchange.request, exchange.reply_bytes, wire.byte_s, self._sent_at_s
-        request_s = len(request) * byte_s
-        earliest_s = sent_at_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S
-        self._pieces.begin(earliest_s, CLOCK_TOLERANCE * byte_s)
-        self._whole_from_s = earliest_s + CLOCK_TOLERANCE * byte_s * expected
-        # a whole intact reply is all that it takes to go on to the next transaction
-        goes_on = exchange.repeatable and not (
-            exchange.total_bytes or transaction.then_baud or transaction.at_baud or transaction.proves
-        )
-        self._missing = missing = expected if goes_on and self._quarantine.in_step and not settings.echo else NOT_PLAIN
-        self._transport.expect(missing - early if missing > early else ANY)
-        over_s = sent_at_s + request_s + exchange.response_s
-        if expected:
-            over_s += expected * byte_s + settings.margin_s + self._transport.lag_s
-        self._watchdog.set(over_s)
-        statistics.exchanges += 1
-        statistics.bytes_out += len(request)
-        self._log.add(sent_at_s, WireEvent.SENT, request, remark)
-        if wire.echo is not None:
-            wire.echo.sent(request)
-        self._users.sent(transaction)
-        if failure:
-            self.transport_lost(failure)
-
-    def _tune(self, baud: int, *, for_good: bool = True) -> None:
-        try:
-            self.wire.tune(baud, for_good=for_good)
-        except TransportLost as error:
-            self.transport_lost(error.message)
 
     # -- time --------------------------------------------------------------------------------------------------------
 
     def _expired(self, now_s: float) -> None:
         if self.phase in (Phase.LINGER, Phase.QUIET):
-            self.wire.note(WireEvent.SETTLED, now_s)
+            self._log.add(now_s, WireEvent.SETTLED)
         match self.phase:
             case Phase.IDLE:
                 self._next()
             case Phase.REPLY if self._transaction:
-                self._timed_out(self._transaction, now_s)
+                self._time_out(self._transaction, now_s)
             case Phase.LINGER if self._transaction:
-                self._settle(self._transaction, *self._kept)
+                reply, received_at_s = self._kept
+                self._accept(self._transaction, reply, self._transaction.exchange.check(reply), received_at_s)
             case Phase.QUIET if self._transaction:
-                self._quiet_over(self._transaction, now_s)
+                self._end_silence(self._transaction, now_s)
             case Phase.QUARANTINE:
                 self._flush(now_s)
-            case Phase.SETTLE:
-                self._flushed(now_s)
+            case Phase.FLUSH:
+                self._probe(now_s)
 
-    def _timed_out(self, transaction: Transaction, now_s: float) -> None:
-        self._transport.collect()
+    def _time_out(self, transaction: Transaction, now_s: float) -> None:
+        self.transport.collect()
         if self._transaction is not transaction or self.phase is not Phase.REPLY:
             return  # the reply was there after all
         self._statistics.timeouts += 1
-        got = f"{len(held)} of {transaction.exchange.reply_bytes} bytes" if (held := self._pieces.held) else "nothing"
+        got = f"{len(self._held)} of {transaction.exchange.reply_bytes} bytes" if self._held else "nothing"
         error = ReplyTimeout(f"node {transaction.exchange.node} on bus {self._settings.name} sent {got} in time")
-        self.wire.note(WireEvent.TIMEOUT, now_s, remark=error.message)
+        self._log.add(now_s, WireEvent.TIMEOUT, note=error.message)
         self._lose(transaction, error, now_s)
 
-    def _quiet_over(self, transaction: Transaction, now_s: float) -> None:
-        """An exchange without a reply is complete once the line may be used again."""
-        timing = self.wire.silent(transaction, self._sent_at_s, now_s)
-        self._users.answered(transaction)
+    def _end_silence(self, transaction: Transaction, now_s: float) -> None:
+        """End an exchange without a reply: it is complete once the line may be used again."""
+        sent_at_s, request_s = self._sent_at_s, len(transaction.exchange.request) * self.byte_s
+        self._statistics.wire_busy_s += request_s
         self._release(transaction, transaction.then_baud)
         self._next()
-        transaction.completed(b"", timing)
+        transaction.completed(b"", Timing(sent_at_s, sent_at_s + request_s, now_s, now_s))

@@ -14,7 +14,7 @@ from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Lane
 from ldcnd.line.flight_recorder import WireEvent
-from ldcnd.line.transaction import AT_ONCE, LANES
+from ldcnd.line.line import AT_ONCE, LANES
 from tests.bench.report import Row
 from tests.bench.saturated_rig import on_jumping_clock, saturating
 from tests.support.rig import RunningRig

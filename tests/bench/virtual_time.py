@@ -81,8 +81,8 @@ async def _saturated(rig: RunningRig, seconds: float) -> tuple[float, float]:
 async def _with_one_dead(rig: RunningRig, seconds: float) -> tuple[float, float]:
     line = _bus(rig)._line
     assert line
-    assert isinstance(line.wire.transport, SimulatedLine)
-    module = line.wire.transport._chain.modules[-1]
+    assert isinstance(line.transport, SimulatedLine)
+    module = line.transport._chain.modules[-1]
     assert isinstance(module, SimulatedModule)
     module.power(on=False, at_s=asyncio.get_running_loop().time())
     return await _saturated(rig, seconds)

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.line.queue import COMMANDS_PER_POLL
+from ldcnd.line.schedule import COMMANDS_PER_POLL
 from tests.bench.commands_and_polls import CALLERS, CROWDS, MOST_ROUNDS, MOST_WAIT, ORDERS, Load, shared
 
 SECONDS = 1.0

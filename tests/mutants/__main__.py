@@ -17,7 +17,7 @@ SUBJECTS = (
     "ldcnd/axis/*.py", "ldcnd/axis/procedures/*.py",
     *(f"ldcnd/daemon/{name}.py" for name in ("dispatch", "leases", "ledger", "line", "rig", "rig_commands")),
     *(f"ldcnd/line/{name}.py" for name in (
-        "bus", "exchange", "line", "proof", "queue", "resync", "settings", "transaction", "wire",
+        "bus", "exchange", "line", "proof", "schedule", "settings",
     )),
     *(f"ldcnd/drives/ldcn/{name}.py" for name in (
         "addressing", "adoption", "commands", "controls", "faults", "gathering", "groups", "io_module", "network",

@@ -1,14 +1,13 @@
-"""A line between plain users and a scripted far end, on the jumping clock."""
+"""A line between a schedule and a scripted far end, on the jumping clock."""
 
 import asyncio
-from collections import deque
 
 from ldcnd.contract.errors import BusError
 from ldcnd.line.exchange import Exchange, Lane, Resync, Timing
 from ldcnd.line.flight_recorder import BusStatistics, WireLog
-from ldcnd.line.line import Line
+from ldcnd.line.line import Line, Transaction
+from ldcnd.line.schedule import Schedule
 from ldcnd.line.settings import BusSettings
-from ldcnd.line.transaction import Transaction
 from tests.support import toy_family as toy
 from tests.support.scripted_line import Say, ScriptedLine
 
@@ -20,7 +19,7 @@ MARGIN_S = 0.005
 
 
 class RecordingTransaction(Transaction):
-    """A transaction that notes in its users' story what it hears."""
+    """A transaction that notes its outcomes in a story."""
 
     def __init__(self, exchange: Exchange[int], story: list[str], lane: Lane = Lane.COMMAND):
         super().__init__(exchange, lane, 0.0)
@@ -45,65 +44,25 @@ class RecordingTransaction(Transaction):
         return again
 
 
-class PlainUsers:
-    """First in, first out; tells its story."""
-
-    def __init__(self) -> None:
-        self.story: list[str] = []
-        self.waiting: deque[RecordingTransaction] = deque()
-        self.mute: set[int] = set()
-        self.taken_at_s: list[float] = []
-
-    def take(self, now_s: float) -> Transaction | None:
-        stops = [transaction for transaction in self.waiting if transaction.lane is Lane.STOP]
-        transaction = stops[0] if stops else self.waiting[0] if self.waiting else None
-        if transaction:
-            self.waiting.remove(transaction)
-            self.taken_at_s.append(now_s)
-        return transaction
-
-    def sent(self, transaction: Transaction) -> None:
-        pass
-
-    def prepare_next(self, transaction: Transaction, asked_at_s: float, byte_s: float) -> None:
-        pass
-
-    def next_due_s(self) -> float:
-        return float("inf")
-
-    def stop_waits(self) -> bool:
-        return any(transaction.lane is Lane.STOP for transaction in self.waiting)
-
-    def failing(self) -> set[int]:
-        return self.mute
-
-    def answered(self, transaction: Transaction, timing: Timing | None = None) -> None:
-        self.story.append(f"answered {transaction.exchange.node}")
-
-    def missed(self, transaction: Transaction, now_s: float) -> None:
-        self.story.append(f"missed {transaction.exchange.node}")
-
-    def again(self, transaction: Transaction) -> None:
-        assert isinstance(transaction, RecordingTransaction)
-        self.waiting.appendleft(transaction)
-
-    def line_lost(self, reason: str) -> None:
-        self.story.append(f"line lost: {reason}")
-
-
 class Bench:
-    """A line between plain users and a scripted far end."""
+    """A line between a schedule and a scripted far end; tells its story."""
 
     make_line: type[Line] = Line
 
     def __init__(self, *, echo: bool = False, paced: bool = True, resync: Resync = toy.RESYNC):
-        self.users = PlainUsers()
+        self.story: list[str] = []
+        self.schedule: Schedule[Transaction] = Schedule()
         self.wire = ScriptedLine(toy.answer)
         self.wire.echo = echo
         self.statistics = BusStatistics()
         self.log = WireLog()
         settings = BusSettings("toy", 115_200, margin_s=MARGIN_S, echo=echo, paced=paced)
-        self.line = self.make_line(settings, self.wire, self.users, resync, self.statistics, self.log)
+        self.line = self.make_line(
+            settings, self.wire, self.schedule, resync, self.statistics, self.log, self._note_loss
+        )
+
+    def _note_loss(self, reason: str) -> None:
+        self.story.append(f"line lost: {reason}")
 
     def add(
         self,
@@ -119,16 +78,16 @@ class Bench:
     ) -> RecordingTransaction:
         """Queue an exchange of that number."""
         exchange = toy.exchange(number, reply_bytes=reply_bytes, response_s=response_s, repeatable=repeatable)
-        transaction = RecordingTransaction(exchange, self.users.story, lane)
+        transaction = RecordingTransaction(exchange, self.story, lane)
         transaction.then_baud, transaction.at_baud = then_baud, at_baud
         transaction.slow_to_deliver = slow_to_deliver
-        self.users.waiting.append(transaction)
+        return self.queue(transaction)
+
+    def queue(self, transaction: RecordingTransaction) -> RecordingTransaction:
+        """Queue a transaction in its lane."""
+        self.schedule.push(transaction, transaction.lane)
         self.line.kick()
         return transaction
-
-    @property
-    def story(self) -> list[str]:
-        return [line for line in self.users.story if not line.startswith(("answered", "missed"))]
 
     def sent(self, number: int) -> list[float]:
         """When a request was written."""

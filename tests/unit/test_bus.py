@@ -13,7 +13,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.line.exchange import Lane, PacketEffect
 from ldcnd.line.proof import only_while
-from ldcnd.line.queue import LANE_LIMITS
+from ldcnd.line.schedule import LANE_LIMITS
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
 from tests.support.toy_family import ToyPoller

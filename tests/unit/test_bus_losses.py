@@ -231,7 +231,7 @@ async def test_a_lost_line_is_opened_again_and_its_pollers_are_forgotten():
         rig.line.lose()
         await rig.bus.wait_closed()
         assert not rig.bus.is_open
-        assert not rig.bus._pollers
+        assert not rig.bus._schedule._pollers
         asked = len(poller.asked_at_s)
         await rig.bus.wait_opened()
         reply = await rig.bus.execute(toy.exchange(1))

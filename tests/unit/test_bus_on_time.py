@@ -77,7 +77,7 @@ async def test_line_that_lets_a_poll_pass_does_not_turn():
 
     async with running(rig):
         now_s = asyncio.get_running_loop().time()
-        rig.bus._queue.schedule(ToyPoller(1, 1.0, now_s), now_s)  # and nobody told the line
+        rig.bus._schedule.polls.schedule(ToyPoller(1, 1.0, now_s), now_s)  # and nobody told the line
 
         assert on_time(rig.bus)
         await asyncio.sleep(LATE_S + 0.1)

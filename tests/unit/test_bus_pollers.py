@@ -8,8 +8,8 @@ from ldcnd.contract.errors import (
     PacketRejected,
     ReplyTimeout,
 )
-from ldcnd.line.bus import LONGEST_BACKOFF_S
 from ldcnd.line.exchange import Exchange
+from ldcnd.line.schedule import LONGEST_BACKOFF_S
 from tests.support import toy_family as toy
 from tests.support.bus_rig import BYTE_S, Rig, polled, running, scripted
 from tests.support.scripted_line import Say, Script

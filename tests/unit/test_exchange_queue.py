@@ -5,8 +5,8 @@ import pytest
 
 from ldcnd.contract.errors import BusBusy
 from ldcnd.line.exchange import Lane, Poller
-from ldcnd.line.queue import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, ExchangeQueue
-from tests.support.queue_turns import take
+from ldcnd.line.schedule import COMMANDS_PER_POLL, LANE_LIMITS, POLLS_PER_BACKGROUND, Schedule
+from tests.support.queue_turns import schedule_by, take
 from tests.support.toy_family import ToyPoller
 
 
@@ -16,29 +16,29 @@ class Ticket:
     abandoned: bool = False
 
 
-def filled(**lanes: int) -> ExchangeQueue[Ticket]:
+def filled(**lanes: int) -> Schedule[Ticket]:
     """A queue with so many jobs in each lane, named after the lane and their order."""
-    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    queue: Schedule[Ticket] = Schedule()
     for name, count in lanes.items():
         for number in range(count):
             queue.push(Ticket(f"{name}{number}"), Lane[name.upper()])
     return queue
 
 
-def always_due(queue: ExchangeQueue[Ticket], node: int = 1) -> Poller[int]:
+def always_due(queue: Schedule[Ticket], node: int = 1) -> Poller[int]:
     poller = ToyPoller(node, 1.0)
-    queue.schedule(poller, 0.0)
+    queue.polls.schedule(poller, 0.0)
     return poller
 
 
-def order(queue: ExchangeQueue[Ticket], turns: int, now_s: float = 0.0) -> list[str]:
+def order(queue: Schedule[Ticket], turns: int, now_s: float = 0.0) -> list[str]:
     """Take so many turns; a poller is due again at once."""
     names = []
     for _ in range(turns):
         taken = take(queue, now_s)
         if isinstance(taken, Poller):
             names.append(f"poll{taken.node}")
-            queue.schedule(taken, now_s)
+            queue.polls.schedule(taken, now_s)
         else:
             names.append(taken.name if taken else "-")
     return names
@@ -80,7 +80,7 @@ def test_commands_go_before_due_polls():
 
 def test_a_poll_that_is_not_due_delays_no_command():
     queue = filled(command=10)
-    queue.schedule(ToyPoller(1, 1.0), 5.0)
+    queue.polls.schedule(ToyPoller(1, 1.0), 5.0)
 
     assert order(queue, 11, now_s=4.9) == [f"command{number}" for number in range(10)] + ["-"]
 
@@ -97,7 +97,7 @@ def test_background_waits_for_eight_polls_at_most():
 
 def test_background_goes_when_no_poll_is_due():
     queue = filled(background=1)
-    queue.schedule(ToyPoller(1, 1.0), 5.0)
+    queue.polls.schedule(ToyPoller(1, 1.0), 5.0)
 
     assert order(queue, 2, now_s=1.0) == ["background0", "-"]
 
@@ -109,9 +109,9 @@ def test_commands_go_before_background():
 
 
 def test_polls_go_in_the_order_of_their_due_times():
-    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    queue: Schedule[Ticket] = Schedule()
     for node, at_s in ((1, 3.0), (2, 1.0), (3, 2.0)):
-        queue.schedule(ToyPoller(node, 1.0), at_s)
+        queue.polls.schedule(ToyPoller(node, 1.0), at_s)
 
     taken = [take(queue, 10.0) for _ in range(3)]
 
@@ -119,7 +119,7 @@ def test_polls_go_in_the_order_of_their_due_times():
 
 
 def test_polls_due_at_once_take_turns():
-    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    queue: Schedule[Ticket] = Schedule()
     for node in (1, 2, 3):
         always_due(queue, node)
 
@@ -127,25 +127,25 @@ def test_polls_due_at_once_take_turns():
 
 
 def test_scheduling_again_replaces_the_turn():
-    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    queue: Schedule[Ticket] = Schedule()
     poller = always_due(queue)
 
-    queue.schedule(poller, 7.0)
+    queue.polls.schedule(poller, 7.0)
 
-    assert queue.next_due_s() == 7.0
+    assert queue.polls.next_due_s() == 7.0
     assert take(queue, 6.9) is None
     assert take(queue, 7.0) is poller
     assert take(queue, 8.0) is None
 
 
 def test_an_unscheduled_poller_is_forgotten():
-    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    queue: Schedule[Ticket] = Schedule()
     poller = always_due(queue)
 
-    queue.unschedule(poller)
-    queue.unschedule(poller)
+    queue.polls.unschedule(poller)
+    queue.polls.unschedule(poller)
 
-    assert queue.next_due_s() == float("inf")
+    assert queue.polls.next_due_s() == float("inf")
     assert take(queue, 1.0) is None
 
 
@@ -182,7 +182,7 @@ def test_a_lane_full_of_abandoned_jobs_has_room():
 def test_a_job_that_is_sent_again_goes_first_and_always_finds_room():
     queue = filled(command=LANE_LIMITS[Lane.COMMAND])
 
-    queue.push_front(Ticket("again"), Lane.COMMAND)
+    queue.requeue(Ticket("again"), Lane.COMMAND)
 
     assert order(queue, 2) == ["again", "command0"]
 
@@ -195,22 +195,22 @@ def test_draining_returns_every_job_and_forgets_the_pollers():
 
     assert [ticket.name for ticket in drained] == ["stop0", "command0", "command1", "background0"]
     assert take(queue, 10.0) is None
-    assert queue.next_due_s() == float("inf")
+    assert queue.polls.next_due_s() == float("inf")
 
 
 def chosen(now_s: float, deadlines_s: list[float], turns: int) -> list[int]:
     """Let somebody who always wants the highest node choose; return who goes. A poll is due again at once."""
-    queue: ExchangeQueue[Ticket] = ExchangeQueue(lambda polls, _now_s: max(polls, key=lambda poll: poll.node))
+    queue: Schedule[Ticket] = schedule_by(lambda polls, _now_s: max(polls, key=lambda poll: poll.node))
     for node, deadline_s in enumerate(deadlines_s, 1):
         poller = ToyPoller(node, 1.0)
         poller.deadline_at_s = deadline_s
-        queue.schedule(poller, 0.0)
+        queue.polls.schedule(poller, 0.0)
     nodes = []
     for _ in range(turns):
         taken = take(queue, now_s)
         assert isinstance(taken, Poller)
         nodes.append(taken.node)
-        queue.schedule(taken, now_s)
+        queue.polls.schedule(taken, now_s)
     return nodes
 
 
@@ -236,11 +236,11 @@ def test_among_late_polls_the_choice_is_free_and_nobody_is_passed_over_for_two_r
 
 
 def test_a_poll_that_was_unscheduled_is_not_chosen():
-    queue: ExchangeQueue[Ticket] = ExchangeQueue(lambda polls, _now_s: polls[-1])
+    queue: Schedule[Ticket] = schedule_by(lambda polls, _now_s: polls[-1])
     kept, gone = ToyPoller(1, 1.0), ToyPoller(2, 1.0)
     for poller in (kept, gone):
-        queue.schedule(poller, 0.0)
-    queue.unschedule(gone)
+        queue.polls.schedule(poller, 0.0)
+    queue.polls.unschedule(gone)
 
     assert [take(queue, 1.0), take(queue, 1.0)] == [kept, None]
 
@@ -266,7 +266,7 @@ def test_a_probe_is_no_stop_and_is_drained_like_any_job():
 
 
 def test_a_probe_is_taken_only_where_it_is_alone():
-    queue: ExchangeQueue[Ticket] = ExchangeQueue()
+    queue: Schedule[Ticket] = Schedule()
     stop = Ticket("stop")
     queue.push(stop, Lane.STOP)
     assert not queue.takes_probe()

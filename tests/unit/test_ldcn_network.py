@@ -427,7 +427,7 @@ async def test_on_a_port_with_one_rate_newcomers_are_looked_for_only_at_the_rate
             await line.network.bring_up()
             await restart(chain, line, 2)
         else:
-            line.bus._mute.missed(2)
+            line.bus._schedule.mute.missed(2)
         seen = len(line.sent())
 
         found = await line.network.rejoin(lambda _: None)

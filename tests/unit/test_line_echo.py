@@ -14,8 +14,7 @@ async def test_our_own_bytes_are_taken_off_by_count(*, bytewise: bool):
     same = Exchange(1, twin, len(twin), toy.check, len, 0.001, repeatable=True)
     bench.replies({1: [Say(twin)]})
 
-    bench.users.waiting.append(RecordingTransaction(same, bench.users.story))
-    bench.line.kick()
+    bench.queue(RecordingTransaction(same, bench.story))
     bench.add(2)
     await settle()
 

@@ -1,8 +1,9 @@
+from dataclasses import replace
+
 import pytest
 
 from ldcnd.line.exchange import Lane, Resync
-from ldcnd.line.line import Phase
-from ldcnd.line.resync import LONGEST_QUARANTINE
+from ldcnd.line.line import LONGEST_QUARANTINE, Phase
 from tests.support import toy_family as toy
 from tests.support.line_bench import BYTE_S, FENCE_S, MARGIN_S, REPLY_S, REQUEST_S, Bench, settle
 from tests.support.scripted_line import Say
@@ -167,8 +168,12 @@ async def test_a_stop_that_is_sent_again_waits_for_no_silence():
     assert second_s == pytest.approx(lost_s + len(toy.FLUSH) * BYTE_S + toy.RESYNC.settle_s)
 
 
+ONE_NODE = replace(toy.RESYNC, probe=lambda _avoid: toy.probe(set()))
+"""A line with no other node to ask."""
+
+
 async def test_a_probe_that_fails_is_repeated_three_times_at_most():
-    bench = Bench()
+    bench = Bench(resync=ONE_NODE)
     bench.wire.script = toy.all_but(toy.PROBE_NODE)
 
     bench.wire.say(b"\x55")
@@ -180,7 +185,7 @@ async def test_a_probe_that_fails_is_repeated_three_times_at_most():
 
 
 async def test_a_late_reply_does_not_pass_for_the_probes():
-    bench = Bench()
+    bench = Bench(resync=ONE_NODE)
     bench.replies({toy.PROBE_NUMBER: [Say(toy.reply(1, toy.PROBE_BYTES))]})
 
     bench.wire.say(b"\x55")
@@ -194,7 +199,7 @@ async def test_a_late_reply_does_not_pass_for_the_probes():
 async def test_the_probe_is_told_which_nodes_fail():
     asked: list[set[int]] = []
     bench = Bench(resync=Resync(probe=lambda avoid: asked.append(set(avoid))))
-    bench.users.mute = {4}
+    bench.schedule.mute.missed(4)
 
     bench.wire.say(b"\x55")
     await settle()

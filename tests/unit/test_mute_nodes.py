@@ -1,6 +1,6 @@
 import pytest
 
-from ldcnd.line.bus import LONGEST_BACKOFF_S, MISSES_BEFORE_BACKOFF, MUTE_SHARE, MuteNodes
+from ldcnd.line.schedule import LONGEST_BACKOFF_S, MISSES_BEFORE_BACKOFF, MUTE_SHARE, MuteNodes
 
 LOST_S = 0.015
 

@@ -5,7 +5,7 @@ import random
 import pytest
 
 from ldcnd.line.exchange import Timing
-from ldcnd.line.queue import MOST_GUARD, PhaseOrder, PhaseTracker
+from ldcnd.line.schedule import MOST_GUARD, PhaseOrder, PhaseTracker
 from ldcnd.line.settings import ServoCycle
 from tests.support.polled_chain import saturated
 from tests.support.toy_family import ToyPoller

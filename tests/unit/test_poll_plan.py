@@ -9,8 +9,8 @@ from ldcnd.drives.cost import Cost
 from ldcnd.drives.line_plan import Poll, Urgent, largest, plan_line
 from ldcnd.drives.response_times import PeriodicTask, load_of, meets_deadlines, response_times_s, taking_turns_s
 from ldcnd.line.exchange import Poller, Priority
-from ldcnd.line.queue import Choose, ExchangeQueue
-from tests.support.queue_turns import take
+from ldcnd.line.schedule import Choose, Schedule
+from tests.support.queue_turns import schedule_by, take
 
 MS = 0.001
 URGENT = Urgent(command_s=2 * MS, stop_s=1 * MS, recovery_s=3 * MS, margin_s=5 * MS)
@@ -51,24 +51,24 @@ def observed_s(
         choose: among equals.
         dice: draw the priorities; all have the same one if missing.
     """
-    queue: ExchangeQueue = ExchangeQueue(choose)
+    queue: Schedule = schedule_by(choose)
     turns = [Turns(task, start) for task, start in zip(tasks, starts_s, strict=True)]
     for each in turns:
         each.priority = dice.choice(list(Priority)) if dice else Priority.NORMAL
     longest = dict.fromkeys(turns, 0.0)
     for each in turns:
-        queue.schedule(each, each.due_at_s)
+        queue.polls.schedule(each, each.due_at_s)
     now_s = 0.0
     while now_s < until_s:
         taken = take(queue, now_s)
         if taken is None:
-            now_s = queue.next_due_s()
+            now_s = queue.polls.next_due_s()
             continue
         due_s = taken.due_at_s
         taken.next_exchange(now_s)
         now_s += taken.task.cost_s
         longest[taken] = max(longest[taken], now_s - due_s)
-        queue.schedule(taken, taken.due_at_s)
+        queue.polls.schedule(taken, taken.due_at_s)
     return [longest[each] for each in turns]
 
 
@@ -200,10 +200,10 @@ def test_what_is_urgent_delays_whoever_takes_turns():
 
 
 def test_the_earliest_deadline_goes_first_among_the_polls_that_are_due():
-    queue: ExchangeQueue = ExchangeQueue()
+    queue: Schedule = Schedule()
     slow, fast = Turns(PeriodicTask(1.0, MS), 0.0), Turns(PeriodicTask(0.1, MS), 0.01)
     for each in (slow, fast):
-        queue.schedule(each, each.due_at_s)
+        queue.polls.schedule(each, each.due_at_s)
 
     assert [take(queue, 0.02), take(queue, 0.02), take(queue, 0.02)] == [fast, slow, None]
 
@@ -251,10 +251,10 @@ def poll(axis: str, rate_hz: float, longest_s: float) -> Poll:
 
 
 def test_deadlines_break_ties_by_due_time():
-    queue: ExchangeQueue = ExchangeQueue()
+    queue: Schedule = Schedule()
     late, early = Turns(PeriodicTask(1.0, MS), 0.0), Turns(PeriodicTask(1.0, MS), 0.0)
     late.deadline_at_s = early.deadline_at_s = 5.0
-    queue.schedule(late, 0.2)
-    queue.schedule(early, 0.1)
+    queue.polls.schedule(late, 0.2)
+    queue.polls.schedule(early, 0.1)
 
     assert [take(queue, 1.0), take(queue, 1.0)] == [early, late]

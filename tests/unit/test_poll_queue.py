@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ldcnd.line.exchange import NO_DEADLINE_S, Poller, Priority
-from ldcnd.line.queue import POLLS_PER_LOWER, Choose, PollQueue
+from ldcnd.line.schedule import POLLS_PER_LOWER, Choose, PollQueue
 from tests.support.toy_family import ToyPoller
 
 HIGH, NORMAL, LOW = Priority

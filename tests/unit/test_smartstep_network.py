@@ -269,7 +269,7 @@ async def test_polling_for_long_leaves_nothing_behind_in_the_queue():
     async with smartstep_line([simulated(1)]) as line:
         heard.listen(line, "u1")
         await asyncio.sleep(100.0)
-        polls = line.bus._queue.polls
+        polls = line.bus._schedule.polls
         kept = len(polls._later) + len(polls._turns) + len(polls._due)
 
     assert len(heard.readings) > 260

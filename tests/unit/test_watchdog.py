@@ -3,7 +3,7 @@ from collections.abc import Callable
 
 import pytest
 
-from ldcnd.line.wire import NEVER_S, Watchdog
+from ldcnd.line.line import NEVER_S, Watchdog
 
 
 class CountingLoop:

@@ -1,8 +1,10 @@
-"""Order of the exchanges: four lanes and a fairness bound. Pure: uses no clock and no wire.
+"""What goes on the wire next: jobs of three lanes, polls by their deadlines, and which nodes do not reply.
 
-`PhaseOrder` chooses among polls of drives that reply at the end of a servo cycle of their own. The drives on a line are
-not synchronised: a drive polled at the right instant replies at once, a drive polled just too late makes the line wait
-for nearly a whole cycle. Phase and length of each cycle are measured from the replies.
+Pure: uses no clock and no wire. `Schedule` puts the lanes in order and bounds how long one waits for another;
+`PollQueue` orders polls by deadline and priority; `PhaseOrder` chooses among polls of drives that reply at the end of
+a servo cycle of their own (PIC-SERVO manual, 4.1). The drives on a line are not synchronised: a drive polled at the
+right instant replies at once, a drive polled just too late makes the line wait for nearly a whole cycle. Phase and
+length of each cycle are measured from the replies.
 """
 
 import heapq
@@ -12,8 +14,252 @@ from itertools import count
 from typing import Any, Generic, Protocol, TypeVar
 
 from ldcnd.contract.errors import BusBusy
-from ldcnd.line.exchange import NO_DEADLINE_S, Lane, Poller, Priority, Timing
+from ldcnd.line.exchange import NO_DEADLINE_S, Exchange, Lane, Poller, Priority, Timing
+from ldcnd.line.proof import Proofs
 from ldcnd.line.settings import ServoCycle
+
+STOP, COMMAND, POLL, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and turns are taken between two packets
+
+
+class Queueable(Protocol):
+    """The interface of a job that the schedule uses."""
+
+    @property
+    def abandoned(self) -> bool:
+        """Whether no caller waits for this job any more."""
+
+
+JobT = TypeVar("JobT", bound=Queueable)
+
+COMMANDS_PER_POLL = 4
+"""Most commands that may pass a due poll."""
+POLLS_PER_BACKGROUND = 8
+"""Most due polls that may pass a background job."""
+LANE_LIMITS = {STOP: 256, COMMAND: 64, BACKGROUND: 64}
+
+
+class Schedule(Generic[JobT]):
+    """The jobs of a line, first in first out in each lane, and its pollers, see `PollQueue`.
+
+    A stop goes before everything. Commands go before polls, but a due poll waits for at most `COMMANDS_PER_POLL`
+    commands; background jobs wait for at most `POLLS_PER_BACKGROUND` polls.
+
+    Attributes:
+        polls: the pollers with their turns.
+        mute: the nodes that do not reply.
+    """
+
+    def __init__(self, cycle: ServoCycle | None = None, proofs: Proofs | None = None) -> None:
+        self._order = PhaseOrder(cycle) if cycle else None
+        self._proofs = proofs or Proofs()
+        self.polls = PollQueue(self._order.choose if self._order else None)
+        self.mute = MuteNodes()
+        self._pollers: set[Poller[Any]] = set()  # also those whose poll is on the wire
+        self._probe: JobT | None = None
+        self._jobs: dict[Lane, deque[JobT]] = {lane: deque() for lane in LANE_LIMITS}
+        self._commands_in_a_row = 0
+        self.polls_in_a_row = 0
+
+    # -- jobs --------------------------------------------------------------------------------------------------------
+
+    def push(self, job: JobT, lane: Lane) -> None:
+        """Queue a job behind its lane's others.
+
+        Raises:
+            BusBusy: the lane is full.
+        """
+        waiting = self._jobs[lane]
+        if len(waiting) >= LANE_LIMITS[lane]:
+            waiting = self._jobs[lane] = deque(other for other in waiting if not other.abandoned)
+        if len(waiting) >= LANE_LIMITS[lane]:
+            raise BusBusy(
+                f"{len(waiting)} exchanges wait in the {lane.name.lower()} lane already; nothing was sent",
+                limit=LANE_LIMITS[lane],
+                remedy="send commands more slowly",
+            )
+        waiting.append(job)
+
+    def requeue(self, job: JobT, lane: Lane) -> None:
+        """Give a job that has to be sent again the next turn of its lane."""
+        self._jobs[lane].appendleft(job)
+
+    def takes_probe(self) -> bool:
+        """Tell whether a probe would be alone: no stop waits, and no other probe."""
+        return self._probe is None and not self.stop_waits()
+
+    def push_probe(self, job: JobT) -> None:
+        """Let a job wait as the only stop would: behind every stop and in front of everything else."""
+        self._probe = job
+
+    def waiting(self, lane: Lane) -> list[JobT]:
+        """Return the jobs of a lane, first to go first; polls are scheduled, not queued."""
+        return list(self._jobs.get(lane, ()))
+
+    def stop_waits(self) -> bool:
+        """Tell whether a stop is queued whose caller still waits."""
+        return any(not stop.abandoned for stop in self._jobs[STOP])
+
+    def take_job(self, now_s: float) -> JobT | None:
+        """Remove and return the job that goes on the wire now, or None when it is a poll's turn or nothing is due."""
+        if self._probe is None and not any(self._jobs.values()):  # as nearly always, and this is between two packets
+            self._commands_in_a_row = 0
+            return None
+        if stop := self._take(STOP):
+            return stop
+        probe, self._probe = self._probe, None
+        if probe and not probe.abandoned:
+            return probe
+        poll_due = self.polls.is_due(now_s)
+        if not (poll_due and self._commands_in_a_row >= COMMANDS_PER_POLL) and (command := self._take(COMMAND)):
+            self._commands_in_a_row += 1
+            return command
+        self._commands_in_a_row = 0
+        if not poll_due or self.polls_in_a_row >= POLLS_PER_BACKGROUND:
+            self.polls_in_a_row = 0
+            return self._take(BACKGROUND)
+        self.polls_in_a_row += 1
+        return None
+
+    def _take(self, lane: Lane) -> JobT | None:
+        waiting = self._jobs[lane]
+        while waiting:
+            job = waiting.popleft()
+            if not job.abandoned:
+                return job
+        return None
+
+    def drain(self) -> list[JobT]:
+        """Remove all pollers; remove and return all jobs, stops first."""
+        self._pollers.clear()
+        self.polls = PollQueue(self._order.choose if self._order else None)
+        drained = [self._probe] if self._probe else []
+        self._probe = None
+        drained += [job for lane in sorted(self._jobs) for job in self._jobs[lane]]
+        for waiting in self._jobs.values():
+            waiting.clear()
+        return drained
+
+    # -- polls -------------------------------------------------------------------------------------------------------
+
+    def add(self, poller: Poller[Any]) -> None:
+        """Let a poller take part from its `due_at_s` on; adding it again only moves its turn."""
+        self._pollers.add(poller)
+        self.polls.schedule(poller, poller.due_at_s)
+
+    def remove(self, poller: Poller[Any]) -> None:
+        """Stop polling; a poll on the wire is still delivered."""
+        self._pollers.discard(poller)
+        self.polls.unschedule(poller)
+
+    def reschedule(self, poller: Poller[Any], at_s: float) -> None:
+        """Give a poller its next turn, unless it was removed while its poll was on the wire."""
+        if poller in self._pollers:
+            self.polls.schedule(poller, at_s)
+
+    def prepare(self, node: int, asked_at_s: float, reply_s: float) -> None:
+        """Choose the next poll and its items, while there is time: that takes longer than all else between two packets.
+
+        Args:
+            node: receiver of the request on the wire.
+            asked_at_s: when the last bit of that request leaves, in loop time.
+            reply_s: duration of the reply at the line's nominal rate.
+        """
+        at_s = self._order.free_at_s(node, asked_at_s, reply_s) if self._order else asked_at_s + reply_s
+        if poller := self.polls.choose_ahead(at_s):
+            poller.prepare(at_s)
+
+    # -- outcomes ----------------------------------------------------------------------------------------------------
+
+    def record_reply(self, exchange: Exchange[Any], timing: Timing | None = None) -> None:
+        """Take note that a node replied.
+
+        Args:
+            exchange: to which it did.
+            timing: of the reply to a poll, to learn the cycle of the drive.
+        """
+        if timing and self._order:
+            self._order.observe(exchange.node, timing)
+        if not exchange.reply_bytes or exchange.node not in self.mute.misses:
+            return
+        self._proofs.answered(exchange.node)
+        if (also := self.mute.answered(exchange.node)) is not None:
+            for poller in self._pollers:
+                if poller.node == also:
+                    self.polls.schedule(poller, poller.due_at_s)
+
+    def record_loss(self, node: int) -> None:
+        """Take note that a node did not reply."""
+        self.mute.missed(node)
+        self._proofs.missed(node, self.mute.misses[node])
+
+    def put_off(self, poller: Poller[Any], now_s: float, lost_s: float) -> None:
+        """Let a poller pause whose poll was lost, the longer the more often.
+
+        Args:
+            poller: of a node whose loss was recorded.
+            now_s: the present, in loop time.
+            lost_s: time that a poll without a reply takes on the line, resynchronisation included.
+        """
+        self.reschedule(poller, max(poller.due_at_s, now_s + self.mute.pause_s(poller.node, lost_s)))
+
+
+MISSES_BEFORE_BACKOFF = 3
+MUTE_SHARE = 0.005
+"""Fraction of the line's time that polls without a reply may take, so that mute nodes cost the others little."""
+FIRST_BACKOFF_S = 0.05
+LONGEST_BACKOFF_S = 5.0
+"""Longest pause between two polls of a mute node, seconds, whatever fraction of the line they take."""
+
+
+class MuteNodes:
+    """The nodes that do not reply.
+
+    Attributes:
+        misses: consecutive exchanges without a reply, by node; nodes that reply are absent.
+    """
+
+    def __init__(self) -> None:
+        self.misses: dict[int, int] = {}
+        self._backed_off: set[int] = set()
+
+    def failing(self) -> set[int]:
+        """Return the nodes that did not reply to their last exchange."""
+        return set(self.misses)
+
+    def missed(self, node: int) -> None:
+        """Count an exchange without a reply."""
+        self.misses[node] = self.misses.get(node, 0) + 1
+
+    def pause_s(self, node: int, lost_s: float) -> float:
+        """Return how long to pause polling a node whose poll has just been lost, in seconds.
+
+        Args:
+            node: its miss was counted.
+            lost_s: time that a poll without a reply takes on the line.
+        """
+        beyond = self.misses[node] - MISSES_BEFORE_BACKOFF
+        if beyond < 0:
+            return 0.0
+        self._backed_off.add(node)
+        many = len(self._backed_off)
+        doubled_s = many * FIRST_BACKOFF_S * 2.0 ** min(10, beyond)
+        return min(doubled_s, many * lost_s / MUTE_SHARE, LONGEST_BACKOFF_S)
+
+    def answered(self, node: int) -> int | None:
+        """Note a reply; return another node to poll at once, if this one was backed off.
+
+        A common cause, such as a connector or the supply of one node, often ends for all mute nodes together.
+        """
+        if self.misses.pop(node, None) is None or node not in self._backed_off:
+            return None
+        self._backed_off.discard(node)
+        return min(self._backed_off, key=lambda other: (other < node, other), default=None)  # the chain, once round
+
+    def forget(self) -> None:
+        """Clear all misses: the line was opened."""
+        self.misses.clear()
+        self._backed_off.clear()
+
 
 CHOICE = 16
 """Most polls with equal deadlines to choose among, because comparing each takes time."""
@@ -232,137 +478,6 @@ class PollQueue:
             return ranks[0]
         self._passed = 0
         return min(lower, key=lambda rank: rank.since_s)
-
-
-STOP, COMMAND, POLL, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and turns are taken between two packets
-
-
-class Queueable(Protocol):
-    """The interface of a job that the queue uses."""
-
-    @property
-    def abandoned(self) -> bool:
-        """Whether no caller waits for this job any more."""
-
-
-JobT = TypeVar("JobT", bound=Queueable)
-
-COMMANDS_PER_POLL = 4
-"""Most commands that may pass a due poll."""
-POLLS_PER_BACKGROUND = 8
-"""Most due polls that may pass a background job."""
-LANE_LIMITS = {Lane.STOP: 256, Lane.COMMAND: 64, Lane.BACKGROUND: 64}
-
-
-class ExchangeQueue(Generic[JobT]):
-    """Jobs of three lanes, first in first out, and the pollers of the fourth, see `PollQueue`.
-
-    A stop goes before everything. Commands go before polls, but a due poll waits for at most `COMMANDS_PER_POLL`
-    commands; background jobs wait for at most `POLLS_PER_BACKGROUND` polls.
-
-    Attributes:
-        polls: the pollers.
-    """
-
-    def __init__(self, choose: Choose | None = None) -> None:
-        self._choose = choose
-        self.polls = PollQueue(choose)
-        self._probe: JobT | None = None
-        self._jobs: dict[Lane, deque[JobT]] = {lane: deque() for lane in LANE_LIMITS}
-        self._commands_in_a_row = 0
-        self.polls_in_a_row = 0
-
-    def push(self, job: JobT, lane: Lane) -> None:
-        """Queue a job behind its lane's others.
-
-        Raises:
-            BusBusy: the lane is full.
-        """
-        waiting = self._jobs[lane]
-        if len(waiting) >= LANE_LIMITS[lane]:
-            waiting = self._jobs[lane] = deque(other for other in waiting if not other.abandoned)
-        if len(waiting) >= LANE_LIMITS[lane]:
-            raise BusBusy(
-                f"{len(waiting)} exchanges wait in the {lane.name.lower()} lane already; nothing was sent",
-                limit=LANE_LIMITS[lane],
-                remedy="send commands more slowly",
-            )
-        waiting.append(job)
-
-    def push_front(self, job: JobT, lane: Lane) -> None:
-        """Give a job that has to be sent again the next turn of its lane."""
-        self._jobs[lane].appendleft(job)
-
-    def takes_probe(self) -> bool:
-        """Tell whether a probe would be alone: no stop waits, and no other probe."""
-        return self._probe is None and not self.stop_waits()
-
-    def push_probe(self, job: JobT) -> None:
-        """Let a job wait as the only stop would: behind every stop and in front of everything else."""
-        self._probe = job
-
-    def waiting(self, lane: Lane) -> list[JobT]:
-        """Return the jobs of a lane, first to go first."""
-        return list(self._jobs[lane])
-
-    def schedule(self, poller: Poller[Any], at_s: float) -> None:
-        """Let a poller have its next turn at `at_s`; replaces any turn it had."""
-        self.polls.schedule(poller, at_s)
-
-    def unschedule(self, poller: Poller[Any]) -> None:
-        """Remove a poller; unknown ones are ignored."""
-        self.polls.unschedule(poller)
-
-    def stop_waits(self) -> bool:
-        """Tell whether a stop is queued whose caller still waits."""
-        return any(not stop.abandoned for stop in self._jobs[Lane.STOP])
-
-    def next_due_s(self) -> float:
-        """Return when the next poller is due; infinity when there is none."""
-        return self.polls.next_due_s()
-
-    def take_job(self, now_s: float) -> JobT | None:
-        """Remove and return the job that goes on the wire now, or None when it is a poll's turn or nothing is due."""
-        if self._probe is None and not any(self._jobs.values()):  # as nearly always, and this is between two packets
-            self._commands_in_a_row = 0
-            return None
-        if stop := self._take_job(STOP):
-            return stop
-        probe, self._probe = self._probe, None
-        if probe and not probe.abandoned:
-            return probe
-        poll_due = self.polls.is_due(now_s)
-        if not (poll_due and self._commands_in_a_row >= COMMANDS_PER_POLL) and (command := self._take_job(COMMAND)):
-            self._commands_in_a_row += 1
-            return command
-        self._commands_in_a_row = 0
-        if not poll_due or self.polls_in_a_row >= POLLS_PER_BACKGROUND:
-            self.polls_in_a_row = 0
-            return self._take_job(BACKGROUND)
-        self.polls_in_a_row += 1
-        return None
-
-    def choose_ahead(self, at_s: float) -> Poller[Any] | None:
-        """Choose the next poll ahead, see `PollQueue`; jobs may still go before it."""
-        return self.polls.choose_ahead(at_s)
-
-    def drain(self) -> list[JobT]:
-        """Remove all pollers; remove and return all jobs, stops first."""
-        self.polls = PollQueue(self._choose)
-        drained = [self._probe] if self._probe else []
-        self._probe = None
-        drained += [job for lane in sorted(self._jobs) for job in self._jobs[lane]]
-        for waiting in self._jobs.values():
-            waiting.clear()
-        return drained
-
-    def _take_job(self, lane: Lane) -> JobT | None:
-        waiting = self._jobs[lane]
-        while waiting:
-            job = waiting.popleft()
-            if not job.abandoned:
-                return job
-        return None
 
 
 MOST_DRIFT = 0.001
