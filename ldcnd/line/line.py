@@ -210,6 +210,7 @@ PROBE_ROUNDS = 3
 LONGEST_QUARANTINE = 20
 """Longest wait for silence, in multiples of `quiet_s`; a line that is never silent is flushed after that."""
 READS = PacketEffect.READS  # looked up slowly in its class
+_OLDER = "may be to something older"
 _FLAWS = {ReplyVerdict.CORRUPT: "is damaged", ReplyVerdict.REJECTED: "packet rejected"}
 
 
@@ -284,16 +285,16 @@ class Line(Receiver):
             self._watchdog.set(self._loop.time())
 
     def distrust(self) -> None:
-        """Resynchronise before another reply is accepted: a reply may have belonged to an older request.
+        """Resynchronise before another request: a reply that was delivered may have belonged to an older one.
 
         Every later reply then belongs to the request before it; so the reply on the wire is not accepted either, unless
         its exchange must not be repeated, nor are those that were not delivered yet.
         """
         while self.undelivered:
             transaction = self.undelivered.popleft()[0]
-            transaction.lost(BadReply(f"node {transaction.exchange.node}: the reply may be to something older"))
+            transaction.lost(BadReply(f"node {transaction.exchange.node}: the reply {_OLDER}"))
+        self._require_probe()
         if self.phase is Phase.IDLE:
-            self._require_probe()
             self._begin_quarantine(self._loop.time())
         elif self.phase is Phase.REPLY and self._transaction and self._transaction.exchange.repeatable:
             self._distrusted, self._missing = True, NOT_PLAIN
@@ -352,6 +353,9 @@ class Line(Receiver):
         while job := schedule.take_job(now_s):
             if job.condition and self.undelivered:
                 self.deliver()  # permission is asked of all that the drives have said by now
+                if self._distrusted:  # and one of them cannot have said that
+                    schedule.requeue(job, job.lane)
+                    return None
             if job.may_go(now_s):
                 return job
         poller = schedule.polls.take(now_s)
@@ -503,7 +507,7 @@ class Line(Receiver):
         why = "came with surplus bytes" if surplus else "came too early" if self._early else _FLAWS.get(verdict, "")
         self._log.add(now_s, WireEvent.RECEIVED, arrived, why)
         if self._distrusted:
-            self._discard_reply(transaction, reply, "may be to something older", now_s)
+            self._discard_reply(transaction, reply, _OLDER, now_s)
         elif surplus or self._early or verdict is ReplyVerdict.CORRUPT:
             self._discard_reply(transaction, reply + surplus, why, now_s)
         elif not transaction.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(transaction)):
@@ -521,7 +525,7 @@ class Line(Receiver):
 
     def _accept(self, transaction: Transaction, reply: bytes, verdict: ReplyVerdict, now_s: float) -> None:
         if verdict is ReplyVerdict.REJECTED:
-            self._handle_rejection(transaction)
+            self._handle_rejection(transaction, reply, now_s)
         elif isinstance(transaction, ResyncExchange):
             self._judge_probe(transaction, reply, now_s)
         else:
@@ -543,6 +547,9 @@ class Line(Receiver):
         if arrived:
             self._statistics.bytes_in += len(arrived)
             self._log.add(now_s, WireEvent.RECEIVED, arrived)
+        if self._distrusted:
+            self._discard_reply(transaction, reply, _OLDER, now_s)
+            return
         timing = self._count_reply(transaction, reply, sent_at_s, byte_s, now_s)
         is_poll = transaction.lane is POLL
         self._schedule.record_reply(transaction.exchange, timing if is_poll else None)
@@ -595,10 +602,13 @@ class Line(Receiver):
         statistics.latency[transaction.lane].add(max(0.0, late_s))
         return Timing(sent_at_s, over_s, max(over_s, begun_s), now_s)
 
-    def _handle_rejection(self, transaction: Transaction) -> None:
+    def _handle_rejection(self, transaction: Transaction, reply: bytes, now_s: float) -> None:
         """Go on after a node did not execute our packet: the line is in step, and sending again is always safe."""
         self._statistics.rejected_packets += 1
         self.deliver()
+        if self._distrusted:
+            self._discard_reply(transaction, reply, _OLDER, now_s)
+            return
         self._schedule.record_reply(transaction.exchange)
         if transaction.rejected():
             self._send_again(transaction)

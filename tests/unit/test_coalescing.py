@@ -257,3 +257,52 @@ async def test_readings_come_before_what_is_learnt_of_a_packet_that_a_drive_rece
     missed = [at for at, said in enumerate(story) if said == "missed 2"]
     assert len(missed) > 5
     assert [story[at - 1] for at in missed] == [f"reading 1.{5 * number}" for number in range(1, len(missed) + 1)]
+
+
+@pytest.mark.parametrize("repeatable", [True, False])
+async def test_after_a_foreign_reading_no_packet_is_sent_before_the_line_is_proven_to_be_in_step(*, repeatable):
+    """Nor is one whose permission made the readings be delivered that waited."""
+    rig, flushed = coalescing(), []
+
+    async with running(rig) as callers:
+        rig.bus.proofs.expect(9, "node 9").prove()
+        first, *_ = busy(rig, [])
+        for _ in range(40):
+            await asyncio.sleep(0.1031)
+            foreign_at: list[int] = []
+
+            def foreign(foreign_at: list[int] = foreign_at) -> None:
+                if not foreign_at:
+                    foreign_at.append(len(rig.line.writes))
+                    rig.bus.distrust()
+
+            first.then = foreign
+            with only_while(lambda: None):
+                move = callers.create_task(rig.bus.execute(replace(moving(7), repeatable=repeatable)), name="move")
+            assert await move == 7
+            await asyncio.sleep(0.05)
+            flushed.append(rig.line.packets()[foreign_at[0]] == toy.FLUSH)
+
+    assert flushed == [True] * 40
+
+
+async def test_a_refusal_behind_a_foreign_reading_is_not_believed_either():
+    rig, story = coalescing(), []
+
+    def script(packet: bytes) -> list[Say]:
+        rejects = packet != toy.FLUSH and toy.node_of(packet) == 2 and toy.number_of(packet) % 5 == 0
+        return [Say(toy.reply(1, kind=toy.REJECTED))] if rejects else toy.answer(packet)
+
+    def foreign() -> None:
+        if len(first.delivered) % 5 == 0:
+            story.append(len(rig.line.writes))
+            rig.bus.distrust()
+
+    rig.opener.script = script
+    async with running(rig):
+        first, *_ = busy(rig, [])
+        first.then = foreign
+        await asyncio.sleep(0.5)
+
+    assert len(story) > 5
+    assert {rig.line.packets()[place] for place in story[:-1]} == {toy.FLUSH}
