@@ -29,7 +29,7 @@ from ldcnd.drives.driver import (
     cannot,
 )
 from ldcnd.drives.network import Network
-from ldcnd.line.transaction import Condition, only_while
+from ldcnd.line.proof import Condition, only_while
 
 
 def always() -> None:
