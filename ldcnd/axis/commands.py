@@ -305,12 +305,14 @@ class AxisCommands:
         """Tell whether the drive goes on from the motion under way to this one, without a halt in between.
 
         PIC-SERVO SC takes goal, velocity and acceleration of a trapezoid at any time and keeps both limits (later
-        vendor data sheets); on other drives a trapezoid loaded in mid-move is erratic (PIC-SERVO manual, 4.4).
+        vendor data sheets); on other drives a trapezoid loaded in mid-move is erratic (PIC-SERVO manual, 4.4). From
+        the points of a path it would begin at standstill, wherever the drive is by then.
         """
         tracker = self._tracker
         return (
             self._driver.retargets
             and not isinstance(request, Jog)
+            and not isinstance(self.procedure, PathMember)
             and request.buffer_mode is BufferMode.ABORTING
             and tracker.command is not None
             and tracker.command.verb in MOVES

@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.contract.commands import Direction, Halt, MoveRelative, Power, Reset, Stop
+from ldcnd.contract.commands import BufferMode, Direction, Halt, MoveRelative, Power, Reset, Stop
 from ldcnd.contract.errors import (
     CommandExpired,
     CommandIdReused,
@@ -208,6 +208,27 @@ async def test_whatever_ends_one_axis_of_a_path_ends_all(what: Callable[[ChainRi
     assert what is not trip or not drive(chain, 2).loop.servo_on
     assert math.dist(places(chain)[1], (0.0, 0.0)) > 0.1
     assert all(state is not None and state.command is None for state in states)
+
+
+@pytest.mark.parametrize("after_s", [0.31, 0.5, 0.97])
+async def test_a_move_that_aborts_a_path_begins_where_its_axis_has_come_to_rest(after_s):
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        await rig.client.ask(path(speed=15.0))
+        await asyncio.sleep(after_s)
+        walker = drive(chain, 1).loop.trajectory
+        aborting = asyncio.create_task(
+            rig.client.command("z", MoveRelative(distance=2.0, buffer_mode=BufferMode.ABORTING))
+        )
+        while walker.path.running:
+            await asyncio.sleep(0.0002)
+            drive(chain, 1)  # with its servo cycles up to now
+        ended_at = walker.position / 65536
+        await rig.client.wait_for_end("z", (await aborting).command_id)
+        await asyncio.sleep(0.5)
+
+        assert walker.position / 65536 == pytest.approx(ended_at + 2000, abs=40)  # the shaft settles
+        assert await rests(chain)
 
 
 @pytest.mark.promise("path-ends-with-daemon")
