@@ -47,7 +47,7 @@ from ldcnd.contract.commands import (
 )
 from ldcnd.contract.errors import LdcndError, NotSupported, OutcomeUnknown, WrongState
 from ldcnd.contract.events import REFERENCE, CommandStatus
-from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive, Moves, Readable, StopMode
 from ldcnd.drives.network import BringUpReport
@@ -448,7 +448,8 @@ class AxisService:
         if not self.tracker.stop_pending:
             return
         try:
-            if not self.readings.seen:  # a stop would close the loop of a disabled axis: see how the drive was left
+            # a stop would close an open loop: see how a drive was left, or what became of it while it was out of reach
+            if not self.readings.seen or self.tracker.link is LinkState.DOWN:
                 asked_s = self._clock.now_s()
                 reading = await self._motion.read()
                 now_s = self._clock.now_s()
@@ -456,9 +457,11 @@ class AxisService:
                     self.readings.take(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
                 else:
                     self.tracker.enabled = reading.enabled
-        except LdcndError as error:  # a stop that comes now withdraws the reading, and is sent itself
-            log.warning("stop not sent again", axis=self.config.name, reason=error.message)
-            return
+        except LdcndError as error:
+            if not self.readings.seen:  # a stop that comes now withdraws the reading, and is sent itself
+                log.warning("stop not sent again", axis=self.config.name, reason=error.message)
+                return
+            log.debug("stop sent to a drive that cannot be read", axis=self.config.name, reason=error.message)
         await self.stops.send_pending()
 
     async def _obey(self, permit: Permit, command: AxisCommand[CommandReply]) -> CommandReply:

@@ -15,10 +15,11 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.drives.axis_config import LossConfig, LossPolicy
-from ldcnd.drives.ldcn.packet import CommandCode, PacketReader
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, PacketReader
 from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
+from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, openers_of, running_rig
 
@@ -93,27 +94,66 @@ async def test_a_stop_sent_while_the_line_is_down_reaches_the_drive_when_it_is_b
         assert CommandStatus.DONE in told
 
 
+def packets_to_the_line(chain: Chain) -> list[Packet]:
+    """Return a list to which every packet of the host is added from now on."""
+    sent: list[Packet] = []
+    reader, write = PacketReader(), chain.write
+
+    def noted(now_s: float, data: bytes) -> None:
+        sent.extend(received.packet for value in data if (received := reader.feed(value)))
+        write(now_s, data)
+
+    chain.write = noted
+    return sent
+
+
 @pytest.mark.promise("stop-until-confirmed")
-async def test_a_stop_is_the_first_packet_to_a_drive_whose_line_is_back_at_its_rate():
+async def test_a_drive_whose_line_is_back_at_its_rate_is_asked_for_its_loop_and_then_stopped():
     chain = chain_of_four()
     async with jogging(chain, baud=19_200) as rig:
         await unplugged(rig, chain)
         await rig.client.stop("x")
         await asyncio.sleep(1.0)
-        sent: list[bytes] = []
-        write = chain.write
-
-        def noted(now_s: float, data: bytes) -> None:
-            sent.append(data)
-            write(now_s, data)
-
-        chain.write = noted
+        sent = packets_to_the_line(chain)
         chain.replug()
         await rig.until("x", lambda state: not state.stop_pending)
 
-    reader = PacketReader()
-    first = next(received.packet for value in b"".join(sent) if (received := reader.feed(value)))
-    assert (first.address, first.command) == (1, CommandCode.STOP_MOTOR)
+    first = [packet.command for packet in sent[:3]]
+    assert first == [CommandCode.READ_STATUS, CommandCode.READ_STATUS, CommandCode.STOP_MOTOR]
+    assert {packet.address for packet in sent[:3]} == {1}
+
+
+@pytest.mark.promise("stop-closes-no-loop")
+async def test_a_loop_that_was_opened_while_the_line_was_away_is_not_closed_by_the_stop_that_waits():
+    chain = chain_of_four()
+    async with jogging(chain) as rig:
+        await unplugged(rig, chain)
+        await rig.client.stop("x")
+        chain.modules[0].loop.open()  # another program, or the drive itself after a position error
+        closed = []
+        chain.replug()
+        while (await rig.client.state("x")).stop_pending:
+            closed.append(chain.modules[0].loop.servo_on)
+            await asyncio.sleep(0.001)
+        await asyncio.sleep(2.0)
+
+        assert not any(closed)
+        assert not chain.modules[0].loop.servo_on
+        assert not (await rig.client.state("x")).enabled
+
+
+@pytest.mark.promise("stop-until-confirmed")
+async def test_a_drive_that_hears_and_is_not_heard_is_stopped_when_its_line_is_back():
+    chain = chain_of_four()
+    async with jogging(chain, baud=19_200) as rig:
+        await unplugged(rig, chain)
+        await rig.client.stop("x")
+        chain._injector = FaultInjector(FaultPlan((LineFault(FaultKind.REPLY_LOST),)))
+        chain.replug()
+        await asyncio.sleep(1.5)
+
+        assert await stands(chain)
+        assert (await rig.client.state("x")).stop_pending
 
 
 async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
