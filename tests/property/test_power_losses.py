@@ -16,6 +16,7 @@ from ldcnd.contract.commands import Halt, MoveAbsolute, Power
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.samples import LinkState
 from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
+from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.testing.jumping_loop import JumpingLoop
 from tests.support.chain_rig import rig_on
@@ -26,6 +27,8 @@ LATER_S = 60.0
 """Until modules whose servo cycles end within microseconds of each other have been told apart."""
 STOPPED_WITHIN_S = 3.0
 LOOKED_EVERY_S = 0.002
+TAKEN_OVER_WITHIN_S = 30.0
+ALONE = "switch one of them off and on again, alone"
 
 
 def config_of(models: tuple[str, ...], baud: int) -> RigConfig:
@@ -237,3 +240,80 @@ def test_modules_behind_one_without_power_get_no_address_while_the_line_is_broug
 def test_the_same_in_histories_without_end(first: int) -> None:
     print(f"seeds {first} to {first + 499}")
     assert flaws_of(range(first, first + 500)) == []
+
+
+class CutShort:
+    """A chain whose bring-ups are cut short, and that is taken over afterwards.
+
+    Attributes:
+        told: what the daemon wanted a person to do.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.dice = random.Random(seed)
+        self.models = tuple(self.dice.choice(MODELS) for _ in range(self.dice.randint(1, 4)))
+        if all(model == "pic-io" for model in self.models):
+            self.models = ("ls-182ap", *self.models[1:])
+        self.chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in self.models), seed=seed))
+        config = config_of(self.models, self.dice.choice((19_200, 57_600, 115_200)))
+        bus = config.bus[0].model_copy(update={"start": StartPolicy.ADOPT, "adopt_fallback": AdoptFallback.RESET})
+        self.starts = config, config.model_copy(update={"bus": (bus,)})
+        self.told: list[str] = []
+
+    async def lose_power(self, places: list[int], for_s: float) -> None:
+        """Let modules be without power for a time."""
+        loop = asyncio.get_running_loop()
+        for on in (False, True):
+            for place in places:
+                self.chain.modules[place].power(on=on, at_s=loop.time())
+            await asyncio.sleep(0.0 if on else for_s)
+
+    async def run(self) -> str:
+        """Kill daemons while they bring the line up, then let one take it over; return what is wrong."""
+        dice, (reset, adopt) = self.dice, self.starts
+        if dice.random() < 0.5:
+            async with rig_on(self.chain, reset):
+                pass
+        for _ in range(dice.choice((1, 1, 2))):
+            async with rig_on(self.chain, dice.choice(self.starts), up=False) as rig:
+                await asyncio.sleep(dice.random())
+                await rig.kill()
+            if dice.random() < 0.3:
+                lost = [place for place in range(len(self.models)) if dice.random() < 0.5]
+                await self.lose_power(lost, dice.choice((0.002, 0.3)))
+        async with rig_on(self.chain, adopt, up=False) as rig:
+            for _ in self.models:
+                with contextlib.suppress(TimeoutError):
+                    await asyncio.wait_for(rig.daemon.wait_up(), TAKEN_OVER_WITHIN_S)
+                    break
+                if ALONE not in rig.line.problem:
+                    return f"not up: {rig.line.problem}"
+                self.told.append(rig.line.problem)
+                silent = [place for place, module in enumerate(self.chain.modules, 1) if module.address != place]
+                await self.lose_power([silent[0] - 1], 1.0)
+        held = [module.address for module in self.chain.modules]
+        return "" if held == [*range(1, len(held) + 1)] else f"the modules have the addresses {held}"
+
+
+def cut_short(seeds: range) -> list[str]:
+    """Return what was wrong after bring-ups that were cut short."""
+    flaws, told = [], 0
+    for seed in seeds:
+        history = CutShort(seed)
+        with asyncio.Runner(loop_factory=JumpingLoop) as runner:
+            if flaw := runner.run(history.run()):
+                flaws.append(f"seed {seed}, {history.models}: {flaw}")
+        told += bool(history.told)
+    print(f"seeds {seeds.start} to {seeds.stop - 1}: {told} times a person had to switch a module off and on")
+    return flaws
+
+
+@pytest.mark.promise("address-only-of-its-place")
+def test_a_line_whose_bring_up_was_cut_short_is_taken_over_or_says_what_to_do() -> None:
+    assert cut_short(range(60)) == []
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("first", range(0, 4000, 500))
+def test_the_same_at_more_instants(first: int) -> None:
+    assert cut_short(range(first, first + 500)) == []

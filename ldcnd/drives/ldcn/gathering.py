@@ -61,6 +61,8 @@ STEPS = 8
 """Most rounds of one search; each either gives an address, or separates modules, or is the last."""
 SPLITS = 24
 """Most attempts of one search to separate modules that share a waiting address."""
+LOOKED_FURTHER = 4
+"""Further waiting addresses at which one search looks for leftovers: stops wait for the end of a bring-up."""
 CONFIRMATIONS = 3
 """Further replies that must be intact where two modules may share a waiting address."""
 GOLDEN = 0.618034
@@ -121,6 +123,7 @@ class Gathering:
         self._waiting: list[int] = []
         self._empty: set[int] = set()  # waiting addresses at which nothing answered the last time
         self._attempt = 0
+        self._looked: int | None = None  # waiting addresses at which the leftovers of another daemon were looked for
         self._sorts = False
 
     @property
@@ -144,11 +147,11 @@ class Gathering:
         if not self.possible:
             return frozenset()
         if left:
-            self._taken = left
-            self._waiting = [address for address in self._pool[: self._taken] if await self._listen(address)]
+            self._waiting = []
+            await self._take_up(range(max(self._taken, left)))
         await self._take_saved_addresses()
         self._sorts = bool(await self._park_all())
-        if not (self._sorts or self._waiting):
+        if not (self._sorts or self._waiting or (left and await self._look_further())):
             return frozenset()
         for _ in range(STEPS):
             stock = await self._take_stock(heard)
@@ -157,6 +160,8 @@ class Gathering:
             if await self._park_all():
                 continue  # something has restarted meanwhile
             if not await self._step(stock, addressing):
+                if left and await self._look_further():
+                    continue
                 self._report(stock)
                 break
         else:
@@ -164,6 +169,57 @@ class Gathering:
         if not stock.silent:
             self.problem, self._taken, self._waiting = "", 0, []
         return frozenset(each.address for at, each in enumerate(self.places) if at not in stock.silent)
+
+    async def left_behind(self) -> frozenset[int]:
+        """Return the rates of modules that a bring-up or a search has left when it was cut short, if no place answers.
+
+        They are at waiting addresses, or several at address 0, where their replies collide.
+
+        Raises:
+            BusError: the line failed meanwhile.
+        """
+        rates = set()
+        for baud in self._rate.candidates:
+            if await self._rate.host_to(baud):
+                addresses = self._pool[: len(self.places)]
+                if any([await self._rate.who_is(address) for address in addresses]):
+                    rates.add(baud)
+        if not rates and await self._rate.host_to(self._rate.at_reset):
+            first = await self._listen(UNADDRESSED.address)
+            if first is not None and first.identity is None:
+                rates.add(self._rate.at_reset)
+        return frozenset(rates)
+
+    async def _take_up(self, numbers: range) -> bool:
+        """Look for modules that were left at waiting addresses, by their numbers; tell whether there are any.
+
+        A bring-up that was cut short has left them at the rate of power-up, in the group of everybody.
+        """
+        found = []
+        for address in self._pool[numbers.start : numbers.stop]:
+            for baud in dict.fromkeys((self._bus.baud, self._rate.at_reset)):
+                if await self._listen(address, baud):
+                    found.append(address)
+                    again = commands.set_address(Node(address, ANY_DIALECT), address, WAITING_GROUP)
+                    await self._acknowledged(baud, again)
+                    break
+        if found:
+            self._waiting += found
+            self._taken = max(self._taken, self._pool.index(found[-1]) + 1)
+            await self._to_line_rate()
+        return bool(found)
+
+    async def _look_further(self) -> bool:
+        """Look for what another daemon may have left at later waiting addresses; tell whether there is anything.
+
+        Not at the first attempt: it is to tell soon why the line is not up, and whether something moves.
+        """
+        if self._looked is None:
+            self._looked = 0
+            return False
+        first = self._looked if self._taken <= self._looked < len(self._pool) else self._taken
+        self._looked = first + LOOKED_FURTHER
+        return await self._take_up(range(first, self._looked))
 
     async def _take_saved_addresses(self) -> None:
         """Reset each PIC-SERVO SC that has restarted with an address that it has saved, while it stands.

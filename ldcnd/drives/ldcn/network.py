@@ -219,19 +219,25 @@ class LdcnNetwork(Network):
 
         try:
             return await self._adoption.attempt()
-        except NetworkMismatch:
-            reads_only = not self._was_up and self._line.adopt_fallback is AdoptFallback.REFUSE
-            found = self._adoption.found
-            if reads_only or not found or not self._gathering.possible:
-                raise
-            await self._to_one_rate(found)
-            await self._gathering.search(addressing, lambda _: None, left=len(self._expected) - len(found))
-            await self._addressing.with_leaders()
-        return await self._adoption.attempt()
+        except NetworkMismatch as error:
+            refused = error
+        reads_only = not self._was_up and self._line.adopt_fallback is AdoptFallback.REFUSE
+        if reads_only or not self._gathering.possible:
+            raise refused
+        found = self._adoption.found
+        rates = frozenset(each.baud for each in found.values()) or await self._gathering.left_behind()
+        if not rates:
+            raise refused
+        await self._to_one_rate(rates)
+        await self._gathering.search(addressing, lambda _: None, left=len(self._expected) - len(found))
+        await self._addressing.with_leaders()
+        adopted = await self._adoption.attempt()
+        if self._restarted.issuperset(self._proofs):
+            raise refused  # none of them moves: a reset brings them to the rate of the configuration
+        return adopted
 
-    async def _to_one_rate(self, found: Mapping[int, Found]) -> None:
+    async def _to_one_rate(self, rates: frozenset[int]) -> None:
         """Bring modules that a lost host has left at different rates to one; allowed while motors move."""
-        rates = {each.baud for each in found.values()}
         if len(rates) == 1:
             (self._rate.working,) = rates
         for baud in rates - {self._rate.working}:
@@ -305,8 +311,10 @@ class LdcnNetwork(Network):
             raise refused
         obstacles = await self._adoption.not_standing()
         if obstacles:
+            unproven = self._gathering.problem
             raise NetworkMismatch(
-                f"{refused.message}; not reset either: {'; '.join(obstacles)}", remedy="wait, or stop the motion"
+                f"{refused.message}; not reset either: {'; '.join([*obstacles, *filter(None, (unproven,))])}",
+                remedy=unproven.rpartition("; ")[2] or "wait, or stop the motion",
             ) from refused
 
     async def _start_afresh(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
