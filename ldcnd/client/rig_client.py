@@ -261,7 +261,9 @@ class RigClient:
         payload, encoding = encode(command, Encoding.MSGPACK)
         key = self.keys.command(axis, command.verb)
         longest_s = command.answer_s if timeout_s is None else timeout_s
-        answers = await self.session.query(key, payload, encoding=encoding, timeout_s=longest_s)
+        answers = await self.session.query(
+            key, payload, encoding=encoding, timeout_s=longest_s, everyone=command.takes_energy_out
+        )  # what takes energy out is for every daemon of the rig: only one has the line
         if not answers:
             whose = "" if axis == RIG_ITSELF else f"axis {axis}: "
             raise await self._unanswered(f"{whose}{command.verb}")
@@ -272,7 +274,7 @@ class RigClient:
         request = Stop(client=client[:LONGEST_NAME] if client else None)
         payload, encoding = encode(request, Encoding.MSGPACK)
         answers = await self.session.query(
-            self.keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True
+            self.keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True, everyone=True
         )
         return self._one(answers, StopReply)
 

@@ -1,29 +1,39 @@
 """Stop, halt and power off pass every gate: a table of gates, for each of these verbs, judged by the shaft."""
 
 import asyncio
+import contextlib
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import NoReturn
 
 import pytest
 
 from ldcnd.client.lease import control
-from ldcnd.contract.commands import MoveVelocity, Power, Reset, SetGains
-from ldcnd.contract.errors import LeaseExpired
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveVelocity, Power, QuickStop, Reset, SetGains, Stop
+from ldcnd.contract.errors import LeaseExpired, OutcomeUnknown, TransportLost
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import LinkState
+from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.dispatch import PENDING_REQUESTS
+from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
+from ldcnd.sim.line import open_simulated_line
 from tests.integration.test_kept_references import chain_of
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
+from tests.support.rig import EPOCH_NS
 
 pytestmark = pytest.mark.promise("energy-out-always-sent")
 KEYS = Keys("sim")
 VERBS = ("halt", "stop", "quick_stop", "power", "@stop")
 CRAWL = 40
 """Counts that a closed loop at rest goes in 0.2 s; the motions here are of 5000 counts/s."""
+
+
+def now_ns() -> int:
+    return EPOCH_NS + round(asyncio.get_running_loop().time() * 1e9)
 
 
 @asynccontextmanager
@@ -153,6 +163,39 @@ async def test_neither_another_daemon_nor_a_flood_nor_a_line_that_is_busy_is_in_
         refused = [json.loads(each.result()[0].payload).get("code") for each in flood if each.done()]
         assert "too_many_requests" in refused
         await asyncio.gather(*flood)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [Halt(), Stop(), QuickStop(), Power(on=False), None],
+    ids=["halt", "stop", "quick_stop", "power", "@stop"],
+)
+async def test_it_reaches_the_one_of_two_daemons_that_has_the_line(command):
+    chain, run_on = chain_of(), {"loss": {"bus": "run_to_target"}}
+    async with rig_on(chain, simulated_config(run_on)) as rig, rig.broker.session() as session:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveAbsolute(position=100.0, velocity=5.0))
+        second = build_daemon(simulated_config(run_on, start="adopt"), session, now_ns, "2nd")
+        bus, other = (each.rig.buses[0].bus for each in (rig.daemon, second))
+        other._opener = lambda: open_simulated_line(chain, RESET_BAUD)
+
+        async def in_use() -> NoReturn:
+            raise TransportLost("the port is in use")
+
+        bus._opener = in_use
+        chain.unplug(asyncio.get_running_loop().time(), 0.01)
+        serving = asyncio.create_task(second.run(), name="second")
+        await second.wait_up()
+        assert not await rests(chain, "halt")
+
+        with contextlib.suppress(OutcomeUnknown):  # says the one that has no line
+            await (rig.client.command("x", command) if command else rig.client.stop("x"))
+        try:
+            assert await rests(chain, "power" if isinstance(command, Power) else "halt")
+        finally:
+            second.end()
+            await asyncio.wait([serving])
 
 
 @pytest.mark.parametrize("verb", ["halt", "power"])
