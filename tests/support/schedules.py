@@ -30,17 +30,7 @@ from ldcnd.contract.commands import (
     SetGains,
     SetPosition,
 )
-from ldcnd.contract.errors import (
-    DuplicateDaemon,
-    LdcndError,
-    LeaseExpired,
-    LeaseHeld,
-    LeaseRequired,
-    LeaseUnknown,
-    OutcomeUnknown,
-    ShuttingDown,
-    TransportLost,
-)
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown, TransportLost
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.leases import Acquire, Release, Renew
 from ldcnd.contract.rig_commands import AxisMove, AxisPath, LinePath, MoveTogether, WalkPath
@@ -62,8 +52,8 @@ it decelerates."""
 BACK_WITHIN_S = 20.0
 PLACES_PROVEN_S = 90.0
 """Until modules whose servo cycles end at the same instant have been told apart."""
-NOT_THEIRS = (LeaseRequired, LeaseHeld, LeaseExpired, LeaseUnknown, ShuttingDown, DuplicateDaemon)
-"""Refusals of what opens a loop: its sender has no control, or the daemon does it by itself."""
+ALONE = "switch one of them off and on again, alone"
+"""What the daemon tells a person to do with modules that it cannot tell apart."""
 KINDS = [kind for kind in FaultKind if kind not in (FaultKind.UNPLUGGED, FaultKind.ECHO, FaultKind.REPLY_FALSIFIED)]
 FAR, NEAR, CORNERS = 36.0, 4.0, 3
 """How far absolute moves go, some of them beyond the limits; how far relative ones and paths; corners of a path."""
@@ -440,7 +430,8 @@ class Play:
             lease = self.leases.get(act.who)
             command = act.command.model_copy(update={"lease": lease})
             if (begun := self.judge.asked.get(act.command.renews or "")) and isinstance(begun.command, Jog):
-                if begun.command.lease == lease:
+                held = self.judge.leases.get(begun.command.lease or "")  # one that a client replaces holds with the new
+                if held is not None and held.client == act.who:
                     self.judge.renewed[act.command.renews or ""] = self.judge.now_s
                 await self.clients[act.who].command(act.axis, command, timeout_s=0.2)
 
@@ -469,7 +460,7 @@ class Play:
             pass
         except LdcndError as error:
             accepted = False
-            if ends and self._is_whole() and not isinstance(error, NOT_THEIRS):
+            if ends and self._is_whole():
                 judge.wrong.append(f"{since_s:.4f}: {command!r} of {axis} was refused: {error}")
             elif ends and checks:
                 checks.cancel()
@@ -483,8 +474,12 @@ class Play:
         for name in names:
             self.judge.stopped(name)
         checks = [asyncio.create_task(self._rests(name, since_s, None)) for name in names]
-        with contextlib.suppress(LdcndError):
-            await self.clients[act.who].stop(act.axis or None, timeout_s=1.0)
+        try:
+            reply = await self.clients[act.who].stop(act.axis or None, timeout_s=1.0)
+            self.judge.kept(reply.kept, since_s)
+        except LdcndError as error:
+            if self._is_whole() and not isinstance(error, OutcomeUnknown):
+                self.judge.wrong.append(f"{since_s:.4f}: the stop of {act.axis or 'all'} was refused: {error}")
         await asyncio.wait(checks)
 
     def _is_whole(self) -> bool:
@@ -584,10 +579,10 @@ class Play:
             if task.done() and not task.cancelled() and (error := task.exception()):
                 return [f"{instance} ended with {error!r}"]
         why = await self._comes_back(daemon)
-        if "may move" in why:  # what does not answer is not reset, unless a person wants that
-            await self.rig.end(daemon)
-            daemon = await self.rig.start("reset")
-            why = await self._comes_back(daemon)
+        for _ in judge.modules:
+            if ALONE in why:
+                await self._switch_one_off_and_on()
+                why = await self._comes_back(daemon)
         if why:
             return [why]
         async with self.rig.broker.session() as session:  # who takes control answers for what is left running
@@ -595,6 +590,8 @@ class Play:
                 request = Acquire(client="last", lease_s=LEASE_S, force=True)
                 await RigClient(session, RIG).ask(request, timeout_s=1.0)
         await asyncio.sleep(LEASE_S + REST_S)
+        if why := await self._comes_back(daemon):  # what had just lost its power was not known to be away
+            return [why]
         judge.came_up(daemon)
         places = {name: zeros[0] for name, zeros in judge.zeros.items() if len(zeros) == 1}
         turning = [name for name, axis in judge.settings.items() if axis.modulo is not None]
@@ -604,6 +601,13 @@ class Play:
             for name, axis in daemon.rig.axes.items()
             if axis.tracker.command is not None
         ]
+
+    async def _switch_one_off_and_on(self) -> None:
+        """Do what the daemon asks for: switch one module that has no address off and on again, alone."""
+        module = next(module for at, module in enumerate(self.judge.modules, 1) if module.address != at)
+        module.power(on=False, at_s=self.judge.now_s)
+        await asyncio.sleep(1.0)
+        module.power(on=True, at_s=self.judge.now_s)
 
     async def _comes_back(self, daemon: Daemon) -> str:
         """Wait until every drive answers; return why it does not."""

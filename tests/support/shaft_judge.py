@@ -34,7 +34,7 @@ from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.drives.ldcn.trajectory import ProfileMode
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from tests.support.witness import Witness
+from tests.support.witness import STANDING_COUNTS, Witness
 
 ROUNDING = 1e-6
 """Tolerance of a profile, relative: it is made of register values."""
@@ -64,12 +64,14 @@ class Asked:
         command: as it was sent.
         sent_s: when, each time.
         refused_s: when it was refused for good; None while it was not.
+        from_counts: where the shaft was when its position was to be named.
     """
 
     axis: str
     command: AxisCommand[CommandReply]
     sent_s: list[float] = field(default_factory=list)
     refused_s: float | None = None
+    from_counts: float = 0.0
 
 
 @dataclass
@@ -105,6 +107,7 @@ class ShaftJudge(Witness):
         asked: the commands of all clients, by id.
         leases: by token.
         stops: of each axis, when the last stop was sent that no reset has followed.
+        latched: of each axis, when that stop was sent, if a daemon has said that its latch is kept.
         zeros: where a position of 0 may be in truth, in counts of the shaft, by axis; empty where nothing is known.
         resets: where the shaft stood when the drive was reset last, by axis.
         heard: when each drive executed Stop Motor.
@@ -122,6 +125,7 @@ class ShaftJudge(Witness):
         self.asked: dict[str, Asked] = {}
         self.leases: dict[str, Held] = {}
         self.stops: dict[str, float] = {}
+        self.latched: dict[str, float] = {}
         self.zeros: dict[str, tuple[float, ...]] = dict.fromkeys(self.settings, (0.0,))
         self.resets: dict[str, float] = dict.fromkeys(self.settings, 0.0)
         self.heard: dict[str, list[float]] = defaultdict(list)
@@ -158,11 +162,13 @@ class ShaftJudge(Witness):
         asked.sent_s.append(self.now_s)
         if isinstance(command, Reset):
             self.stops.pop(axis, None)
+            self.latched.pop(axis, None)
         if isinstance(command, Jog):
             self.renewed[command.renews or command.command_id] = self.now_s
         if isinstance(command, SetPosition):
             self._naming[axis] += 1
             self.zeros[axis] = ()
+            asked.from_counts = self.drive(axis).shaft.position_counts
         return asked
 
     def answered(self, asked: Asked, *, accepted: bool | None) -> None:
@@ -174,13 +180,21 @@ class ShaftJudge(Witness):
         if not isinstance(asked.command, SetPosition):
             return
         self._naming[asked.axis] -= 1
-        if accepted and not self._naming[asked.axis] and len(asked.sent_s) == 1:
+        here = self.drive(asked.axis).shaft.position_counts
+        stood = abs(here - asked.from_counts) < STANDING_COUNTS  # one that coasts is named where it was read
+        if accepted and stood and not self._naming[asked.axis] and len(asked.sent_s) == 1:
             counts = asked.command.position * self.settings[asked.axis].signed_counts_per_unit
-            self.zeros[asked.axis] = (self.drive(asked.axis).shaft.position_counts - counts,)
+            self.zeros[asked.axis] = (here - counts,)
 
     def stopped(self, axis: str) -> None:
         """Note a stop that is about to be sent."""
         self.stops[axis] = self.now_s
+
+    def kept(self, axes: tuple[str, ...], since_s: float) -> None:
+        """Note that the latches of a stop outlast the daemon, for those that no reset has followed."""
+        for axis in axes:
+            if self.stops.get(axis, math.inf) <= since_s:
+                self.latched[axis] = since_s
 
     def came_up(self, daemon: Daemon) -> None:
         """See whether a daemon has brought its line up for the first time, and which places it has taken for 0."""
@@ -191,6 +205,8 @@ class ShaftJudge(Witness):
         keeps = daemon.config.state_dir is not None
         for name in daemon.rig.axes:
             self.zeros[name] = (self.resets[name], *(self.zeros[name] if keeps else ()))
+            if name in self.latched and not daemon.rig.axes[name].tracker.stop_latched:
+                self.wrong.append(f"{self.now_s:.4f}: {instance} does not know that {name} is latched")
 
     def _settled_s(self, at_s: float) -> float:
         """Return until when what happened at an instant may not have been noticed."""
@@ -257,7 +273,8 @@ class ShaftJudge(Witness):
         if others := self.daemons - {instance}:
             return f"there are other daemons, {sorted(others)}"
         stopped_s = self.stops.get(name, math.inf)
-        if now_s > self._settled_s(stopped_s) and stopped_s >= self.born[instance]:
+        holds = name in self.latched or stopped_s >= self.born[instance]
+        if now_s > self._settled_s(stopped_s) and holds:
             return f"it was stopped at {stopped_s:.4f} and not reset"
         return super()._forbidden(daemon, name, now_s)
 
