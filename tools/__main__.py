@@ -6,6 +6,7 @@ man pages.
 """
 
 import argparse
+import ast
 import sys
 from pathlib import Path
 
@@ -55,7 +56,8 @@ def write_all() -> None:
     pages = {"configuration": config_reference(), "cli": as_markdown(), "python": client_reference()}
     for name, text in pages.items():
         (REFERENCE / f"{name}.md").write_text(text, encoding="utf-8")
-    for name, table in {"keys": keys_table(), "errors": errors_table()}.items():
+    tables = {"keys": keys_table(), "errors": errors_table(), "motor-record": rules_table()}
+    for name, table in tables.items():
         renew_table(REFERENCE / f"{name}.md", table)
 
 
@@ -92,6 +94,20 @@ def errors_table() -> str:
         meaning = " ".join((error.__doc__ or "").split())
         lines.append(f"* `{code}`{' (retryable)' if error.retryable else ''}: {meaning}")
     return "\n".join(lines) + "\n"
+
+
+def rules_table() -> str:
+    """Return the rules of the motor record, made of the tests that hold them, as a Markdown table."""
+    rows = []
+    for path in (ROOT / "tests" / "integration").glob("*.py"):
+        text = path.read_text(encoding="utf-8")
+        for node in ast.walk(ast.parse(text)) if "mark.record(" in text else ():
+            match node:
+                case ast.Call(
+                    func=ast.Attribute(attr="record"), args=[ast.Constant(str(field)), ast.Constant(str(rule))]
+                ):
+                    rows.append(f"| {field} | {rule} |\n")
+    return "".join(["| field | rule |\n|---|---|\n", *sorted(rows)])
 
 
 if __name__ == "__main__":

@@ -187,6 +187,8 @@ class AxisInfo(Frozen):
     """Level of the limit switch inputs at which the drive stops a motion towards the switch; null when it does not."""
     approach: float | None = None
     """Signed distance over which moves come to their goal, in axis units; null without an approach from one side."""
+    home_velocity: float | None = None
+    """Search velocity of a `home` that names none, in units a second, positive forward; null when not configured."""
     group: str | None = None
     """Its group: axes that `move_together` starts in the same servo cycle; null when it is in none."""
     capabilities: tuple[Verb, ...]

@@ -201,6 +201,7 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         limits=config.limits,
         limit_stop=LEVELS[driver.spec.limit_stop],
         approach=config.approach.signed if config.approach else None,
+        home_velocity=config.home.velocity if config.home else None,
         group=group,
         capabilities=tuple(sorted(driver.capabilities, key=list(Verb).index)),
         items=tuple(item.value for item in TelemetryItem if _publishes(driver, item)),

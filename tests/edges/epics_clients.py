@@ -37,7 +37,14 @@ def caget(record: str) -> None:
     assert epics.caget(f"{record}.DMOV") == 1
     epics.caput(record, 1000.0, wait=True, timeout=LONGEST_S)
     assert abs(epics.caget(f"{record}.RBV") - 2.0) < 0.02
-    assert "100" in epics.caget(f"{record}:message", as_string=True)
+    message = epics.caget(f"{record}:message", as_string=True)
+    assert "100" in message
+    assert len(message) > 40
+    assert epics.PV(f"{record}:message").get(as_string=True, timeout=LONGEST_S) == message
+    assert epics.caget(f"{record}.NAME$", as_string=True) == record == epics.caget(f"{record}.NAME")
+    assert epics.caget(f"{record}.STAT", as_string=True) == "NO_ALARM"
+    assert epics.caget(f"{record}_able.VAL") == 0
+    assert [epics.caget(f"{record}-Err"), epics.caget(f"{record}-MsgTxt", as_string=True)] == [0, ""]
     assert len(seen) > 3
     epics.camonitor_clear(f"{record}.RBV")
 

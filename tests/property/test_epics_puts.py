@@ -1,4 +1,7 @@
-"""No sequence of puts moves an axis that the gateway may not move, does not control, or has stopped since."""
+"""No sequence of puts, stops and reloads moves an axis that the gateway may not move, does not control, or has stopped.
+
+After each, VAL is where the axis was sent or stands.
+"""
 
 import asyncio
 import random
@@ -10,6 +13,7 @@ from caproto import CaprotoError, Forbidden
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
+from ldcnd.config.plan import plan_rig
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.samples import LinkState, Moving
@@ -24,6 +28,7 @@ pytestmark = pytest.mark.timeout(3600)
 
 PLACES = {"x": 1, "y": 2}
 STILL_COUNTS = 3
+COUNTS_PER_UNIT = 1000
 SETTLING_COUNTS = 50
 SETTLING_S = 3.0
 """By how much, and for how long, the loop goes on after the end of a profile that a halt has cut short."""
@@ -47,6 +52,7 @@ class Campaign:
     """Where x stands, from the moment when nothing may move it."""
     checks: int = 0
     stops: int = 0
+    compared: int = 0
 
     def counts(self, axis: str) -> float:
         return drive(self.chain, PLACES[axis]).shaft.position_counts
@@ -115,8 +121,40 @@ class Campaign:
             self.checks += 1
             assert abs(self.counts("x") - self.rests_at) <= STILL_COUNTS
 
+    async def stop_elsewhere(self) -> None:
+        """Stop x as another program does, which latches, and clear that."""
+        if not self.taken:
+            self.begin()
+            await self.running.client.stop("x")
+            await self.running.until("x", lambda state: state.moving is Moving.NO)
+            await put(self.made, "T:x-ErrRst", 1)
+
+    async def reload(self) -> None:
+        """Have the daemon read a configuration with other velocities."""
+        config = two_axes()
+        (bus,) = config.bus
+        velocity = self.dice.choice([5.0, 10.0, 20.0])
+        axes = tuple(axis.model_copy(update={"velocity": velocity}) for axis in bus.axis)
+        config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
+        self.running.daemon.reconfigure(config, plan_rig(config))
+
+    async def compare(self) -> None:
+        """At rest VAL is where x was sent, which is where it stands, whatever has been put or has stopped it."""
+        if self.taken:
+            return
+        await put(self.made, "T:x.STOP", 1)
+        while self.under_way:
+            await asyncio.wait(self.under_way)
+        await self.running.until("x", lambda state: state.moving is Moving.NO and state.command is None)
+        await asyncio.sleep(SETTLING_S)
+        target, here = (float(self.made.variables[f"T:x.{name}"].value) for name in ("VAL", "RBV"))
+        assert abs(target - here) <= SETTLING_COUNTS / COUNTS_PER_UNIT
+        self.compared += 1
+
     async def step(self) -> None:
-        match self.dice.choice(["put"] * 7 + ["wait"] * 3 + ["heal", "control", "stop"]):
+        match self.dice.choice(
+            ["put"] * 7 + ["wait"] * 3 + ["heal", "control", "stop", "elsewhere", "reload", "compare"]
+        ):
             case "put":
                 self.begin()
             case "wait":
@@ -125,6 +163,12 @@ class Campaign:
                 await self.heal()
             case "stop":
                 await self.stop()
+            case "elsewhere":
+                await self.stop_elsewhere()
+            case "reload":
+                await self.reload()
+            case "compare":
+                await self.compare()
             case _:
                 await (self.give() if self.taken else self.take())
         self.check()
@@ -146,8 +190,10 @@ async def campaign(seed: int, steps: int) -> tuple[int, int]:
             for _ in range(steps):
                 await going.step()
             if not going.taken:
+                await going.compare()
                 await going.take()
             await going.give()
+            await going.compare()
         events = (await running.client.ask(ReadEvents(count=1000))).events
     begun = [event for event in events if event.verb in MOVES]
     assert {(event.axis, event.client) for event in begun} <= {("x", WHO)}

@@ -1,11 +1,18 @@
 """Motor records of a gateway as a Channel Access client uses them, without the network in between."""
 
 import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from random import Random
+from types import SimpleNamespace
 
 from caproto import ChannelType
 
-from ldcnd.lab.epics.gateway import Gateway
+from ldcnd.client.rig import Rig
+from ldcnd.config.rig import RigConfig
+from ldcnd.contract.samples import LinkState
+from ldcnd.lab.epics.gateway import Gateway, gateway
+from tests.support.rig import RunningRig, running_rig, two_axes
 
 KINDS = {str: ChannelType.STRING, int: ChannelType.LONG, float: ChannelType.DOUBLE}
 VALUES: tuple[float | int | str, ...] = (
@@ -15,6 +22,39 @@ VALUES: tuple[float | int | str, ...] = (
 """What is put at random."""
 STARTS = (".VAL", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR")
 STARTING = 0.7
+
+
+@asynccontextmanager
+async def records(
+    *, moves: bool = True, power: bool = True, config: RigConfig | None = None
+) -> AsyncIterator[tuple[RunningRig, Gateway]]:
+    """Run a daemon and a gateway in this process; x is enabled if it can be moved."""
+    async with running_rig(config or two_axes()) as running:
+        for name in running.daemon.rig.axes:
+            await running.until(name, lambda state: state.link is LinkState.UP)
+        rig = Rig(running.client, await running.client.daemon())
+        async with gateway(rig, prefix="T:", moves=rig.axes if moves else ()) as made:
+            await shows(made, "T:x.SEVR", "NO_ALARM")
+            if moves and power:
+                await put(made, "T:x.CNEN", "Enable")
+                await shows(made, "T:x.CNEN", "Enable")
+            yield running, made
+
+
+async def monitored(made: Gateway, name: str, kind: ChannelType = ChannelType.LONG) -> "asyncio.Queue[SimpleNamespace]":
+    """Return the queue of all that a client is sent who monitors a variable."""
+    sent: asyncio.Queue[SimpleNamespace] = asyncio.Queue()
+    wanted = SimpleNamespace(channel_filter=SimpleNamespace(sync=None), data_type_name=kind.name)
+    await made.variables[name].subscribe(sent, _Hashed(wanted), None)
+    return sent
+
+
+class _Hashed:
+    """What a subscription asks for."""
+
+    def __init__(self, wanted: SimpleNamespace) -> None:
+        self.channel_filter = wanted.channel_filter
+        self.data_type_name = wanted.data_type_name
 
 
 async def put(made: Gateway, name: str, value: float | str) -> None:

@@ -262,10 +262,10 @@ def bluesky(at: Known) -> str:
 
 
 def epics(at: Known) -> str:
-    motor = pytest.importorskip("ldcnd.lab.epics.motor")
+    motor = pytest.importorskip("ldcnd.lab.epics.record")
 
     async def shown() -> str:
-        record = motor.MotorRecord(INFO, (1.0, 1.0), None, None, frozenset, moves=False)
+        record = motor.MotorRecord(INFO, (1.0, 1.0))
         for sample in (at.faults, at.position, at.state):
             await record.take(sample)
         said = record.fields["x:condition"].value

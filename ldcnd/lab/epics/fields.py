@@ -1,7 +1,8 @@
 """Channels of a gateway: what Channel Access clients see of a value, and what happens when they put one.
 
-A field without an action is read-only, and says so to its clients. An action raises what it refuses; its client then
-gets a failed put.
+What each field of a motor record is, caproto's `MotorFields` says: its type, its words, whether it is a long string. A
+field without an action is read-only, and says so to its clients. An action raises what it refuses; its client then gets
+a failed put.
 """
 
 import math
@@ -18,16 +19,22 @@ from caproto import (
     ChannelDouble,
     ChannelEnum,
     ChannelInteger,
+    ChannelShort,
     ChannelString,
+    ChannelType,
+    SubscriptionType,
 )
+from caproto.server.records import MotorFields
 
 from ldcnd.contract.number_text import read_number
 
 LONGEST_TEXT = 512
-"""Characters of a text that is longer than an EPICS string, which has 39."""
+"""Bytes of a text that is an array of characters."""
 LONGEST_STRING = 39
-DESCRIPTION = (*("units", "precision", "upper_ctrl_limit", "lower_ctrl_limit", "upper_disp_limit", "lower_disp_limit"),)
-"""What a channel says about its values."""
+"""Bytes of an EPICS string."""
+LONGEST_UNIT = 7
+"""Bytes of a unit in what describes a number to its clients; a longer one would fail the read."""
+UTF_8 = "utf-8"
 
 Value = float | int | str
 
@@ -64,6 +71,12 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
 
     action: Action | None = None
 
+    def get_field(self, name: str) -> "RecordField":
+        """Return the channel for what a client names behind a dot: a variable beside a record has only its value."""
+        if name not in ("", "VAL"):
+            raise KeyError(name)
+        return self
+
     # Any: caproto has no types
     def check_access(self, hostname: str, username: str) -> Any:  # noqa: ANN401, ARG002
         """Say who may do what: puts need an action."""
@@ -92,11 +105,9 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
         stamp = {} if at_s is None else {"timestamp": at_s}
         await super().write(value, verify_value=False, status=alarm.status, severity=alarm.severity, **stamp)
 
-    async def redescribe(self, like: "RecordField") -> None:
-        """Take unit, precision and limits from another field, and tell those who monitor them."""
-        said = {name: getattr(like, name) for name in DESCRIPTION if hasattr(like, name)}
-        if any(getattr(self, name) != value for name, value in said.items()):
-            await self.write_metadata(**said)
+    def begin(self, value: Value) -> None:
+        """Take the first value, before there are clients."""
+        self._data["value"] = value
 
     def native(self, value: Any) -> Value:  # noqa: ANN401
         """Return a value as this channel has it."""
@@ -104,7 +115,40 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
 
 
 class Number(RecordField, ChannelDouble):  # type: ignore[misc]
-    """A number with a unit; a client may put it as a text, read as everywhere a person types one."""
+    """A number with a unit; a client may put it as a text, read as everywhere a person types one.
+
+    Attributes:
+        deadband: monitors are sent no value that differs by no more from the one before, unless its alarm does.
+    """
+
+    deadband = 0.0
+    _sent: tuple[float, RecordAlarm] | None = None
+
+    def mean(self, unit: str, precision: int, limits: tuple[float, float]) -> bool:
+        """Say what the value means, and tell whether that is new.
+
+        Args:
+            unit: as clients show it.
+            precision: digits behind the point.
+            limits: lowest and highest value that can be put; both 0 for none.
+        """
+        low, high = limits
+        said = {"units": cut(unit, LONGEST_UNIT), "precision": precision}
+        said |= {"lower_ctrl_limit": low, "lower_disp_limit": low, "upper_ctrl_limit": high, "upper_disp_limit": high}
+        is_new = any(self._data[name] != value for name, value in said.items())
+        self._data.update(said)
+        return is_new
+
+    async def publish(self, flags: Any) -> None:  # noqa: ANN401
+        """Send the value to those who monitor it, if it has left the deadband or its description is new."""
+        alarm = RecordAlarm(self.status, self.severity)
+        if self.deadband and self._sent and not flags & SubscriptionType.DBE_PROPERTY:
+            before, its_alarm = self._sent
+            if alarm == its_alarm and abs(self.value - before) <= self.deadband:
+                self._content.clear()  # of the value before, which a read would return
+                return
+        self._sent = self.value, alarm
+        await super().publish(flags)
 
     def native(self, value: Any) -> Value:  # noqa: ANN401
         """Return a number or the number that a text stands for.
@@ -121,6 +165,10 @@ class Number(RecordField, ChannelDouble):  # type: ignore[misc]
 
 class Integer(RecordField, ChannelInteger):  # type: ignore[misc]
     """A whole number."""
+
+
+class Short(RecordField, ChannelShort):  # type: ignore[misc]
+    """A small whole number."""
 
 
 class ChoiceField(RecordField, ChannelEnum):  # type: ignore[misc]
@@ -147,36 +195,25 @@ class String(RecordField, ChannelString):  # type: ignore[misc]
 
     async def show(self, value: Value, alarm: RecordAlarm = NO_ALARM, at_s: float | None = None) -> None:
         """Publish a text, cut to what an EPICS string holds."""
-        await super().show(str(value)[:LONGEST_STRING], alarm, at_s)
+        await super().show(cut(str(value), LONGEST_STRING), alarm, at_s)
 
 
 class Text(RecordField, ChannelChar):  # type: ignore[misc]
-    """A text longer than EPICS strings."""
+    """A text longer than EPICS strings: an array of characters, of a record's field only when its name ends in `$`."""
 
     async def show(self, value: Value, alarm: RecordAlarm = NO_ALARM, at_s: float | None = None) -> None:
         """Publish a text, cut to what the channel holds."""
-        await super().show(str(value)[:LONGEST_TEXT], alarm, at_s)
+        await super().show(cut(str(value), self.long_string_max_length), alarm, at_s)
 
 
-def number(
-    value: float = 0.0, unit: str = "", *, precision: int = 4, limits: tuple[float, float] = (0.0, 0.0)
-) -> Number:
-    """Return a number; limits are those of puts, 0 and 0 for none."""
-    low, high = limits
-    return Number(
-        value=value,
-        units=unit,
-        precision=precision,
-        lower_ctrl_limit=low,
-        upper_ctrl_limit=high,
-        lower_disp_limit=low,
-        upper_disp_limit=high,
-    )
+def cut(text: str, size: int) -> str:
+    """Return as much of a text as fits into some bytes."""
+    return text.encode()[:size].decode(errors="ignore")
 
 
-def integer(value: int = 0) -> Integer:
-    """Return a whole number."""
-    return Integer(value=value)
+def number(value: float = 0.0, unit: str = "", *, precision: int = 4) -> Number:
+    """Return a number."""
+    return Number(value=value, units=cut(unit, LONGEST_UNIT), precision=precision, string_encoding=UTF_8)
 
 
 def choice(value: str, *words: str) -> ChoiceField:
@@ -186,9 +223,32 @@ def choice(value: str, *words: str) -> ChoiceField:
 
 def string(value: str = "") -> String:
     """Return a short text."""
-    return String(value=value[:LONGEST_STRING])
+    return String(value=cut(value, LONGEST_STRING), string_encoding=UTF_8)
 
 
-def text(value: str = "") -> Text:
-    """Return a longer text."""
-    return Text(value=value, max_length=LONGEST_TEXT, string_encoding="utf-8", report_as_string=True)
+def text(value: str = "", *, size: int = LONGEST_TEXT, is_field: bool = False) -> Text:
+    """Return a longer text, of a field of a record or beside one."""
+    return Text(value=cut(value, size), max_length=size, string_encoding=UTF_8, report_as_string=is_field)
+
+
+def motor_fields() -> dict[str, RecordField]:
+    """Return the fields of a motor record, as caproto has them and without what they are worth, by their names."""
+    return {spec.name: _made(spec) for spec in (each.pvspec for each in MotorFields._pvs_.values())}
+
+
+def _made(spec: Any) -> RecordField:  # noqa: ANN401
+    """Return the channel that caproto describes; what is a byte there is a small number: many clients print bytes."""
+    kind = ChannelType(getattr(spec.dtype, "data_type", spec.dtype))
+    is_text = kind is ChannelType.CHAR and "report_as_string" in (spec.cls_kwargs or {})
+    match kind:
+        case ChannelType.ENUM:
+            words = spec.cls_kwargs["enum_strings"]
+            return choice(spec.value if spec.value in words else words[spec.value or 0], *words)
+        case ChannelType.DOUBLE | ChannelType.FLOAT:
+            return number(float(spec.value or 0) if isinstance(spec.value, float | int) else 0.0)
+        case ChannelType.LONG:
+            return Integer(value=0)
+        case ChannelType.STRING:
+            return string()
+        case _:
+            return text(size=spec.max_length, is_field=True) if is_text else Short(value=0)

@@ -11,8 +11,9 @@ from caproto.asyncio.server import Context
 from ldcnd.client.rig import Rig
 from ldcnd.contract.errors import LdcndError, UnknownAxis
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.lab.epics.fields import RecordField
-from ldcnd.lab.epics.motor import NO_HOLDER, MotorRecord, database
+from ldcnd.lab.epics.fields import Put, RecordField, Short, Value
+from ldcnd.lab.epics.motor import MovedRecord
+from ldcnd.lab.epics.record import NO_HOLDER, MotorRecord
 from ldcnd.listen_address import ListenAddress
 
 LEASE_S = 1.0
@@ -41,18 +42,25 @@ class Gateway:
         self._group = group
         self._tasks: set[asyncio.Task[None]] = set()
         self._records: dict[str, MotorRecord] = {}
+        self._all_stop = Short(value=0)
+        self._all_stop.action = self._stop_all
         self._start(self._follow_descriptions(), "descriptions")
 
     def add(self, info: AxisInfo, defaults: tuple[float, float], prefix: str, *, moves: bool) -> None:
         """Show an axis, and begin to follow it."""
-        record = MotorRecord(info, defaults, self._start_motion, self._rig.watch, self.connected, moves=moves)
+        record = (
+            MovedRecord(info, defaults, self._start_motion, self._rig.watch, self.connected)
+            if moves
+            else MotorRecord(info, defaults)
+        )
         self._records[info.axis] = record
-        self.variables |= database(prefix, {info.axis: record})
+        self.variables |= {f"{prefix}{name}": field for name, field in record.fields.items()}
         self._start(self._follow(record), f"values of {info.axis}")
         for monitor in info.monitors:
             self._start(self._follow_monitor(record, monitor), f"{monitor} of {info.axis}")
-        if moves:
+        if isinstance(record, MovedRecord):
             self._start(self._hold(record), f"control of {info.axis}")
+            self.variables[f"{prefix}allstop"] = self._all_stop
 
     def end(self) -> None:
         """End all that runs in the background; motions halt when control is released."""
@@ -97,7 +105,16 @@ class Gateway:
             async for _, sample in samples:
                 await record.take(sample, monitor)
 
-    async def _hold(self, record: MotorRecord) -> None:
+    async def _stop_all(self, asked: Value) -> Put:
+        """Do to each axis what a put to its STOP does: one that fails hinders no other."""
+        moved = [record for record in self._records.values() if isinstance(record, MovedRecord)]
+        if asked:
+            stopped = await asyncio.gather(*(record.halt() for record in moved), return_exceptions=True)
+            for error in filter(None, stopped):
+                raise error
+        return Put(0)
+
+    async def _hold(self, record: MovedRecord) -> None:
         """Control an axis from a put that needs it until it idles; what another program has is never taken by force."""
         while True:
             await record.wait_wanted()

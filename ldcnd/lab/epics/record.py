@@ -1,0 +1,356 @@
+"""An axis as a motor record: what its fields say. What puts to them do is in `motor`.
+
+Fields and what they mean follow the documentation of the EPICS collaboration's motor record, "Motor Record and related
+software"; "User" and "dial" coordinates are the same here: OFF is 0 and DIR is Pos.
+"""
+
+from caproto import AlarmSeverity, AlarmStatus
+
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.condition import Alarm as Severity
+from ldcnd.contract.condition import assess
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import (
+    AdcSample,
+    AxisState,
+    FaultSample,
+    InputsSample,
+    LinkState,
+    MonitorSample,
+    Moving,
+    PositionSample,
+    Quality,
+    Sample,
+    StateSample,
+    TelemetryItem,
+    VelocitySample,
+)
+from ldcnd.lab.epics.fields import (
+    NO_ALARM,
+    Number,
+    RecordAlarm,
+    RecordField,
+    Short,
+    Value,
+    choice,
+    cut,
+    motor_fields,
+    number,
+    string,
+    text,
+)
+
+NO_HOLDER = "none"
+"""Shown as who controls an axis while this gateway does not and was not refused."""
+NO_LIMIT = 1e30
+"""Stands for a missing limit when the other one is set; both 0 stand for none, as in the motor record."""
+SILENT = RecordAlarm(AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM)
+UNDEFINED = RecordAlarm(AlarmStatus.UDF, AlarmSeverity.INVALID_ALARM)
+QUALITIES = {
+    Quality.GOOD: NO_ALARM,
+    Quality.UNCERTAIN: RecordAlarm(AlarmStatus.SOFT, AlarmSeverity.MINOR_ALARM),
+    Quality.BAD: SILENT,
+}
+ALARMS = {
+    Severity.NONE: NO_ALARM,
+    Severity.MINOR: RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM),
+    Severity.MAJOR: RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MAJOR_ALARM),
+    Severity.INVALID: SILENT,
+}
+INPUTS = ("forward_limit", "reverse_limit", "index", "stop_input", "amplifier_enable")
+SEVERITIES = ("NO_ALARM", "MINOR", "MAJOR", "INVALID")
+PRIVATE = frozenset({"LVAL", "LDVL", "LRVL", "LRLV", "LSPG", "MMAP", "NMAP", "PP", "CDIR"})
+"""Fields that the motor record's documentation calls private and no screen shows: they are not served."""
+SAME = {
+    **dict.fromkeys(("DVAL",), "VAL"),
+    **dict.fromkeys(("DRBV", "MLST", "ALST"), "RBV"),
+    **dict.fromkeys(("RMP", "REP"), "RRBV"),
+    **dict.fromkeys(("RHLS",), "HLS"),
+    **dict.fromkeys(("RLLS",), "LLS"),
+}
+"""Fields that say the same as another one, by their names."""
+PLACES = (
+    *("VAL", "RBV", "DIFF", "HLM", "LLM", "DHLM", "DLLM", "HOPR", "LOPR", "TWV", "RLV", "OFF", "BDST", "RDBD", "SPDB"),
+    *("MDEL", "ADEL", "HIHI", "HIGH", "LOW", "LOLO"),
+)
+STEPS = ("MRES", "ERES", "RRES", "UREV")
+VELOCITIES = ("VELO", "BVEL", "JVEL", "HVEL", "VMAX", "VBAS")
+DURATIONS = ("ACCL", "BACC", "DLY")
+MSTA_PLUS, MSTA_DONE, MSTA_HIGH_SWITCH, MSTA_POSITION = 0x1, 0x2, 0x4, 0x20
+MSTA_HOME, MSTA_ENCODER, MSTA_PROBLEM, MSTA_MOVING = 0x80, 0x100, 0x200, 0x400
+MSTA_GAIN_SUPPORT, MSTA_COMM, MSTA_LOW_SWITCH, MSTA_HOMED = 0x800, 0x1000, 0x2000, 0x4000
+"""Bits of MSTA, in the words of its documentation: last direction, motion complete, plus limit switch, closed-loop
+position control enabled; at the encoder's home signal, encoder present, hardware problem, moving; closed-loop position
+control supported, communication error, minus limit switch, homed."""
+MIP_MOVE = 0x20
+
+
+class MotorRecord:
+    """One axis; its variables are in `fields`, by their names behind the prefix.
+
+    Args:
+        info: what the axis is.
+        defaults: its velocity and acceleration, in units a second and a second squared, when a client names no others.
+    """
+
+    def __init__(self, info: AxisInfo, defaults: tuple[float, float]) -> None:
+        self.info = info
+        self.condition = assess(None)
+        self.moving = Moving.UNKNOWN
+        self.state: StateSample | None = None
+        self._defaults = defaults
+        self._alarm = SILENT
+        self._faults: FaultSample | None = None
+        self._switches = 0  # bits of MSTA
+        record = {name: field for name, field in motor_fields().items() if name not in PRIVATE}
+        record["VAL"] = number()
+        record |= {name: record[same] for name, same in SAME.items()}
+        record["DTYP"] = choice(kind := cut(f"{info.family} {info.model}", 25), kind)
+        record["SEVR"] = choice("INVALID", *SEVERITIES)
+        self.fields: dict[str, RecordField] = {f"{info.axis}.{name}": field for name, field in record.items()}
+        self.fields |= self._variables_beside(record["VAL"])
+        for name, value in {**self._described(), **self._speeds(), "NAME": info.axis, "UDF": 1}.items():
+            self[name].begin(value)
+        self._set_metadata()
+
+    def _variables_beside(self, target: RecordField) -> dict[str, RecordField]:
+        info, reset = self.info, Short(value=0)
+        condition = text()
+        beside: dict[str, RecordField] = {
+            "": target,
+            "_able": choice("Enable", "Enable", "Disable"),  # as `asyn_motor.db` has it
+            "-MsgTxt": condition,  # these three as NICOS and the devices of ESS have them
+            "-Err": Short(value=0),
+            "-ErrRst": reset,
+            ":condition": condition,
+            ":reset": reset,
+            ":state": string(),
+            ":velocity": number(),
+            ":faults": text(),
+            ":first_fault": string(),
+            ":message": text(),
+            ":control": string(NO_HOLDER),
+        }
+        if info.adc_full_scale:
+            beside[":adc"] = number(0.0, "V")
+        beside |= {f":{monitor}": number(0.0, precision=0) for monitor in info.monitors}
+        if "input_signals" in info.monitors or TelemetryItem.INPUTS in info.items:
+            beside[":inputs"] = text()
+        return {f"{info.axis}{name}": field for name, field in beside.items()}
+
+    def __getitem__(self, field: str) -> RecordField:
+        return self.fields[f"{self.info.axis}.{field}"]
+
+    def beside(self, name: str) -> RecordField | None:
+        """Return a variable beside the record, such as `:adc`."""
+        return self.fields.get(f"{self.info.axis}{name}")
+
+    # -- what the axis is --------------------------------------------------------------------------------------------
+
+    @property
+    def _step(self) -> float:
+        """The smallest step of the axis, in its unit."""
+        return 1.0 / self.info.counts_per_unit if self.info.counts_per_unit else 1.0
+
+    @property
+    def _limits(self) -> tuple[float, float]:
+        low, high = self.info.limits.position_min, self.info.limits.position_max
+        if low is None and high is None:
+            return 0.0, 0.0
+        return -NO_LIMIT if low is None else low, NO_LIMIT if high is None else high
+
+    def _described(self) -> dict[str, Value]:
+        """Return the values of fields that say what the axis is."""
+        info, step = self.info, self._step
+        low, high = self._limits
+        return {
+            **dict.fromkeys(("HLM", "DHLM", "HOPR"), high),
+            **dict.fromkeys(("LLM", "DLLM", "LOPR"), low),
+            **dict.fromkeys(STEPS, step),
+            "SREV": 1,
+            "PREC": max(0, min(9, len(f"{step:.9f}".rstrip("0").partition(".")[2]))),
+            "EGU": info.unit,
+            "VMAX": info.limits.velocity or 0.0,
+            "SMAX": (info.limits.velocity or 0.0) / step,
+            "BDST": info.approach or 0.0,
+            "OUT": f"{info.bus} {info.address}",
+            "DESC": f"{info.axis}, {info.model}",
+            "CARD": -1,  # of what is on no VME bus
+            "FRAC": 1.0,
+            "UEIP": "Yes",
+            "FOFF": "Frozen",
+            "RTYP": "motor",
+            **dict.fromkeys(("HHSV", "HSV", "LSV", "LLSV"), "NO_ALARM"),  # not used, says the documentation
+        }
+
+    def _speeds(self) -> dict[str, Value]:
+        """Return the values of fields that say how an axis moves for which a client has put nothing else."""
+        velocity, acceleration = self._defaults
+        return {
+            **dict.fromkeys(("VELO", "BVEL", "JVEL"), velocity),
+            **dict.fromkeys(("S", "SBAK"), velocity / self._step),
+            **dict.fromkeys(("ACCL", "BACC"), velocity / acceleration),
+            "JAR": acceleration,
+            "HVEL": abs(self.info.home_velocity or 0.0),
+            "TWV": 1.0,
+        }
+
+    def _set_metadata(self) -> list[RecordField]:
+        """Say what numbers mean, and return those that meant something else before."""
+        unit, places = self.info.unit, int(self._described()["PREC"])
+        means = {
+            **dict.fromkeys(PLACES, (unit, places)),
+            **dict.fromkeys(STEPS, (unit, 9)),
+            **dict.fromkeys(VELOCITIES, (f"{unit}/s", places)),
+            **dict.fromkeys(DURATIONS, ("s", 3)),
+            "JAR": (f"{unit}/s2", places),
+        }
+        fields = {self[name]: (*meaning, (0.0, 0.0)) for name, meaning in means.items()}
+        fields[self["VAL"]] = unit, places, self._limits
+        velocity = self.beside(":velocity")
+        if velocity is not None:
+            fields[velocity] = f"{unit}/s", places, (0.0, 0.0)
+        return [field for field, meaning in fields.items() if isinstance(field, Number) and field.mean(*meaning)]
+
+    async def describe(self, info: AxisInfo, defaults: tuple[float, float]) -> None:
+        """Take what the axis is from now on: its daemon was reloaded or restarted.
+
+        What a client has put into a field stays, unless it cannot be: after a change of unit, or above a limit.
+        """
+        before, is_new = self.info, defaults != self._defaults
+        self.info, self._defaults = info, defaults
+        is_other_unit = info.unit != before.unit
+        if is_other_unit:
+            self.state = None
+            await self.silent()  # what is shown is of the former daemon
+        for field in self._set_metadata():
+            await field.write_metadata()
+        is_too_fast = float(self["VELO"].value) > (info.limits.velocity or NO_LIMIT)
+        speeds = self._speeds() if is_other_unit or is_new or is_too_fast else {}
+        for name, value in {**self._described(), **speeds}.items():
+            await self[name].show(value)
+
+    # -- what the axis says ------------------------------------------------------------------------------------------
+
+    async def take(self, sample: Sample, item: str = "") -> None:
+        """Show a sample; the item names monitors."""
+        alarm, at_s = QUALITIES[sample.quality], sample.t * 1e-9
+        match sample:
+            case PositionSample() if sample.unit != self.info.unit:
+                await self["RBV"].show(self["RBV"].value, SILENT)  # of a daemon that is not described here yet
+            case PositionSample():
+                worst = max(alarm, self._alarm, key=lambda each: each.severity)
+                await self["RBV"].show(sample.value, worst, at_s)
+                await self["RRBV"].show(sample.counts, worst, at_s)
+                await self["UDF"].show(0)
+                await self.show_target()
+            case VelocitySample():
+                await self.show_beside(":velocity", sample.value, alarm, at_s)
+                await self["RVEL"].show(round(sample.value / self._step))
+                if sample.value and self.moving is not Moving.NO:  # a loop at rest goes to and fro
+                    await self["TDIR"].show(int(sample.value > 0))
+            case AdcSample():
+                await self.show_beside(":adc", sample.volts, alarm, at_s)
+            case InputsSample():
+                await self._take_inputs(sample, alarm, at_s)
+            case FaultSample():
+                self._faults = sample
+                await self.show_beside(":faults", "\n".join(f"{each.code}: {each.text}" for each in sample.active))
+                await self.show_beside(":first_fault", sample.first.code if sample.first else "")
+            case StateSample():
+                await self._take_state(sample)
+            case MonitorSample():
+                await self.show_beside(f":{item}", sample.value, alarm, at_s)
+                if item == "input_signals":
+                    await self.show_beside(
+                        ":inputs", ", ".join(sample.active if sample.active is not None else sample.high)
+                    )
+
+    def target(self, state: StateSample) -> float | None:
+        """Return where the axis was sent; None where only a position tells."""
+        return state.target
+
+    async def show_target(self) -> None:
+        """Show where the axis was sent, by any program, or else where it is, and how far it is from there."""
+        if self.state is None:
+            return
+        target = self.target(self.state)
+        here = float(self["RBV"].value)
+        await self["VAL"].show(here if target is None else target)
+        difference = float(self["VAL"].value) - here
+        steps = round(difference / self._step)
+        await self["DIFF"].show(difference)
+        await self["RDIF"].show(steps)
+        await self["RVAL"].show(int(self["RRBV"].value) + steps * (-1 if self.info.direction == "reverse" else 1))
+
+    async def _take_state(self, sample: StateSample) -> None:
+        self.moving, self.state = sample.moving, sample
+        self.condition = assess(sample, self._faults)
+        before, self._alarm = self._alarm, ALARMS[self.condition.alarm]
+        if sample.moving is Moving.UNKNOWN:
+            self._alarm = SILENT
+        if self._alarm != before:  # no position may come that would carry it
+            for field in ("RBV", "RRBV"):
+                await self[field].show(self[field].value, self._alarm)
+        await self.show_beside(":condition", ", ".join(self.condition.notes))
+        await self.show_beside("-Err", int(sample.stop_latched or sample.state is AxisState.ERROR_STOP))
+        await self.show_beside(":state", sample.state.value + (", stop latched" if sample.stop_latched else ""))
+        await self["CNEN"].show("Enable" if sample.enabled else "Disable")
+        await self.show_target()
+        await self.show_motion()
+
+    async def _take_inputs(self, sample: InputsSample, alarm: RecordAlarm, at_s: float) -> None:
+        """Show inputs, and the switches at both ends of the axis; a drive may not show them for a while."""
+        active = ", ".join(name for name in INPUTS if getattr(sample, name))
+        await self.show_beside(":inputs", active, alarm, at_s)
+        await self["ATHM"].show(int(bool(sample.index)), UNDEFINED if sample.index is None else alarm, at_s)
+        self._switches = MSTA_HOME * bool(sample.index)
+        if self.info.limit_stop is None:
+            return
+        ends = [sample.forward_limit, sample.reverse_limit]
+        if self.info.direction == "reverse":
+            ends.reverse()
+        for field, level, bit in zip(("HLS", "LLS"), ends, (MSTA_HIGH_SWITCH, MSTA_LOW_SWITCH), strict=True):
+            on = level is (self.info.limit_stop == "high")
+            self._switches |= bit * on
+            await self[field].show(int(on), UNDEFINED if level is None else alarm, at_s)
+
+    async def silent(self) -> None:
+        """Show that nothing is known of the axis: the daemon does not publish."""
+        self.moving, self._alarm = Moving.UNKNOWN, SILENT
+        self.condition = assess(None, silence="nothing is published any more")
+        await self.show_beside(":condition", ", ".join(self.condition.notes))
+        await self["RBV"].show(self["RBV"].value, SILENT)
+        await self.show_motion()
+
+    def stands(self) -> bool:
+        """Tell whether the axis has done what was put: one of which that is not known has not arrived."""
+        return self.moving is Moving.NO
+
+    async def show_motion(self) -> None:
+        """Show whether the axis moves."""
+        stands, state = self.stands(), self.state
+        await self["MOVN"].show(int(not stands))
+        await self["MIP"].show(0 if stands else MIP_MOVE)
+        await self["MSTA"].show(
+            (MSTA_DONE if self.moving is Moving.NO else MSTA_MOVING)
+            | MSTA_PLUS * bool(self["TDIR"].value)
+            | MSTA_ENCODER
+            | MSTA_GAIN_SUPPORT * (Verb.POWER in self.info.capabilities)
+            | self._switches
+            | MSTA_POSITION * bool(state and state.enabled)
+            | MSTA_HOMED * bool(state and state.referenced)
+            | MSTA_PROBLEM * bool(state and state.state is AxisState.ERROR_STOP)
+            | MSTA_COMM * (state is None or state.link is LinkState.DOWN)
+        )
+        await self["DMOV"].show(int(stands))
+        await self["STAT"].show(self._alarm.status.name)
+        await self["SEVR"].show(SEVERITIES[self._alarm.severity])
+
+    async def show_beside(
+        self, name: str, value: Value, alarm: RecordAlarm = NO_ALARM, at_s: float | None = None
+    ) -> None:
+        """Show a value of a variable beside the record, if it has it."""
+        field = self.beside(name)
+        if field is not None:  # an empty one is false
+            await field.show(value, alarm, at_s)

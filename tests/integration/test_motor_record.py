@@ -1,0 +1,233 @@
+"""Rules of the motor record's documentation, each with its test; `docs/reference/motor-record.md` is made of them."""
+
+import asyncio
+from contextlib import suppress
+from itertools import pairwise
+
+import pytest
+from caproto import AccessRights, ChannelType
+
+from ldcnd.contract.errors import CommandAborted, PositionLimit, StopLatched, WrongState
+from ldcnd.contract.samples import Moving
+from tests.support.epics_records import monitored, put, records, shows
+from tests.support.rig import two_axes
+
+DONE, CLOSED, ENCODER, MOVING, SUPPORT, HOMED, PLUS = 0x2, 0x20, 0x100, 0x400, 0x800, 0x4000, 0x1
+ALWAYS = ENCODER | SUPPORT | HOMED
+AT_INDEX = 0x80
+"""Comes and goes as the motor turns."""
+
+
+def values(made, *fields):
+    return tuple(made.variables[f"T:x.{field}"].value for field in fields)
+
+
+@pytest.mark.record(
+    "MSTA",
+    "bit 1 is the last direction, 2 done, 6 closed loop enabled, 9 encoder, 11 moving, 12 gain support, 15 homed",
+)
+async def test_the_status_word_has_the_bits_of_its_documentation():
+    async with records(power=False) as (_, made):
+
+        async def becomes(*bits, hides=0):
+            async with asyncio.timeout(30):
+                while made.variables["T:x.MSTA"].value & ~(AT_INDEX | hides) != sum(bits) | ALWAYS:
+                    await asyncio.sleep(0.05)
+
+        await becomes(DONE)
+        await put(made, "T:x.CNEN", "Enable")
+        await becomes(DONE, CLOSED, hides=PLUS)
+        for target, direction in ((20.0, PLUS), (0.0, 0)):
+            moving = asyncio.create_task(put(made, "T:x", target))
+            await becomes(MOVING, CLOSED, direction)
+            await moving
+            await becomes(DONE, CLOSED, hides=PLUS)  # a loop that settles goes to and fro
+
+
+@pytest.mark.record("SPMG", "with Move it falls back to Pause when a motion completes, and nothing moves in Pause")
+async def test_move_is_for_one_motion():
+    async with records() as (_, made):
+        await put(made, "T:x.SPMG", "Move")
+        await put(made, "T:x", 2.0)
+        assert values(made, "SPMG", "DMOV") == ("Pause", 1)
+        with pytest.raises(WrongState, match="SPMG"):
+            await put(made, "T:x", 3.0)
+
+        assert made.variables["T:x.RBV"].value == pytest.approx(2, abs=0.02)
+
+
+@pytest.mark.record("RLV", "its value is added to VAL and it is reset to 0")
+async def test_a_relative_value_is_added_to_the_target():
+    async with records() as (_, made):
+        first = asyncio.create_task(put(made, "T:x.RLV", 2.0))
+        await asyncio.sleep(0)
+        await asyncio.gather(first, put(made, "T:x.RLV", 0.5), put(made, "T:x.RLV", -1.0))
+
+        assert values(made, "VAL", "RLV") == (1.5, 0.0)
+        assert made.variables["T:x.RBV"].value == pytest.approx(1.5, abs=0.02)
+
+
+@pytest.mark.record("DMOV", "it posts 1, 0, 1 when the motor is commanded to move, even to where it is")
+async def test_a_move_to_the_present_position_is_a_pulse_of_done():
+    async with records() as (_, made):
+        await put(made, "T:x", 1.0)
+        sent = await monitored(made, "T:x.DMOV")
+        await put(made, "T:x", 1.0)
+
+        assert [sent.get_nowait().values[0] for _ in range(sent.qsize())] == [1, 0, 1]
+
+
+@pytest.mark.record("DIFF", "it is DVAL less DRBV; RDIF is the same in steps, and RVAL less RRBV")
+async def test_the_difference_is_that_of_the_target():
+    async with records() as (_, made):
+        moving = asyncio.create_task(put(made, "T:x", 20.0))
+        for _ in range(20):
+            await asyncio.sleep(0.05)
+            target, here, difference, steps, raw, counts = values(made, "DVAL", "DRBV", "DIFF", "RDIF", "RVAL", "RRBV")
+            assert difference == pytest.approx(target - here)
+            assert (steps, raw - counts) == (round(difference * 1000), steps)
+        await moving
+
+        assert abs(made.variables["T:x.DIFF"].value) < 0.02
+
+
+@pytest.mark.record("HOMF", "it is 1 until the homing is over, which a put with completion waits for; VAL is RBV then")
+@pytest.mark.record("HVEL", "it is the velocity of the search that is configured, until another one is put")
+async def test_a_homing_shows_and_ends():
+    async with records() as (running, made):
+        assert made.variables["T:x.HVEL"].value == 1
+        homing = asyncio.create_task(put(made, "T:x.HOMF", 1))
+        await shows(made, "T:x.HOMF", 1)
+        await shows(made, "T:x.DMOV", 0)
+        await homing
+        state = await running.client.state("x")
+
+        assert values(made, "HOMF", "DMOV") == (0, 1)
+        assert state.referenced
+        assert made.variables["T:x.VAL"].value == pytest.approx(made.variables["T:x.RBV"].value, abs=0.02)
+
+
+@pytest.mark.record("SSET", "a put sets SET to Set, one to SUSE to Use")
+async def test_set_and_use_have_a_field_each():
+    async with records() as (_, made):
+        await put(made, "T:x.SSET", 1)
+        was = made.variables["T:x.SET"].value
+        await put(made, "T:x.SUSE", 1)
+
+        assert (was, made.variables["T:x.SET"].value) == ("Set", "Use")
+
+
+@pytest.mark.record("MDEL", "monitors of RBV are sent only what differs by more from what they were sent before")
+async def test_a_deadband_thins_what_monitors_get_and_not_what_is_read():
+    async with records() as (_, made):
+        await put(made, "T:x.MDEL", 1.0)
+        sent = await monitored(made, "T:x.RBV", ChannelType.DOUBLE)
+        await put(made, "T:x", 5.0)
+        got = [sent.get_nowait().values[0] for _ in range(sent.qsize())]
+
+        assert all(abs(after - before) > 1 for before, after in pairwise(got[1:]))
+        assert 3 <= len(got) <= 7
+        assert made.variables["T:x.RBV"].value == pytest.approx(5, abs=0.02)
+
+
+@pytest.mark.record("VELO", "S, BVEL and SBAK follow it, BACC follows ACCL")
+async def test_speeds_in_steps_follow_those_in_units():
+    async with records() as (_, made):
+        await put(made, "T:x.VELO", 5.0)
+        await put(made, "T:x.ACCL", 0.5)
+
+        assert values(made, "VELO", "S", "BVEL", "SBAK", "BACC") == (5.0, pytest.approx(5000), 5.0, 5000.0, 0.5)
+
+
+@pytest.mark.record(
+    "DISP", "while it is 1, and the record beside it says Disable, puts are refused; those that stop are not"
+)
+async def test_puts_are_disabled_and_a_stop_is_not():
+    async with records() as (running, made):
+        moving = asyncio.create_task(put(made, "T:x", 50.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await put(made, "T:x_able", "Disable")
+        for field, value in (("VAL", 1.0), ("TWF", 1), ("JOGF", 1), ("HOMF", 1), ("RLV", 1.0), ("VELO", 1.0)):
+            with pytest.raises(WrongState, match="disabled"):
+                await put(made, f"T:x.{field}", value)
+        assert made.variables["T:x.DISP"].value == 1
+        await put(made, "T:x.STOP", 1)
+        await moving
+        await put(made, "T:x.DISP", 0)
+        await put(made, "T:x", 1.0)
+
+        assert made.variables["T:x_able"].value == "Enable"
+        assert made.variables["T:x.RBV"].value == pytest.approx(1, abs=0.02)
+
+
+@pytest.mark.record("STOP", "`allstop` is one for all records of the gateway")
+async def test_a_stop_of_all_halts_each_axis():
+    async with records() as (running, made):
+        await put(made, "T:y.CNEN", "Enable")
+        await shows(made, "T:y.CNEN", "Enable")
+        moving = [asyncio.create_task(put(made, f"T:{axis}", 50.0)) for axis in ("x", "y")]
+        for axis in ("x", "y"):
+            await running.until(axis, lambda state: state.moving is Moving.YES)
+        await put(made, "T:allstop", 1)
+        await asyncio.gather(*moving)
+        states = await running.client.states()
+
+        assert {(state.moving, state.stop_latched) for state in states.values()} == {(Moving.NO, False)}
+        assert made.variables["T:y.VAL"].value == pytest.approx(made.variables["T:y.RBV"].value, abs=0.05)
+
+
+@pytest.mark.record("STAT", "it is COMM or STATE and an enumeration, as SEVR is")
+@pytest.mark.record("UDF", "it is 1 before a position is known")
+async def test_alarms_are_enumerations():
+    async with records() as (running, made):
+        status, severity = made.variables["T:x.STAT"], made.variables["T:x.SEVR"]
+        assert {status.data_type, severity.data_type} == {ChannelType.ENUM}
+        assert (status.raw_value, severity.raw_value, made.variables["T:x.UDF"].value) == (0, 0, 0)
+        await running.client.stop("x")
+        await shows(made, "T:x.STAT", "STATE")
+        running.daemon.end()
+        await shows(made, "T:x.STAT", "COMM")
+
+        assert (status.raw_value, severity.raw_value) == (9, 3)
+
+
+async def test_errors_are_shown_and_cleared_as_nicos_does():
+    async with records() as (running, made):
+        moving = asyncio.create_task(put(made, "T:x", 50.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        assert made.variables["T:x-Err"].value == 0
+        await running.client.stop()
+        with suppress(CommandAborted, StopLatched):
+            await moving
+        await shows(made, "T:x-Err", 1)
+        assert "latched" in made.variables["T:x-MsgTxt"].value
+        await put(made, "T:x-ErrRst", 1)
+        await shows(made, "T:x-Err", 0)
+
+        assert (await running.client.state("x")).moving is Moving.NO
+
+
+@pytest.mark.parametrize("unit", ["degrees", "counts of it", "\u03bcm", "°"])
+async def test_a_unit_of_any_length_can_be_read(unit: str):
+    config = two_axes()
+    (bus,) = config.bus
+    axes = tuple(axis.model_copy(update={"unit": unit}) for axis in bus.axis)
+    config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
+    async with records(moves=False, config=config) as (_, made):
+        for name, field in made.variables.items():
+            control = {ChannelType.DOUBLE: ChannelType.CTRL_DOUBLE, ChannelType.CHAR: ChannelType.CTRL_CHAR}
+            await field.read(control.get(field.data_type, field.data_type))
+            assert field.check_access("host", "user") == AccessRights.READ, name
+        metadata, _ = await made.variables["T:x.VELO"].read(ChannelType.CTRL_DOUBLE)
+
+        assert f"{unit}/s".encode().startswith(metadata.units)
+        assert len(metadata.units) > 0
+
+
+async def test_a_refused_target_leaves_the_one_before():
+    async with records() as (_, made):
+        await put(made, "T:x", 5.0)
+        with pytest.raises(PositionLimit):
+            await put(made, "T:x.RLV", 1000.0)
+
+        assert values(made, "VAL", "RLV", "LVIO") == (5.0, 0.0, 1)
