@@ -53,6 +53,7 @@ class Gateway:
             if moves
             else MotorRecord(info, defaults)
         )
+        record["NAME"].begin(f"{prefix}{info.axis}")
         self._records[info.axis] = record
         self.variables |= {f"{prefix}{name}": field for name, field in record.fields.items()}
         self._start(self._follow(record), f"values of {info.axis}")

@@ -109,7 +109,7 @@ class MotorRecord:
         record["SEVR"] = choice("INVALID", *SEVERITIES)
         self.fields: dict[str, RecordField] = {f"{info.axis}.{name}": field for name, field in record.items()}
         self.fields |= self._variables_beside(record["VAL"])
-        for name, value in {**self._described(), **self._speeds(), "NAME": info.axis, "UDF": 1}.items():
+        for name, value in {**self._described(), **self._speeds(), "UDF": 1}.items():
             self[name].begin(value)
         self._set_metadata()
 
