@@ -57,4 +57,4 @@ async def test_monitors_and_inputs_of_a_drive_are_variables_beside_a_record_that
     assert torque.severity == AlarmSeverity.NO_ALARM
     assert 1e9 < torque.timestamp < 1.8e9  # of the rig's clock
     writable = {name.rpartition(".")[2] for name, field in made.variables.items() if field.action}
-    assert writable == {"STOP", "SPMG"}
+    assert writable == {"STOP", "SPMG", "T:allstop"}
