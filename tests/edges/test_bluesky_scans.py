@@ -71,6 +71,23 @@ def test_two_hundred_points_are_where_the_motor_was():
         assert lab.documents.data("x") == pytest.approx([0.1 * at for at in range(POINTS)], abs=IN_POSITION)
 
 
+def test_two_hundred_values_of_a_slow_signal_are_those_of_their_points():
+    def at_each(_, document):
+        truth.append(lab.potentiometer("x"))
+
+    truth: list[float] = []
+    with laboratory() as lab, lab.powered("x") as (x,):
+        adc = lab.devices.signal("x", "adc")
+        lab.engine.subscribe(at_each, "event")
+        lab.engine(bp.scan([adc], x, 0, 99.5, POINTS))
+        shown = lab.loop.run(lab.running.client.last("x", "adc"))
+        volts_per_share = shown.volts * shown.full_scale / shown.counts
+
+        assert lab.documents.exit_status == "success"
+        assert lab.documents.data("x_adc") == pytest.approx([each * volts_per_share for each in truth], abs=0.02)
+        assert len({*lab.documents.data("x_adc")}) > POINTS // 2
+
+
 def test_a_stop_in_the_middle_fails_the_run_with_the_axis_at_rest():
     with laboratory() as lab, lab.powered("x") as (x,):
         truth = scan_until(lab, x, lab.running.client.stop)

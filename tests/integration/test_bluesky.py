@@ -9,9 +9,10 @@ import bluesky.plans as bp
 import pytest
 from bluesky import protocols
 from bluesky.preprocessors import monitor_during_wrapper
+from bluesky.suspenders import SuspendBoolHigh
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
-import ldcnd.lab.bluesky.axis
+import ldcnd.lab.bluesky.flight
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.errors import (
@@ -22,12 +23,14 @@ from ldcnd.contract.errors import (
     SessionError,
     StopLatched,
     UnknownAxis,
+    ValueOutOfRange,
     WrongState,
 )
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import AxisState, Moving
 from ldcnd.lab.bluesky import Fly, PlanAxis, ReadableAxis, Signal, Status, TraceDetector
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.bluesky_engine import Laboratory, laboratory
 from tests.support.rig import two_axes
 
@@ -198,20 +201,16 @@ def test_the_limits_of_a_description_follow_a_reload(lab: Laboratory):
 
 
 def test_a_fly_scan_yields_pages_of_positions_with_the_times_of_the_drive(lab: Laboratory, monkeypatch):
-    monkeypatch.setattr(ldcnd.lab.bluesky.axis, "PAGE_SAMPLES", 10)
-
-    def flight():
-        yield from bps.prepare(x, Fly(0, 5, velocity=5), wait=True)
-        yield from bp.fly([x])
+    monkeypatch.setattr(ldcnd.lab.bluesky.flight, "PAGE_SAMPLES", 10)
 
     with lab.powered("x") as (x,):
-        lab.engine(flight())
+        lab.engine(flown(x, Fly(0, 5, velocity=5), "any name"))
 
     (descriptor,) = lab.documents.of("descriptor")
     pages = lab.documents.of("event_page")
     positions = [value for page in pages for value in page["data"]["x"]]
     times = [at for page in pages for at in page["timestamps"]["x"]]
-    assert descriptor["name"] == "x_fly"
+    assert descriptor["name"] == "any name"
     assert len(positions) >= 15  # 1 s at 20 Hz
     assert {len(page["time"]) for page in pages[:-1]} == {10}
     assert (positions[0], positions[-1]) == pytest.approx((0, 5), abs=0.5)
@@ -220,6 +219,166 @@ def test_a_fly_scan_yields_pages_of_positions_with_the_times_of_the_drive(lab: L
     middle = [(at, value) for at, value in zip(times, positions, strict=True) if 1 < value < 4]
     speed = (middle[-1][1] - middle[0][1]) / (middle[-1][0] - middle[0][0])
     assert speed == pytest.approx(5, rel=0.01)
+
+
+def flown(device, flight, stream: str, **more):
+    """Fly and collect while that goes on."""
+    yield from bps.prepare(device, flight, wait=True)
+    yield from bps.open_run()
+    yield from bps.declare_stream(device, name=stream, collect=True)
+    yield from bps.kickoff(device, wait=True)
+    yield from bps.collect_while_completing([device], [device], stream_name=stream, **more)
+    yield from bps.close_run()
+
+
+def test_two_axes_fly_in_one_stream_that_is_collected_meanwhile(lab: Laboratory):
+    with lab.powered("x", "y") as (x, y):
+        both = lab.devices.flight(x, y)
+        flights = {"x": Fly(0, 10, velocity=5), "y": Fly(0, -4, velocity=2)}
+        lab.engine(flown(both, flights, "both", flush_period=0.5))
+        with pytest.raises(WrongState, match="each of x, y"):
+            both.prepare(Fly(0, 1))
+
+    (descriptor,) = lab.documents.of("descriptor")
+    pages = lab.documents.of("event_page")
+    rows = [
+        (page["timestamps"][name][at], page["data"][name][at])
+        for page in pages
+        for at in range(len(page["time"]))
+        for name in ("x", "y")
+    ]
+    xs, ys = rows[0::2], rows[1::2]
+    assert (descriptor["name"], lab.documents.exit_status) == ("both", "success")
+    assert len(pages) >= 3
+    assert (xs[-1][1], ys[-1][1]) == pytest.approx((10, -4), abs=IN_POSITION)
+    for places, speed in ((xs, 5), (ys, -2)):
+        middle = [(at, value) for at, value in places if 1 < abs(value) < 3]
+        assert (middle[-1][1] - middle[0][1]) / (middle[-1][0] - middle[0][0]) == pytest.approx(speed, rel=0.02)
+    assert all(abs(x_at - y_at) < 0.2 for (x_at, _), (y_at, _) in zip(xs, ys, strict=True))
+
+
+def test_a_flight_of_which_one_axis_fails_halts_the_other(lab: Laboratory):
+    async def stop_y():
+        await lab.running.until("y", lambda state: state.moving is Moving.YES)
+        await lab.running.client.stop("y")
+
+    with lab.powered("x", "y") as (x, y):
+        both = lab.devices.flight(x, y)
+        both.prepare({"x": Fly(0, 50, velocity=5), "y": Fly(0, 50, velocity=5)}).wait(60)
+        both.kickoff().wait(20)
+        lab.loop.run(stop_y())
+        failed = both.complete().exception(60)
+        y.reset().wait(20)
+
+        assert isinstance(failed, CommandAborted)
+        assert lab.truth("x") < 20
+        assert stands(lab, "x")
+
+
+def test_velocity_and_acceleration_are_moved_by_plans_and_configured(lab: Laboratory):
+    def plan():
+        yield from bps.mv(x.velocity, 4.0, x.acceleration, 50.0)
+        seen.append((yield from bps.rd(x.velocity)))
+        old, new = yield from bps.configure(x, {"velocity": 8.0})
+        seen.extend((old["x_velocity"]["value"], new["x_velocity"]["value"]))
+        yield from bp.scan([x.velocity], x, 0, 1, 2)
+
+    seen = []
+    with lab.powered("x") as (x,):
+        lab.engine(plan())
+        (descriptor,) = lab.documents.of("descriptor")
+        with pytest.raises(ValueOutOfRange, match="limit"):
+            x.configure({"acceleration": 20.0, "velocity": 51.0})
+        assert x.acceleration.value == 50.0
+
+    assert seen == pytest.approx([4.0, 4.0, 8.0], rel=1e-3)
+    assert descriptor["configuration"]["x"]["data"]["x_velocity"] == pytest.approx(8, rel=1e-3)
+    assert lab.documents.data("x_velocity") == pytest.approx([8, 8], rel=1e-3)
+
+
+def test_a_move_that_takes_too_long_is_halted_and_fails(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        x.set(0).wait(60)
+        with pytest.raises(FailedStatus):
+            lab.engine(bps.abs_set(x, 50, timeout=1.0, wait=True))
+
+        assert 5 < lab.truth("x") < 30
+        assert stands(lab, "x")
+        assert lab.loop.run(lab.running.client.state("x")).stop_latched is False
+
+
+def test_a_second_set_sends_a_moving_axis_elsewhere(lab: Laboratory):
+    def plan():
+        yield from bps.open_run()
+        yield from bps.abs_set(x, 50, group="moves")
+        yield from bps.sleep(0.5)
+        yield from bps.abs_set(x, 3, group="moves")
+        yield from bps.wait("moves")
+        yield from bps.create()
+        yield from bps.read(x)
+        yield from bps.save()
+        yield from bps.close_run()
+
+    with lab.powered("x") as (x,):
+        x.set(0).wait(60)
+        lab.engine(plan())
+
+        assert lab.documents.exit_status == "success"
+        assert lab.documents.data("x") == pytest.approx([3], abs=IN_POSITION)
+        assert lab.truth("x") == pytest.approx(3, abs=IN_POSITION)
+
+
+def test_an_adaptive_scan_of_a_signal_ends(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        adc = lab.devices.signal("x", "adc")
+        lab.engine(bp.adaptive_scan([adc], "x_adc", x, 0, 4, 0.5, 2, 0.5, backstep=False))
+
+    assert lab.documents.exit_status == "success"
+    assert len(lab.documents.data("x_adc")) >= 3
+
+
+def test_a_plan_is_suspended_while_a_fault_or_a_value_is_there_and_goes_on_after_it(lab: Laboratory):
+    async def trouble():
+        await lab.running.until("x", lambda state: state.moving is Moving.YES)
+        lab.module("y").set_condition(FaultCondition.MOTOR_SHORT, present=True, at_s=asyncio.get_running_loop().time())
+        await lab.running.until("y", lambda state: state.state is AxisState.ERROR_STOP)
+        await asyncio.sleep(20)
+        suspended_for.append(len(lab.documents.of("event")))
+        lab.module("y").set_condition(FaultCondition.MOTOR_SHORT, present=False, at_s=asyncio.get_running_loop().time())
+        await y_axis._axis.reset()
+
+    suspended_for = []
+    with lab.powered("x", "y") as (x, y_axis):
+        fault = lab.devices.signal("y", "fault")
+        suspender = SuspendBoolHigh(fault)  # codes of faults, an empty text without one
+        lab.engine.install_suspender(suspender)
+        went_wrong = lab.loop.start(trouble())
+        lab.engine(bp.scan([], x, 0, 40, 5))
+        went_wrong.result(60)
+        lab.engine.remove_suspender(suspender)
+        tripped = []
+        floor = lab.devices.signal("x", "velocity")
+        floor.subscribe(lambda value, **_: tripped.append(value), event_type="value", run=True)
+        x.set(0).wait(60)
+        floor.clear_sub(next(iter(floor._followers)))
+
+    assert lab.documents.exit_status == "success"
+    assert suspended_for[0] < 5
+    assert len({event["seq_num"] for event in lab.documents.of("event")}) == 5
+    assert min(tripped) < -1
+
+
+def test_what_devices_are_fits_a_line_of_a_terminal(lab: Laboratory):
+    with lab.powered("x") as (x,), lab.devices.watch("y") as y:
+        shown = [repr(each) for each in (x, y, x.velocity, lab.devices.signal("x", "adc"), lab.devices.flight(x))]
+
+    assert shown == [
+        "<axis x: ldcnd://sim/x>",
+        "<read-only axis y: ldcnd://sim/y>",
+        "<x_velocity: default>",
+        "<signal x_adc: ldcnd://sim/x/adc>",
+        "<flight flight: x>",
+    ]
 
 
 def test_a_flight_is_prepared_first_and_within_the_limits(lab: Laboratory):
@@ -278,7 +437,7 @@ def test_what_the_daemon_would_refuse_is_raised_by_the_check(lab: Laboratory):
 
 def test_configuration_says_what_the_registers_would_hold(lab: Laboratory):
     with lab.powered("x") as (x,):
-        x.velocity = 7.0
+        x.velocity.set(7.0).wait()
         configured = lab.loop.run(x.read_configuration())
         described = lab.loop.run(x.describe_configuration())
 

@@ -14,10 +14,23 @@ plot does with the RunEngine's loop delays no renewal of a lease. They satisfy t
 itself is not needed to make them.
 """
 
-from ldcnd.lab.bluesky.axis import Fly, PlanAxis, ReadableAxis
+from ldcnd.lab.bluesky.axis import PlanAxis, ReadableAxis
 from ldcnd.lab.bluesky.devices import Devices, connect
+from ldcnd.lab.bluesky.flight import Flight, Fly
+from ldcnd.lab.bluesky.setting import Setting
 from ldcnd.lab.bluesky.signal import Signal
 from ldcnd.lab.bluesky.status import Status
 from ldcnd.lab.bluesky.trace import TraceDetector
 
-__all__ = ["Devices", "Fly", "PlanAxis", "ReadableAxis", "Signal", "Status", "TraceDetector", "connect"]
+__all__ = [
+    "Devices",
+    "Flight",
+    "Fly",
+    "PlanAxis",
+    "ReadableAxis",
+    "Setting",
+    "Signal",
+    "Status",
+    "TraceDetector",
+    "connect",
+]

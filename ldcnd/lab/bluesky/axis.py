@@ -1,32 +1,45 @@
 """An axis as a Bluesky device: read, moved, stopped and flown by a plan."""
 
 import asyncio
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeVar, cast
 
 from ldcnd.client.axis import Axis as ClientAxis
+from ldcnd.client.axis import Positions
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.motion import Motion, Position
 from ldcnd.client.rig import Rig
+from ldcnd.contract.commands import BufferMode
 from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import (
     AxisUnreachable,
     CommandAborted,
     DriveFault,
     LdcndError,
-    OutcomeUnknown,
     RequestRefused,
+    SessionError,
     StopLatched,
     UnknownAxis,
-    WrongState,
 )
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import LinkState, Moving, PositionSample, Quality
+from ldcnd.lab.bluesky.flight import Flight, Fly
+from ldcnd.lab.bluesky.setting import Setting
 from ldcnd.lab.bluesky.status import Status
 from ldcnd.lab.bluesky.trace import TraceDetector
-from ldcnd.lab.bluesky.values import SILENT_S, instant, number_key, reading, refuse_other_unit, text_key, within
+from ldcnd.lab.bluesky.values import (
+    SILENT_S,
+    ValueCallback,
+    by_value,
+    instant,
+    number_key,
+    reading,
+    refuse_other_unit,
+    text_key,
+    within,
+)
 
 if TYPE_CHECKING:
     from bluesky.protocols import Callback, Hints, Location, Reading
@@ -35,25 +48,8 @@ if TYPE_CHECKING:
 
 FRESH_S = 1.0
 """A position that came longer ago is not read: a newer one is waited for, in seconds."""
-PAGE_SAMPLES = 1000
-"""Maximum number of positions on a page of a fly scan."""
 
 ResultT = TypeVar("ResultT")
-
-
-@dataclass(frozen=True, slots=True)
-class Fly:
-    """A motion during which positions are recorded; what `PlanAxis.prepare` takes.
-
-    Attributes:
-        start: where it begins, in axis units.
-        end: where it ends, in axis units.
-        velocity: of the motion, in units a second; the axis default when missing.
-    """
-
-    start: float
-    end: float
-    velocity: float | None = None
 
 
 class ReadableAxis:
@@ -74,7 +70,7 @@ class ReadableAxis:
         self._source = f"ldcnd://{rig.name}/{info.axis}"
         self._loop = loop
         self._not_before_ns = 0
-        self._followers: dict[Callback[float], Status] = {}
+        self._followers: dict[object, Status] = {}
 
     @property
     def hints(self) -> "Hints":
@@ -95,13 +91,15 @@ class ReadableAxis:
 
     async def describe(self) -> "dict[str, DataKey]":
         """Return what the reading is, by the daemon that is there now."""
+        return {self.name: await self.describe_position()}
+
+    async def describe_position(self) -> "DataKey":
+        """Return what the position is."""
         self._info = await self._there(described(self._rig, self._info.axis))
         limits = self._info.limits
-        return {
-            self.name: number_key(
-                f"{self._source}/position", self._info.unit, limits=(limits.position_min, limits.position_max)
-            )
-        }
+        return number_key(
+            f"{self._source}/position", self._info.unit, limits=(limits.position_min, limits.position_max)
+        )
 
     async def read_configuration(self) -> "dict[str, Reading[float | str]]":
         """Return what the axis is and, of one that can be moved, how fast it would move."""
@@ -120,23 +118,41 @@ class ReadableAxis:
         return keys
 
     def trigger(self) -> Status:
-        """Have `read` return a position that was measured from now on, whichever axis has moved until now."""
+        """Wait for a position that is measured from now on, for the next readings."""
 
-        async def set_instant() -> None:
-            self._not_before_ns = max(self._not_before_ns, await instant(self._rig))
+        async def measure() -> None:
+            positions = self._axis.positions()
+            not_before_ns = await instant(self._rig)
+            async with within(SILENT_S, f"axis {self._info.axis}: no position was measured within {SILENT_S:g} s"):
+                async for sample in positions:
+                    if sample.t > not_before_ns and sample.quality is not Quality.BAD:
+                        self._not_before_ns = max(self._not_before_ns, sample.t)
+                        return
 
-        return self._start("trigger", set_instant())
+        return self._start("trigger", measure())
 
-    def subscribe(self, function: "Callback[float]") -> None:
-        """Call `function` with the reading of every position that comes, on the devices' own thread."""
+    def subscribe(
+        self,
+        function: "Callback[float] | ValueCallback",
+        event_type: str | None = None,  # noqa: ARG002 - there is one kind of events
+        run: bool | None = None,  # noqa: FBT001 - ophyd's signature
+    ) -> None:
+        """Call `function` with the reading of every position that comes, on the devices' own thread.
+
+        Args:
+            function: what is called.
+            event_type: accepted for those who name one, as suspenders do.
+            run: any value: call with `value` and `timestamp`, as a signal of ophyd does; suspenders need that.
+        """
+        told = by_value(self.name, function) if run is not None else cast("Callback[float]", function)
 
         async def follow() -> None:
             async for sample in self._axis.positions():
-                function(self._of(sample))
+                told(self._of(sample))
 
         self._followers[function] = self._start("subscription", follow())
 
-    def clear_sub(self, function: "Callback[float]") -> None:
+    def clear_sub(self, function: "Callback[float] | ValueCallback") -> None:
         """End a subscription."""
         status = self._followers.pop(function, None)
         if status:
@@ -156,14 +172,14 @@ class ReadableAxis:
         return TraceDetector(name or f"{self.name}_trace", self._axis, channels, samples, interval_s, self._loop)
 
     async def _reading(self) -> "dict[str, Reading[float]]":
-        return self._of((await self._measured()).sample)
+        return self._of((await self.measured()).sample)
 
     def _of(self, sample: PositionSample) -> "dict[str, Reading[float]]":
         refuse_other_unit(self._info.axis, self._info.unit, sample.unit)
         condition = assess(self._axis.state.sample)
         return {self.name: reading(sample.value, sample.t * 1e-9, sample.quality, condition)}
 
-    async def _measured(self) -> Position:
+    async def measured(self) -> Position:
         """Return a position that is a measurement, not old, and newer than the end of the last motion."""
         async with within(SILENT_S, f"axis {self._info.axis}: no new position came for {SILENT_S:g} s"):
             while True:
@@ -187,32 +203,39 @@ class ReadableAxis:
         return Status(f"{name} of {self.name}", self._loop.start(work))
 
     def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.name}: {self._axis!r}>"
+        return f"<{'axis' if isinstance(self, PlanAxis) else 'read-only axis'} {self.name}: {self._source}>"
 
 
 class PlanAxis(ReadableAxis):
     """An axis that a plan moves, under a lease of its own; made by `Devices.control`.
 
     Attributes:
-        velocity: of the moves, in units a second; None for the axis default.
-        acceleration: of the moves, in units a second squared; None for the axis default.
+        velocity: of the moves, in units a second; a plan can move it, and None is the default of the axis.
+        acceleration: of the moves, in units a second squared; likewise.
     """
 
     def __init__(self, name: str, axis: ClientAxis, info: AxisInfo, rig: Rig, loop: LoopThread) -> None:
         super().__init__(name, axis, info, rig, loop)
-        self.velocity: float | None = None
-        self.acceleration: float | None = None
+        self.velocity = Setting(self, "velocity", lambda: self._info.limits.velocity)
+        self.acceleration = Setting(self, "acceleration", lambda: self._info.limits.acceleration)
         self._under_way = 0
         self._stopped: bool | None = None
-        self._fly: Fly | None = None
-        self._flight: Status | None = None
-        self._flown: list[PositionSample] = []
+        self._newest: Status | None = None  # of the moves that were set
+        self._flight = Flight(self.name, (self,), loop)
 
     # -- moving ------------------------------------------------------------------------------------------------------
 
-    def set(self, value: float) -> Status:
-        """Move to a position in axis units; the status is done when the axis stands there, or where it was stopped."""
-        return self._begin(f"move to {value}", lambda: self._move(value, self.velocity))
+    def set(self, value: float, *, timeout: float | None = None) -> Status:
+        """Move to a position in axis units; the status is done when the axis stands there, or where it was stopped.
+
+        While a move of this device is under way the axis is sent elsewhere; its status is done when that one is.
+
+        Args:
+            value: the position.
+            timeout: halt the axis and fail after so long, in seconds.
+        """
+        self._newest = self._begin(f"move to {value:g}", lambda: self._move_or_halt(value, timeout))
+        return self._newest
 
     def home(self) -> Status:
         """Find the reference position, as the axis's configuration says."""
@@ -239,7 +262,7 @@ class PlanAxis(ReadableAxis):
 
     async def locate(self) -> "Location[float]":
         """Return where the axis was sent last, or stands since anything else stopped or moved it, and where it is."""
-        position = (await self._there(self._measured())).value
+        position = (await self._there(self.measured())).value
         return {"setpoint": self._axis.target, "readback": position}
 
     async def check_value(self, value: float) -> None:
@@ -248,7 +271,7 @@ class PlanAxis(ReadableAxis):
         Raises:
             RequestRefused: as the daemon would refuse it, with the nearest position that it would accept.
         """
-        await self._there(self._check(value, self.velocity))
+        await self._there(self._check(value, self.velocity.value))
 
     async def read(self) -> "dict[str, Reading[float]]":
         """Return the position and the setpoint, as `locate` does.
@@ -270,11 +293,8 @@ class PlanAxis(ReadableAxis):
     async def read_configuration(self) -> "dict[str, Reading[float | str]]":
         """Return what the axis is, and the velocity and acceleration of a move, as the drive's registers hold them."""
         read = await super().read_configuration()
-        move = await self._there(self._axis.preview(distance=0, velocity=self.velocity, acceleration=self.acceleration))
-        if move.refusal:
-            raise RequestRefused(move.refusal.message, axis=self._info.axis)
         now_s = read[f"{self.name}_unit"]["timestamp"]
-        for name, value in (("velocity", move.velocity), ("acceleration", move.acceleration)):
+        for name, value in (await self.read_speeds()).items():
             if value is not None:
                 read[f"{self.name}_{name}"] = reading(value, now_s)
         return read
@@ -282,81 +302,91 @@ class PlanAxis(ReadableAxis):
     async def describe_configuration(self) -> "dict[str, DataKey]":
         """Return what the configuration is."""
         keys = await super().describe_configuration()
-        for name, unit in (("velocity", f"{self._info.unit}/s"), ("acceleration", f"{self._info.unit}/s2")):
-            keys[f"{self.name}_{name}"] = number_key(f"{self._source}/{name}", unit)
-        return keys
+        return {**keys, **{f"{self.name}_{name}": key for name, key in (await self.describe_speeds()).items()}}
+
+    def configure(self, settings: "Mapping[str, float | None]") -> "tuple[dict[str, Reading[float | None]], ...]":
+        """Set `velocity` and `acceleration` of the moves that follow; return both as they were and as they are.
+
+        Raises:
+            ValueOutOfRange: above the limit; nothing is set then.
+        """
+        known: dict[str, Setting] = {"velocity": self.velocity, "acceleration": self.acceleration}
+        chosen = {known[name.removeprefix(f"{self.name}_")]: value for name, value in settings.items()}
+        before = {setting.name: reading(setting.value, time.time()) for setting in chosen}
+        for setting, value in chosen.items():
+            setting.check(value)
+        for setting, value in chosen.items():
+            setting.value = value
+        return before, {setting.name: reading(setting.value, time.time()) for setting in chosen}
 
     # -- fly scans ---------------------------------------------------------------------------------------------------
 
     def prepare(self, value: Fly) -> Status:
         """Move to the start of a fly scan, after a check of its end."""
-
-        async def ready() -> None:
-            await self._check(value.end, value.velocity)
-            await self._move(value.start, self.velocity)
-            self._fly = value
-
-        return self._begin(f"preparation to fly to {value.end:g}", ready)
+        return self._flight.prepare(value)
 
     def kickoff(self) -> Status:
         """Begin the motion that `prepare` was given; done when the drive has acknowledged it."""
-
-        async def kick_off() -> None:
-            fly, self._fly = self._fly, None
-            if fly is None:
-                raise WrongState(
-                    f"axis {self._info.axis}: no fly scan is prepared", axis=self._info.axis, remedy="call prepare"
-                )
-            began = asyncio.get_running_loop().create_future()
-            self._flight = self._begin(f"fly to {fly.end:g}", lambda: self._follow(fly, began))
-            self._flight.add_callback(lambda flight: self._loop.call(_pass_on, flight, began))
-            await began
-
-        return self._start("kickoff", kick_off())
+        return self._flight.kickoff()
 
     def complete(self) -> Status:
         """Return the status of the motion of a fly scan."""
-        if self._flight is None:
-            raise WrongState(f"axis {self._info.axis}: no fly scan is under way", axis=self._info.axis)
-        return self._flight
+        return self._flight.complete()
 
-    async def describe_collect(self) -> "dict[str, dict[str, DataKey]]":
-        """Return what the pages of a fly scan hold; their stream is called `<name>_fly`."""
-        described = await super().describe()
-        return {f"{self.name}_fly": {self.name: described[self.name]}}
+    async def describe_collect(self) -> "dict[str, DataKey]":
+        """Return what the events of a fly scan hold; the plan names the stream."""
+        return await self._flight.describe_collect()
 
-    def collect_pages(self) -> "Iterator[PartialEventPage]":
-        """Yield the positions of the last fly scan, with the times at which the drive was there."""
-        samples, self._flown = self._flown, []
-        for first in range(0, len(samples), PAGE_SAMPLES):
-            page = samples[first : first + PAGE_SAMPLES]
-            times = [sample.t * 1e-9 for sample in page]
-            values = [sample.value for sample in page]
-            yield {"time": times, "data": {self.name: values}, "timestamps": {self.name: list(times)}}
+    def collect_pages(self) -> "AsyncIterator[PartialEventPage]":
+        """Yield the positions since the last call or the beginning, with the times at which the drive was there."""
+        return self._flight.collect_pages()
 
-    async def _follow(self, fly: Fly, began: asyncio.Future[None]) -> None:
-        """Move to the end of a fly scan and keep the positions on the way."""
-        self._flown = []
-        positions = self._axis.positions()
+    def prepare_flight(self, fly: Fly, check: Callable[[], Awaitable[None]]) -> Status:
+        """Move to the start of a flight after a check."""
 
-        async def keep() -> None:
-            async for sample in positions:
-                self._flown.append(sample)
+        async def ready() -> None:
+            await check()
+            await self._move(fly.start)
 
-        keeping = asyncio.create_task(keep(), name=f"positions of {self.name}")
-        try:
-            await self._end_of(
-                self._axis.move_absolute(fly.end, velocity=fly.velocity, acceleration=self.acceleration), began
-            )
-            await self._measured()
-        finally:
-            keeping.cancel()
-        if positions.dropped:
-            raise OutcomeUnknown(
-                f"axis {self._info.axis}: {positions.dropped} positions of the fly scan were lost: this program was too"
-                " busy to take them",
-                axis=self._info.axis,
-            )
+        return self._begin(f"preparation to fly to {fly.end:g}", ready)
+
+    async def check_flight(self, fly: Fly) -> None:
+        """Raise what the motion of a flight would be refused for."""
+        await self._check(fly.end, self._velocity_of(fly))
+
+    def begin_flight(self, fly: Fly, began: asyncio.Future[None]) -> Status:
+        """Move to the end of a flight."""
+        velocity, acceleration = self._velocity_of(fly), self.acceleration.value
+        return self._begin(
+            f"fly to {fly.end:g}",
+            lambda: self._end_of(
+                self._axis.move_absolute(fly.end, velocity=velocity, acceleration=acceleration), began
+            ),
+        )
+
+    def positions(self) -> Positions:
+        """Return the positions from now on, for the devices' own loop."""
+        return self._axis.positions()
+
+    def _velocity_of(self, fly: Fly) -> float | None:
+        return self.velocity.value if fly.velocity is None else fly.velocity
+
+    async def read_speeds(self) -> dict[str, float | None]:
+        """Return the velocity and acceleration of a move as the drive's registers would hold them."""
+        move = await self._there(
+            self._axis.preview(distance=0, velocity=self.velocity.value, acceleration=self.acceleration.value)
+        )
+        if move.refusal:
+            raise RequestRefused(move.refusal.message, axis=self._info.axis)
+        return {"velocity": move.velocity, "acceleration": move.acceleration}
+
+    async def describe_speeds(self) -> "dict[str, DataKey]":
+        """Return what velocity and acceleration are, by their names."""
+        unit = self._info.unit
+        return {
+            name: number_key(f"{self._source}/{name}", per)
+            for name, per in (("velocity", f"{unit}/s"), ("acceleration", f"{unit}/s2"))
+        }
 
     # -- inside the loop ---------------------------------------------------------------------------------------------
 
@@ -379,15 +409,41 @@ class PlanAxis(ReadableAxis):
 
         return self._start(name, moving())
 
-    async def _move(self, target: float, velocity: float | None) -> None:
-        await self._end_of(self._axis.move_absolute(target, velocity=velocity, acceleration=self.acceleration))
+    async def _move(self, target: float) -> None:
+        await self._end_of(
+            self._axis.move_absolute(
+                target,
+                buffer_mode=BufferMode.ABORTING if self._under_way > 1 else BufferMode.REFUSE,
+                velocity=self.velocity.value,
+                acceleration=self.acceleration.value,
+            )
+        )
+
+    async def _move_or_halt(self, target: float, within_s: float | None) -> None:
+        """Move, or wait for the move that was set after it; halt what takes too long."""
+        own = self._newest
+        try:
+            async with asyncio.timeout(within_s):
+                try:
+                    await self._move(target)
+                except CommandAborted:
+                    if self._newest is own or self._newest is None or self.is_stopped():
+                        raise
+                    await asyncio.shield(self._newest.wrapped())
+        except TimeoutError:
+            raise SessionError(
+                f"axis {self._info.axis}: it did not reach {target:g} {self._info.unit} within {within_s:g} s and was"
+                " halted",
+                axis=self._info.axis,
+                remedy="wait longer, or move faster",
+            ) from None
 
     async def _end_of(
         self,
         starting: Coroutine[object, object, Motion],
         began: asyncio.Future[None] | None = None,
     ) -> None:
-        if self._is_stopped():
+        if self.is_stopped():
             starting.close()
             raise CommandAborted(
                 f"axis {self._info.axis}: it was stopped before the motion began", axis=self._info.axis
@@ -395,11 +451,12 @@ class PlanAxis(ReadableAxis):
         motion = await starting
         if began and not began.done():
             began.set_result(None)
-        if self._is_stopped():  # it overtook the motion on its way to the daemon
+        if self.is_stopped():  # it overtook the motion on its way to the daemon
             await self._axis.halt()
         await motion.done()
 
-    def _is_stopped(self) -> bool:
+    def is_stopped(self) -> bool:
+        """Tell whether what was begun last was stopped by `stop`."""
         return self._stopped is not None
 
     async def _halt(self, *, success: bool) -> None:
@@ -420,7 +477,7 @@ class PlanAxis(ReadableAxis):
                 await self._axis.news(None)
 
     async def _check(self, target: float, velocity: float | None) -> None:
-        reply = await self._axis.preview(position=target, velocity=velocity, acceleration=self.acceleration)
+        reply = await self._axis.preview(position=target, velocity=velocity, acceleration=self.acceleration.value)
         if reply.refusal:
             refused = reply.refusal
             raise RequestRefused(
@@ -442,13 +499,6 @@ async def described(rig: Rig, axis: str) -> AxisInfo:
     if axis not in infos:
         raise UnknownAxis(f"rig {rig.name} has no axis {axis!r}; it has {', '.join(infos)}", axis=axis, value=axis)
     return infos[axis]
-
-
-def _pass_on(flight: Status, began: asyncio.Future[None]) -> None:
-    """Let a motion that ended before it began be the error of its beginning."""
-    error = flight.exception()
-    if not began.done():
-        began.set_exception(error or CommandAborted("the motion was stopped before it began"))
 
 
 async def _discard(work: Awaitable[object]) -> None:

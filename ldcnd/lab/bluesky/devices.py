@@ -10,6 +10,7 @@ from ldcnd.client.rig import connect as connect_rig
 from ldcnd.contract.errors import UnknownAxis
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.lab.bluesky.axis import PlanAxis, ReadableAxis, described
+from ldcnd.lab.bluesky.flight import Flight
 from ldcnd.lab.bluesky.signal import Signal
 
 LEASE_S = 2.0
@@ -62,6 +63,10 @@ class Devices:
         """Yield a device for each of several axes, as `control` does."""
         with ExitStack() as held:
             yield tuple(held.enter_context(self.control(axis, client=client, lease_s=lease_s)) for axis in axes)
+
+    def flight(self, *axes: PlanAxis, name: str = "flight") -> Flight:
+        """Return axes that fly at the same time as one device, whose positions are the events of one stream."""
+        return Flight(name, axes, self._loop)
 
     @contextmanager
     def watch(self, axis: str, *, name: str | None = None) -> Iterator[ReadableAxis]:

@@ -1,7 +1,7 @@
 """An item of an axis's telemetry as a Bluesky device that is read and monitored."""
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
@@ -18,7 +18,17 @@ from ldcnd.contract.samples import (
     VelocitySample,
 )
 from ldcnd.lab.bluesky.status import Status
-from ldcnd.lab.bluesky.values import SILENT_S, instant, number_key, reading, refuse_other_unit, text_key, within
+from ldcnd.lab.bluesky.values import (
+    SILENT_S,
+    ValueCallback,
+    by_value,
+    instant,
+    number_key,
+    reading,
+    refuse_other_unit,
+    text_key,
+    within,
+)
 
 if TYPE_CHECKING:
     from bluesky.protocols import Callback, Hints, Reading
@@ -46,7 +56,7 @@ class Signal:
         self._loop = loop
         self._triggered: Sample | None = None
         self._unit: str | None = None  # as described last
-        self._followers: dict[Callback[float | str], Status] = {}
+        self._followers: dict[object, Status] = {}
 
     @property
     def hints(self) -> "Hints":
@@ -86,17 +96,33 @@ class Signal:
         _, self._unit = _value(await self._latest())
         return {self.name: number_key(self._source, self._unit)}
 
-    def subscribe(self, function: "Callback[float | str]") -> None:
-        """Call `function` with every value that comes, on the devices' own thread."""
+    def subscribe(
+        self,
+        function: "Callback[float | str] | ValueCallback",
+        event_type: str | None = None,  # noqa: ARG002 - there is one kind of events
+        run: bool | None = None,  # noqa: FBT001 - ophyd's signature
+    ) -> None:
+        """Call `function` with every value that comes, on the devices' own thread.
+
+        Args:
+            function: what is called.
+            event_type: accepted for those who name one, as suspenders do.
+            run: call with `value` and `timestamp`, as a signal of ophyd does, and when true with the last value at
+                once; suspenders need that.
+        """
+        told = by_value(self.name, function) if run is not None else cast("Callback[float | str]", function)
 
         async def follow() -> None:
             async with self._rig.samples(self._axis, self._item) as samples:
+                last = await self._rig.latest(self._axis, self._item) if run else None
+                if last is not None:
+                    told(self._of(last))
                 async for _, sample in samples:
-                    function(self._of(sample))
+                    told(self._of(sample))
 
         self._followers[function] = Status(f"subscription of {self.name}", self._loop.start(follow()))
 
-    def clear_sub(self, function: "Callback[float | str]") -> None:
+    def clear_sub(self, function: "Callback[float | str] | ValueCallback") -> None:
         """End a subscription."""
         status = self._followers.pop(function, None)
         if status:

@@ -44,6 +44,10 @@ class Status:
         """Call `callback` with this status at the end of the work, at once if that is past; on any thread."""
         self._work.add_done_callback(lambda _: callback(self))
 
+    def wrapped(self) -> "asyncio.Future[None]":
+        """Return the work as a future of the running loop."""
+        return asyncio.wrap_future(self._work)
+
     def cancel(self) -> None:
         """Give the work up."""
         self._work.cancel()
@@ -65,3 +69,10 @@ class Status:
     def __repr__(self) -> str:
         ended = "done" if self.done and self.success else "failed" if self.done else "under way"
         return f"<{self.name}: {ended}>"
+
+
+def finished(name: str) -> Status:
+    """Return the status of what needed no time."""
+    work: concurrent.futures.Future[None] = concurrent.futures.Future()
+    work.set_result(None)
+    return Status(name, work)

@@ -1,0 +1,191 @@
+"""Flights: motions during which positions are recorded, of one axis or of several, as the events of one stream."""
+
+import asyncio
+from collections.abc import AsyncIterator, Coroutine, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING
+
+from ldcnd.client.loop_thread import LoopThread
+from ldcnd.contract.errors import CommandAborted, LdcndError, OutcomeUnknown, WrongState
+from ldcnd.contract.samples import PositionSample
+from ldcnd.lab.bluesky.status import Status
+
+if TYPE_CHECKING:
+    from bluesky.protocols import Hints
+    from event_model.documents import DataKey
+    from event_model.documents.event_page import PartialEventPage
+
+    from ldcnd.lab.bluesky.axis import PlanAxis
+
+PAGE_SAMPLES = 1000
+"""Maximum number of positions on a page of a fly scan."""
+
+Row = tuple[PositionSample, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Fly:
+    """A motion during which positions are recorded; what `prepare` takes.
+
+    Attributes:
+        start: where it begins, in axis units.
+        end: where it ends, in axis units.
+        velocity: of the motion, in units a second; that of the device's moves when missing.
+    """
+
+    start: float
+    end: float
+    velocity: float | None = None
+
+
+class Flight:
+    """Axes that fly at the same time; made by `Devices.flight`. Each axis is one of its own, too.
+
+    An event has the position of the first axis and those that the others had published last, each with the time at
+    which its drive was there.
+
+    Attributes:
+        name: of the device.
+        parent: None; it is part of no other device.
+    """
+
+    parent = None
+
+    def __init__(self, name: str, axes: "tuple[PlanAxis, ...]", loop: LoopThread) -> None:
+        self.name = name
+        self._axes = axes
+        self._loop = loop
+        self._prepared: dict[str, Fly] = {}
+        self._under_way: Status | None = None
+        self._rows: list[Row] = []
+
+    @property
+    def hints(self) -> "Hints":
+        """Plot the positions."""
+        return {"fields": [axis.name for axis in self._axes]}
+
+    def prepare(self, value: "Fly | Mapping[str, Fly]") -> Status:
+        """Move each axis to the start of its motion, after a check of all ends.
+
+        Args:
+            value: by the names of the devices; a single one for a flight of one axis.
+        """
+        flights = {self._axes[0].name: value} if isinstance(value, Fly) else dict(value)
+        if set(flights) != {axis.name for axis in self._axes}:
+            named = ", ".join(axis.name for axis in self._axes)
+            raise WrongState(
+                f"{self.name}: a flight of each of {named} is needed, there is one of {', '.join(flights)}"
+            )
+
+        async def check() -> None:
+            for axis in self._axes:
+                await axis.check_flight(flights[axis.name])
+
+        moves = [axis.prepare_flight(flights[axis.name], check) for axis in self._axes]
+
+        async def ready() -> None:
+            await asyncio.gather(*(moved.wrapped() for moved in moves))
+            if not any(axis.is_stopped() for axis in self._axes):
+                self._prepared = flights
+
+        return self._start("preparation", ready())
+
+    def kickoff(self) -> Status:
+        """Begin the motions that `prepare` was given; done when every drive has acknowledged its own."""
+
+        async def kick_off() -> None:
+            flights, self._prepared = self._prepared, {}
+            if not flights:
+                raise WrongState(f"{self.name}: no fly scan is prepared", remedy="call prepare")
+            began: list[asyncio.Future[None]] = [asyncio.get_running_loop().create_future() for _ in self._axes]
+            self._rows = []
+            self._under_way = self._start("flight", self._fly(flights, began))
+            await asyncio.gather(*began)
+
+        return self._start("kickoff", kick_off())
+
+    def complete(self) -> Status:
+        """Return the status of the motions of a flight."""
+        if self._under_way is None:
+            raise WrongState(f"{self.name}: no fly scan is under way")
+        return self._under_way
+
+    async def stop(self, success: bool = True) -> None:  # noqa: FBT001, FBT002 - the protocol's signature
+        """Halt what is under way, if anything; see `PlanAxis.stop`."""
+        for axis in self._axes:
+            await axis.stop(success)
+
+    async def describe_collect(self) -> "dict[str, DataKey]":
+        """Return what the events hold; the plan names the stream."""
+        keys: dict[str, DataKey] = {}
+        for axis in self._axes:
+            keys[axis.name] = await axis.describe_position()
+        return keys
+
+    async def collect_pages(self) -> "AsyncIterator[PartialEventPage]":
+        """Yield the positions since the last call or the beginning, with the times at which the drives were there."""
+        rows = await asyncio.wrap_future(self._loop.start(self._taken()))
+        for first in range(0, len(rows), PAGE_SAMPLES):
+            page = rows[first : first + PAGE_SAMPLES]
+            columns = {axis.name: [row[at] for row in page] for at, axis in enumerate(self._axes)}
+            yield {
+                "time": [row[0].t * 1e-9 for row in page],
+                "data": {name: [sample.value for sample in column] for name, column in columns.items()},
+                "timestamps": {name: [sample.t * 1e-9 for sample in column] for name, column in columns.items()},
+            }
+
+    async def _taken(self) -> list[Row]:
+        rows, self._rows = self._rows, []
+        return rows
+
+    async def _fly(self, flights: Mapping[str, Fly], began: list[asyncio.Future[None]]) -> None:
+        """Move every axis to its end and keep the positions on the way."""
+        readers = [axis.positions() for axis in self._axes]
+        last: dict[int, PositionSample] = {}
+
+        async def keep(at: int) -> None:
+            async for sample in readers[at]:
+                last[at] = sample
+                if at == 0 and len(last) == len(readers):
+                    self._rows.append(tuple(last[each] for each in range(len(readers))))
+
+        keeping = [
+            asyncio.create_task(keep(at), name=f"positions of {axis.name}") for at, axis in enumerate(self._axes)
+        ]
+        moves = [axis.begin_flight(flights[axis.name], future) for axis, future in zip(self._axes, began, strict=True)]
+        try:
+            for moved, future in zip(moves, began, strict=True):
+                moved.add_callback(partial(_pass_on, self._loop, future))
+            await asyncio.gather(*(moved.wrapped() for moved in moves))
+            for axis in self._axes:
+                await axis.measured()
+        except LdcndError:
+            with suppress(LdcndError):  # what failed matters more than how the others came to rest
+                await self.stop(success=False)
+            raise
+        finally:
+            for task in keeping:
+                task.cancel()
+        dropped = sum(reader.dropped for reader in readers)
+        if dropped:
+            raise OutcomeUnknown(
+                f"{self.name}: {dropped} positions of the fly scan were lost: this program was too busy to take them"
+            )
+
+    def _start(self, name: str, work: Coroutine[object, object, None]) -> Status:
+        return Status(f"{name} of {self.name}", self._loop.start(work))
+
+    def __repr__(self) -> str:
+        return f"<flight {self.name}: {', '.join(axis.name for axis in self._axes)}>"
+
+
+def _pass_on(loop: LoopThread, began: asyncio.Future[None], move: Status) -> None:
+    """Let a motion that ended before it began be the error of its beginning."""
+
+    def end() -> None:
+        if not began.done():
+            began.set_exception(move.exception() or CommandAborted("the motion was stopped before it began"))
+
+    loop.call(end)
