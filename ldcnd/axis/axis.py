@@ -217,6 +217,12 @@ class AxisService:
         self.traces.disconnected()
         self.readings.disconnect()
 
+    def explain_loss(self) -> None:
+        """Say of a drive that is out of reach what is known by now of the reason."""
+        if self.tracker.link is LinkState.DOWN:
+            self.tracker.disconnected(self._clock.now_ns())
+            self.telemetry.state(self._clock.now_ns())
+
     def taken_over(self) -> None:
         """Its drive is as another host has left it: what moves in it without an end is to be brought to rest.
 
@@ -375,6 +381,11 @@ class AxisService:
     @property
     def _active_id(self) -> str | None:
         return self.tracker.command.command_id if self.tracker.command else None
+
+    def controlled_by(self, client: str | None) -> None:
+        """Publish who controls the axis from now on; None when no client does."""
+        self.tracker.holder = client
+        self.telemetry.state(self._clock.now_ns())
 
     async def set_speed_share(self, share: float) -> tuple[bool, bool]:
         """Take another speed override, 0 to 1; return whether what moves goes on at another speed, or was halted.

@@ -32,6 +32,10 @@ WINDOW_OF_EL = 1 / 400
 SHORTEST_READING_PAUSE_S = 0.005
 """Shortest time between two readings of an axis that settles."""
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
+LINK_BLOCKED = (
+    "the drive does not answer, nor does {before}, before it on the line and needed to reach it: switch that on first,"
+    " then send reset"
+)
 NOT_IDENTIFIED = Fault(
     "not_identified",
     "what answers is not known to be this drive: only what stops it is sent; correct the wiring or the configuration",
@@ -284,6 +288,7 @@ class AxisTracker:
         target: where the axis was sent last, or came to rest after anything else, in axis units; None while it is
             neither, and while nothing holds it.
         proof: that who answers is its drive; None for an axis without a line.
+        holder: the client in control; None without one.
     """
 
     has_reference = True
@@ -315,6 +320,7 @@ class AxisTracker:
         self.active_faults: tuple[FaultEntry, ...] = ()
         self.first_fault: FaultEntry | None = None
         self.speed_share = 1.0
+        self.holder: str | None = None
         self._failure: str | None = None
         self.found: Callable[[PastFault], None] = _ignore
         self.latch_changed: Callable[[], None] = _ignore_latch
@@ -345,6 +351,7 @@ class AxisTracker:
             "reference_lost": self.reference_lost,
             "target": self.target,
             "speed_override": 100.0 * self.speed_share,
+            "holder": self.holder,
         }
 
     @property
@@ -540,13 +547,18 @@ class AxisTracker:
     def disconnected(self, now_ns: int) -> None:
         """The drive is gone: nothing is known any more, and nothing resumes."""
         another = self.proof is not None and self.proof.is_another
+        before = self.proof.blocked_by if self.proof else ""
+        lost = replace(LINK_LOST, text=LINK_BLOCKED.format(before=before)) if before else LINK_LOST
         was_up = self.link is not LinkState.DOWN
+        if not (was_up or another) and any(fault.code == lost.code for fault in self.active_faults):
+            self._faults((lost,), now_ns)  # what is before it is known by now, or answers again
+            return
         if not was_up and (not another or any(fault.code == NOT_IDENTIFIED.code for fault in self.active_faults)):
             return
         self.link = LinkState.DOWN
         self.referenced, self.target = False, None
         self._rest.forget()
-        self._faults((NOT_IDENTIFIED if another else LINK_LOST,), now_ns)
+        self._faults((NOT_IDENTIFIED if another else lost,), now_ns)
         if was_up and self.state is not AxisState.DISABLED:
             self._fail(LINK_LOST.text)
 
@@ -554,7 +566,7 @@ class AxisTracker:
         known = {entry.code: entry for entry in self.active_faults}
         if self.stop_pending:
             faults = (*faults, STOP_UNCONFIRMED)
-        self.active_faults = tuple(known.get(fault.code) or self._entered(fault, now_ns) for fault in faults)
+        self.active_faults = tuple(self._entry(known.get(fault.code), fault, now_ns) for fault in faults)
         if self.first_fault is None:
             causes = (fault for fault in self.active_faults if fault.code != REFERENCE_REFUSED.code)
             self.first_fault = next(causes, None)
@@ -565,6 +577,11 @@ class AxisTracker:
             self.refused = ""
             self._own = tuple(fault for fault in self._own if fault.code != REFERENCE_REFUSED.code)
         return self._own
+
+    def _entry(self, known: FaultEntry | None, fault: Fault, now_ns: int) -> FaultEntry:
+        if known is None:
+            return self._entered(fault, now_ns)
+        return known if known.text == fault.text else known.model_copy(update={"text": fault.text})
 
     def _entered(self, fault: Fault, now_ns: int) -> FaultEntry:
         entry = _entry(fault, now_ns)

@@ -149,7 +149,7 @@ class Watched:
             condition = assess(self._states.get(name), self._faults.get(name))
             if isinstance(sample, PositionSample):
                 return f"position {condition.position(f'{sample.value:.4f}', sample.unit)}"
-            return f"state    {condition.summary}"
+            return f"state    {condition.in_full}"
         return sample_text(sample)
 
 
@@ -175,7 +175,7 @@ async def _say_silence(client: RigClient, wanted: str) -> None:
 
 def _all_of(now: AxisNow) -> str:
     where = now.condition.position(_digits(now), now.info.unit, now.age_s)
-    return f"{where}, {now.condition.summary}"
+    return f"{where}, {now.condition.in_full}"
 
 
 @click.command()
@@ -339,7 +339,7 @@ def rig_table(rig: RigReport) -> list[str]:
 def _axis(axis: AxisReport) -> str:
     info, state, health = axis.info, axis.state, axis.health
     where = f"{info.bus}/{info.address}"
-    what = axis.condition.summary
+    what = axis.condition.in_full
     link = state.link.value if state else "?"
     rate = f"{health.rate_hz:6.1f} Hz" if health else "     ? Hz"
     return f"{info.axis:12} {info.model:14} {where:12} {link:8} {rate}  {what}"

@@ -18,6 +18,7 @@ from ldcnd.client.traces import Trace, take_trace
 from ldcnd.client.verbs import AxisVerbs
 from ldcnd.contract.codec import decode_received, explained
 from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
+from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError
 from ldcnd.contract.events import CommandOutcome, ReadOutcome
 from ldcnd.contract.frozen import Frozen
@@ -316,7 +317,7 @@ class Axis(AxisVerbs):
             ("state", state),
             ("enabled", "yes" if state.enabled else "no"),
             ("homed", "yes" if state.referenced else "no"),
-            ("control", self._who or "none"),
+            ("control", assess(state.sample).control or "unknown"),
         ]
         return table(f"axis {self.name}", rows)
 

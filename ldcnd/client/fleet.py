@@ -3,9 +3,8 @@
 import asyncio
 
 from ldcnd.client.health import last_bus_health, last_health
-from ldcnd.client.overview import holders_of
 from ldcnd.client.rig_client import RigClient, daemons, find_rigs
-from ldcnd.contract.condition import UNKNOWN_HOLDER, Condition, assess, line_troubles
+from ldcnd.contract.condition import Condition, assess, line_troubles
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth
@@ -32,13 +31,11 @@ class AxisReport(Frozen):
     """How fresh its samples are; null before the first report."""
     line_up: bool = True
     """Its line is up."""
-    holder: str | None = UNKNOWN_HOLDER
-    """The client in control; null without one, empty where that is not known."""
 
     @property
     def condition(self) -> Condition:
         """Whether its place is known, and all that is to be said of it."""
-        return assess(self.state, self.fault, self.health, line_up=self.line_up, holder=self.holder)
+        return assess(self.state, self.fault, self.health, line_up=self.line_up)
 
 
 class RigReport(Frozen):
@@ -106,7 +103,7 @@ async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, 
             axes = await client.axes()
             states = await client.states()
             faults = await client.faults()
-            health, holders = await last_health(client), await holders_of(client)
+            health = await last_health(client)
             buses = tuple(sorted(await last_bus_health(client), key=lambda bus: bus.bus))
     except LdcndError as error:
         return view.model_copy(update={"problems": (f"stopped answering: {error.message}",)})
@@ -120,7 +117,6 @@ async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, 
             fault=faults.get(name),
             health=freshness.get(name),
             line_up=axis.bus not in down,
-            holder=holders.get(name, UNKNOWN_HOLDER),
         )
         for name, axis in known.items()
     )

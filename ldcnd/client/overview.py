@@ -4,11 +4,9 @@ from dataclasses import dataclass
 
 from ldcnd.client.health import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.condition import UNKNOWN_HOLDER, Condition, Place, assess
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.condition import Condition, Place, assess
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth
-from ldcnd.contract.leases import ListHolders
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import AxisState, FaultSample, LinkState, Moving, PositionSample, Quality, StateSample
 
@@ -78,7 +76,7 @@ async def overview(client: RigClient) -> list[AxisNow]:
         SessionError: no daemon answers.
     """
     axes, states, positions = await client.axes(), await client.states(), await client.positions()
-    faults, report, holders = await client.faults(), await last_health(client), await holders_of(client)
+    faults, report = await client.faults(), await last_health(client)
     lines = {line.bus: line for line in await last_bus_health(client)}
     stamps = [sample.t for samples in (states, positions) for sample in samples.values()]
     now_ns = max([*stamps, report.t if report else 0], default=0)  # the clocks of two hosts may differ
@@ -88,16 +86,6 @@ async def overview(client: RigClient) -> list[AxisNow]:
         health = next((each for each in line.axes if each.axis == info.axis), None) if line else None
         age_s = (now_ns - position.t) / 1e9 if position else None
         fault: FaultSample | None = faults.get(info.axis)
-        holder, line_up = holders.get(info.axis, UNKNOWN_HOLDER), line is None or line.up
-        condition = assess(state, fault, health, age_s=age_s, line_up=line_up, holder=holder)
+        condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up)
         found.append(AxisNow(info, state, position, age_s, health, condition))
     return found
-
-
-async def holders_of(client: RigClient) -> dict[str, str | None]:
-    """Return who controls each axis, None where no client does; an axis of which that cannot be learned is missing."""
-    try:
-        reply = await client.ask(ListHolders())
-    except LdcndError:
-        return {}
-    return {each.axis: each.client for each in reply.holders}

@@ -5,7 +5,7 @@ silent. So it is decided again a few times a second, and goes to pages when it i
 """
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -13,7 +13,7 @@ import msgpack
 
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.contract.codec import Encoding, decode_received
-from ldcnd.contract.condition import UNKNOWN_HOLDER, Condition, Place, Severity, Trouble, TroubleKind, assess
+from ldcnd.contract.condition import Condition, Place, Severity, Trouble, TroubleKind, assess
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.health import BusHealth
 from ldcnd.contract.keys import Keys
@@ -55,12 +55,10 @@ class Conditions:
 
     Attributes:
         silence: why nothing comes from the daemon, as the console knows it; empty while it is there.
-        holders: who controls each axis; None where no client does. An axis of which that is not known is missing.
     """
 
     def __init__(self, rig: str, put: Callable[[Publication], None], now_s: Callable[[], float]) -> None:
         self.silence = ""
-        self.holders: Mapping[str, str | None] = {}
         self._keys = Keys(rig)
         self._telemetry = self._keys.telemetry("x", TelemetryItem.STATE).removesuffix(f"x/{TelemetryItem.STATE}")
         self._put = put
@@ -128,7 +126,6 @@ class Conditions:
                 self._note_clock(sample.t)
         line = next((line for line in self._lines.values() if any(each.axis == name for each in line.axes)), None)
         health = next((each for each in line.axes if each.axis == name), None) if line else None
-        holder = UNKNOWN_HOLDER if silence else self.holders.get(name, UNKNOWN_HOLDER)
         condition = assess(
             state,
             fault,
@@ -136,9 +133,8 @@ class Conditions:
             age_s=self._age_s(position.t) if position else None,
             line_up=line is None or line.up,
             silence=silence,
-            holder=holder,
         )
-        return {**as_payload(condition), "holder": holder}
+        return as_payload(condition)
 
     def _note_clock(self, t: int) -> None:
         if t > self._newest[0]:
@@ -159,6 +155,8 @@ def as_payload(condition: Condition) -> dict[str, object]:
         "state": condition.state,
         "live": condition.live,
         "alarm": condition.alarm.name.lower(),
+        "holder": condition.holder,
+        "control": condition.control,
         "troubles": [_trouble(each) for each in condition.troubles],
     }
 

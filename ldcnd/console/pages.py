@@ -16,7 +16,6 @@ from pydantic import Field
 
 from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control
-from ldcnd.client.overview import holders_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitor
@@ -32,7 +31,7 @@ from ldcnd.contract.errors import (
     UnknownAxis,
 )
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.leases import Acquire
+from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.rig_commands import MoveTogether, MoveTogetherReply
 from ldcnd.contract.samples import Moving
 from ldcnd.log import get_logger
@@ -178,13 +177,11 @@ class PageControl:
             before.keeping.cancel()  # the daemon has put the new lease in its place
         keeping = self._group.create_task(self._keep(rig, axis, control), name=f"lease of {self.client} on {axis}")
         self._held[rig, axis] = _Hold(client, axis, control, keeping)
-        self._rigs.control_changed(rig)
 
     async def release(self, rig: str, axis: str) -> None:
         """Give up control of an axis; one that may move is halted before."""
         if hold := self._held.pop((rig, axis), None):
             await _give_up(hold, self.client)
-            self._rigs.control_changed(rig)
 
     async def command(self, rig: str, axis: str, command: AxisCommand[CommandReply]) -> CommandReply:
         """Send one command, under the page's lease where it has one.
@@ -290,12 +287,15 @@ class PageControl:
             why = control.lost.message if control.lost else ""
             log.info("control lost", client=self.client, rig=rig, axis=axis, reason=why)
             taker = await self._holder(rig, axis)
-            self._rigs.control_changed(rig)
             self._tell(ToPage(lost=Lost(rig=rig, axis=axis, message=why, taken_by=taker)))
 
     async def _holder(self, rig: str, axis: str) -> str | None:
         """Return who controls an axis that this page has lost; None where none does, or the daemon does not answer."""
-        holder = (await holders_of(self._rigs.client(rig))).get(axis)
+        try:
+            reply = await self._rigs.client(rig).ask(ListHolders())
+        except LdcndError:
+            return None
+        holder = next((each.client for each in reply.holders if each.axis == axis), None)
         return None if holder == self.client else holder
 
 

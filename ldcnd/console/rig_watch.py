@@ -7,7 +7,6 @@ from contextlib import suppress
 import msgpack
 
 from ldcnd.client.network import Publication, SampleKind
-from ldcnd.client.overview import holders_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.console.latest_values import LatestValues
@@ -30,8 +29,6 @@ ASK_WHY_EACH_S = 0.2
 """Shortest time between two rounds of questions for what forbids the commands of axes, seconds."""
 ASK_ALL_WHY_S = 2.0
 """Longest time between them: what is not in the state of an axis, as another daemon, forbids commands too."""
-HOLDERS_EACH_S = 1.0
-"""Period of queries for who controls what, seconds; the daemon publishes everything else by itself."""
 LINGER_S = 0.016
 """Period in which samples are taken together, seconds; less than a frame at the highest rate."""
 DESCRIPTION_AGE_S = 1.0
@@ -61,10 +58,10 @@ class RigWatch:
         self._why_due: set[str] = set()
         self._why_wanted = asyncio.Event()
         self._conditions = Conditions(client.rig, values.take, asyncio.get_running_loop().time)
+        self._telemetry = client.keys.telemetry_pattern("*", "*").removesuffix("*/*")
         self._instances: set[str] = set()
         self._stirred = asyncio.Event()
         client.watch_rivals(self._stirred.set)
-        self._control_changed = asyncio.Event()
         self._reply = RigReply(
             name=client.rig, endpoint=endpoint, connected=False, problem="its daemon has not been seen yet"
         )
@@ -96,24 +93,8 @@ class RigWatch:
         """Watch until cancelled."""
         async with asyncio.TaskGroup() as group:
             group.create_task(self._conditions.run(), name=f"conditions of {self.client.rig}")
-            group.create_task(self._follow_holders(), name=f"holders of {self.client.rig}")
             group.create_task(self._follow_obstacles(), name=f"obstacles of {self.client.rig}")
             await self._watch()
-
-    def control_changed(self) -> None:
-        """Query at once who controls what: a page has taken control, given it up or lost it."""
-        self._control_changed.set()
-        self._want_why(*self.axes)
-
-    async def _follow_holders(self) -> None:
-        """Query who controls what, for all pages at once."""
-        while True:
-            self._control_changed.clear()
-            self._conditions.holders = await holders_of(self.client) if self.connected else {}
-            self._conditions.show()
-            with suppress(TimeoutError):
-                async with asyncio.timeout(HOLDERS_EACH_S):
-                    await self._control_changed.wait()
 
     def _want_why(self, *axes: str) -> None:
         self._why_due.update(axes)
@@ -145,6 +126,8 @@ class RigWatch:
         self._values.take(Publication(key, payload, Encoding.MSGPACK, kind, measured_at_ns=None))
 
     def _take(self, sample: Publication) -> None:
+        if sample.kind is SampleKind.DELETE and sample.key.startswith(self._telemetry):
+            return  # its daemon ends, which is known otherwise: pages show these as the last known values, not as none
         if sample.key.endswith((f"/{TelemetryItem.STATE}", f"/{TelemetryItem.FAULT}")):
             self._want_why(sample.key.split("/")[-2])
         self._values.take(sample)

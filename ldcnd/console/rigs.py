@@ -73,10 +73,6 @@ class Rigs:
         """Return the run of a rig's daemon that the console shows, or None before it was there."""
         return self._watch(rig).instance
 
-    def control_changed(self, rig: str) -> None:
-        """Learn that control of an axis of a rig may have another holder now."""
-        self._watch(rig).control_changed()
-
     def axes(self, rig: str) -> frozenset[str]:
         """Return the names of a rig's axes, as it described itself last."""
         return self._watch(rig).axes

@@ -5,12 +5,21 @@ sentence of its own; the console's pages get the result from the console's serve
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum, auto
 from typing import Protocol
 
 from ldcnd.contract.health import AxisHealth
-from ldcnd.contract.samples import AxisState, CurrentCommand, FaultEntry, LinkState, Moving, Quality, TelemetryItem
+from ldcnd.contract.samples import (
+    UNKNOWN_HOLDER,
+    AxisState,
+    CurrentCommand,
+    FaultEntry,
+    LinkState,
+    Moving,
+    Quality,
+    TelemetryItem,
+)
 
 ENOUGH = 0.9
 """Minimum share of the requested rate at which a rate counts as kept."""
@@ -22,8 +31,6 @@ OLD_PERIODS = 4
 """Periods of a position's rate that may pass besides: a poll may be lost or late."""
 FULL_SPEED = 100.0
 """Speed override at which nothing is slowed, percent."""
-UNKNOWN_HOLDER = ""
-"""Stands for a holder of control of whom this face knows nothing."""
 
 
 class Severity(IntEnum):
@@ -57,7 +64,6 @@ class TroubleKind(Enum):
     MISSED_POLLS = auto()
     SLOW = auto()
     SLOWED = auto()
-    CONTROL = auto()
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +118,8 @@ class Condition:
         live: state and velocity are to be believed.
         alarm: how bad it is.
         troubles: everything that is to be said, the worst first.
+        holder: the client in control; None without one, `UNKNOWN_HOLDER` where that is not known.
+        control: the same in words; empty where that is not known.
     """
 
     place: Place
@@ -120,15 +128,22 @@ class Condition:
     live: bool
     alarm: Alarm
     troubles: tuple["Trouble", ...]
+    holder: str | None = UNKNOWN_HOLDER
+    control: str = ""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Everything that is to be said, in a few words each."""
-        return tuple(trouble.short for trouble in self.troubles)
+        """Everything that is to be said, in a few words each, and who controls the axis."""
+        return tuple(filter(None, (*(trouble.short for trouble in self.troubles), self.control)))
 
     @property
     def summary(self) -> str:
         """The state and everything that is to be said besides, in one line."""
+        return ", ".join((self.state, *(trouble.short for trouble in self.troubles)))
+
+    @property
+    def in_full(self) -> str:
+        """The same and who controls the axis."""
         return ", ".join((self.state, *self.notes))
 
     @property
@@ -211,6 +226,10 @@ class KnownState(Protocol):
     def speed_override(self) -> float:
         """Percent of every velocity."""
 
+    @property
+    def holder(self) -> str | None:
+        """The client in control; None without one, `UNKNOWN_HOLDER` where that is not known."""
+
 
 class Faults(Protocol):
     """The faults of an axis: a fault sample, or the daemon's own knowledge."""
@@ -251,8 +270,12 @@ _NOT_HOMED = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "not homed: its position is
 _HOMING = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "it is being homed: its position is not known yet", "homing")
 _LATCHED = Trouble(TroubleKind.STOP_LATCHED, _NOTICE, "a stop is latched: nothing moves before reset", "stop latched")
 _UNCOMMANDED = Trouble(
-    TroubleKind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command"
+    TroubleKind.UNCOMMANDED,
+    _WRONG,
+    "moves, and was started by no client that is connected: halt it, or take control of it",
+    "moves without a command",
 )
+_PUSHED = Trouble(TroubleKind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command")
 _OVERRIDE_ZERO = Trouble(
     TroubleKind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: nothing moves", "speed override 0 %"
 )
@@ -261,7 +284,7 @@ SHARED = frozenset({TroubleKind.SILENCE, TroubleKind.NOT_HOMED, TroubleKind.STAN
 """Troubles of which several axes have one cause, or which are said once for all; so is a line that is down."""
 _MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
 """Faults whose name says best why the position is lost."""
-_AT_REST = frozenset({AxisState.DISABLED, AxisState.STANDSTILL, AxisState.ERROR_STOP})
+_DRIVEN = frozenset({AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION})
 
 
 def line_troubles(*, up: bool, problem: str = "") -> tuple[Trouble, ...]:
@@ -283,7 +306,6 @@ def assess(
     age_s: float | None = None,
     line_up: bool = True,
     silence: str = "",
-    holder: str | None = UNKNOWN_HOLDER,
 ) -> Condition:
     """Return the condition of an axis.
 
@@ -297,21 +319,24 @@ def assess(
         age_s: age of its position, seconds; None where the face cannot tell.
         line_up: its line is up, as far as the face knows.
         silence: why nothing comes from its daemon; empty while it reports.
-        holder: who controls it; None when no client does, `UNKNOWN_HOLDER` where the face does not know.
     """
     if state is None:
         lost = (_silent(silence),) if silence else () if line_up else (_ON_DEAD_LINE,)
         return _unanswered("unknown", lost or (_NEVER_SEEN,), lost[0].short if lost else "no data")
     word = state_word(state.state)
+    holder = UNKNOWN_HOLDER if silence else state.holder
+    control = _control(holder, moves=state.moving is Moving.YES and state.command is not None)
     gone = _unreachable(state, faults, silence=silence, line_up=line_up)
     pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
     if gone:
-        return _unanswered(f"unknown, was {word}", (*pending, gone), gone.short)
+        return replace(
+            _unanswered(f"unknown, was {word}", (*pending, gone), gone.short), holder=holder, control=control
+        )
     place, mark = _place(state, faults, is_old=_is_old(age_s, health))
-    troubles = (*pending, *_found(state, faults, health, place), *_beside(state, holder))
+    troubles = (*pending, *_found(state, faults, health, place), *_slowed(state))
     worst = max((trouble.severity for trouble in troubles), default=_FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
-    return Condition(place, mark, word, place is not Place.OLD, alarm, troubles)
+    return Condition(place, mark, word, place is not Place.OLD, alarm, troubles, holder, control)
 
 
 def state_word(state: AxisState) -> str:
@@ -335,7 +360,10 @@ def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line
         return _NOT_IDENTIFIED
     if state.link is not LinkState.DOWN:
         return None  # a report on its line may be a second older than this
-    return _NO_ANSWER if line_up else _ON_DEAD_LINE
+    if not line_up:
+        return _ON_DEAD_LINE
+    lost = next((fault for fault in faults.active if fault.code == "link_lost"), None) if faults else None
+    return replace(_NO_ANSWER, text=lost.text) if lost else _NO_ANSWER
 
 
 def _is_old(age_s: float | None, health: AxisHealth | None) -> bool:
@@ -371,8 +399,11 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
         found.append(_HOMING if state.state is AxisState.HOMING else lost)
     if state.stop_latched and not state.stop_pending:
         found.append(_LATCHED)
-    if state.moving is Moving.YES and state.command is None and state.state in _AT_REST:
-        found.append(_UNCOMMANDED)
+    if state.moving is Moving.YES and state.command is None:
+        if state.state not in _DRIVEN:
+            found.append(_PUSHED)
+        elif state.has_reference:  # without: a drive that takes no motion over its line; others move it
+            found.append(_UNCOMMANDED)
     if not state.speed_override:
         found.append(_OVERRIDE_ZERO)
     found += [_of_fault(entry, TroubleKind.WARNING, _NOTICE) for entry in entries if not entry.stops]
@@ -383,18 +414,18 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     return tuple(sorted(found, key=lambda trouble: -trouble.severity))
 
 
-def _beside(state: KnownState, holder: str | None) -> tuple[Trouble, ...]:
+def _slowed(state: KnownState) -> tuple[Trouble, ...]:
     """Return what is to be known and is not wrong."""
-    said = []
-    if 0 < state.speed_override < FULL_SPEED:
-        short = f"speed override {state.speed_override:g} %"
-        said.append(Trouble(TroubleKind.SLOWED, _FINE, f"{short} of every velocity", short))
+    if not 0 < state.speed_override < FULL_SPEED:
+        return ()
+    short = f"speed override {state.speed_override:g} %"
+    return (Trouble(TroubleKind.SLOWED, _FINE, f"{short} of every velocity", short),)
+
+
+def _control(holder: str | None, *, moves: bool) -> str:
     if holder is None:
-        said.append(Trouble(TroubleKind.CONTROL, _FINE, "no client controls it", "not controlled"))
-    elif holder:
-        moves = "moved" if state.moving is Moving.YES else "controlled"
-        said.append(Trouble(TroubleKind.CONTROL, _FINE, f"{moves} by {holder}", f"{moves} by {holder}"))
-    return tuple(said)
+        return "not controlled"
+    return f"{'moved' if moves else 'controlled'} by {holder}" if holder else ""
 
 
 def _first_cause_first(faults: Faults) -> list[FaultEntry]:

@@ -96,7 +96,7 @@ class BusInfo(LineCounters[int]):
     problem: str
     """Why it is not up; empty while it is."""
     remarks: tuple[str, ...]
-    """Warnings although it is up."""
+    """What was noteworthy when it came up; what is wrong now is said of its axes."""
     started_by: Literal["reset", "adoption"] | None = None
     """Whether the drives were reset, so that positions count from 0, or taken over as they were; null while down."""
     modules: tuple[ModuleInfo, ...] = ()

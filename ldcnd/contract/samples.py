@@ -246,6 +246,10 @@ class ShadowSample(Sample):
     """Those of which enough is known."""
 
 
+UNKNOWN_HOLDER = ""
+"""Stands for a holder of control of whom nothing is known."""
+
+
 class CurrentCommand(Frozen):
     """The command that the axis carries out."""
 
@@ -294,6 +298,8 @@ class StateSample(Sample):
     came to rest. Null while it moves without a target, while its position loop is open, and while it is not known."""
     speed_override: float = Field(default=100.0, ge=0, le=100)
     """Percent of every velocity, for the whole rig; nothing moves at 0."""
+    holder: str | None = UNKNOWN_HOLDER
+    """The client in control of the axis; null without one, empty where that is not known."""
 
 
 class MonitorName(StrEnum):

@@ -279,6 +279,7 @@ class LeaseWatch:
         """End leases that were not renewed in time; called before any waiting command is examined."""
         for lease in self._authority.expire(self._clock.now_s()):
             log.warning("lease ended", client=lease.client, axes=sorted(lease.axes))
+            self._show(lease.axes)
             self._lost(lease, lease.axes, "its lease was not renewed", ErrorCode.LEASE_EXPIRED)
 
     def acquire(self, request: Acquire) -> Lease:
@@ -297,6 +298,7 @@ class LeaseWatch:
         except LeaseHeld as error:
             self._refused(request, error)
             raise
+        self._show(lease.axes.union(*(other.axes for other in displaced)))
         for other in displaced:
             if other.client == lease.client:
                 self._lost(other, other.axes - lease.axes, "its client took a lease that covers less", None)
@@ -313,6 +315,7 @@ class LeaseWatch:
             LeaseExpired, LeaseUnknown: it does not hold any more, or never did.
         """
         lease = self._authority.release(token, self._clock.now_s())
+        self._show(lease.axes)
         log.info("control released", client=lease.client, axes=sorted(lease.axes), leave_running=leave_running)
         moving = [name for name in lease.axes if self._rig.axes[name].tracker.moving is not Moving.NO]
         if not leave_running:
@@ -321,6 +324,12 @@ class LeaseWatch:
         for name in sorted(moving) if leave_running else ():
             self._note(name, lease, CommandStatus.DONE, "released; what moves was left running on purpose", None)
         return lease
+
+    def _show(self, axes: Iterable[str]) -> None:
+        """Publish who controls axes from now on: it is a part of their states."""
+        for name in axes:
+            lease = self._authority.holder(name)
+            self._rig.axes[name].controlled_by(lease.client if lease else None)
 
     def _take_gains_back(self, axes: Iterable[str]) -> None:
         if self.group is None:

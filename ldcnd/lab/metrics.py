@@ -155,6 +155,9 @@ class HealthCollector(Collector):
         condition = GaugeMetricFamily(
             "ldcnd_axis_condition", "1 for each thing that is to be said of an axis", labels=[*labels, "condition"]
         )
+        control = GaugeMetricFamily(
+            "ldcnd_axis_control", "1 with who controls or moves an axis as a label", labels=[*labels, "control"]
+        )
         down = {axis.axis for bus in buses if not bus.up for axis in bus.axes}
         since_s = self._now_s() - FRESH_S
         for axis, (at_s, state) in self._states.items():
@@ -162,9 +165,11 @@ class HealthCollector(Collector):
             now = assess(state, self._faults.get(axis), line_up=axis not in down, silence=silence)
             known.add_metric([self._rig, axis], float(now.place is Place.KNOWN))
             severity.add_metric([self._rig, axis], now.alarm)
-            for note in dict.fromkeys((*([now.mark] if now.mark else []), *now.notes)):
+            for note in dict.fromkeys((*([now.mark] if now.mark else []), *(each.short for each in now.troubles))):
                 condition.add_metric([self._rig, axis, note], 1.0)
-        yield from (known, severity, condition)
+            if now.control:
+                control.add_metric([self._rig, axis, now.control], 1.0)
+        yield from (known, severity, condition, control)
 
     def _of_shadows(self) -> Iterator[Metric]:
         labels = ["rig", "axis", "figure"]

@@ -87,18 +87,20 @@ class Proof:
 
     Attributes:
         holds: it was identified since the line came up, and was not lost since.
+        blocked_by: the silent one before it on its line, without which no address reaches it; empty without one.
     """
 
-    __slots__ = ("_axis", "_problem", "_silent", "_what", "holds")
+    __slots__ = ("_axis", "_problem", "_silent", "_what", "blocked_by", "holds")
 
     def __init__(self, what: str, axis: str | None) -> None:
         self.holds = False
+        self.blocked_by = ""
         self._what, self._axis = what, axis
         self._problem, self._silent = "its line has not come up yet", True
 
     def prove(self) -> None:
         """Note that it is the one that is meant."""
-        self.holds = True
+        self.holds, self.blocked_by = True, ""
 
     def lose(self, problem: str, *, silent: bool = True) -> None:
         """Note why it is not, or may not be any more.
@@ -117,10 +119,13 @@ class Proof:
     def refusal(self) -> LdcndError:
         """Return the refusal of what would change something: `AxisUnreachable` if it is silent, or `NotIdentified`."""
         if self._silent:
+            before = f", nor does {self.blocked_by} before it" if self.blocked_by else ""
             return AxisUnreachable(
-                f"{self._what}: the drive does not answer: {self._problem}",
+                f"{self._what}: the drive does not answer: {self._problem}{before}",
                 axis=self._axis,
-                remedy="check its power and the line",
+                remedy=f"check the power of {self.blocked_by} first"
+                if self.blocked_by
+                else "check its power and the line",
             )
         return NotIdentified(
             f"{self._what} is not identified, so only what stops it is sent: {self._problem}",

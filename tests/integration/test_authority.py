@@ -56,6 +56,21 @@ async def test_a_leased_rig_moves_under_a_lease_only():
         assert {holder.client for holder in holders.holders} == {None}
 
 
+async def test_the_state_of_an_axis_says_who_controls_it_however_that_changes():
+    async with running_rig(leased()) as rig:
+        await rig.until("x", lambda state: state.link == "up" and state.holder is None)
+        async with control(rig.client, "ann", "x", lease_s=1.0):
+            await rig.until("x", lambda state: state.holder == "ann")
+            async with control(rig.client, "bob", "x", lease_s=1.0, force=True):
+                await rig.until("x", lambda state: state.holder == "bob")
+            await rig.until("x", lambda state: state.holder is None)
+        await rig.client.ask(Acquire(client="eve", axes=("x", "y"), lease_s=0.5))
+        for axis in ("x", "y"):
+            await rig.until(axis, lambda state: state.holder == "eve")
+        for axis in ("x", "y"):  # which is not renewed
+            await rig.until(axis, lambda state: state.holder is None)
+
+
 @pytest.mark.promise("stop-in-any-state")
 async def test_stop_and_halt_never_need_a_lease():
     async with running_rig(leased()) as rig:

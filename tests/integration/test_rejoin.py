@@ -5,8 +5,9 @@ from itertools import pairwise
 
 import pytest
 
+from ldcnd.client.overview import overview
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.commands import MoveAbsolute, Power, Why
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
@@ -92,6 +93,31 @@ async def test_a_drive_that_lost_power_is_back_within_3_s_and_the_others_finish_
     assert abs(drive(chain, 4).loop.position - 90_000) <= 1
     assert [drive(chain, address).loop.servo_on for address in (1, 2, 3, 4)] == [True, False, True, True]
     assert drive(chain, 2).loop.position == 0
+
+
+async def test_a_drive_behind_one_without_power_names_that_one_on_every_face():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config()) as rig:
+        await power_all(rig)
+        set_power(chain, 2, on=False)
+        await rig.until("z", lambda state: state.link is LinkState.DOWN)
+        async with asyncio.timeout(30):
+            while "axis y, address 2" not in (await rig.client.faults())["z"].active[0].text:
+                await asyncio.sleep(0.1)
+        said = {now.info.axis: [each.text for each in now.condition.troubles] for now in await overview(rig.client)}
+        why = await rig.client.ask(Why(), "z")
+        set_power(chain, 2, on=True)
+        for name in ("y", "z"):
+            await rig.until(name, lambda state: state.link is LinkState.UP)
+        after = await rig.client.ask(Why(), "z")
+
+    assert "nor does axis y, address 2" in said["z"][0]
+    assert "nor does" not in said["y"][0]
+    assert (why.causes[0].code, why.causes[0].remedy) == (
+        "axis_unreachable",
+        "check the power of axis y, address 2 first",
+    )
+    assert not any("address 2" in cause.text for cause in after.causes)
 
 
 async def test_the_axis_works_again_once_it_is_powered():

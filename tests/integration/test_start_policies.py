@@ -5,7 +5,9 @@ import contextlib
 
 import pytest
 
+from ldcnd.client.overview import overview
 from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power
+from ldcnd.contract.condition import Severity
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.samples import AxisState, LinkState, Moving, StateSample, TelemetryItem
 from ldcnd.drives.ldcn.controls import StopControl
@@ -55,6 +57,9 @@ async def test_a_daemon_killed_in_mid_move_is_followed_by_one_that_adopts():
     async with rig_on(chain, ADOPTING) as rig:
         adopted_with = commands_in(rig.sent)
         moving = await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.until("x", lambda state: state.moving is Moving.YES)
+        x, *others = await overview(rig.client)
+        (worst, *_) = x.condition.wrong
         ended = await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
         await asyncio.sleep(0.5)
         (bus,) = await rig.client.buses()
@@ -65,6 +70,9 @@ async def test_a_daemon_killed_in_mid_move_is_followed_by_one_that_adopts():
     assert sent <= HARMLESS | OPEN_LOOPS_OFF
     assert not any(stops)  # a motion with an end has it
     assert (moving.state, moving.referenced) == (AxisState.DISCRETE_MOTION, False)
+    assert (worst.severity, worst.short) == (Severity.WRONG, "moves without a command")
+    assert "started by no client that is connected" in worst.text
+    assert not any("moves" in note for other in others for note in other.condition.notes)
     assert (ended.state, ended.last_error) == (AxisState.STANDSTILL, None)
     assert (bus.up, bus.started_by, bus.baud) == (True, "adoption", 115_200)
     assert abs(drive(chain, 1).loop.position - 50_000) <= 1

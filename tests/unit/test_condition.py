@@ -80,7 +80,8 @@ def test_a_line_that_is_not_up_is_wrong_and_says_why_where_that_is_known():
 def test_of_a_drive_that_does_not_answer_nothing_else_is_said():
     gone = state(link=LinkState.DOWN, state=AxisState.ERROR_STOP, stop_latched=True)
 
-    assert said(troubles_of(gone, faults(entry("link_lost")), health(0.0))) == wrong("the drive does not answer")
+    assert said(troubles_of(gone, None, health(0.0))) == wrong("the drive does not answer")
+    assert said(troubles_of(gone, faults(entry("link_lost")), health(0.0))) == wrong("remedy of link_lost")
 
 
 def test_a_stop_that_no_drive_has_confirmed_comes_before_everything_even_of_a_drive_that_does_not_answer():

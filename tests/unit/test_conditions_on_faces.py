@@ -20,13 +20,15 @@ from ldcnd.client.overview import AxisNow
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.contract.codec import Encoding, encode
-from ldcnd.contract.condition import UNKNOWN_HOLDER, Place, assess
+from ldcnd.contract.condition import Place, assess
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth, StopWaitHealth
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import AxisInfo, AxisLimits, DaemonInfo
 from ldcnd.contract.samples import (
+    UNKNOWN_HOLDER,
     AxisState,
+    CurrentCommand,
     FaultEntry,
     FaultSample,
     LinkState,
@@ -37,7 +39,7 @@ from ldcnd.contract.samples import (
     TelemetryItem,
 )
 from ldcnd.lab.metrics import HealthCollector
-from ldcnd.lab.ros2.bridge import ERROR, OK, STALE, WARN, Bridge
+from ldcnd.lab.ros2.bridge import ERROR, STALE, WARN, Bridge
 from ldcnd.lab.top.columns import as_text
 from ldcnd.lab.top.rig_view import Description, RigView
 from ldcnd.net.memory_session import MemoryBroker
@@ -65,7 +67,6 @@ class Case:
     Attributes:
         name: as the reference has it.
         state: what differs from an axis that stands, enabled and homed.
-        holder: who controls the axis.
         says: what stands on faces; `without` is said by those that know neither faults, nor the line, nor ages.
         place: whether the position is known.
     """
@@ -78,16 +79,17 @@ class Case:
     age_s: float = 0.0
     line_up: bool = True
     without: str | None = None
-    holder: str | None = UNKNOWN_HOLDER
 
 
+MOVE = CurrentCommand(command_id="c-1", verb="move_absolute", since=0)
 DOWN = {"link": LinkState.DOWN, "moving": Moving.UNKNOWN, "referenced": False, "quality": Quality.BAD}
 LOST = {"quality": Quality.UNCERTAIN, "referenced": False, "reference_lost": True, "state": AxisState.ERROR_STOP}
 CASES = (
     Case("well", {}, "", Place.KNOWN),
     Case("not homed", {"referenced": False}, "not homed", Place.NOT_HOMED),
     Case("reference lost", {"referenced": False, "reference_lost": True}, "reference lost", Place.NOT_HOMED),
-    Case("homing", {"referenced": False, "state": AxisState.HOMING, "moving": Moving.YES}, "homing", Place.NOT_HOMED),
+    Case("homing", {"referenced": False, "state": AxisState.HOMING, "moving": Moving.YES, "command": MOVE}, "homing",
+         Place.NOT_HOMED),
     Case("drive does not answer", DOWN, "no answer", Place.NOT_ANSWERING, (fault("link_lost"),)),
     Case("line down", DOWN, "line down", Place.NOT_ANSWERING, line_up=False, without="no answer"),
     Case("not identified", DOWN, "not identified", Place.NOT_ANSWERING, (fault("not_identified"),),
@@ -97,8 +99,11 @@ CASES = (
          without="position lost"),
     Case("drive was reset", LOST, "drive reset", Place.CONTRADICTED, (fault("drive_reset"),),
          without="position lost"),
-    Case("moves without a command", {"state": AxisState.DISABLED, "moving": Moving.YES}, "moves without a command",
-         Place.KNOWN),
+    Case("pushed", {"state": AxisState.DISABLED, "moving": Moving.YES}, "moves without a command", Place.KNOWN),
+    Case("moves without a command", {"state": AxisState.DISCRETE_MOTION, "moving": Moving.YES},
+         "moves without a command", Place.KNOWN),
+    Case("moved by pulses", {"state": AxisState.DISCRETE_MOTION, "moving": Moving.YES, "has_reference": False},
+         "", Place.KNOWN),
     Case("stop latched", {"stop_latched": True}, "stop latched", Place.KNOWN),
     Case("stop pending", {"stop_latched": True, "stop_pending": True}, "stop NOT CONFIRMED by the drive", Place.KNOWN),
     Case("stop pending, no answer", {**DOWN, "stop_pending": True}, "stop NOT CONFIRMED by the drive",
@@ -110,10 +115,10 @@ CASES = (
          without="error stop"),
     Case("missed polls", {"link": LinkState.DEGRADED, "quality": Quality.UNCERTAIN, "moving": Moving.UNKNOWN},
          "missed polls", Place.KNOWN),
-    Case("moved by another", {"state": AxisState.DISCRETE_MOTION, "moving": Moving.YES}, "moved by ada", Place.KNOWN,
-         without="", holder="ada"),
-    Case("controlled by another", {}, "controlled by ada", Place.KNOWN, without="", holder="ada"),
-    Case("not controlled", {}, "not controlled", Place.KNOWN, without="", holder=None),
+    Case("moved by another", {"state": AxisState.DISCRETE_MOTION, "moving": Moving.YES, "holder": "ada",
+         "command": MOVE}, "moved by ada", Place.KNOWN),
+    Case("controlled by another", {"holder": "ada"}, "controlled by ada", Place.KNOWN),
+    Case("not controlled", {"holder": None}, "not controlled", Place.KNOWN),
 )  # fmt: skip
 
 
@@ -133,7 +138,7 @@ def known(case: Case) -> Known:
     stamp = {"t": NOW_NS, "t_error_ns": 0, "seq": 1}
     standing = StateSample(
         **stamp, quality=Quality.GOOD, state=AxisState.STANDSTILL, enabled=True, referenced=True, moving=Moving.NO,
-        link=LinkState.UP, stop_latched=False, command=None,
+        link=LinkState.UP, stop_latched=False, command=None, holder=UNKNOWN_HOLDER,
     )  # fmt: skip
     axis = AxisHealth(axis="x", link=LinkState.UP, sample_age_s=0.0, rate_wanted_hz=20, rate_hz=20, faults=0)
     line = BusHealth(
@@ -169,7 +174,7 @@ def published(at: Known) -> list[Publication]:
 
 def axis_now(at: Known) -> AxisNow:
     health = at.line.axes[0]
-    condition = assess(at.state, at.faults, health, age_s=at.case.age_s, line_up=at.case.line_up, holder=at.case.holder)
+    condition = assess(at.state, at.faults, health, age_s=at.case.age_s, line_up=at.case.line_up)
     return AxisNow(INFO, at.state, at.position, at.case.age_s, health, condition)
 
 
@@ -195,26 +200,15 @@ def top(at: Known) -> str:
     for sample in published(at):
         view.take(sample, 100.0 - (at.case.age_s if sample.key.endswith("position") else 0.0))
     view.take(put(KEYS.health, DaemonHealth(t=NOW_NS, seq=0, loop_lag_s=0, published=0, missed_reports=0)), 100.0)
-    view.describe(Description(DAEMON, (INFO,), holders(at)))
+    view.describe(Description(DAEMON, (INFO,)))
     return "\n".join(as_text(view.glance(100.0))[2:4])
-
-
-def holders(at: Known) -> dict[str, str | None]:
-    return {} if at.case.holder == UNKNOWN_HOLDER else {"x": at.case.holder}
 
 
 DAEMON = DaemonInfo.model_construct(rig="sim", version="1", instance="a", buses=("line0",))
 
 
 def fleet_table(at: Known) -> str:
-    report = AxisReport(
-        info=INFO,
-        state=at.state,
-        fault=at.faults,
-        health=at.line.axes[0],
-        line_up=at.case.line_up,
-        holder=at.case.holder,
-    )
+    report = AxisReport(info=INFO, state=at.state, fault=at.faults, health=at.line.axes[0], line_up=at.case.line_up)
     return "\n".join(rig_table(RigReport(rig="sim", instance="a", daemon=None, health=None, axes=(report,))))
 
 
@@ -277,12 +271,11 @@ def epics(at: Known) -> str:
 def console(at: Known) -> str:
     sent: list[Publication] = []
     conditions = Conditions("sim", sent.append, lambda: 100.0)
-    conditions.holders = holders(at)
     for sample in published(at):
         conditions.take(sample)
     conditions.show()
     told = msgpack.unpackb(sent[-1].payload)
-    return " ".join((told["mark"], told["state"], *(each["short"] for each in told["troubles"])))
+    return " ".join((told["mark"], told["state"], *(each["short"] for each in told["troubles"]), told["control"]))
 
 
 ALL_KNOWN = (axis_list, axis_list_json, top, console)
@@ -298,12 +291,10 @@ FACES = (*ALL_KNOWN, *NO_AGE, *FAULTS_ONLY, *STATE_ONLY)
 
 def wanted(case: Case, face: object) -> str:
     """Return what a face has to say of a case."""
-    if face is bluesky and not assess(known(case).state).alarm:
-        return ""  # a reading has a message where it has an alarm
+    if face is python_repr and "holder" in case.state:
+        return ""  # one line of a position and a state
     if case.without is None or face in ALL_KNOWN:
         return case.says
-    if case.holder != UNKNOWN_HOLDER:
-        return case.says if face is fleet_table else ""  # the others are not told who controls an axis
     knows = case.name != "old" and (face in NO_AGE or (face in FAULTS_ONLY and case.name != "line down"))
     return case.says if knows else case.without
 
@@ -344,7 +335,7 @@ def test_a_joint_state_leaves_out_a_place_that_is_not_known(case):
     assert (joint is not None) is (case.place in (Place.KNOWN, Place.OLD))
 
 
-LEVELS = {Place.KNOWN: {OK, WARN, ERROR}, Place.NOT_HOMED: {WARN, ERROR}}
+CALM = ("moved by another", "controlled by another", "not controlled", "moved by pulses")
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
@@ -356,7 +347,7 @@ def test_alarm_systems_get_no_ok_of_an_axis_whose_place_is_not_known(case):
     bridge.take("x", at.faults)
 
     assert condition.place is case.place
-    assert (condition.alarm == 0) is (case.name in ("well", "speed override 30 %") or case.holder != UNKNOWN_HOLDER)
+    assert (condition.alarm == 0) is (case.name in ("well", "speed override 30 %") or case.name in CALM)
     if case.place is not Place.KNOWN and case.name != "old":
         assert bridge.diagnostics(NOW_NS).statuses[0].level in {WARN, ERROR}
         assert not epics(at).startswith("NO_ALARM")

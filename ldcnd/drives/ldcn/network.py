@@ -412,10 +412,12 @@ class LdcnNetwork(Network):
         """
         different = differences(self._expected, modules)
         if different:
+            missing = next((each for each in self._expected if each.address not in modules), None)
+            first = f": {missing.what}, address {missing.address}, first, those behind it need it" if missing else ""
             raise NetworkMismatch(
                 f"bus {self._bus.settings.name}: {len(modules)} module(s) found within"
                 f" {self._rate.reset_s:g} s of the reset, {len(self._expected)} configured; " + "; ".join(different),
-                remedy="switch on what has no power, and correct the wiring or the configuration",
+                remedy=f"switch on what has no power{first}; correct the wiring or the configuration",
             )
         known = {each.address for each in self._expected}
         return tuple(
@@ -486,7 +488,20 @@ class LdcnNetwork(Network):
             await self._gathering.search(addressing, reached)
         for address in await self._identify():
             reached(address)
+        self._note_blocked()
         return frozenset(back)
+
+    def _note_blocked(self) -> None:
+        """Note which silent modules stand behind another one.
+
+        A module hears nothing while the address output of the one before it is not low (LS-182AP manual, Addressing).
+        """
+        first = ""
+        for each in self._expected:
+            proof = self._proofs[each.address]
+            proof.blocked_by = first if not proof.holds else ""
+            if not (proof.holds or first):
+                first = f"{each.what}, address {each.address}"
 
     @property
     @override

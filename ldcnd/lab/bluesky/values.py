@@ -24,11 +24,14 @@ def reading(
     value: ValueT, at_s: float, quality: Quality = Quality.GOOD, condition: Condition | None = None
 ) -> "Reading[ValueT]":
     """Return a value with the instant at which it was true, in seconds since 1970, and the condition of its axis."""
+    said = ", ".join(dict.fromkeys(filter(None, (condition.mark, *condition.notes)))) if condition else ""
     if condition and condition.alarm > SEVERITIES[quality]:
-        said = ", ".join(dict.fromkeys((*([condition.mark] if condition.mark else []), *condition.notes)))
         return {"value": value, "timestamp": at_s, "alarm_severity": condition.alarm.value, "message": said}
     if quality is Quality.GOOD:
-        return {"value": value, "timestamp": at_s}
+        plain: Reading[ValueT] = {"value": value, "timestamp": at_s}
+        if said:
+            plain["message"] = said
+        return plain
     message = f"quality {quality.value}"
     return {"value": value, "timestamp": at_s, "alarm_severity": SEVERITIES[quality], "message": message}
 

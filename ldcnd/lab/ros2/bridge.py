@@ -88,6 +88,7 @@ class Bridge:
         condition = assess(state, faults, silence=NOT_REPORTED if is_old else "")
         values = (
             ("place", condition.place.value),
+            ("control", condition.control or "unknown"),
             *((fault.code, fault.text) for fault in active),
             *((trouble.short, trouble.text) for trouble in condition.troubles),
         )

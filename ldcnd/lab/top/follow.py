@@ -4,11 +4,10 @@ import asyncio
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import LdcndError
-from ldcnd.contract.leases import ListHolders
-from ldcnd.lab.top.rig_view import RigView, described
+from ldcnd.lab.top.rig_view import Description, RigView
 
 CHECK_PERIOD_S = 1.0
-"""Period of queries for the daemon's description and the holders of leases; everything else it publishes by itself."""
+"""Period of queries for the daemon's description; everything else it publishes by itself."""
 
 
 async def follow(client: RigClient, view: RigView) -> None:
@@ -23,8 +22,7 @@ async def follow(client: RigClient, view: RigView) -> None:
                     for sample in await client.last_published():
                         view.take(sample, loop.time())
                     instance = daemon.instance
-                holders = await client.ask(ListHolders())
-                view.describe(described(daemon, await client.axes(), holders))
+                view.describe(Description(daemon, tuple(await client.axes())))
             except LdcndError:
                 pass  # the view shows how long the daemon has been silent
             await asyncio.sleep(CHECK_PERIOD_S)

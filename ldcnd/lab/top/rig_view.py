@@ -3,18 +3,16 @@
 Samples are kept as they come and decoded when they are shown: a rig publishes many more than are read.
 """
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.client.overview import seen_of
 from ldcnd.contract.codec import decode_received
-from ldcnd.contract.condition import SHARED, UNKNOWN_HOLDER, Severity, Trouble, TroubleKind, assess, line_troubles
+from ldcnd.contract.condition import SHARED, Severity, Trouble, TroubleKind, assess, line_troubles
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import BusHealth, LaneHealth
 from ldcnd.contract.keys import Keys
-from ldcnd.contract.leases import HolderList
 from ldcnd.contract.meta import AxisInfo, DaemonInfo
 from ldcnd.contract.samples import (
     AdcSample,
@@ -39,18 +37,10 @@ class Description:
     Attributes:
         daemon: itself.
         axes: in the order in which they are shown.
-        holders: who controls which axis; None where no client does.
     """
 
     daemon: DaemonInfo
     axes: tuple[AxisInfo, ...]
-    holders: Mapping[str, str | None]
-
-
-def described(daemon: DaemonInfo, axes: list[AxisInfo], holders: HolderList) -> Description:
-    """Return the answers as one description."""
-    held = {holder.axis: holder.client for holder in holders.holders}
-    return Description(daemon, tuple(axes), held)
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,15 +62,18 @@ class RigView:
     def __init__(self, rig: str, now_s: float) -> None:
         self._keys = Keys(rig)
         self._began_at_s = now_s
+        self._ended = False
         self._description: Description | None = None
         self._kept: dict[str, _Kept] = {}
         self._report_before: dict[str, BusHealth] = {}
 
     def take(self, sample: Publication, now_s: float) -> None:
         """Keep a sample in the place of the one before."""
+        is_state = sample.key.endswith(f"/{TelemetryItem.STATE}")
         if sample.kind is SampleKind.DELETE:
-            self._kept.pop(sample.key, None)
+            self._ended |= is_state  # what is shown from now on is what it said last
             return
+        self._ended &= not is_state
         before = self._kept.get(sample.key)
         if before and sample.key.startswith(f"{self._keys.health}/"):
             report = self._decoded(before, BusHealth)
@@ -111,6 +104,8 @@ class RigView:
     def _rig_trouble(self, now_s: float) -> str:
         report = self._kept.get(self._keys.health)
         silent_s = now_s - (report.at_s if report else self._began_at_s)
+        if self._ended:
+            return "the daemon has ended: what is shown is what it said last"
         if silent_s > SILENT_S:
             return f"the daemon has been silent for {silent_s:.0f} s: what is shown is what it said last"
         return "" if self._description else "waiting for the daemon"
@@ -124,12 +119,8 @@ class RigView:
         state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
         health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
         age_s = now_s - self._kept[position_key].at_s if position else None
-        condition = assess(
-            state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent,
-            holder=self._description.holders.get(info.axis, UNKNOWN_HOLDER) if self._description else UNKNOWN_HOLDER,
-        )  # fmt: skip
-        control = next((each.short for each in condition.troubles if each.kind is TroubleKind.CONTROL), None)
-        worst = next((each for each in condition.troubles if each.kind is not TroubleKind.CONTROL), None)
+        condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent)
+        worst = next(iter(condition.troubles), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(
             axis=info.axis,
@@ -144,8 +135,8 @@ class RigView:
             adc_volts=adc.volts if adc else None,
             rate_hz=health.rate_hz if health else None,
             rate_wanted_hz=health.rate_wanted_hz if health else None,
-            control=control,
-            severity=worst.severity if worst else Severity.NOTICE if news else Severity.FINE,
+            control=condition.control or None,
+            severity=worst.severity if worst else Severity.FINE,
             trouble=worst.text if worst else news,
         )
 

@@ -32,7 +32,7 @@ function Line({ rig, bus }) {
   if (!info) return null;
   return html`<${Panel} title=${`${rig.name} · ${bus.name}`} of=${rig}>
     ${info.up ? null : html`<p class="notice mark" data-level="bad">Down: ${info.problem}</p>`}
-    ${info.remarks.map((remark) => html`<p class="mark" data-level="warn">${remark}</p>`)}
+    ${info.remarks.map((remark) => html`<p class="quiet">At the start: ${remark}.</p>`)}
     <${Facts} of=${[
       ["port", info.port],
       ["rate", `${info.baud} baud`],

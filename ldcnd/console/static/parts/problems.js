@@ -40,7 +40,6 @@ function* ofRig(rig) {
 function* ofBus(rig, bus) {
   const at = { where: `${rig.name} · ${bus.name}`, link: "#/network" };
   if (bus.up === false) yield { ...at, level: "bad", text: bus.problem };
-  for (const remark of bus.info?.remarks ?? []) yield { ...at, level: "warn", text: remark };
   if (!bus.health) return;
   const errors = COUNTERS.reduce((sum, counter) => sum + bus.lately(counter), 0);
   if (errors > ERRORS_A_MINUTE) {

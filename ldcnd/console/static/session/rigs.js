@@ -57,7 +57,7 @@ export class Axis {
 
   /** The same in words. */
   get control() {
-    return this.rig.worth ? "unknown" : (this.condition.troubles.find(({ kind }) => kind === "control")?.short ?? (this.holder || "unknown"));
+    return this.rig.worth ? "unknown" : this.condition.control || "unknown";
   }
 
   can(capability) {
