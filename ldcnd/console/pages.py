@@ -97,7 +97,9 @@ class ToPage(Frozen):
     lost: Lost | None = None
     """Control that it does not have any more."""
     refused: ErrorReply | None = None
-    """Why a jog did not begin, or how it ended by itself."""
+    """Why a jog did not begin, or what went wrong in it."""
+    jog_over: bool | None = None
+    """The jog has ended, not by the page: by a halt, a stop or a limit; the events of the axis say by what."""
 
 
 @dataclass(slots=True, eq=False)
@@ -266,9 +268,11 @@ class PageControl:
             await self._end_of_jog(wanted, error)
 
     async def _end_of_jog(self, wanted: PageJog, error: BaseException) -> None:
-        """Halt the axis, and say why if the page has not let go of it."""
+        """Halt the axis, and say so if the page has not let go of it; what went wrong if it was no ordinary end."""
         await self._halt_jog(wanted)
-        if isinstance(error, LdcndError):
+        if isinstance(error, LeaseExpired):  # the daemon has ended it before
+            self._tell(ToPage(jog_over=True))
+        elif isinstance(error, LdcndError):
             self._tell(ToPage(refused=error_reply(error)))
         if isinstance(error, asyncio.CancelledError):
             raise error

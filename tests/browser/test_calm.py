@@ -1,10 +1,11 @@
 """Every condition of an axis on the rig page and on the axis page, as a person reads them."""
 
-import asyncio
+import re
 
 import pytest
 
 from ldcnd.console.conditions import as_payload
+from ldcnd.contract.commands import Reset
 from ldcnd.contract.condition import Place
 from tests.unit.test_conditions_on_faces import CASES, Case, axis_now, known
 
@@ -20,12 +21,17 @@ pytestmark = [
 SHOW = """async ([axes, condition, lineUp]) => {
   const { rigs, changed } = await import("/static/session/rigs.js");
   const rig = rigs.get("sim");
-  for (const name of axes) rig.axis(name).samples.condition = condition;
+  for (const name of axes) {
+    const axis = rig.axis(name);
+    axis.take = (item, ...rest) => item !== "condition" && Object.getPrototypeOf(axis).take.call(axis, item, ...rest);
+    axis.samples.condition = condition;
+  }
   const bus = rig.buses.get("line0");
-  if (bus.health) bus.health.up = lineUp;
+  bus.report = () => {};
+  bus.reports = bus.reports.map((each) => ({ ...each, up: lineUp }));
   changed();
 }"""
-"""Put what the console process sends into the page; it sends a condition when it is another, so this one stays."""
+"""Put what the console process sends into the page, which takes no other condition and no report of the line."""
 
 
 def payload(case: Case) -> dict[str, object]:
@@ -50,7 +56,6 @@ async def test_the_rig_page_says_every_condition_in_its_row(house, width):
                 await playwright.expect(cell).to_contain_text(payload(case)["mark"])
                 await playwright.expect(desk.page.get_by_text("Nothing needs attention")).to_have_count(0)
                 await playwright.expect(attention.get_by_role("link", name="sim · x")).not_to_have_count(0)
-        await desk.page.evaluate(SHOW, [["x"], payload(CASES[0]), True])
 
 
 async def test_the_axis_page_says_every_condition_beside_its_large_number(house):
@@ -69,7 +74,6 @@ async def test_the_axis_page_says_every_condition_beside_its_large_number(house)
                 await playwright.expect(number).to_contain_text("(")
                 await playwright.expect(panel.locator(".place-mark")).to_have_text(told["mark"])
             await playwright.expect(panel.locator(".state")).to_have_text(told["state"])
-        await desk.page.evaluate(SHOW, [["x"], payload(CASES[0]), True])
 
 
 async def test_a_line_that_is_down_is_one_cause_with_the_names_of_its_axes(house):
@@ -78,14 +82,111 @@ async def test_a_line_that_is_down_is_one_cause_with_the_names_of_its_axes(house
         await desk.open("rig")
         line = desk.page.get_by_role("region", name="Line line0 of sim")
         await playwright.expect(line).to_contain_text("in use")
-        async with asyncio.timeout(30):
-            while True:  # a report of the living line may come in between
-                await desk.page.evaluate(SHOW, [["x", "y", "z", "c"], payload(down), False])
-                causes = desk.page.locator(".attention li").filter(has_text="The line is not up")
-                texts = await causes.all_inner_texts()
-                if len(texts) == 1 and all(f"sim · {name}" in texts[0] for name in ("line0", "x", "y", "z", "c")):
-                    break
-                await asyncio.sleep(0.05)
-        assert await desk.page.locator(".attention li").count() == 1
-        await playwright.expect(desk.page.locator(".summary")).to_contain_text("1 needs attention")
-        await desk.page.evaluate(SHOW, [["x", "y", "z", "c"], payload(CASES[0]), True])
+        await desk.page.evaluate(SHOW, [["x", "y", "z", "c"], payload(down), False])
+        causes = desk.page.locator(".attention li").filter(has_text="The line is not up")
+        await playwright.expect(causes).to_have_count(1)
+        for name in ("line0", "x", "y", "z", "c"):
+            await playwright.expect(causes).to_contain_text(f"sim · {name}")
+
+
+async def test_what_a_line_has_remarked_at_its_start_needs_no_attention_once_it_is_up(house):
+    async with house.desk() as desk:
+        await desk.open("network")
+        await playwright.expect(desk.page.get_by_role("heading", name="sim · line0")).to_be_visible()
+        await desk.page.route("**/api/rigs", remarked)
+        await playwright.expect(
+            desk.page.get_by_text("At the start: not taken over, 0 of 4 modules answer.").first
+        ).to_be_visible()
+        await desk.page.evaluate("() => { location.hash = '#/rig'; }")
+        await playwright.expect(desk.panel("Rig sim")).to_be_visible()
+        await playwright.expect(desk.page.get_by_text("not taken over")).to_have_count(0)
+
+
+async def remarked(route):
+    """Answer with a remark on every line."""
+    answer = await route.fetch()
+    document = await answer.json()
+    for rig in document["rigs"]:
+        for bus in rig["buses"]:
+            bus["remarks"] = ["not taken over, 0 of 4 modules answer"]
+    await route.fulfill(response=answer, json=document)
+
+
+async def test_a_stop_is_in_the_headline_until_reset_whoever_has_stopped(house):
+    await house.sim.quiet("x", "y", "z", "c")
+    async with house.desk() as desk:
+        await desk.open("rig")
+        stops, box = desk.page.locator(".stops"), desk.page.locator(".stop-report")
+        await playwright.expect(desk.panel("Rig sim").locator("tr[data-axis=x]")).to_be_visible()
+        await playwright.expect(stops.filter(has_text="sim")).to_have_count(0)
+
+        await house.sim.rig.stop("y")  # another person
+        await playwright.expect(stops).to_contain_text("stopped and latched: y")
+        await house.sim.rig.command("y", Reset())
+        await playwright.expect(stops.filter(has_text="sim")).to_have_count(0)
+
+        await desk.page.keyboard.press("Escape")
+        await playwright.expect(stops.filter(has_text="sim")).to_contain_text("stopped and latched: x, y, z, c")
+        await playwright.expect(box).to_have_attribute("data-shown", "no")
+        await house.sim.quiet("x", "y", "z", "c")
+        await playwright.expect(stops.filter(has_text="sim")).to_have_count(0)
+        await playwright.expect(box).to_have_attribute("data-shown", "no")
+    await house.mixed.quiet("x")
+
+
+async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_the_daemon(house):
+    await house.alpha.start()
+    try:
+        async with house.desk() as desk:
+            await desk.open("axis/alpha/x")
+            story, preview = desk.panel("Move").locator(".story"), desk.panel("Move").locator(".preview")
+            await desk.button("Take control").click()
+            await desk.button("Enable").click()
+            await house.alpha.until("x", lambda state: state.enabled)
+            await desk.panel("Move").get_by_label("Position mm").fill("80")
+            await playwright.expect(preview).to_contain_text("Ends at 80.000 mm")
+            await desk.panel("Move").get_by_label("Velocity mm/s").fill("2")
+            await desk.button("Move").click()
+            await playwright.expect(story).to_contain_text("x moves to 80.000 mm.")
+            await house.alpha.rig.stop("x")
+            await playwright.expect(story).to_contain_text("move absolute, stopped at")
+            await playwright.expect(desk.panel("Now")).to_contain_text("move absolute, stopped at")
+
+            await desk.button("Reset").click()
+            await house.alpha.until("x", lambda state: not state.stop_latched)
+            await desk.panel("Move").get_by_label("Position mm").fill("70")
+            await desk.button("Move").click()
+            await playwright.expect(story).to_contain_text("x moves to 70.000 mm.")
+            house.alpha.pause(on=True)
+            await playwright.expect(story).to_contain_text("not known how far it is")
+            await playwright.expect(preview).to_contain_text("Not known")
+            house.alpha.pause(on=False)
+            await house.alpha.end()
+            await playwright.expect(desk.page.get_by_label("Position", exact=True)).to_have_text(
+                re.compile(r"\(.*\d.*\)")
+            )
+            await house.alpha.start()
+            await playwright.expect(story).not_to_contain_text("x moves to")
+    finally:
+        house.alpha.pause(on=False)
+        await house.alpha.end()
+
+
+async def test_a_jog_that_a_stop_ends_is_an_ordinary_end(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        button = desk.page.get_by_role("button", name="Hold to run +")
+        await playwright.expect(button).to_be_enabled()
+        await button.hover()
+        await desk.page.mouse.down()
+        await house.sim.until("x", lambda state: state.moving == "yes")
+        await desk.page.keyboard.press("Escape")
+        await playwright.expect(desk.panel("Now")).to_contain_text("jog, stopped at")
+        await desk.page.mouse.up()
+        await playwright.expect(desk.page.locator(".refusal:not(:empty)")).to_have_count(0)
+    await house.sim.quiet("x", "y", "z", "c")
+    await house.mixed.quiet("x")

@@ -14,7 +14,7 @@ import { decimalsOf, number } from "./parts/format.js";
 import { problems } from "./parts/problems.js";
 import { Mark, placeText } from "./parts/state.js";
 import { overrideOf, slowed } from "./pages/rig_speed.js";
-import { StopAll } from "./parts/stop_all.js";
+import { StopAll, Stops } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
 import { feed } from "./session/feed.js";
 import { axisNamed, commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
@@ -72,6 +72,7 @@ function Notices() {
       >${rig.name}: no values. ${rig.worth.why}</p>`)}
     ${lost.size > 0 && html`<p class="notice mark" data-level="bad">${lostInWords().join(" ")}
       <button type="button" class="plain" onClick=${dismissLost}>Dismiss</button></p>`}
+    <${Stops} />
   </div>`;
 }
 

@@ -3,6 +3,7 @@
 import { html, useEffect, useId, useState } from "../html.js";
 import { Action, Choice, enterSends, Panel, Reason, RefusalText, useOnce } from "../parts/controls.js";
 import { decimalsOf, duration, number } from "../parts/format.js";
+import { StoryOf } from "../parts/motion_story.js";
 import { NumberField, unread } from "../parts/number_field.js";
 import { command, question } from "../session/control.js";
 import { moves, obstacle } from "../session/obstacles.js";
@@ -79,6 +80,8 @@ function Move({ axis, kinds }) {
   const missing = unread(usedBy(verb, values)) ?? (body === null ? `${missingOf(verb, values)} is missing.` : null);
   const way = obstacle(axis, verb, body?.buffer_mode !== undefined && body.buffer_mode !== "refuse") ?? missing ?? once.obstacle(body, moves(axis));
   const move = () => once.send(body, moves(axis), () => command(axis, verb, body));
+  const [sent, setSent] = useState(null);
+  const noteSent = (reply) => setSent({ ...reply, run: axis.rig.daemon?.instance });
 
   return html`<${Panel} title="Move">
     <div class="fields" onKeyDown=${enterSends}>
@@ -114,7 +117,8 @@ function Move({ axis, kinds }) {
     </div>
     ${previewed && html`<${Preview} axis=${axis} body=${body} field=${field} onNearest=${set(field)} />`}
     <p class="row"><${Action} act=${move} obstacle=${way} reason=${reason}
-      kind="main" outcome=${(reply) => outcomeOf(axis, reply)}>Move<//></p>
+      kind="main" onDone=${noteSent}>Move<//>
+      <span class="story" role="status">${sent && html`<${StoryOf} axis=${axis} sent=${sent} />`}</span></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}
   <//>`;
 }
@@ -135,10 +139,6 @@ function usedBy(verb, values) {
   return { ...main, ...limits, ...ends };
 }
 
-function outcomeOf(axis, { position }) {
-  return position == null ? "Accepted." : `Accepted: ${axis.name} moves to ${position} ${axis.info.unit}.`;
-}
-
 /** Return what the verb carries, or null while a value is missing or cannot be read. */
 function bodyOf(verb, values) {
   const { field } = KINDS[verb];
@@ -156,7 +156,10 @@ function bodyOf(verb, values) {
 function Preview({ axis, body, field, onNearest }) {
   const [plan, setPlan] = useState(null);
   const [refusal, setRefusal] = useState(null);
-  const asked = body && JSON.stringify({ ...body, buffer_mode: undefined });
+  const asked = body && !axis.rig.worth && JSON.stringify({ ...body, buffer_mode: undefined });
+  const { state } = axis;
+  // what a motion would do depends on where the axis is, which a motion or a stop has changed
+  const situation = [state?.state, state?.command?.command_id, state?.referenced, state?.stop_latched].join();
   useEffect(() => {
     setPlan(null);
     setRefusal(null);
@@ -172,14 +175,14 @@ function Preview({ axis, body, field, onNearest }) {
       wanted = false;
       clearTimeout(timer);
     };
-  }, [asked, axis]);
+  }, [asked, axis, situation]);
 
   return html`<div class="preview" aria-live="polite">
     <h3>Preview</h3>
     ${
       plan
         ? html`<${Planned} axis=${axis} plan=${plan} field=${field} onNearest=${onNearest} />`
-        : html`<p class="quiet">${asked ? "Asking the daemon…" : "Type a value to see what the move would do."}</p>`
+        : html`<p class="quiet">${axis.rig.worth ? `Not known: ${axis.rig.worth.why}` : asked ? "Asking the daemon…" : "Type a value to see what the move would do."}</p>`
     }
     <${RefusalText} refusal=${refusal} />
   </div>`;

@@ -3,6 +3,7 @@
 import { html, useState } from "../html.js";
 import { Action, Facts, Panel } from "../parts/controls.js";
 import { age, clock, decimalsOf, number, words } from "../parts/format.js";
+import { EndOfMotion } from "../parts/motion_story.js";
 import { Lamp, Mark, QualityWord, StateWord } from "../parts/state.js";
 import { readSignals, signalsOf } from "../session/captures.js";
 import { feed } from "../session/feed.js";
@@ -31,8 +32,7 @@ export function NowPanel({ axis }) {
       ["encoder", html`${number(position?.counts, 0)} <span class="unit">count</span>`],
       ["A/D input", adc ? html`${number(adc.volts, 3)} <span class="unit">V</span> (${adc.counts})` : "none"],
       ["command", state?.command ? `${words(state.command.verb)}, ${remaining(state.command)}` : "none"],
-      ["last motion", lastMotion(axis)],
-      ["last command ended", state?.last_error ?? "done, or not yet"],
+      ["last motion", axis.ended() ? html`<${EndOfMotion} axis=${axis} event=${axis.ended()} />` : "none yet"],
     ]} />
     <h3>Status</h3>
     <${StatusLamps} state=${state} live=${live} />
@@ -40,15 +40,6 @@ export function NowPanel({ axis }) {
     <${Monitors} axis=${axis} />
     <${Signals} axis=${axis} />
   <//>`;
-}
-
-function lastMotion(axis) {
-  const ended = axis.rig.events.findLast((event) => event.axis === axis.name && event.position != null);
-  if (!ended) return "none";
-  const { position, following_error: off, settled, verb } = ended;
-  const decimals = decimalsOf(axis.info);
-  const rest = settled == null ? "" : `, ${number(off, decimals)} off, ${settled ? "settled" : "NOT settled"}`;
-  return html`${words(verb)} to ${number(position, decimals)} <span class="unit">${axis.info.unit}</span>${rest}`;
 }
 
 function remaining(command) {

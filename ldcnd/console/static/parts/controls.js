@@ -8,25 +8,22 @@ import { faultPage } from "./state.js";
 
  * It stays in the tab order then, so that everybody can reach the reason. A double click and a key that repeats are one
  * press: what is sent may move something, and the button may be another one by the second.
- * With `reason` the id of an element that shows the obstacle already. `outcome` says what a reply means.
+ * With `reason` the id of an element that shows the obstacle already.
  */
-export function Action({ act, obstacle = null, reason = null, kind = "", onDone, onRefused, title, outcome, children }) {
+export function Action({ act, obstacle = null, reason = null, kind = "", onDone, onRefused, title, children }) {
   const own = useId();
   const [underWay, setUnderWay] = useState(false);
   const pressed = useRef(false); // a second press comes before the first is drawn
   const [refusal, setRefusal] = useState(null);
-  const [said, setSaid] = useState("");
 
   async function press(event) {
     if (obstacle || pressed.current || event.detail > 1) return;
     pressed.current = true;
     setUnderWay(true);
     setRefusal(null);
-    setSaid("");
     try {
       const reply = await act();
       onDone?.(reply);
-      if (outcome) setSaid(outcome(reply));
     } catch (error) {
       if (onRefused) onRefused(error);
       else setRefusal(error);
@@ -43,7 +40,6 @@ export function Action({ act, obstacle = null, reason = null, kind = "", onDone,
       onKeyDown=${(event) => event.repeat && event.key === "Enter" && event.preventDefault()}
     >${children}</button>
     ${obstacle && !reason && html`<small class="reason" id=${own}>${obstacle}</small>`}
-    ${outcome && html`<small role="status">${said}</small>`}
     <${RefusalText} refusal=${refusal} />
   </span>`;
 }

@@ -2,6 +2,10 @@
 
 import { html, useEffect, useState } from "../html.js";
 import { askAtOnce, rigPath } from "../session/api.js";
+import { command } from "../session/control.js";
+import { obstacle } from "../session/obstacles.js";
+import { rigs } from "../session/rigs.js";
+import { Action } from "./controls.js";
 import { clock } from "./format.js";
 
 const KEY = "Escape";
@@ -12,7 +16,7 @@ export function stopAxis(axis) {
   return askAtOnce(`${rigPath(axis.rig.name)}/stop`, { axis: axis.name }, { patienceMs: PATIENCE_MS });
 }
 
-/** The button, the key and the report. */
+/** The button and the key. What came of a stop is in the states of the axes: `Stops` shows that, whoever has stopped. */
 export function StopAll() {
   const [report, setReport] = useState(null);
 
@@ -20,13 +24,10 @@ export function StopAll() {
     setReport({ at: Date.now() * 1e6, text: "Stop sent; waiting for the drives.", lines: [] });
     const at = Date.now() * 1e6;
     try {
-      const { rigs } = await askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
-      setReport({ at, lines: Object.entries(rigs).map(([rig, reply]) => outcome(rig, reply)) });
+      const { rigs: replies } = await askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
+      setReport({ at, lines: Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)) });
     } catch (error) {
-      setReport({
-        at,
-        lines: [{ bad: true, text: `The stop did not get through: ${error.message} Use the emergency stop.` }],
-      });
+      setReport({ at, lines: [{ text: `The stop did not get through: ${error.message} Use the emergency stop.`, level: "bad" }] });
     }
   }
 
@@ -40,16 +41,19 @@ export function StopAll() {
     return () => removeEventListener("keydown", pressed, true);
   }, []);
 
+  // what a rig publishes now says more than what it answered then
+  const lines = report?.lines.filter(({ answered }) => !answered || rigs.get(answered)?.worth !== null) ?? [];
+  const shown = Boolean(report?.text) || lines.length > 0;
   return html`<div class="stop-all">
     <button type="button" class="stop" aria-keyshortcuts=${KEY} onClick=${stop}>
       <b>Stop all axes</b> <kbd>Esc</kbd><small>software stop, not an emergency stop</small>
     </button>
-    <div class="stop-report" role="alert" data-shown=${report ? "yes" : "no"}>
+    <div class="stop-report" role="alert" data-shown=${shown ? "yes" : "no"}>
       ${
-        report &&
+        shown &&
         html`<p class="quiet">Stop at ${clock(report.at)}</p>
         ${report.text && html`<p>${report.text}</p>`}
-        ${report.lines.map((line) => html`<p class="mark" data-level=${line.bad ? "bad" : ""}>${line.text}</p>`)}
+        ${lines.map((line) => html`<p class="mark" data-level=${line.level}>${line.text}</p>`)}
         <button type="button" class="plain" onClick=${() => setReport(null)}>Dismiss</button>`
       }
     </div>
@@ -57,13 +61,40 @@ export function StopAll() {
 }
 
 function outcome(rig, reply) {
-  if (!reply.axes) return { bad: true, text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.` };
+  if (!reply.axes) return { level: "bad", text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.` };
   const missing = reply.axes.filter((axis) => !reply.confirmed.includes(axis));
-  const answered = reply.axes.filter((axis) => reply.confirmed.includes(axis));
-  const confirmed = answered.length ? `confirmed by ${answered.join(", ")}` : "confirmed by no drive";
-  if (!missing.length) return { bad: false, text: `${rig}: stopped and latched; ${confirmed}.` };
+  const confirmed = reply.confirmed.length ? `confirmed by ${reply.confirmed.join(", ")}` : "confirmed by no drive";
+  if (!missing.length) return { answered: rig, level: "", text: `${rig}: stopped and latched; ${confirmed}.` };
   return {
-    bad: true,
+    answered: rig,
+    level: "bad",
     text: `${rig}: NOT confirmed by ${missing.join(", ")}; ${confirmed}. The latch holds; look at the machine.`,
   };
+}
+
+/** The stops that are latched now, as the axes say it: by this page, another one, or any other program. */
+export function Stops() {
+  return [...rigs.values()].filter((rig) => !rig.worth).map((rig) => html`<${StopsOf} key=${rig.name} rig=${rig} />`);
+}
+
+function StopsOf({ rig }) {
+  const axes = [...rig.axes.values()].filter((axis) => axis.info && axis.state?.stop_latched);
+  const pending = axes.filter(({ state }) => state.stop_pending);
+  const latched = axes.filter(({ state }) => !state.stop_pending);
+  if (!axes.length) return null;
+  const of = rigs.size > 1 ? `${rig.name}: ` : "";
+  const ready = latched.filter((axis) => obstacle(axis, "reset") === null);
+  const reset = () => Promise.all(ready.map((axis) => command(axis, "reset")));
+  return html`<p class="notice mark stops" data-level=${pending.length ? "bad" : "warn"}>
+    ${pending.length > 0 && html`<span>${of}stop NOT confirmed by ${named(pending)}: use the machine’s emergency stop.</span> `}
+    ${latched.length > 0 && html`<span>${of}stopped and latched: ${named(latched)}. Nothing moves before Reset.</span> `}
+    ${ready.length > 0 && html`<${Action} act=${reset}>Reset stopped axes<//>`}
+  </p>`;
+}
+
+const MOST_NAMED = 8;
+
+function named(axes) {
+  const names = axes.slice(0, MOST_NAMED).map(({ name }) => name).join(", ");
+  return axes.length > MOST_NAMED ? `${names} and ${axes.length - MOST_NAMED} more` : names;
 }

@@ -16,7 +16,7 @@ export let client = null;
 /** The axes of which control was lost, by why, until the operator has seen it; empty when none was. */
 export const lost = new Map();
 
-/** Why a jog did not begin, or ended by itself; null when the last one did what the hand did. */
+/** Why a jog did not begin, or what went wrong in it; null when nothing did. */
 export let jogRefusal = null;
 
 let socket = null;
@@ -129,6 +129,7 @@ function open() {
       client = told.client;
       nameThisPage(told.page);
     } else if (told.lost) forget(told.lost);
+    else if (told.jog_over) endJog();
     else if (told.refused) {
       endJog();
       jogRefusal = told.refused;

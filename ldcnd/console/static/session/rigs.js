@@ -17,6 +17,9 @@ const SLOPE_S = 0.3;
 const AT_REST = new Set(["disabled", "standstill", "error_stop"]);
 const REPORTS_KEPT = 61;
 const EVENTS_KEPT = 1_000;
+const ENDS_KEPT = 20;
+/** Statuses with which a command is over. */
+const FINAL = new Set(["done", "aborted", "refused", "failed", "unknown"]);
 /** An observer speaks every ten seconds: an hour and a half. */
 const SHADOWS_KEPT = 540;
 
@@ -30,6 +33,7 @@ export class Axis {
   shadows = [];
   #positions = [];
   #motion = { key: null, sinceNs: 0 };
+  #ends = new Map();
   #arrived = new Map();
 
   constructor(rig, name) {
@@ -123,8 +127,22 @@ export class Axis {
     this.#positions = good ? [...(recent.length ? recent : before.slice(-1)), sample] : [];
   }
 
+  /** The event with which a command ended; without an id that of the last motion. Null while none is known. */
+  ended(commandId = null) {
+    const mine = (event) =>
+      event.axis === this.name && FINAL.has(event.status) &&
+      (commandId ? event.command_id === commandId : this.rig.motions.has(event.verb) && event.status !== "refused");
+    return this.rig.events.findLast(mine) ?? null;
+  }
+
+  /** Seconds from the end of a command's profile to its own end; null where the profile has none, or was not seen. */
+  settlingS({ command_id: id, t }) {
+    return this.#ends.has(id) ? Math.max(0, (t - this.#ends.get(id)) / 1e9) : null;
+  }
+
   /** A motion begins or ends: only positions from then on belong to it. */
   #noteMotion({ t, state, moving, command }) {
+    if (command?.expected_end) this.#ends = new Map([...this.#ends, [command.command_id, command.expected_end]].slice(-ENDS_KEPT));
     const key = `${state} ${moving} ${command?.command_id}`;
     if (key === this.#motion.key) return;
     this.#motion = { key, sinceNs: t };
@@ -180,6 +198,8 @@ export class Rig {
   daemon = null;
   plan = null;
   health = null;
+  /** The verbs that may move an axis. */
+  motions = new Set();
   axes = new Map();
   buses = new Map();
   events = [];
@@ -215,6 +235,7 @@ export class Rig {
     this.problem = told.problem;
     this.daemon = told.daemon ?? this.daemon;
     this.plan = told.plan ?? this.plan;
+    for (const { verb, effect } of told.commands?.commands ?? []) if (effect === "motion") this.motions.add(verb);
     const described = Boolean(told.daemon);
     if (described) for (const axis of this.axes.values()) axis.info = null; // those that it has not any more keep none
     for (const bus of this.buses.keys()) if (described && !told.buses.some((each) => each.bus === bus)) this.buses.delete(bus);

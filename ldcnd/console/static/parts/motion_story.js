@@ -1,0 +1,48 @@
+/** What became of a motion, in the words of a person: where the axis came to rest, and why there. */
+
+import { html } from "../html.js";
+import { clock, decimalsOf, duration, number, words } from "./format.js";
+import { Mark } from "./state.js";
+
+/** Ends that are nobody's mistake, by how the event says them. */
+const ORDINARY = { "aborted by halt": "halted", "aborted by stop": "stopped", "aborted by quick_stop": "stopped" };
+
+/** How a motion ended; `event` is its last event. */
+export function EndOfMotion({ axis, event }) {
+  const { status, verb, reason, following_error: off, settled } = event;
+  const position = restOf(axis, event);
+  const decimals = decimalsOf(axis.info);
+  const place = position == null ? "" : html` at ${number(position, decimals)} <span class="unit">${axis.info.unit}</span>`;
+  const target = settled == null || off == null ? "" : ` to ${number(position + off, decimals)}`;
+  const at = html` <span class="quiet">${clock(event.t).slice(0, -4)}</span>`;
+  if (status === "done") {
+    const tookS = axis.settlingS(event);
+    const rest = settled === false
+      ? html`, <${Mark} level="warn">NOT settled, ${number(off, decimals)} off<//>`
+      : settled && tookS !== null ? `, settled in ${duration(tookS)}` : settled ? ", settled" : "";
+    return html`${words(verb)}${target}:${place || " done"}${rest}${at}`;
+  }
+  if (status === "aborted") return html`${words(verb)}${target}, ${ORDINARY[reason] ?? `ended, ${reason}`}${place}${at}`;
+  return html`${words(verb)}${target} <${Mark} level="bad">${status}<//>${place}: ${reason}${at}`;
+}
+
+/** Where a motion came to rest; null while that is not known. One that was cut off is still moving at its own end. */
+function restOf(axis, event) {
+  if (event.position != null) return event.position;
+  const after = axis.rig.events.slice(axis.rig.events.indexOf(event) + 1).filter((each) => each.axis === axis.name);
+  const ending = after.find((each) => each.position != null);
+  if (ending) return axis.rig.motions.has(ending.verb) ? null : ending.position;
+  return axis.condition.live && axis.state?.moving === "no" && axis.ended() === event ? (axis.samples.position?.value ?? null) : null;
+}
+
+/** What becomes of a command that this page has sent; `sent` is its reply, with the run of the daemon it was sent to. */
+export function StoryOf({ axis, sent }) {
+  const { state, rig } = axis;
+  const ended = axis.ended(sent.command_id);
+  if (ended) return html`<${EndOfMotion} axis=${axis} event=${ended} />`;
+  const to = sent.position == null ? "" : ` to ${number(sent.position, decimalsOf(axis.info))} ${axis.info.unit}`;
+  if (rig.worth) return html`${words(sent.verb)}${to}: <${Mark} level="bad">not known how far it is.<//> ${rig.worth.why}`;
+  if (rig.daemon?.instance !== sent.run) return html`${words(sent.verb)}${to}: <${Mark} level="warn">not known how it ended<//>, the daemon was started again.`;
+  if (state?.command?.command_id === sent.command_id) return `${axis.name} moves${to}.`;
+  return `Accepted: ${words(sent.verb)}${to}.`;
+}
