@@ -21,8 +21,8 @@ PACKAGES = "git,make,python3-venv,ca-certificates"
 ROOT = Path(__file__).parents[1]
 CHECKOUT = "ldcnd"
 UP = "Ctrl-C here ends it"
-README = ("axis list", "axis power x on", "axis move x 10 --wait", "axis watch x --count 5", "axis power z on")
-README += ("axis home z --wait", "axis stop", "axis reset x")
+README = ("list", "power on x", "move x 10 --wait", "watch x --count 5", "power on z")
+README += ("home z --wait", "stop", "reset x")
 TUTORIALS = ("first-rig", "move-from-python", "take-a-trace", "record-and-export")
 
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import click
 
 from ldcnd.cli.connection import TargetOption
-from ldcnd.cli.main import COMMANDS, cli
+from ldcnd.cli.main import cli
+from ldcnd.cli.names import COMMANDS
 from ldcnd.cli.output import EXIT_CODES
 from ldcnd.version import version
 
@@ -27,7 +28,7 @@ class Entry:
     """One command.
 
     Attributes:
-        path: its words, such as `ldcnd axis move`.
+        path: its words, such as `ldcnd move`.
         usage: what follows them.
         paragraphs: of its help.
         options: as they are written, with their meaning; without those for finding the daemon, and without help.

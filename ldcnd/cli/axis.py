@@ -7,11 +7,20 @@ from functools import partial
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
-from ldcnd.cli.main import LazyGroup
+from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import end_as_interrupted, show_lines
-from ldcnd.cli.quantities import number, rounded, sample_text, seconds
-from ldcnd.cli.rig import stop_rig
-from ldcnd.cli.sending import NAME, WAITING, Sender, commanding, derived, halted, halting
+from ldcnd.cli.quantities import number, rounded, seconds
+from ldcnd.cli.sending import (
+    NAME,
+    WAITING,
+    Sender,
+    Shown,
+    commanding,
+    derived,
+    derived_question,
+    halted,
+    halting,
+)
 from ldcnd.cli.terminal import keys, repetitions
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.jog import Jogging
@@ -28,14 +37,10 @@ from ldcnd.contract.commands import (
     MoveAnalog,
     MoveRelative,
     MoveVelocity,
-    Power,
     Preview,
     PreviewReply,
     Probe,
-    ProbeSource,
-    ProbeStop,
     QuickStop,
-    Reset,
     SetGains,
     SetOutputs,
     SetPosition,
@@ -44,36 +49,12 @@ from ldcnd.contract.commands import (
 )
 from ldcnd.contract.errors import ConfigError, LeaseExpired
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import TelemetryItem
+from ldcnd.contract.parameters import AlarmReport, ClearCounter, CounterReply, ReadAlarms
 
 WAIT, LEAVE = (click.option(name, is_flag=True, help=text) for name, text in WAITING.items())
 
-HOMES = {
-    "list": "ldcnd.cli.looking:list_axes",
-    "watch": "ldcnd.cli.looking:watch",
-    "jog": "ldcnd.cli.axis:jog",
-    "monitors": "ldcnd.cli.looking:monitors",
-    "alarms": "ldcnd.cli.looking:alarms",
-    "clear-counter": "ldcnd.cli.looking:clear_counter",
-}
-"""The commands that are not in this file; they are loaded when they are used."""
 
-
-@click.group(cls=LazyGroup, homes=HOMES)
-def command() -> None:
-    """List, watch, move, stop and home axes of a running daemon."""
-
-
-@command.command()
-@click.argument("axis", type=AXIS)
-@click.argument("switch", type=click.Choice(["on", "off"]))
-@commanding
-def power(sender: Sender, axis: str, switch: str) -> None:
-    """Close (on) or open (off) the position loop of AXIS; nothing moves."""
-    sender.send(axis, Power(on=switch == "on"))
-
-
-@command.command(context_settings={"ignore_unknown_options": True})
+@click.command(context_settings={"ignore_unknown_options": True})
 @click.argument("axis", type=AXIS)
 @click.argument("value", type=Finite())
 @click.option("--relative", is_flag=True, help="VALUE is a distance.")
@@ -108,7 +89,7 @@ def move(
     wait: bool,
     leave_running: bool,
 ) -> None:
-    """Move AXIS to the position VALUE."""
+    """Move AXIS to the position VALUE, by the distance VALUE, or at the velocity VALUE."""
     if relative and at_velocity:
         raise click.UsageError("--relative and --at-velocity exclude each other")
     given = {"acceleration": acceleration, "buffer_mode": buffer_mode}
@@ -124,107 +105,6 @@ def move(
     else:
         request = of_options(MoveAbsolute, position=value, velocity=velocity, direction=direction, **given)
     sender.send(axis, request, wait=wait, leave_running=leave_running)
-
-
-@command.command(context_settings={"ignore_unknown_options": True})
-@click.argument("axis")
-@click.option(
-    "--source",
-    "sources",
-    multiple=True,
-    required=True,
-    type=click.Choice([source.value for source in ProbeSource]),
-    help="What latches; several may be named, the first that comes counts.",
-)
-@click.option("--position", type=Finite(), help="Where the move ends when no input comes.")
-@click.option("--distance", type=Finite(), help="How far it goes when no input comes, signed.")
-@click.option("--velocity", type=Finite(), help="Units a second; the axis default when missing.")
-@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
-@click.option("--stop", type=click.Choice([stop.value for stop in ProbeStop]), help="How the motor stops there.")
-@WAIT
-@LEAVE
-@commanding
-def probe(sender: Sender, axis: str, *, wait: bool, leave_running: bool, **given: object) -> None:
-    """Move AXIS until an input changes and latch the position there; with --wait show it."""
-    sender.send(axis, of_options(Probe, **given), wait=wait, leave_running=leave_running)
-    if wait:
-        latch = sender.target.run(lambda client: client.last(axis, TelemetryItem.LATCH))
-        if latch is not None:
-            sender.target.show(latch, f"{axis}: {sample_text(latch)}")
-
-
-@command.command()
-@click.argument("axis", type=AXIS, required=False)
-@with_target
-def stop(target: Target, axis: str | None) -> None:
-    """Stop AXIS, or the whole rig, and latch: nothing moves again before reset."""
-    stop_rig(target, axis)
-
-
-for each in (
-    derived("halt", Halt),
-    derived("reset", Reset),
-    derived("home", Home, moves=True),
-    derived("quick-stop", QuickStop),
-    derived("set-position", SetPosition, "position"),
-    derived("gains", SetGains),
-    derived("pwm", SetPwm, "duty", "duration_s", moves=True),
-    derived("track", Track, "position", moves=True),
-    derived("move-analog", MoveAnalog, "target", moves=True),
-    derived("outputs", SetOutputs),
-):
-    command.add_command(each)
-
-
-@command.command()
-@click.argument("axis", type=AXIS)
-@click.option("--position", type=Finite(), help="A move to this position.")
-@click.option("--distance", type=Finite(), help="A move by this distance.")
-@click.option("--velocity", type=Finite(), help="Speed of the move; alone: a motion at this velocity, signed.")
-@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
-@with_target
-def preview(
-    target: Target,
-    axis: str,
-    position: float | None,
-    distance: float | None,
-    velocity: float | None,
-    acceleration: float | None,
-) -> None:
-    """Show what a motion of AXIS would do; nothing is sent to its drive."""
-    asked = of_options(Preview, position=position, distance=distance, velocity=velocity, acceleration=acceleration)
-
-    async def work(client: RigClient) -> tuple[AxisInfo, PreviewReply]:
-        return await axis_of(client, axis), await client.ask(asked, axis)
-
-    info, reply = target.run(work)
-    target.show(reply, *_previewed(info, reply))
-
-
-def _previewed(info: AxisInfo, reply: PreviewReply) -> list[str]:
-    if reply.refusal:
-        lines = [f"{info.axis}: would be refused: {reply.refusal.message} [{reply.refusal.code}]"]
-        if reply.refusal.nearest is not None:
-            lines.append(f"  the nearest value that would be accepted is {reply.refusal.nearest:g}")
-        return lines
-    end = "runs until stopped or to the soft limit"
-    if reply.position is not None:
-        end = f"ends at {number(reply.position, info)}"
-    time = f", in {seconds(reply.duration_s)} without settling" if reply.duration_s is not None else ""
-    lines = [
-        f"{info.axis}: {end}{time}",
-        f"  velocity     {_held(reply.velocity, reply.velocity_error)} {info.unit}/s",
-        f"  acceleration {_held(reply.acceleration, reply.acceleration_error)} {info.unit}/s²",
-    ]
-    if reply.bus_s is not None:
-        lines.append(f"  {len(reply.packets)} packets, {seconds(reply.bus_s)} on the line at most")
-    return [*lines, *(f"  now in the way: {obstacle}" for obstacle in reply.obstacles)]
-
-
-def _held(value: float | None, error: float | None) -> str:
-    if value is None:
-        return "unknown"
-    return f"{value:.6g}" + (f" ({error:+.2g} by rounding)" if error else "")
 
 
 LEASE_S = 1.0
@@ -309,3 +189,78 @@ async def _renewed_until_released(pressed: "asyncio.Queue[str]", jog: Jogging) -
         if loop.time() >= due_s:
             due_s = loop.time() + RENEW_EACH_S
             await jog.renew(hold_s=HOLD_S)
+
+
+def _previewed(reply: PreviewReply, info: AxisInfo | None) -> Shown:
+    yield reply, _preview_lines(reply, info) if info else ()
+
+
+def _preview_lines(reply: PreviewReply, info: AxisInfo) -> list[str]:
+    if reply.refusal:
+        lines = [f"{info.axis}: would be refused: {reply.refusal.message} [{reply.refusal.code}]"]
+        if reply.refusal.nearest is not None:
+            lines.append(f"  the nearest value that would be accepted is {reply.refusal.nearest:g}")
+        return lines
+    end = "runs until stopped or to the soft limit"
+    if reply.position is not None:
+        end = f"ends at {number(reply.position, info)}"
+    time = f", in {seconds(reply.duration_s)} without settling" if reply.duration_s is not None else ""
+    lines = [
+        f"{info.axis}: {end}{time}",
+        f"  velocity     {_held(reply.velocity, reply.velocity_error)} {info.unit}/s",
+        f"  acceleration {_held(reply.acceleration, reply.acceleration_error)} {info.unit}/s²",
+    ]
+    if reply.bus_s is not None:
+        lines.append(f"  {len(reply.packets)} packets, {seconds(reply.bus_s)} on the line at most")
+    return [*lines, *(f"  now in the way: {obstacle}" for obstacle in reply.obstacles)]
+
+
+def _held(value: float | None, error: float | None) -> str:
+    if value is None:
+        return "unknown"
+    return f"{value:.6g}" + (f" ({error:+.2g} by rounding)" if error else "")
+
+
+def _alarms(reply: AlarmReport, _info: AxisInfo | None) -> Shown:
+    past = (f"  {place} {entry.code:04X}H {entry.text}" for place, entry in enumerate(reply.history))
+    yield reply, [f"{reply.axis}: {reply.present.code:04X}H {reply.present.text}", *past]
+
+
+def _cleared(reply: CounterReply, _info: AxisInfo | None) -> Shown:
+    remarks = "".join(f"; {remark}" for remark in reply.remarks)
+    yield reply, [f"{reply.axis}: the {reply.counter} counter is cleared and reads {reply.value}{remarks}"]
+
+
+home = derived("home", Home, moves=True)
+halt = derived("halt", Halt)
+
+
+HOMES = {
+    "monitors": "ldcnd.cli.looking:monitors",
+    "reset": "ldcnd.cli.rig:reset",
+    "stop": "ldcnd.cli.rig:stop",
+}
+"""The commands that are not in this file; they are loaded when they are used."""
+
+
+@click.group(cls=CommandGroup, homes=HOMES)
+def command() -> None:
+    """Send a command to an axis of a running daemon; those of every day are typed without `axis`."""
+
+
+for each in (
+    halt,
+    home,
+    derived("quick-stop", QuickStop),
+    derived("set-position", SetPosition, "position"),
+    derived("gains", SetGains),
+    derived("probe", Probe, moves=True),
+    derived("pwm", SetPwm, "duty", "duration_s", moves=True),
+    derived("track", Track, "position", moves=True),
+    derived("move-analog", MoveAnalog, "target", moves=True),
+    derived("outputs", SetOutputs),
+    derived_question("preview", Preview, shows=_previewed),
+    derived_question("alarms", ReadAlarms, shows=_alarms),
+    derived_question("clear-counter", ClearCounter, "counter", shows=_cleared),
+):
+    command.add_command(each)

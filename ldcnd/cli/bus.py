@@ -7,11 +7,14 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import Target, of_options, with_target
+from ldcnd.cli.main import CommandGroup
+from ldcnd.cli.sending import Shown, derived_question
 from ldcnd.cli.typed import Finite, NewFile, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
+from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, read_whole
-from ldcnd.contract.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer, Snapshot
+from ldcnd.contract.rig_commands import IoReply, SetIo, SetIoTimer, Snapshot, SnapshotReply
 from ldcnd.daemon.capture import config_of
 from ldcnd.drives.known import FAMILIES
 from ldcnd.drives.transcript import Describe
@@ -44,7 +47,7 @@ DISSECTOR = click.option(
 )
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def command() -> None:
     """Show the lines of a running daemon, and what was on them."""
 
@@ -74,20 +77,6 @@ def set_io(
     target.show(*_shown(target.run(lambda client: client.ask(request))))
 
 
-@command.command("set-io-timer")
-@click.argument("module")
-@click.argument("mode", type=click.Choice([mode.value for mode in IoTimer]))
-@click.option(
-    "--prescale", type=click.Choice(["1", "2", "4", "8"]), default="1", help="Edges or clocks for each count."
-)
-@click.option("--lease", envvar="LDCND_LEASE", help="Send it under this lease, as `ldcnd lease hold` prints it.")
-@with_target
-def set_io_timer(target: Target, module: str, mode: str, prescale: str, lease: str | None) -> None:
-    """Choose what the counter of the I/O module MODULE counts."""
-    request = of_options(SetIoTimer, module=module, mode=mode, prescale=int(prescale), lease=lease)
-    target.show(*_shown(target.run(lambda client: client.ask(request))))
-
-
 def _shown(reply: IoReply) -> tuple[IoReply, str]:
     outputs = "not known" if reply.outputs is None else ", ".join(map(str, reply.outputs)) or "none"
     return reply, f"{reply.module}: {_levels(reply.levels)}; outputs: {outputs}"
@@ -97,22 +86,25 @@ def _levels(levels: tuple[bool, ...]) -> str:
     return " ".join(f"{line}={'high' if level else 'low'}" for line, level in enumerate(levels, 1))
 
 
-@command.command()
-@click.argument("bus")
-@with_target
-def snapshot(target: Target, bus: str) -> None:
-    """Show the positions of all axes of the line BUS, and inputs of its I/O modules, at one instant; nothing moves."""
-    reply = target.run(lambda client: client.ask(Snapshot(bus=bus)))
+def _counted(reply: IoReply, _axis: AxisInfo | None) -> Shown:
+    yield reply, _shown(reply)[1:]
+
+
+def _snapshot(reply: SnapshotReply, _axis: AxisInfo | None) -> Shown:
     lines = [
         f"{each.axis:8} {each.position:14.6f} {each.unit:8} {each.counts:12d} counts"
-        f"{'' if each.referenced else '  not referenced'}"
+        f"{'' if each.referenced else '  not homed'}"
         for each in reply.positions
     ]
     lines += [
         f"{each.module:8} {_levels(each.levels)}; count {each.counter}{'' if each.proven else '  not proven'}"
         for each in reply.io
     ]
-    target.show(reply, *lines, f"all within {reply.t_error_ns / 1e6:.2f} ms of {reply.t / 1e9:.6f} s UTC")
+    yield reply, [*lines, f"all within {reply.t_error_ns / 1e6:.2f} ms of {reply.t / 1e9:.6f} s UTC"]
+
+
+command.add_command(derived_question("set-io-timer", SetIoTimer, "module", "mode", shows=_counted))
+command.add_command(derived_question("snapshot", Snapshot, "bus", shows=_snapshot))
 
 
 @command.command("list")

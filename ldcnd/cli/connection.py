@@ -17,7 +17,8 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 from pydantic import ValidationError
 
-from ldcnd.cli.output import OPTIONS_TYPED, show_lines
+from ldcnd.cli.names import OPTIONS_TYPED
+from ldcnd.cli.output import show_lines
 from ldcnd.client.lease import inherited_lease
 from ldcnd.client.rig_client import RigClient, find_rigs, on_each_rig
 from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis

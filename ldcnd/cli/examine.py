@@ -15,6 +15,7 @@ from ldcnd.bench.begun import begun_with, scan_port, write
 from ldcnd.bench.family import BenchFamily, TrialMove
 from ldcnd.bench.known import BENCHES, line_of
 from ldcnd.bench.opened import show_findings
+from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.typed import Finite, WholeNumber
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError, NotSupported
@@ -76,16 +77,17 @@ def scan(port: str, family: str | None, file: Path | None, *, give_addresses: bo
     sys.exit(NOTHING_FOUND if wrong or not drives else 0)
 
 
-class Examinations(click.Group):
+class Examinations(CommandGroup):
     """One command for each family, and what else a family can examine."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """Return the names of all commands."""
         return list(self._commands())
 
-    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:  # noqa: ARG002
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return the command of that name."""
-        return self._commands().get(cmd_name)
+        self.commands = self._commands()
+        return super().get_command(ctx, cmd_name)
 
     @staticmethod
     def _commands() -> dict[str, click.Command]:

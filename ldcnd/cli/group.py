@@ -7,6 +7,7 @@ from collections.abc import Mapping
 import click
 
 from ldcnd.cli.connection import Target, of_options, with_target
+from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import FAILED, end_as_interrupted, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, commanding, halted
@@ -24,7 +25,7 @@ from ldcnd.contract.rig_commands import (
 )
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def command() -> None:
     """Move several axes that start in the same servo cycle."""
 

@@ -9,7 +9,7 @@ import click
 from click.shell_completion import CompletionItem
 
 from ldcnd.cli.connection import AXIS, Target, with_target
-from ldcnd.cli.output import typed
+from ldcnd.cli.names import typed
 from ldcnd.cli.quantities import decimals, sample_text
 from ldcnd.cli.typed import Finite, WholeNumber, axis_of
 from ldcnd.client.events import follow_events, latest_events
@@ -24,11 +24,6 @@ from ldcnd.contract.events import ALARM_HISTORY, DRIVE_CHANGED, REFERENCE, UNSET
 from ldcnd.contract.fault_pages import codes, page_text
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import (
-    AlarmReport,
-    ClearCounter,
-    CounterName,
-    CounterReply,
-    ReadAlarms,
     ReadMonitors,
 )
 from ldcnd.contract.samples import (
@@ -43,11 +38,11 @@ from ldcnd.contract.samples import (
 from ldcnd.net.session import Session
 
 SILENT_S = 3.0
-"""Time without a sample after which `axis watch` says why, seconds."""
+"""Time without a sample after which `watch` says why, seconds."""
 
 
 class AxisRow(AxisSeen, AxisInfo):
-    """An axis as `axis list --json` has it: its description, and how it is now."""
+    """An axis as `list --json` has it: its description, and how it is now."""
 
     referenced: bool
     """The position is valid."""
@@ -205,37 +200,6 @@ def monitors(target: Target, axis: str, names: tuple[str, ...], *, read: bool) -
             high = f"  high: {', '.join(sample.high)}" if sample.high else ""
             line = f"{name:22} {sample.value:8d} {sample.unit:14} {sample.title}{high}  ({sample.quality})"
             target.show(sample, line)
-
-
-@click.command()
-@click.argument("axis", type=AXIS)
-@with_target
-def alarms(target: Target, axis: str) -> None:
-    """Show the present alarm of AXIS and the history that its drive keeps."""
-
-    async def work(client: RigClient) -> AlarmReport:
-        await axis_of(client, axis)
-        return await client.command(axis, ReadAlarms())
-
-    reply = target.run(work)
-    past = (f"  {place} {entry.code:04X}H {entry.text}" for place, entry in enumerate(reply.history))
-    target.show(reply, f"{axis}: {reply.present.code:04X}H {reply.present.text}", *past)
-
-
-@click.command("clear-counter")
-@click.argument("axis", type=AXIS)
-@click.argument("counter", type=click.Choice([name.value for name in CounterName]))
-@with_target
-def clear_counter(target: Target, axis: str, counter: str) -> None:
-    """Set a pulse counter of AXIS to 0; command pulses must be stopped, and the motor must stand."""
-
-    async def work(client: RigClient) -> CounterReply:
-        await axis_of(client, axis)
-        return await client.command(axis, ClearCounter(counter=CounterName(counter)))
-
-    reply = target.run(work)
-    remarks = "".join(f"; {remark}" for remark in reply.remarks)
-    target.show(reply, f"{axis}: the {counter} counter is cleared and reads {reply.value}{remarks}")
 
 
 @click.command()

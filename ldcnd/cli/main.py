@@ -3,30 +3,37 @@
 import gc
 import os
 import re
+import shlex
 import sys
 from collections.abc import Mapping
+from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
+from types import MappingProxyType
 from typing import Any, NoReturn
 
 import click
 
-from ldcnd.cli.output import DONE, EXIT_CODES, OPTIONS_TYPED, exit_code, print_under_any_encoding
+from ldcnd.cli.names import COMMANDS, EXAMPLES, GROUPS, OPTIONS_TYPED, example_of
+from ldcnd.cli.output import DONE, EXIT_CODES, exit_code, print_under_any_encoding
 from ldcnd.contract.errors import LdcndError
 
 _NEGATIVE = re.compile(r"^-(?=[.,]?[0-9])")
 _MINUS = "\u2212"
+LONGEST_SUMMARY = 200
+"""Of a command in the help of its group, in characters."""
+NO_HOMES: Mapping[str, str] = MappingProxyType({})
 
 
-class LazyGroup(click.Group):
-    """A group with commands that are imported when they are used.
+class CommandGroup(click.Group):
+    """A group with commands that are imported when they are used; the help of each ends with an example.
 
     Args:
         homes: the module of such a command, and behind a colon its name there, which is `command` otherwise.
         given: as `click.Group` takes it.
     """
 
-    def __init__(self, *given: Any, homes: Mapping[str, str], **named: Any) -> None:  # noqa: ANN401 - click's own
+    def __init__(self, *given: Any, homes: Mapping[str, str] = NO_HOMES, **named: Any) -> None:  # noqa: ANN401 - click's
         super().__init__(*given, **named)
         self._homes = homes
 
@@ -40,13 +47,46 @@ class LazyGroup(click.Group):
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         """Return a command, whose module may be imported for that."""
-        if cmd_name not in self._homes:
-            return super().get_command(ctx, cmd_name)
-        module, _, name = self._homes[cmd_name].partition(":")
-        command = getattr(import_module(module), name or "command")
-        if not isinstance(command, click.Command):
-            raise TypeError(f"{self._homes[cmd_name]} is no command")
+        command = super().get_command(ctx, cmd_name)
+        if command is None and cmd_name in self._homes:
+            module, _, name = self._homes[cmd_name].partition(":")
+            command = getattr(import_module(module), name or "command")
+            if not isinstance(command, click.Command):
+                raise TypeError(f"{self._homes[cmd_name]} is no command")
+        if command:
+            command.epilog = example_of(" ".join([*_words(ctx), cmd_name])) or command.epilog
         return command
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        """Return the command of an argument line; one that stands elsewhere is refused with the words that reach it."""
+        if not ctx.resilient_parsing and self.get_command(ctx, args[0]) is None and not args[0].startswith("-"):
+            raise click.UsageError(self._not_here(ctx, *args), ctx)
+        return super().resolve_command(ctx, args)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """List the commands, each with its first sentence whole."""
+        found = {name: self.get_command(ctx, name) for name in self.list_commands(ctx)}
+        with formatter.section("Commands"):
+            formatter.write_dl(
+                [(name, each.get_short_help_str(LONGEST_SUMMARY)) for name, each in found.items() if each]
+            )
+
+    def _not_here(self, ctx: click.Context, name: str, *rest: str) -> str:
+        here = _words(ctx)
+        elsewhere = [name] if here and name in COMMANDS else ["axis", name]
+        if " ".join(elsewhere) in EXAMPLES and elsewhere != [*here, name]:
+            given = [word.replace(_MINUS, "-", 1) if word.startswith(_MINUS) else word for word in rest]
+            return f"There is no `ldcnd {' '.join([*here, name])}`: type `ldcnd {shlex.join([*elsewhere, *given])}`."
+        near = get_close_matches(name, self.list_commands(ctx), 1)
+        meant = f" Did you mean {near[0]!r}?" if near else ""
+        return f"No such command {name!r}.{meant}"
+
+
+def _words(ctx: click.Context) -> list[str]:
+    """Return the words behind the name of the program that lead to a context."""
+    return [*_words(ctx.parent), str(ctx.info_name)] if ctx.parent else []
 
 
 def _with_values(args: list[str]) -> list[str]:
@@ -58,56 +98,8 @@ def _with_values(args: list[str]) -> list[str]:
     return [*(_NEGATIVE.sub(_MINUS, arg) if _NEGATIVE.match(arg) else arg for arg in args[:end]), *args[end:]]
 
 
-COMMANDS = {
-    "run": ("ldcnd.cli.run", "Run the daemon."),
-    "check-config": ("ldcnd.cli.prepare:check_config", "Validate a configuration without opening anything."),
-    "plan": ("ldcnd.cli.prepare:plan", "Show what the lines of a configuration promise, before any hardware is there."),
-    "scan": ("ldcnd.cli.examine:scan", "Find out which drives are on a port, at which rate and in which state."),
-    "commission": (
-        "ldcnd.cli.commission:commission",
-        "Go through the checklist of an axis: from its first motion to a report.",
-    ),
-    "sim": ("ldcnd.cli.sim", "Simulate a line of drives behind a pseudo-terminal."),
-    "stop": ("ldcnd.cli.rig:stop", "Stop every axis of a rig, or one, and latch."),
-    "reset": ("ldcnd.cli.rig:reset", "Clear stop latches and faults of all axes."),
-    "power": ("ldcnd.cli.rig:power", "Close or open the position loops of all axes."),
-    "axis": ("ldcnd.cli.axis", "List, watch, move, stop and home axes of a running daemon."),
-    "group": ("ldcnd.cli.group", "Move several axes together."),
-    "lease": ("ldcnd.cli.rig:lease", "See who controls which axis; hold control."),
-    "top": ("ldcnd.cli.top", "Show every axis and line of a rig, what is wrong first."),
-    "why": ("ldcnd.cli.looking:why", "Tell why an axis cannot move, and what would clear that."),
-    "fleet": ("ldcnd.cli.looking:fleet", "Show every rig, axis, version and health that can be reached."),
-    "fault": ("ldcnd.cli.looking:fault", "Explain a fault or an error code: what to check, how to clear it."),
-    "events": ("ldcnd.cli.looking:events", "Show who moved what, when, with which result."),
-    "drill": ("ldcnd.cli.rig:drill", "Rehearse the loss of a client, a line or the daemon."),
-    "bus": ("ldcnd.cli.bus", "Show the lines of a running daemon."),
-    "speed": ("ldcnd.cli.rig:speed", "Show or set the speed override of the rig."),
-    "console": ("ldcnd.cli.serve:console", "Show rigs in a browser."),
-    "metrics": ("ldcnd.cli.serve:metrics", "Serve the health of a running daemon to Prometheus."),
-    "record": ("ldcnd.cli.record:record", "Record a rig to MCAP; recover and convert recordings."),
-    "plot": ("ldcnd.cli.record:plot", "Draw an axis of a recording."),
-    "epics": ("ldcnd.cli.serve:epics", "Serve axes as EPICS motor records."),
-    "ros2": ("ldcnd.cli.serve:ros2", "Publish joint states and diagnostics to a ROS 2 graph."),
-    "foxglove": ("ldcnd.cli.serve:foxglove", "Show a running rig live in Foxglove, read-only."),
-    "params": ("ldcnd.cli.params", "Read, write, save and compare the parameters of a drive."),
-    "trace": ("ldcnd.cli.trace", "Record an axis against time, show the result, draw it."),
-    "tune": (
-        "ldcnd.cli.commission:tune",
-        "Find gains for an axis: move it a little, identify it, propose, apply, verify.",
-    ),
-    "shadow": (
-        "ldcnd.cli.commission:shadow",
-        "Watch axes for growing friction, a changed load, a coupling that slips.",
-    ),
-    "doctor": ("ldcnd.cli.examine:doctor", "Examine a line by reading only, before a daemon uses it."),
-    "accept": ("ldcnd.cli.examine:accept", "Try real drives against what the documents say, and keep a report of it."),
-    "pki": ("ldcnd.cli.pki", "Make certificates and access rules for a network with mutual TLS."),
-    "schema": ("ldcnd.cli.prepare:schema", "Write the JSON Schemas of the public models."),
-}
-
-
-class Program(LazyGroup):
-    """All commands; its help names them without importing them."""
+class Program(CommandGroup):
+    """All commands; its help names them by their groups, without importing them."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """Return the names in the order of the table."""
@@ -115,8 +107,9 @@ class Program(LazyGroup):
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:  # noqa: ARG002 - click's
         """List the commands without importing them."""
-        with formatter.section("Commands"):
-            formatter.write_dl([(name, summary) for name, (_, summary) in COMMANDS.items()])
+        for title, group in GROUPS.items():
+            with formatter.section(title):
+                formatter.write_dl([(name, summary) for name, (_, summary) in group.items()])
 
 
 HELP = f"""Own RS-485 servo lines and expose their drives over Zenoh.

@@ -8,46 +8,13 @@ import sys
 import termios
 from collections.abc import Callable
 from contextlib import suppress
-from contextvars import ContextVar
 
 import click
 
-from ldcnd.contract.errors import ConfigError, LdcndError, RemedyCommand, SessionError
+from ldcnd.cli.names import typed
+from ldcnd.contract.errors import ConfigError, LdcndError, SessionError
 from ldcnd.parts import missing_wing
 from ldcnd.printable import printable
-
-TYPED = {
-    "power": "axis power {axis} on",
-    "set_position": "axis set-position {axis} POSITION",
-    "set_speed_override": "speed PERCENT",
-    "set_gains": "axis gains {axis} --kp KP --el EL",
-    "set_outputs": "axis outputs {axis} --limit1 input --limit2 input",
-    "move_relative": "axis move {axis} DISTANCE --relative",
-    "jog": "axis jog {axis} VELOCITY",
-    "trace_abort": "trace abort {axis}",
-    "clear_counter": "axis clear-counter {axis} COUNTER",
-    "restart_eeprom_count": "params restart-count {axis}",
-    "list_parameters": "params list {axis}",
-    "acquire": "lease hold --axis {axis} -- COMMAND",
-    "events": "events",
-}
-"""How a command that a remedy names is typed; what is missing is `axis VERB AXIS`."""
-OPTIONS_TYPED: ContextVar[str] = ContextVar("options that name daemon and rig", default="")
-"""Those of the command that runs, as they were typed: without them what a remedy names would reach another rig."""
-
-
-def typed(step: RemedyCommand, axis: str | None) -> str:
-    """Return a step of a remedy as it is typed.
-
-    Args:
-        step: the command.
-        axis: what it is about; None when it is not about one axis.
-    """
-    words = TYPED.get(step.verb, f"axis {step.verb.replace('_', '-')} {{axis}}").format(axis=axis or "AXIS")
-    words, separator, program = words.partition(" -- ")
-    force = " --force" if step.arguments.get("force") else ""
-    return f"ldcnd {words}{force}{OPTIONS_TYPED.get()}{separator}{program}"
-
 
 DONE = 0
 FAILED = 1

@@ -10,15 +10,21 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import AXIS, Target, with_target
+from ldcnd.cli.main import CommandGroup
+from ldcnd.cli.sending import Shown, derived_question
 from ldcnd.cli.typed import NewFile, WholeNumber, force_option
 from ldcnd.client.parameters import Transfer, carry_out, plan_transfer, read_dump
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, read_word
 from ldcnd.contract.parameters import (
+    EepromCount,
     ListParameters,
     Memory,
     ParameterDump,
+    ParameterList,
+    ParameterReply,
     ParameterValue,
     PlannedParameters,
     PlannedWrite,
@@ -123,34 +129,34 @@ def _word(_context: click.Context, _parameter: click.Parameter, value: str) -> i
         raise click.BadParameter(str(error)) from None
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def command() -> None:
     """Read, write, save, compare and copy the parameters of a drive."""
 
 
-@command.command("list")
-@click.argument("axis", type=AXIS)
-@with_target
-def list_parameters(target: Target, axis: str) -> None:
-    """Show what is known of the parameters of AXIS; ranges are hints, the drive decides."""
-    reply = target.run(lambda client: client.command(axis, ListParameters()))
+def _known(reply: ParameterList, _axis: AxisInfo | None) -> Shown:
     for each in reply.parameters:
         limits = "-" if each.lowest is None else f"{each.lowest} to {each.highest}"
         hint = f" [{each.confidence}]" if each.confidence else ""
         cycle = ", from the next power-on" if each.power_cycle else ""
         digits = [f"         .{one.digit} {one.title} [{one.confidence}]" for one in each.digit_meanings]
-        target.show(each, f"{each.parameter}  {limits:>14} {each.unit or '':18}{hint:6} {each.name}{cycle}", *digits)
+        yield each, [f"{each.parameter}  {limits:>14} {each.unit or '':18}{hint:6} {each.name}{cycle}", *digits]
 
 
-@command.command()
-@click.argument("axis", type=AXIS)
-@click.argument("parameter")
-@click.option("--unlisted", is_flag=True, help="Allow a number that the manual does not list.")
-@with_target
-def get(target: Target, axis: str, parameter: str, *, unlisted: bool) -> None:
-    """Show PARAMETER (Pn100, or its name) of AXIS in both memories."""
-    reply = target.run(lambda client: client.command(axis, ReadParameter(parameter=parameter, unlisted=unlisted)))
-    target.show(reply, _line(reply.value))
+def _read(reply: ParameterReply, _axis: AxisInfo | None) -> Shown:
+    yield reply, [_line(reply.value)]
+
+
+def _counted(reply: EepromCount, _axis: AxisInfo | None) -> Shown:
+    yield reply, [f"{reply.axis}: {reply.total} EEPROM writes; the drive before it had {reply.previous}"]
+
+
+for each in (
+    derived_question("list", ListParameters, shows=_known),
+    derived_question("get", ReadParameter, "parameter", shows=_read),
+    derived_question("restart-count", RestartEepromCount, shows=_counted, confirm="Was the drive of {axis} replaced?"),
+):
+    command.add_command(each)
 
 
 @command.command("set")
@@ -263,19 +269,6 @@ def save(target: Target, axis: str, *, dry_run: bool, yes: bool) -> None:
     reply = target.run(lambda client: read_dump(client, axis))
     values = {value.parameter: value.active for value in reply.values if value.differs}
     _transfer(target, axis, values, None, memory=Memory.EEPROM, dry_run=dry_run, any_type=True, yes=yes)
-
-
-@command.command("restart-count")
-@click.argument("axis", type=AXIS)
-@click.option("--writes", type=WholeNumber(0, 10_000), default=0, help="Writes that the new drive has taken already.")
-@click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
-@with_target
-def restart_count(target: Target, axis: str, writes: int, *, yes: bool) -> None:
-    """Restart the count of EEPROM writes of AXIS, because its drive was replaced; nothing is sent to the drive."""
-    if not yes and not click.confirm(f"Was the drive of {axis} replaced?", err=True):
-        raise click.Abort
-    reply = target.run(lambda client: client.command(axis, RestartEepromCount(writes=writes)))
-    target.show(reply, f"{axis}: {reply.total} EEPROM writes; the drive before it had {reply.previous}")
 
 
 # -- transfer --------------------------------------------------------------------------------------------------------

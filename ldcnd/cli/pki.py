@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.typed import WholeNumber
 from ldcnd.ops.pki.access import CertificateRole
 from ldcnd.parts import require
@@ -14,7 +15,7 @@ FOLDER = click.argument("folder", type=click.Path(path_type=Path, file_okay=Fals
 DAYS = 730
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def command() -> None:
     """Make certificates for mutual TLS, and the access rules that go with them.
 

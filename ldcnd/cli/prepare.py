@@ -1,4 +1,4 @@
-"""Commands that need neither daemon nor hardware: check and plan a configuration, schemas."""
+"""Commands that need neither daemon nor hardware: check and plan a configuration."""
 
 import json
 import sys
@@ -11,7 +11,6 @@ from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.plan import BusPlan
 from ldcnd.daemon.assembly import session_settings
-from ldcnd.daemon.contract import write_schemas
 from ldcnd.net.zenoh_config import zenoh_config
 
 
@@ -82,13 +81,3 @@ def _table(bus: BusPlan) -> str:
 
 def _ms(seconds: float | None) -> str:
     return "unbounded" if seconds is None else f"{seconds * 1e3:.2f} ms"
-
-
-@click.command()
-@click.argument("folder", type=click.Path(path_type=Path, file_okay=False), default=Path("schemas"))
-def schema(folder: Path) -> None:
-    """Write the JSON Schemas of all that crosses the network, and of the configuration, into FOLDER.
-
-    Schemas in it whose models are gone are removed.
-    """
-    click.echo(f"{write_schemas(folder)} schemas in {folder}")

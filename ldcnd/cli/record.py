@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import click
 
 from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import on_end
 from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.typed import NewFile, WholeNumber, force_option
@@ -42,7 +43,7 @@ def utc(t_ns: int) -> str:
 FILE = click.Path(path_type=Path, dir_okay=False)
 
 
-@click.group(invoke_without_command=True)
+@click.group(cls=CommandGroup, invoke_without_command=True)
 @click.option(
     "--out",
     "-o",

@@ -9,9 +9,10 @@ import sys
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
+from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import FAILED, UNREACHABLE, show_error, show_lines
 from ldcnd.cli.quantities import rounded
-from ldcnd.cli.sending import NAME, Sender, commanding
+from ldcnd.cli.sending import NAME, Sender, commanding, derived_for_all
 from ldcnd.cli.typed import Finite, axis_of
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
@@ -64,21 +65,8 @@ def stop(target: Target, axis: str | None) -> None:
     stop_rig(target, axis)
 
 
-@click.command()
-@click.argument("axes", type=AXIS, nargs=-1, metavar="[AXIS]...")
-@commanding
-def reset(sender: Sender, axes: tuple[str, ...]) -> None:
-    """Clear stop latches and faults of each AXIS, or of all axes; nothing moves."""
-    sender.send_to_all(axes, Reset())
-
-
-@click.command()
-@click.argument("switch", type=click.Choice(["on", "off"]))
-@click.argument("axes", type=AXIS, nargs=-1, metavar="[AXIS]...")
-@commanding
-def power(sender: Sender, switch: str, axes: tuple[str, ...]) -> None:
-    """Close (on) or open (off) the position loops of each AXIS, or of all axes; nothing moves."""
-    sender.send_to_all(axes, Power(on=switch == "on"))
+reset = derived_for_all("reset", Reset)
+power = derived_for_all("power", Power, "on")
 
 
 @click.command()
@@ -106,7 +94,7 @@ def speed(sender: Sender, percent: float | None) -> None:
     sender.target.show(reply, f"speed override {rounded(reply.percent)} %", *told)
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def lease() -> None:
     """See who controls which axis, and take control."""
 

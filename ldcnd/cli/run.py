@@ -53,9 +53,9 @@ def first_steps(rig: RigConfig, endpoint: str, link: str | None) -> list[str]:
     program = _program()
     at = "" if endpoint == DEFAULT_ENDPOINT else f" -e {shlex.quote(endpoint)}"
     lines = ["", f"Rig {rig.rig} is up: {', '.join(axis.name for axis in axes)}. Nothing moves unless you ask for it."]
-    lines += ["In a second terminal:", f"  {program} axis list{at}"]
+    lines += ["In a second terminal:", f"  {program} list{at}"]
     if movable := next((axis.name for axis in axes if axis.reference == "at_reset"), None):
-        lines += [f"  {program} axis power {movable} on{at}", f"  {program} axis move {movable} 10 --wait{at}"]
+        lines += [f"  {program} power on {movable}{at}", f"  {program} move {movable} 10 --wait{at}"]
     lines += [f"  {program} stop{at}    # at any time; software, not an emergency stop"]
     lines += [f"In a browser, within ten minutes: {link}"] if link else ["No console serves; `ldcnd console` says why."]
     return [*lines, "Ctrl-C here ends it; what moves is brought to rest first.", ""]

@@ -2,33 +2,36 @@
 
 import asyncio
 import sys
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from contextlib import asynccontextmanager, nullcontext, suppress
 from enum import Enum
 from functools import wraps
 from types import NoneType
-from typing import Any, get_args
+from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import click
+from typing_extensions import override
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
+from ldcnd.cli.names import typed, whose
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines, show_passing
-from ldcnd.cli.quantities import number, outcome, values_of
+from ldcnd.cli.quantities import number, outcome, sample_text, values_of
 from ldcnd.cli.typed import Finite, WholeNumber, axis_of
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Verb
-from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis
+from ldcnd.contract.commands import About, AxisCommand, Command, CommandReply, Halt, Verb
+from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, step
 from ldcnd.contract.events import CommandStatus, ReadOutcome
-from ldcnd.contract.frozen import attribute_docstrings
+from ldcnd.contract.frozen import Frozen, attribute_docstrings
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.samples import PositionSample, Sample, StateSample, TelemetryItem
 
 HALT_TIME_S = 3.0
 NAME = "ldcnd"
 """Under this name the command line is found in events unless a lease says another."""
 
 Sent = AxisCommand[CommandReply]
+ReplyT = TypeVar("ReplyT", bound=Frozen)
 
 
 def commanding(work: Callable[..., None]) -> Callable[..., None]:
@@ -66,18 +69,18 @@ class Sender:
             self.send_to_all((axis,), command, "accepted")
             return
 
-        async def work(client: RigClient) -> tuple[StateSample, str] | None:
+        async def work(client: RigClient) -> tuple[StateSample, str, Sample | None] | None:
             info = await axis_of(client, axis)
             async with halting(client, info, leave_running=leave_running) if wait else nullcontext():
                 reply = await self.command(client, axis, command)
                 words = command.verb.replace("_", " ")
                 waits = f", waits until {reply.waits_for} has ended" if reply.waits_for else ""
-                said = f"{axis}: {words} accepted{values_of(reply, info)}{waits}"
+                said = f"{whose(client.rig)}{axis}: {words} accepted{values_of(reply, info)}{waits}"
                 try:
                     self.target.show(reply, said)
                 except OSError:
                     if not wait:
-                        show_lines(f"{said}; it goes on, `ldcnd axis halt {axis}` halts it", err=True)
+                        show_lines(f"{said}; it goes on, {_halts(axis)}", err=True)
                     raise
                 if not wait:
                     return None
@@ -85,13 +88,16 @@ class Sender:
                 ended = await client.ask(ReadOutcome(command_id=reply.command_id))
                 if reply.waits_for and ended.status is not CommandStatus.DONE:
                     raise failure(ended)
-                return state, outcome(info, ended, state)
+                latch = await client.last(axis, TelemetryItem.LATCH) if command.verb == Verb.PROBE else None
+                return state, f"{whose(client.rig)}{outcome(info, ended, state)}", latch
 
         ended = self.target.run(work)
         if ended is None:
             return
-        state, said = ended
+        state, said, latch = ended
         self.target.show(state, said)
+        if latch:
+            self.target.show(latch, f"{axis}: {sample_text(latch)}")
         if state.last_error is not None:
             sys.exit(FAILED)
 
@@ -100,8 +106,11 @@ class Sender:
 
         What takes energy out goes to every rig that can be reached unless one is named: it asks no question first.
         """
+        rig = ""
 
         async def work(client: RigClient) -> list[CommandReply | LdcndError]:
+            nonlocal rig
+            rig = client.rig
             known = [info for info in await client.axes() if Verb(command.verb) in info.capabilities]
             for axis in axes:
                 await axis_of(client, axis)
@@ -111,20 +120,21 @@ class Sender:
             return [task.result() for task in tasks]
 
         if not command.takes_energy_out:
-            reached = {"": self.target.run(work)}
+            done = self.target.run(work)
+            reached = {whose(rig): done}
         else:
             on_each = self.target.run_on_each(work)
             there = {rig: made for rig, made in on_each.items() if not isinstance(made, UnknownAxis)} or on_each
             reached = {
-                f"{rig}: " if len(on_each) > 1 else "": [made] if isinstance(made, LdcndError) else made
+                whose(rig, len(on_each)): [made] if isinstance(made, LdcndError) else made
                 for rig, made in there.items()
             }
-        for whose, outcomes in reached.items():
+        for who, outcomes in reached.items():
             for each in outcomes:
                 if isinstance(each, LdcndError):
-                    show_error(each, whose)
+                    show_error(each, who)
                 else:
-                    self.target.show(each, f"{whose}{each.axis}: {each.verb.replace('_', ' ')} {said}")
+                    self.target.show(each, f"{who}{each.axis}: {each.verb.replace('_', ' ')} {said}")
         failures = [each for outcomes in reached.values() for each in outcomes if isinstance(each, LdcndError)]
         if failures:
             sys.exit(UNREACHABLE if all(isinstance(each, SessionError) for each in failures) else FAILED)
@@ -153,7 +163,7 @@ async def halting(client: RigClient, info: AxisInfo, *, leave_running: bool = Fa
     except LdcndError:
         raise
     except BaseException:
-        said = f"{axis} is left running; `ldcnd axis halt {axis}` halts it" if leave_running else None
+        said = f"{whose(client.rig)}{axis} is left running; {_halts(axis)}" if leave_running else None
         said = said or await halted(client, info)
         with suppress(OSError):  # the terminal may be what has gone
             show_lines(said, err=True)
@@ -168,9 +178,14 @@ async def halted(client: RigClient, info: AxisInfo) -> str:
             await client.wait_for_end(info.axis, reply.command_id)
             position = await client.last(info.axis, TelemetryItem.POSITION)
     except (TimeoutError, LdcndError) as error:
-        return f"{info.axis}: NOT confirmed at rest: {str(error) or 'it still moves'}; `ldcnd stop` stops every axis"
+        why = str(error) or "it still moves"
+        return f"{whose(client.rig)}{info.axis}: NOT confirmed at rest: {why}; `ldcnd stop` stops every axis"
     at = f" at {number(position.value, info)}" if isinstance(position, PositionSample) else ""
-    return f"{info.axis}: halted{at}"
+    return f"{whose(client.rig)}{info.axis}: halted{at}"
+
+
+def _halts(axis: str) -> str:
+    return f"`{typed(step('halt'), axis)}` halts it"
 
 
 async def _follow(client: RigClient, info: AxisInfo, reply: CommandReply) -> StateSample:
@@ -197,10 +212,15 @@ WAITING = {
     "--leave-running": "With --wait: Ctrl-C ends the wait only, the axis moves on.",
 }
 """Options of a command that moves an axis."""
+Shown = Iterator[tuple[Frozen, Sequence[str]]]
 
 
-def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False) -> click.Command:
-    """Return a command that sends one class to an axis.
+class Derived(click.Command):
+    """A command that sends one class: its arguments, its options and its help are the fields and words of the class."""
+
+
+def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False) -> Derived:
+    """Return a command that sends one class to an axis and tells that the drive has accepted it.
 
     Args:
         name: what it is called.
@@ -221,34 +241,109 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
     ) -> None:
         sender.send(axis, of_options(command, **given), wait=wait, leave_running=leave_running)
 
-    params: list[click.Parameter] = [click.Argument(["axis"], type=AXIS)]
-    for field, described in command.model_fields.items():
-        if field in AxisCommand.model_fields:
-            continue
-        kind = _kind(described.annotation)
+    waiting = [click.Option([name], is_flag=True, help=text) for name, text in WAITING.items()] if moves else []
+    return _derived(name, command, callback, arguments, [click.Argument(["axis"], type=AXIS)], waiting)
+
+
+def derived_for_all(name: str, command: type[Sent], *arguments: str) -> Derived:
+    """Return a command that sends one class to the axes that are named behind its arguments, or to all that take it."""
+
+    @commanding
+    def callback(sender: Sender, /, axes: tuple[str, ...], **given: Any) -> None:  # noqa: ANN401
+        sender.send_to_all(axes, of_options(command, **given))
+
+    axes = click.Argument(["axes"], type=AXIS, nargs=-1, metavar="[AXIS]...")
+    made = _derived(name, command, callback, arguments, [], [axes])
+    made.help = f"{made.help}\n\nOf each AXIS that is named; without one, of all axes that have it."
+    return made
+
+
+def derived_question(
+    name: str,
+    command: type[Command[ReplyT]],
+    *arguments: str,
+    shows: Callable[[ReplyT, AxisInfo | None], Shown],
+    confirm: str = "",
+) -> Derived:
+    """Return a command that sends one class to an axis or a rig and shows the reply.
+
+    Args:
+        name: what it is called.
+        command: what it sends.
+        arguments: the fields that are given by their place; the others are options.
+        shows: yields the parts of a reply, each with the lines of text that stand for it; gets the axis, too.
+        confirm: asks this first, with `{axis}` in it, unless --yes is given.
+    """
+
+    @with_target
+    def callback(target: Target, /, axis: str | None = None, *, yes: bool = True, **given: Any) -> None:  # noqa: ANN401
+        if not yes and not click.confirm(confirm.format(axis=axis), err=True):
+            raise click.Abort
+        request = of_options(command, **given)
+
+        async def work(client: RigClient) -> tuple[ReplyT, AxisInfo | None]:
+            if axis is None:
+                return await client.ask(request), None
+            info = await axis_of(client, axis)
+            if isinstance(request, AxisCommand):
+                return await client.command(axis, request), info
+            return await client.ask(request, axis), info
+
+        reply, info = target.run(work)
+        for part, lines in shows(reply, info):
+            target.show(part, *lines)
+
+    first = [click.Argument(["axis"], type=AXIS)] if command.about is About.AXIS else []
+    asks = [click.Option(["--yes"], is_flag=True, help="Do not ask for confirmation.")] if confirm else []
+    return _derived(name, command, callback, arguments, first, asks)
+
+
+def _derived(
+    name: str,
+    command: type[Command[Frozen]],
+    callback: Callable[..., None],
+    arguments: tuple[str, ...],
+    before: Sequence[click.Parameter],
+    behind: Sequence[click.Parameter],
+) -> Derived:
+    fields = {each: described for each, described in command.model_fields.items() if each not in _SENT_BY_ITSELF}
+    params: list[click.Parameter] = list(before)
+    for field, described in fields.items():
+        kind, many = _kind(described.annotation)
         if field in arguments:
-            params.append(click.Argument([field], type=kind))
+            params.append(click.Argument([field], type=kind, nargs=-1 if many else 1))
         else:
-            params.append(_FieldOption(command, field, kind))
-    if moves:
-        params += [click.Option([name], is_flag=True, help=text) for name, text in WAITING.items()]
+            params.append(_FieldOption(command, field, kind, many=many))
     target = getattr(callback, "__click_params__", [])
-    return click.Command(
+    return Derived(
         name,
-        params=[*params, *reversed(target)],
+        params=[*params, *behind, *reversed(target)],
         callback=callback,
         help=command.summary(),
         context_settings={"ignore_unknown_options": True},  # a value may be negative
     )
 
 
+_SENT_BY_ITSELF = frozenset({*AxisCommand.model_fields, "leases"})
+"""Fields that prove permission and prevent a second execution."""
+
+
 class _FieldOption(click.Option):
     """An option for a field; its meaning is read from the source of the class when help is shown."""
 
-    def __init__(self, command: type[Sent], field: str, kind: click.ParamType[Any]) -> None:
-        is_flag = command.model_fields[field].annotation is bool
-        name = f"--{field.removesuffix('_s').replace('_', '-')}"  # its meaning says that it is in seconds
-        super().__init__([name, field], type=None if is_flag else kind, is_flag=is_flag)
+    def __init__(self, command: type[Command[Frozen]], field: str, kind: click.ParamType[Any], *, many: bool) -> None:
+        described = command.model_fields[field]
+        is_flag = described.annotation is bool
+        written = (
+            field.removesuffix("s") if many else field.removesuffix("_s")
+        )  # its meaning says that it is in seconds
+        super().__init__(
+            [f"--{written.replace('_', '-')}", field],
+            type=None if is_flag else kind,
+            is_flag=is_flag,
+            multiple=many,
+            required=described.is_required(),
+        )
         self._command = command
         self._field = field
 
@@ -258,10 +353,29 @@ class _FieldOption(click.Option):
         return super().get_help_record(ctx)
 
 
-def _kind(annotation: object) -> click.ParamType[Any]:
-    """Return how a field is written on the command line."""
+class Switch(click.Choice[str]):
+    """On or off, for a truth that is given by its place."""
+
+    def __init__(self) -> None:
+        super().__init__(["on", "off"])
+
+    @override
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return value if isinstance(value, bool) else super().convert(value, param, ctx) == "on"
+
+
+def _kind(annotation: object) -> tuple[click.ParamType[Any], bool]:
+    """Return how a field is written on the command line, and whether it may be written several times."""
+    if get_origin(annotation) is tuple:
+        return _kind(get_args(annotation)[0])[0], True
     kinds = [each for each in get_args(annotation) or (annotation,) if each is not NoneType]
     kind = kinds[0]
     if isinstance(kind, type) and issubclass(kind, Enum):
-        return click.Choice([each.value for each in kind])
-    return WholeNumber() if kind is int else Finite()
+        return click.Choice([each.value for each in kind]), False
+    if get_origin(annotation) is Literal:
+        return click.Choice(kinds), False
+    if kind is str:
+        return click.STRING, False
+    if kind is bool:
+        return Switch(), False
+    return (WholeNumber() if kind is int else Finite()), False

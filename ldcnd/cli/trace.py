@@ -7,18 +7,22 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
+from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import end_as_interrupted, show_passing
 from ldcnd.cli.quantities import save_figure, stacked_rows
+from ldcnd.cli.sending import Shown, derived_question
 from ldcnd.cli.typed import Finite, NewFile, WholeNumber, axis_of, force_option
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
-from ldcnd.client.traces import ENDING_S, Trace, armed_trace, fetch_trace, wait_for_trace
+from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
+from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, read_number
 from ldcnd.contract.traces import (
     LONGEST_WAIT_S,
     MOST_SAMPLES,
     AbortTrace,
     TakeTrace,
+    TraceAbortReply,
     TraceChannel,
     TraceHeader,
     TraceReply,
@@ -75,7 +79,7 @@ def _file(_context: click.Context, _parameter: click.Parameter, value: Path | No
 out_option = click.option("--out", type=NewFile(), callback=_file, help="Write the trace to FILE.csv or FILE.json.")
 
 
-@click.group()
+@click.group(cls=CommandGroup)
 def command() -> None:
     """Record an axis against time, and show the result."""
 
@@ -139,13 +143,11 @@ def last(target: Target, axis: str, out: Path | None) -> None:
     _deliver(target, target.run(lambda client: fetch_trace(client, axis)), out)
 
 
-@command.command()
-@click.argument("axis", type=AXIS)
-@with_target
-def abort(target: Target, axis: str) -> None:
-    """End the trace of AXIS that is under way, or one that was left armed in its drive."""
-    reply = target.run(lambda client: client.command(axis, AbortTrace(), ENDING_S))
-    target.show(reply, f"{axis}: trace ended")
+def _aborted(reply: TraceAbortReply, _axis: AxisInfo | None) -> Shown:
+    yield reply, [f"{reply.axis}: trace ended"]
+
+
+command.add_command(derived_question("abort", AbortTrace, shows=_aborted))
 
 
 @command.command()

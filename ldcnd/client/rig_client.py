@@ -257,7 +257,9 @@ class RigClient:
 
     async def _answer(self, axis: str, command: Command[ReplyT], timeout_s: float | None) -> ReplyT:
         if self.lease and getattr(command, "lease", self.lease) is None:
-            command = command.model_copy(update={"lease": self.lease, "client": None})
+            under = {"lease": self.lease, "client": None}  # a lease names its client; not every command has the field
+            known = type(command).model_fields
+            command = command.model_copy(update={name: value for name, value in under.items() if name in known})
         payload, encoding = encode(command, Encoding.MSGPACK)
         key = self.keys.command(axis, command.verb)
         longest_s = command.answer_s if timeout_s is None else timeout_s

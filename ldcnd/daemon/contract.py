@@ -12,7 +12,7 @@ from ldcnd.contract.frozen import Frozen, schema_name, schema_text
 
 @cache
 def all_schemas() -> Mapping[str, str]:
-    """Return the schema text of every public model by name, as `ldcnd schema` writes it; made once."""
+    """Return the schema text of every public model by name, as `schemas` has it; made once."""
     models: tuple[type[Frozen], ...] = (*PUBLIC_MODELS, RigConfig)
     return MappingProxyType({schema_name(model): schema_text(model) for model in models})
 

@@ -20,24 +20,24 @@ pytestmark = [
 PLAIN = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
 ENCODINGS = [{**PLAIN, "PYTHONIOENCODING": name} for name in ("ascii", "latin-1", "ascii:strict")] + [PLAIN]
 COMMANDS = [
-    "axis power x on",
-    "axis power y on",
-    "axis move x 3 --velocity 20 --wait",
-    "axis move x 1 --velocity 20 --wait --json",
-    "axis jog x 2 --for 0.3",
+    "power on x",
+    "power on y",
+    "move x 3 --velocity 20 --wait",
+    "move x 1 --velocity 20 --wait --json",
+    "jog x 2 --for 0.3",
     "group move x=2 y=1 --wait",
-    "axis halt x",
-    "axis list",
+    "halt x",
+    "list",
     "axis set-position x 0",
     "axis gains x --kp 100 --kd 1000 --ki 0 --el 4000",
-    "axis move x 300000",
+    "move x 300000",
     "why x",
     "events",
     "stop",
     "reset",
 ]
 
-REFUSED = {"axis move x 300000", "why x", "group move x=2 y=1 --wait"}
+REFUSED = {"move x 300000", "why x", "group move x=2 y=1 --wait"}
 
 
 @pytest_asyncio.fixture(scope="module", loop_scope="module")
@@ -73,7 +73,7 @@ async def test_a_waited_move_whose_output_has_no_reader_is_halted(served):
     await ready(rig)
     reading, writing = os.pipe()
     os.close(reading)
-    code, _, errors = await run(endpoint, "axis move x 90 --velocity 3 --wait", stdout=writing)
+    code, _, errors = await run(endpoint, "move x 90 --velocity 3 --wait", stdout=writing)
     os.close(writing)
 
     assert (code, "x: halted at" in errors) == (1, True)
@@ -85,17 +85,17 @@ async def test_a_move_that_goes_on_is_named_where_its_output_has_no_reader(serve
     await ready(rig)
     reading, writing = os.pipe()
     os.close(reading)
-    _, _, errors = await run(endpoint, "axis move x 90 --velocity 3", stdout=writing)
+    _, _, errors = await run(endpoint, "move x 90 --velocity 3", stdout=writing)
     os.close(writing)
 
-    assert "ldcnd axis halt x" in errors
+    assert "ldcnd halt x" in errors
     await rig.command("x", Halt())
 
 
 async def test_a_waited_move_without_a_standard_output_gets_to_its_end(served):
     endpoint, rig = served
     await ready(rig)
-    line = f"{' '.join(LDCND)} axis move x 2 --velocity 10 --wait -e {endpoint} >&-"
+    line = f"{' '.join(LDCND)} move x 2 --velocity 10 --wait -e {endpoint} >&-"
     running = await asyncio.create_subprocess_shell(line, stderr=PIPE)
     async with asyncio.timeout(60):
         _, errors = await running.communicate()

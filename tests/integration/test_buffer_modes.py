@@ -237,10 +237,10 @@ async def test_an_aborting_move_on_a_standing_axis_is_like_any_other():
 def test_the_command_line_waits_for_as_long_as_what_it_waits_behind_takes(monkeypatch):
     with virtual_rig(monkeypatch) as here:
         here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
-        here.run("axis power x on")
-        here.run("axis move x 30 --velocity 1")
+        here.run("power on x")
+        here.run("move x 30 --velocity 1")
 
-        ran = here.run("axis move x 2 --buffer-mode buffered --wait")
+        ran = here.run("move x 2 --buffer-mode buffered --wait")
 
         assert (ran.code, ran.errors) == (0, "")
         assert "accepted, waits until" in ran.printed
@@ -251,15 +251,15 @@ def test_the_command_line_waits_for_as_long_as_what_it_waits_behind_takes(monkey
 def test_the_command_line_says_why_what_it_waited_for_did_not_begin(monkeypatch):
     with virtual_rig(monkeypatch) as here:
         here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
-        here.run("axis power x on")
-        here.run("axis move x 30 --velocity 1")
+        here.run("power on x")
+        here.run("move x 30 --velocity 1")
 
         async def halted_later():
             await asyncio.sleep(8.0)
             await here.rig.client.command("x", Halt())
 
         halting = here.wait(_begun(halted_later()))
-        ran = here.run("axis move x 2 --buffer-mode buffered --wait")
+        ran = here.run("move x 2 --buffer-mode buffered --wait")
         here.wait(halting)
 
         assert ran.code == 1

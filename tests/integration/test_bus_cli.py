@@ -51,7 +51,7 @@ def last_line(ran: Ran) -> str:
 
 
 def test_a_probe_latches_and_its_position_can_be_read(bench: VirtualRig):
-    assert bench.run("axis power x on").code == 0
+    assert bench.run("power on x").code == 0
 
     probed = bench.run("axis probe x --source forward_limit --distance 9 --velocity 4 --wait")
     latch = bench.wait(bench.rig.client.last("x", TelemetryItem.LATCH))
@@ -95,8 +95,8 @@ def test_outputs_are_set_by_line_and_level(bench: VirtualRig):
 
 
 def test_a_module_can_be_watched_as_an_axis_can(bench: VirtualRig):
-    watched = bench.run("axis watch cabinet --count 1")
-    other = bench.run("axis watch closet --count 1")
+    watched = bench.run("watch cabinet --count 1")
+    other = bench.run("watch closet --count 1")
 
     assert watched.code == 0, watched.errors
     assert "cabinet" in last_line(watched)

@@ -59,7 +59,7 @@ async def moving(served, *options):
     """Let a command wait for a long move of x; yields its process once x moves."""
     endpoint, rig = served
     await standing(rig, "x")
-    words = ("axis", "move", "x", "90", "--velocity", "3", "--wait", "-e", endpoint, *options)
+    words = ("move", "x", "90", "--velocity", "3", "--wait", "-e", endpoint, *options)
     running = await asyncio.create_subprocess_exec(*LDCND, *words, stdout=PIPE, stderr=PIPE)
     try:
         await until(rig, "x", lambda state: state.moving == "yes")
@@ -82,7 +82,7 @@ async def test_a_waited_move_that_is_interrupted_is_halted(served, ending):
     state = await until(served[1], "x", lambda state: state.moving == "no")
     position = (await served[1].last("x", "position")).value
     assert running.returncode == 130
-    assert said.decode().startswith("x: halted at ")
+    assert said.decode().startswith("sim: x: halted at ")
     assert "Traceback" not in said.decode()
     assert position < 80
     assert not state.stop_latched
@@ -91,7 +91,7 @@ async def test_a_waited_move_that_is_interrupted_is_halted(served, ending):
 async def test_a_move_that_waits_behind_another_is_withdrawn_by_the_end_of_its_command(served):
     async with moving(served, "--leave-running"):
         endpoint, rig = served
-        words = ("axis", "move", "x", "0", "--buffer-mode", "buffered", "--wait", "-e", endpoint)
+        words = ("move", "x", "0", "--buffer-mode", "buffered", "--wait", "-e", endpoint)
         behind = await asyncio.create_subprocess_exec(*LDCND, *words, stdout=PIPE, stderr=PIPE)
         async with asyncio.timeout(PATIENCE_S):
             accepted = (await behind.stdout.readline()).decode()
@@ -115,13 +115,13 @@ async def test_a_waited_move_may_be_left_running(served):
         assert (await served[1].state("x")).moving == "yes"
     await standing(served[1], "x")
     assert running.returncode == 130
-    assert "ldcnd axis halt x" in said.decode()
+    assert "ldcnd halt x" in said.decode()
 
 
 async def test_output_that_nobody_reads_ends_a_command_without_a_word(served):
     endpoint, _ = served
     watching = await asyncio.create_subprocess_shell(
-        f"{' '.join(LDCND)} axis watch -e {endpoint} | head -1", stdout=PIPE, stderr=PIPE
+        f"{' '.join(LDCND)} watch -e {endpoint} | head -1", stdout=PIPE, stderr=PIPE
     )
     async with asyncio.timeout(PATIENCE_S):
         printed, said = await watching.communicate()

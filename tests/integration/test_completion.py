@@ -14,7 +14,7 @@ def completed(*words: str, incomplete: str = "") -> list[str]:
 
 def test_axes_of_the_daemon_are_completed(monkeypatch: pytest.MonkeyPatch) -> None:
     with virtual_rig(monkeypatch):
-        axes = completed("axis", "move")
+        axes = completed("move")
         begun = completed("axis", "gains", incomplete="x")
         several = completed("reset", "x", incomplete="y")
         commissioned = completed("commission", "--config", "rig.toml", incomplete="z")
@@ -24,7 +24,8 @@ def test_axes_of_the_daemon_are_completed(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_commands_verbs_and_codes_are_completed() -> None:
-    assert "move" in completed("axis")
+    assert "move" in completed()
+    assert "probe" in completed("axis")
     assert completed("axis", incomplete="quick") == ["quick-stop"]
     assert completed("fault", incomplete="stop_l") == ["stop_latched"]
 
@@ -33,4 +34,4 @@ def test_commands_verbs_and_codes_are_completed() -> None:
 def test_no_daemon_is_no_completion(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("LDCND_CONNECT", "127.0.0.1:1")
 
-    assert completed("axis", "move") == []
+    assert completed("move") == []

@@ -96,7 +96,7 @@ def test_a_rig_whose_kept_files_are_damaged_starts_and_lacks_what_they_held(
         counted = here.run("params restart-count feed --writes 3 --yes")
         written = here.run("params set feed Pn102 63 --eeprom")
         other = here.run("params set spool Pn102 63 --eeprom")
-        moved = [here.run(line) for line in ("axis power x on", "axis set-position x 1", "axis move x 2 --wait")]
+        moved = [here.run(line) for line in ("power on x", "axis set-position x 1", "move x 2 --wait")]
 
     assert "it is not known how often its EEPROM was written" in eeprom.errors
     assert [ran.code for ran in (ram, counted, written, other)] == [0, 0, 0, 1]

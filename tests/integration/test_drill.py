@@ -23,7 +23,7 @@ async def drill(endpoint: str, kind: str, *options: str) -> dict[str, float]:
 
 async def reset(endpoint: str) -> None:
     """Reset x as soon as its drive has said that it stands: it is refused before."""
-    words = ("axis", "reset", "x", "--connect", endpoint)
+    words = ("reset", "x", "--connect", endpoint)
     async with asyncio.timeout(20):
         while True:
             done = await create_subprocess_exec(*LDCND, *words, stdout=PIPE, stderr=PIPE, cwd=ROOT)

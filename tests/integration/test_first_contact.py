@@ -75,7 +75,7 @@ async def test_make_run_says_what_to_type_and_the_first_program_moves(tmp_path):
     ]
     assert len(code) <= LINES
     assert "Rig sim is up: x, y, z, c." in said
-    assert f"ldcnd axis move x 10 --wait -e {endpoint}" in said
+    assert f"ldcnd move x 10 --wait -e {endpoint}" in said
     assert answer.status == 303
     assert first.returncode == 0
     assert tour.returncode == 0

@@ -237,12 +237,12 @@ async def test_roles_hold_across_routers(site: SiteNetwork) -> None:
         client = RigClient(session, "mill")
         await ready(client)
 
-        off = ("axis", "power", "x", "off", "--rig", "mill")
+        off = ("power", "off", "x", "--rig", "mill")
         refused, why = await at_the_desk(site, "vic", *off)
         untouched = await client.state("x")
         done, printed = await at_the_desk(site, "ada", *off)
         opened = await client.state("x")
-        stopped, told = await at_the_desk(site, "vic", "axis", "stop", "x", "--rig", "mill")
+        stopped, told = await at_the_desk(site, "vic", "stop", "x", "--rig", "mill")
         latched = await client.state("x")
         await client.command("x", Reset())  # the tests that follow find the fleet well
 

@@ -16,20 +16,20 @@ from tests.support.command_line import VirtualRig, virtual_rig
 from tests.support.rig import SIMULATED
 
 SENT = (
-    "axis power x on",
-    "axis move x 1 --wait",
-    "axis move x 1 --relative --wait",
-    "axis jog x 2 --for 0.3",
+    "power on x",
+    "move x 1 --wait",
+    "move x 1 --relative --wait",
+    "jog x 2 --for 0.3",
     "axis set-position x 0",
-    "axis home x --wait",
+    "home x --wait",
     "axis probe z --source forward_limit --distance 1 --velocity 4 --wait",
-    "axis halt x",
+    "halt x",
     "axis outputs z --limit1 input",
     "axis gains x --kp 100 --kd 1000 --ki 0 --el 4000",
     "axis pwm z 0.1 1",
     "axis track z 0",
-    "axis power z off",
-    "axis reset y",
+    "power off z",
+    "reset y",
     "trace take x --channel position --samples 5",
     "trace abort x",
     "speed 50",
@@ -47,7 +47,7 @@ SENT = (
     "bus set-io-timer cabinet timer",
 )
 NOT_TYPED = {
-    "move_velocity",  # `axis jog` holds it
+    "move_velocity",  # `jog` holds it
     "move_analog",  # no axis here has a sensor for it
 }
 """What needs control and has no line above."""
@@ -104,7 +104,7 @@ def test_outside_of_it_what_needs_control_is_refused(rig, tmp_path):
     held(rig, *ALL)
     (tmp_path / "feed.toml").write_text("type = 1\n[parameters]\nPn102 = 41\n")
     for line in SENT:
-        if line.startswith(("axis jog", "axis move", "axis reset", "params set")):
+        if line.startswith(("jog", "move", "reset", "params set")):
             refused = rig.run(line)
             assert "lease_held" in refused.errors, line
 

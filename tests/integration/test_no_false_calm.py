@@ -27,7 +27,7 @@ def up(virtual, axis: str) -> None:
 
 
 def rows(virtual) -> dict[str, dict[str, object]]:
-    printed = virtual.run("axis list --json").printed
+    printed = virtual.run("list --json").printed
     return {row["axis"]: row for row in map(json.loads, printed.splitlines())}
 
 
@@ -35,15 +35,15 @@ def test_a_daemon_that_ended_in_mid_move_leaves_an_axis_that_says_it_is_not_home
     chain = four_drives()
     with virtual_rig(monkeypatch, chains={"line0": chain}) as first:
         up(first, "x")
-        assert "(" not in line_of(first.run("axis list").printed, "x")  # at rest where it was powered on
+        assert "(" not in line_of(first.run("list").printed, "x")  # at rest where it was powered on
         first.wait(first.rig.client.command("x", Power(on=True)))
         first.wait(first.rig.client.command("x", MoveAbsolute(position=60.0, velocity=10.0)))
         first.wait(asyncio.sleep(3.0))
 
     with virtual_rig(monkeypatch, chains={"line0": chain}) as second:
         up(second, "x")
-        listed, topped = second.run("axis list").printed, second.run("top").printed
-        watched = second.run("axis watch x --item position --count 1")
+        listed, topped = second.run("list").printed, second.run("top").printed
+        watched = second.run("watch x --item position --count 1")
         fleet, why, now = second.run("fleet").printed, second.run("why x").printed, rows(second)["x"]
 
     assert abs(chain.modules[0].shaft.position_counts) > 20_000  # the shaft is far from where it reads 0
@@ -66,10 +66,10 @@ def test_a_drive_that_lost_power_has_lost_its_reference_and_a_reset_does_not_bri
             virtual.wait(virtual.rig.until("z", lambda state, on=on: (state.link is LinkState.UP) is on))
         virtual.wait(virtual.rig.client.command("z", Reset()))
         virtual.wait(asyncio.sleep(60.0))
-        listed, topped = virtual.run("axis list").printed, virtual.run("top").printed
+        listed, topped = virtual.run("list").printed, virtual.run("top").printed
         virtual.run("axis set-position z 0")
         virtual.wait(asyncio.sleep(1.0))
-        after = virtual.run("axis list").printed
+        after = virtual.run("list").printed
 
     assert "reference lost" in line_of(listed, "z")
     assert "(" in line_of(listed, "z")
@@ -86,9 +86,9 @@ def test_a_dead_line_shows_no_bare_number_and_watch_says_at_once_what_is_wrong(m
             virtual.wait(_switch(chain, module, on=False))
         virtual.wait(virtual.rig.until("x", lambda state: state.link is LinkState.DOWN))
         virtual.wait(asyncio.sleep(30.0))
-        listed, topped, now = virtual.run("axis list").printed, virtual.run("top").printed, rows(virtual)["x"]
+        listed, topped, now = virtual.run("list").printed, virtual.run("top").printed, rows(virtual)["x"]
         virtual.wait(_later(chain))
-        watched = virtual.run("axis watch x --item position --count 2")
+        watched = virtual.run("watch x --item position --count 2")
 
     for axis in ("x", "y", "z", "c"):
         assert "(" in line_of(listed, axis)
@@ -106,7 +106,7 @@ def test_what_is_said_of_a_drive_without_motions_names_no_command_that_it_does_n
     with virtual_rig(monkeypatch, load_config(CONFIGS / "mixed.toml")) as virtual:
         up(virtual, "feed")
         told = virtual.run("why feed")
-        listed = virtual.run("axis list").printed
+        listed = virtual.run("list").printed
 
     for verb in ("home", "halt", "set-position", "power", "enable"):
         assert verb not in told.printed

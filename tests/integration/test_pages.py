@@ -48,7 +48,7 @@ NOT_RUN = {
     ("docs/how-to/run-in-a-container.md", "docker build -f deploy/container/Dockerfile -t ldcnd ."): (
         "needs an engine and fetches packages; tests/unit/test_deploy_container.py reads the files"
     ),
-    ("README.md", ".venv/bin/ldcnd axis list"): "test_the_tour_of_the_readme_runs",
+    ("README.md", ".venv/bin/ldcnd list"): "test_the_tour_of_the_readme_runs",
     ("README.md", ".venv/bin/python examples/move_and_watch.py"): (
         "test_the_example_follows_a_moving_axis_to_its_target"
     ),
@@ -91,10 +91,10 @@ NOT_RUN = {
     ("docs/how-to/tune.md", "ldcnd tune x --put-back"): "test_gains_of_a_tuning_that_was_killed_are_put_back_by_hand",
     (MONITOR, "ldcnd metrics"): "test_metrics_are_served_over_http_by_a_process_of_their_own",
     (MONITOR, "ldcnd foxglove"): "test_a_daemon_is_shown_by_a_process_of_its_own",
-    ("docs/how-to/secure-a-rig.md", "ldcnd axis move x 10 --connect unixsock-stream//run/ldcnd/operator.sock"): (
+    ("docs/how-to/secure-a-rig.md", "ldcnd move x 10 --connect unixsock-stream//run/ldcnd/operator.sock"): (
         "needs the socket of the service"
     ),
-    ("docs/how-to/secure-a-rig.md", "ldcnd axis list --config wall_display.json5   # lists"): (
+    ("docs/how-to/secure-a-rig.md", "ldcnd list --config wall_display.json5   # lists"): (
         "needs the machines of a site; tests/integration/test_security_lan.py has one"
     ),
 }

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import pytest
 
 import ldcnd
-from ldcnd.cli.output import typed
+from ldcnd.cli.names import typed
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import AxisCommand, Command, CommandReply, Jog, MoveVelocity
 from ldcnd.contract.errors import LdcndError, Remedy, step
@@ -56,8 +56,8 @@ class Case:
     then: str = ""
 
 
-MOVING = ("axis power x on", "axis move x 1 --wait", "axis move x 60 --velocity 5")
-HALT = "ldcnd axis halt AXIS and wait"
+MOVING = ("power on x", "move x 1 --wait", "move x 60 --velocity 5")
+HALT = "ldcnd halt AXIS and wait"
 GAINS = "ldcnd axis gains AXIS --kp KP --el EL"
 OUTPUTS = "ldcnd axis outputs AXIS --limit1 input --limit2 input"
 RESTART = (
@@ -73,49 +73,45 @@ DAMAGED = (
     " you know of"
 )
 CASES = {
-    "disabled": Case(
-        "ldcnd axis power AXIS on", ("axis power x off",), "axis move x 1 --relative --wait", "axis power x on"
-    ),
+    "disabled": Case("ldcnd power on AXIS", ("power off x",), "move x 1 --relative --wait", "power on x"),
     "not homed": Case(
-        "ldcnd axis home AXIS or ldcnd axis set-position AXIS POSITION",
-        ("axis power n on",),
-        "axis move n 1",
-        "axis home n",
+        "ldcnd home AXIS or ldcnd axis set-position AXIS POSITION",
+        ("power on n",),
+        "move n 1",
+        "home n",
         waits_s=30.0,
     ),
     "not homed, place known": Case(
-        "ldcnd axis home AXIS or ldcnd axis set-position AXIS POSITION",
-        ("axis power z on",),
-        "axis move z 6",
+        "ldcnd home AXIS or ldcnd axis set-position AXIS POSITION",
+        ("power on z",),
+        "move z 6",
         "axis set-position z POSITION",
     ),
-    "moving": Case(HALT, MOVING, "axis move x 1 --wait", "axis halt x", waits_s=2.0),
-    "moving, unreferenced": Case(HALT, MOVING, "axis set-position x 1", "axis halt x", waits_s=2.0),
-    "resetting in motion": Case(HALT, MOVING, "axis reset x", "axis halt x", waits_s=2.0),
-    "latched": Case("ldcnd axis reset AXIS", ("axis stop x",), "axis power x on", "axis reset x"),
+    "moving": Case(HALT, MOVING, "move x 1 --wait", "halt x", waits_s=2.0),
+    "moving, unreferenced": Case(HALT, MOVING, "axis set-position x 1", "halt x", waits_s=2.0),
+    "resetting in motion": Case(HALT, MOVING, "reset x", "halt x", waits_s=2.0),
+    "latched": Case("ldcnd reset AXIS", ("stop x",), "power on x", "reset x"),
     "speed override": Case(
-        "ldcnd speed PERCENT above 0 %", ("axis power x on", "speed 0"), "axis move x 1 --wait", "speed PERCENT"
+        "ldcnd speed PERCENT above 0 %", ("power on x", "speed 0"), "move x 1 --wait", "speed PERCENT"
     ),
     "faulted": Case(
-        "remove the cause, then ldcnd axis reset AXIS",
+        "remove the cause, then ldcnd reset AXIS",
         (
-            "axis power x on",
+            "power on x",
             "axis gains x --el 1",
-            "TRY axis move x 30 --relative --velocity 40",
+            "TRY move x 30 --relative --velocity 40",
             "WAIT 3",
             "axis gains x --el 4000",
         ),
-        "axis power x on",
-        "axis reset x",
+        "power on x",
+        "reset x",
     ),
-    "velocity of nothing": Case(
-        "ldcnd axis halt AXIS", ("axis power x on",), "VELOCITY x 0", "axis halt x", then="axis halt x"
-    ),
+    "velocity of nothing": Case("ldcnd halt AXIS", ("power on x",), "VELOCITY x 0", "halt x", then="halt x"),
     "few gains": Case(GAINS, (), "axis gains g --kd 5", "axis gains g --kp KP --el EL"),
     "pin is an output": Case(
         OUTPUTS,
-        ("axis power z on", "axis outputs z --limit2 low"),
-        "axis home z --method forward_limit --velocity 5",
+        ("power on z", "axis outputs z --limit2 low"),
+        "home z --method forward_limit --velocity 5",
         "axis outputs z --limit1 input --limit2 input",
     ),
     "traced": Case(
@@ -139,11 +135,11 @@ CASES = {
         then="params set feed Pn102 57 --eeprom",
     ),
     "renewal of no jog": Case(
-        "let go, then ldcnd axis jog AXIS VELOCITY again",
-        ("axis power x on",),
+        "let go, then ldcnd jog AXIS VELOCITY again",
+        ("power on x",),
         "RENEW x",
-        "axis jog x 1 --for 0.2",
-        then="axis halt x",
+        "jog x 1 --for 0.2",
+        then="halt x",
     ),
     "unknown command": Case("ldcnd events", (), "OUTCOME x", "events", then="events"),
 }
@@ -229,10 +225,10 @@ def test_gains_that_were_never_given_are_given_as_the_refusal_says(monkeypatch):
     with virtual_rig(monkeypatch, rig_config()) as here:
         here.wait(here.rig.until("g", lambda state: state.link is LinkState.UP))
 
-        refused = here.run("axis power g on")
+        refused = here.run("power on g")
         assert CLOSE.replace("AXIS", "g") in refused.errors
         assert type_line(here, "axis gains g --kp KP --el EL").code == 0
-        assert here.run("axis power g on").code == 0
+        assert here.run("power on g").code == 0
 
 
 def test_a_count_of_writes_that_was_lost_is_begun_again_as_the_refusal_says(monkeypatch, tmp_path):
@@ -249,15 +245,15 @@ def test_a_count_of_writes_that_was_lost_is_begun_again_as_the_refusal_says(monk
 def test_control_that_a_refusal_tells_people_to_take_is_enough(rig, monkeypatch):
     here = rig
     client = here.rig.client
-    here.run("axis power x on")
+    here.run("power on x")
     here.wait(client.ask(Acquire(client="ann", axes=("x",), lease_s=60.0)))
-    refused = here.run("axis move x 1 --relative")
+    refused = here.run("move x 1 --relative")
     assert HELD.replace("AXIS", "x") in refused.errors
     held = here.wait(client.ask(Acquire(client="ldcnd", axes=("x",), lease_s=60.0, force=True)))
     monkeypatch.setenv("LDCND_LEASE", held.lease)
 
-    assert here.run("axis move x 1 --relative --wait").code == 0
-    assert here.run("axis jog x 1 --for 0.2").code == 0
+    assert here.run("move x 1 --relative --wait").code == 0
+    assert here.run("jog x 1 --for 0.2").code == 0
 
 
 def test_a_lease_that_is_missing_is_taken_as_the_refusal_says(monkeypatch):
@@ -269,29 +265,29 @@ def test_a_lease_that_is_missing_is_taken_as_the_refusal_says(monkeypatch):
         here.wait(asyncio.sleep(1.0))
         for lease in ("", "no-such-lease", other.lease, brief.lease):
             monkeypatch.setenv("LDCND_LEASE", lease)
-            refused = here.run("axis power x on")
+            refused = here.run("power on x")
             assert refused.code != 0
             assert LEASE.replace("AXIS", "x") in refused.errors.replace("AXIS", "x"), lease
         taken = here.wait(take(Acquire(client="ldcnd", axes=("x",), lease_s=60.0)))
         monkeypatch.setenv("LDCND_LEASE", taken.lease)
-        assert here.run("axis power x on").code == 0
+        assert here.run("power on x").code == 0
 
 
 BY_OTHER_TESTS = {CLOSE, DAMAGED, HELD, LEASE}
 NOT_RUN = {
-    "ldcnd axis halt AXIS, wait until it stands, then ldcnd axis reset AXIS": "a shaft that turns without its drive",
-    "wait until it stands, then ldcnd axis power AXIS on": "a shaft that turns without its drive",
-    "ldcnd axis reset AXIS first": "an encoder that is unplugged and plugged in by hand",
-    "ldcnd axis home AXIS, then power it off": "a tuning, which the tests of tuning run",
-    "secure the load, then ldcnd axis reset AXIS": "a load that is secured by hand",
+    "ldcnd halt AXIS, wait until it stands, then ldcnd reset AXIS": "a shaft that turns without its drive",
+    "wait until it stands, then ldcnd power on AXIS": "a shaft that turns without its drive",
+    "ldcnd reset AXIS first": "an encoder that is unplugged and plugged in by hand",
+    "ldcnd home AXIS, then power it off": "a tuning, which the tests of tuning run",
+    "secure the load, then ldcnd reset AXIS": "a load that is secured by hand",
     "wait for the end of the trace, or ldcnd trace abort AXIS": "a drive that a dead program has left in its trace",
     "ldcnd trace abort AXIS": "a daemon that is lost during a trace",
     "ldcnd trace abort AXIS again": "a drive that does not leave its trace",
     "ldcnd axis clear-counter AXIS COUNTER again": "a drive that does not leave its counter mode",
     "ldcnd events; give every command an id of its own": "thousands of commands",
-    "ldcnd axis halt AXIS first: at standstill the counter is set back": "hours of motion",
-    "ldcnd axis move AXIS DISTANCE --relative, a small distance: it sets the counter back": "hours of motion",
-    "ldcnd axis halt AXIS and wait: at standstill the gains are loaded again": "a drive taken over in motion",
+    "ldcnd halt AXIS first: at standstill the counter is set back": "hours of motion",
+    "ldcnd move AXIS DISTANCE --relative, a small distance: it sets the counter back": "hours of motion",
+    "ldcnd halt AXIS and wait: at standstill the gains are loaded again": "a drive taken over in motion",
 }
 """Remedies whose state takes hands, hours or a broken drive, with what that is."""
 

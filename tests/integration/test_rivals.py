@@ -164,7 +164,7 @@ def test_axis_watch_shows_the_positions_of_the_daemon_and_that_there_is_another_
     with virtual_rig(monkeypatch, load_config(SIMULATED)) as virtual:
         holding = rival(virtual.rig.broker)
         virtual.wait(holding.__aenter__())
-        watched = virtual.run("axis watch x --item position --count 20")
+        watched = virtual.run("watch x --item position --count 20")
         virtual.wait(holding.__aexit__(None, None, None))
 
     assert watched.code == 0

@@ -80,9 +80,7 @@ def test_a_rig_without_the_axis_is_no_failure_and_an_axis_that_no_rig_has_is_one
     assert ran.errors.count("[unknown_axis]") == 2
 
 
-@pytest.mark.parametrize(
-    ("line", "enabled"), [("axis halt x", True), ("power off x", False), ("axis power x off", False)]
-)
+@pytest.mark.parametrize(("line", "enabled"), [("halt x", True), ("axis halt x", True), ("power off x", False)])
 def test_halt_and_power_off_ask_for_no_rig_either(two_rigs, line, enabled):
     here, mill = two_rigs
 
@@ -109,11 +107,11 @@ def test_what_a_remedy_names_is_typed_with_the_options_that_led_to_its_rig(two_r
     here.wait(mill.client.stop("x"))
     here.wait(mill.until("x", lambda state: state.moving == "no"))
 
-    asked, refused = here.run("why x --rig mill"), here.run("axis move x 1 --rig mill")
+    asked, refused = here.run("why x --rig mill"), here.run("move x 1 --rig mill")
 
-    assert "ldcnd axis reset x --rig mill" in asked.printed
-    assert "ldcnd axis reset x --rig mill" in refused.errors
-    assert here.run("axis reset x --rig mill").code == 0
+    assert "ldcnd reset x --rig mill" in asked.printed
+    assert "ldcnd reset x --rig mill" in refused.errors
+    assert here.run("reset x --rig mill").code == 0
     assert [state.stop_latched for state in states(here, mill)] == [False, False]
     assert here.wait(here.rig.client.state("x")).moving == "yes"
 
@@ -127,3 +125,26 @@ def test_a_stop_that_reaches_no_daemon_says_that_nothing_was_stopped():
 
     assert ran.returncode == 3
     assert ran.stderr.startswith("NOT stopped, use the emergency stop: ")
+
+
+def test_what_is_accepted_and_done_names_its_rig_where_another_could_be_meant(two_rigs):
+    here, mill = two_rigs
+    for line in ("halt x --rig mill", "power on y --rig mill"):
+        assert here.run(line).code == 0
+    here.wait(mill.until("x", lambda state: state.moving == "no"))
+
+    moved = said(here.run("move y 1 --wait --rig mill"))
+    powered = said(here.run("power off --rig mill"))
+
+    assert [line.startswith("mill: y: ") for line in moved] == [True, True]
+    assert [line.split(": ")[0] for line in powered] == ["mill"] * 4
+
+
+def test_a_rig_that_is_the_only_one_is_not_named(monkeypatch):
+    with virtual_rig(monkeypatch) as here:
+        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
+
+        powered, moved = said(here.run("power on x")), said(here.run("move x 1 --wait"))
+
+    assert powered == ["x: power done"]
+    assert [line.split(": ")[0] for line in moved] == ["x", "x"]

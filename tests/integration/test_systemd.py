@@ -81,7 +81,7 @@ def log_of(machine: Machine, unit: str = UNIT) -> str:
 def test_service_is_active_and_says_what_works(service: Machine):
     assert service.show(UNIT, "ActiveState") == "active"
     assert service.show(UNIT, "StatusText") == "rig sim: 1/1 buses, 4/4 axes up"
-    listed = service.must("ldcnd", "axis", "list", "--json").splitlines()
+    listed = service.must("ldcnd", "list", "--json").splitlines()
     assert [axis["axis"] for axis in map(json.loads, listed)] == ["x", "y", "z", "c"]
 
 
@@ -95,8 +95,8 @@ def test_reload_applies_what_it_can_and_names_the_rest(service: Machine):
     assert status.endswith("restart needed for bus.line0.axis.c.address")
     assert "bus.line0.axis.x.limits.velocity" in log_of(service)
     assert (service.show(UNIT, "ActiveState"), service.show(UNIT, "MainPID")) == ("active", pid)
-    service.must("ldcnd", "axis", "power", "x", "on")
-    refused = service.run("ldcnd", "axis", "move", "x", "1", "--velocity", "48")
+    service.must("ldcnd", "power", "on", "x")
+    refused = service.run("ldcnd", "move", "x", "1", "--velocity", "48")
     assert "45" in refused.stderr
 
 
@@ -138,8 +138,8 @@ def test_daemon_that_hangs_is_killed_and_started_again(service: Machine):
 
 
 def test_stop_brings_what_moves_to_rest_in_time(service: Machine):
-    service.must("ldcnd", "axis", "power", "x", "on")
-    service.must("ldcnd", "axis", "move", "x", "90", "--velocity", "5")
+    service.must("ldcnd", "power", "on", "x")
+    service.must("ldcnd", "move", "x", "90", "--velocity", "5")
 
     service.must("systemctl", "stop", UNIT, timeout_s=12)
 
@@ -169,7 +169,7 @@ def test_journal_entries_can_be_found_by_their_fields(service: Machine):
     service.must("systemctl", "restart", UNIT)
     service.until_shown(UNIT, "StatusText", lambda text: "4/4 axes up" in text)
 
-    service.must("ldcnd", "axis", "power", "x", "on")
+    service.must("ldcnd", "power", "on", "x")
     service.must("journalctl", "--sync")
 
     found = service.must("journalctl", "--no-pager", "--output=json", "EXTRA_AXIS=x", "EXTRA_VERB=power")

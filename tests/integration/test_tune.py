@@ -309,7 +309,7 @@ async def test_a_closed_loop_is_not_tuned():
         with pytest.raises(WrongState, match="begins with the loop open") as refused:
             await plan(rig.client, "x", None)
 
-    assert "ldcnd axis power x off" in refused.value.remedy
+    assert "ldcnd power off x" in refused.value.remedy
 
 
 async def test_a_distance_must_fit_into_the_travel_and_be_long_enough():

@@ -17,18 +17,18 @@ async def test_what_a_drive_can_do_can_be_typed(tmp_path):
         typed = [
             "power on",
             "axis set-position x 1.5",
-            "axis move x 3 --velocity 10 --wait",
+            "move x 3 --velocity 10 --wait",
             "axis preview x --position 400",
             "axis preview x --distance -1",
             "axis gains z --kp 400",
-            "axis jog z 1 --for 0.2",
+            "jog z 1 --for 0.2",
             "axis quick-stop z",
-            "axis move z 1",
+            "move z 1",
             "why z",
-            "axis watch x --item position --count 2",
+            "watch x --item position --count 2",
             "lease list",
             "lease hold --axis x -- true",
-            "axis move X 1",
+            "move X 1",
             "axis monitors x",
             "bus list --rig sum",
             "trace channels x",
@@ -47,24 +47,24 @@ async def test_what_a_drive_can_do_can_be_typed(tmp_path):
 
     went = dict(zip(typed, ran, strict=True))
     refused = {
-        "axis move z 1": 1,
+        "move z 1": 1,
         "why z": 1,
-        "axis move X 1": 1,
+        "move X 1": 1,
         "axis monitors x": 1,
         "bus list --rig sum": 3,
     }
     assert {line: each.code for line, each in went.items()} == {line: refused.get(line, 0) for line in went}, went
-    accepted, done = went["axis move x 3 --velocity 10 --wait"].printed.splitlines()
-    assert accepted == "x: move absolute accepted: to 3.000 mm, at 10 mm/s, with 200 mm/s², in 200 ms"
-    assert re.fullmatch(r"x: done, standstill at (2\.99|3\.00)\d mm, 0\.00\d mm off its target", done)
+    accepted, done = went["move x 3 --velocity 10 --wait"].printed.splitlines()
+    assert accepted == "sim: x: move absolute accepted: to 3.000 mm, at 10 mm/s, with 200 mm/s², in 200 ms"
+    assert re.fullmatch(r"sim: x: done, standstill at (2\.99|3\.00)\d mm, 0\.00\d mm off its target", done)
     assert (
         went["axis preview x --position 400"].printed.splitlines()[1]
         == "  the nearest value that would be accepted is 100"
     )
-    assert "z: halted at " in went["axis jog z 1 --for 0.2"].printed
-    assert "ldcnd axis reset z" in went["axis move z 1"].errors
-    assert "ldcnd axis reset z" in went["why z"].printed
-    assert went["axis move X 1"].errors.startswith("there is no axis 'X'; did you mean 'x'?")
+    assert "z: halted at " in went["jog z 1 --for 0.2"].printed
+    assert "ldcnd reset z" in went["move z 1"].errors
+    assert "ldcnd reset z" in went["why z"].printed
+    assert went["move X 1"].errors.startswith("there is no axis 'X'; did you mean 'x'?")
     assert went["bus list --rig sum"].errors.startswith("no rig 'sum' answers; did you mean 'sim'?")
     assert "position" in went["trace channels x"].printed.splitlines()
     assert went["stop"].printed == "sim: stopped and latched: x, y, z, c\n"

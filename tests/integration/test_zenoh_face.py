@@ -126,15 +126,15 @@ async def test_a_storage_that_answers_with_older_values_deceives_no_client(serve
                     query.reply(key, sample.payload, encoding=sample.encoding, timestamp=sample.timestamp)
 
         declared = storage.declare_queryable("ldcn/**", answer, complete=True)
-        await command_line(served, "axis", "reset", "y")
-        await command_line(served, "axis", "power", "y", "on")
-        await command_line(served, "axis", "move", "y", "9", "--velocity", "5", "--wait")
+        await command_line(served, "reset", "y")
+        await command_line(served, "power", "on", "y")
+        await command_line(served, "move", "y", "9", "--velocity", "5", "--wait")
         (truth,) = (
             json.loads(reply.ok.payload.to_string())
             for reply in session.get("ldcn/sim/tele/y/position", target=zenoh.QueryTarget.ALL, timeout=5)
             if reply.ok and str(reply.replier_id.zid) != str(storage.zid())
         )
-        listed = await command_line(served, "axis", "list")
+        listed = await command_line(served, "list")
         async with client(served) as rig:
             positions, state = await rig.positions(), await rig.state("y")
         declared.undeclare()
@@ -219,7 +219,7 @@ async def test_the_tour_of_the_readme_runs(tmp_path):
 
 async def test_a_command_without_a_daemon_says_so_and_exits_with_3():
     done = await create_subprocess_exec(
-        sys.executable, "-m", "ldcnd", "axis", "list", "--connect", "tcp/127.0.0.1:1", stdout=PIPE, stderr=STDOUT
+        sys.executable, "-m", "ldcnd", "list", "--connect", "tcp/127.0.0.1:1", stdout=PIPE, stderr=STDOUT
     )
     printed, _ = await done.communicate()
 

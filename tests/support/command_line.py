@@ -61,7 +61,7 @@ class Ran:
 
 
 async def run_all(folder: Path, *commands: str) -> list[Ran]:
-    """Run command lines such as `ldcnd axis list`, perhaps with ` > FILE` behind them, in a folder."""
+    """Run command lines such as `ldcnd list`, perhaps with ` > FILE` behind them, in a folder."""
     running = await asyncio.create_subprocess_exec(
         sys.executable, "-c", PROGRAM, json.dumps(commands), cwd=folder, stdout=PIPE, stderr=PIPE
     )
@@ -85,7 +85,7 @@ class VirtualRig:
         self._loop = loop
 
     def run(self, line: str, typed: str = "") -> Ran:
-        """Run a command line such as `axis list --json`; it finds on its standard input what is typed."""
+        """Run a command line such as `list --json`; it finds on its standard input what is typed."""
         return run_here(*shlex.split(line), typed=typed)
 
     def wait(self, work: Coroutine[object, object, ResultT]) -> ResultT:

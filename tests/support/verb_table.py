@@ -69,9 +69,7 @@ def _found(command: type[Command[Frozen]], place: str) -> str:
 
 def _commands_that_send(command: type[Command[Frozen]]) -> str:
     """Return the commands of the command line from whose code the class is reached."""
-    return ", ".join(
-        path for path, reached in _command_line() if command in reached and path.split()[1] not in {"schema", "drill"}
-    )
+    return ", ".join(path for path, reached in _command_line() if command in reached and path.split()[1] != "drill")
 
 
 @functools.cache

@@ -1,11 +1,16 @@
 """What the command line says when it is refused."""
 
+import shlex
+
 import click
 import pytest
 
 from ldcnd.cli import main
+from ldcnd.cli.names import COMMANDS, EXAMPLES
 from ldcnd.cli.output import WRONG_CONFIG, show_lines
 from ldcnd.contract.errors import ConfigError, LeaseHeld
+from tests.support.command_line import run_here
+from tests.support.pages import require_command_line
 
 
 def test_a_refused_configuration_comes_with_what_to_do(monkeypatch, capsys):
@@ -43,3 +48,60 @@ def test_errors_quote_what_a_stranger_sent_without_passing_it_on(monkeypatch, ca
     assert "eve\\x1b[2J" in said
     assert "\x1b" not in said
     assert "\x9b" not in said
+
+
+@pytest.mark.parametrize("path", sorted(EXAMPLES))
+def test_the_example_of_each_command_can_be_typed_and_stands_in_its_help(path):
+    words = path.split()
+
+    require_command_line([*words, *shlex.split(EXAMPLES[path])])
+    assert f"Example: ldcnd {path} {EXAMPLES[path]}".rstrip() in " ".join(run_here(*words, "--help").printed.split())
+
+
+def test_every_command_has_an_example():
+    def walk(command, context, path):
+        yield path
+        if isinstance(command, click.Group):
+            for name in command.list_commands(context):
+                inner = command.get_command(context, name)
+                yield from walk(inner, click.Context(inner, parent=context, info_name=name), [*path, name])
+
+    paths = {" ".join(path) for path in walk(main.cli, click.Context(main.cli), [])} - {""}
+    other_names = {f"axis {name}" for name in COMMANDS}
+
+    assert paths - other_names == set(EXAMPLES)
+
+
+def test_the_help_has_five_groups_with_every_command():
+    printed = run_here("--help").printed
+
+    assert [line[:-1] for line in printed.splitlines() if line in {"Run:", "Operate:", "Look:", "Set up:", "Connect:"}]
+    for name in ("list", "move", "home", "stop", "watch", "jog", "why", "scan", "run"):
+        assert f"\n  {name} " in printed
+
+
+@pytest.mark.parametrize(
+    ("typed", "said"),
+    [
+        ("axis move x -1.5 --wait", "`ldcnd move x -1.5 --wait`"),
+        ("axis list", "`ldcnd list`"),
+        ("axis watch x", "`ldcnd watch x`"),
+        ("axis jog x 1", "`ldcnd jog x 1`"),
+        ("set-position x -1", "`ldcnd axis set-position x -1`"),
+        ("probe x", "`ldcnd axis probe x`"),
+        ("mvoe x 1", "'move'"),
+    ],
+)
+def test_a_command_that_stands_elsewhere_is_refused_with_what_to_type(typed, said):
+    ran = run_here(*typed.split())
+
+    assert ran.code == 2
+    assert said in ran.errors
+
+
+@pytest.mark.parametrize("name", ["stop", "halt", "home", "reset"])
+def test_commands_of_every_day_have_two_names(name):
+    context = click.Context(main.cli)
+    axis = main.cli.get_command(context, "axis")
+
+    assert axis.get_command(click.Context(axis, parent=context), name) is main.cli.get_command(context, name)

@@ -4,11 +4,11 @@ import click
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.cli.main import LazyGroup, cli
+from ldcnd.cli.main import CommandGroup, cli
 from ldcnd.cli.typed import Finite, WholeNumber
 
 
-@click.group(cls=LazyGroup, homes={})
+@click.group(cls=CommandGroup, homes={})
 def program() -> None:
     """Hold one command."""
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import ldcnd
-from ldcnd.cli.output import OPTIONS_TYPED, typed
+from ldcnd.cli.names import OPTIONS_TYPED, typed
 from ldcnd.contract.codec import error_reply, rebuild_error
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import LeaseHeld, Remedy, step
@@ -64,7 +64,7 @@ def test_steps_travel_with_an_error_and_are_said_by_each_face():
     assert received.remedy.phrased(lambda each: typed(each, "x")) == (
         "wait until it is released, or ldcnd lease hold --axis x --force -- COMMAND"
     )
-    assert typed(step("power", on=True), "x") == "ldcnd axis power x on"
+    assert typed(step("power", on=True), "x") == "ldcnd power on x"
 
 
 def test_options_of_the_command_stand_before_a_program_of_the_remedy():

@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from ldcnd.cli.main import COMMANDS
+from ldcnd.cli.names import COMMANDS
 from tests.support.pages import ROOT
 from tools.__main__ import write_man_pages
 from tools.manual import as_markdown, entries, man_pages

@@ -48,7 +48,7 @@ class LimitSwitches(Step):
             raise WrongState(
                 f"axis {axis.name}: this drive shows its limit switches only while its power driver is on",
                 axis=axis.name,
-                remedy=f"type `ldcnd axis power {axis.name} on`; it then holds its position while you press them",
+                remedy=f"type `ldcnd power on {axis.name}`; it then holds its position while you press them",
             )
         pressed: list[int] = []
         for side in SIDES:

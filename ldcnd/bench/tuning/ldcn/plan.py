@@ -155,7 +155,7 @@ async def check_off(axis: Axis) -> None:
             value=state.state.value,
             remedy=Remedy("secure the load, then {}", step("reset"))
             if state.state is AxisState.ERROR_STOP
-            else f"secure the load, then type: ldcnd axis power {axis.name} off",
+            else f"secure the load, then type: ldcnd power off {axis.name}",
         )
     await at_rest(axis)
 

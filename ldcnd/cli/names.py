@@ -1,0 +1,227 @@
+"""What each command is called: the table of the program with its groups and examples, and how a remedy is typed."""
+
+import shlex
+from collections.abc import Mapping
+from contextvars import ContextVar
+from typing import Final
+
+from ldcnd.contract.errors import RemedyCommand
+
+GROUPS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
+    "Run": {
+        "run": ("ldcnd.cli.run", "Run the daemon."),
+        "check-config": ("ldcnd.cli.prepare:check_config", "Validate a configuration without opening anything."),
+        "plan": (
+            "ldcnd.cli.prepare:plan",
+            "Show what the lines of a configuration promise, before any hardware is there.",
+        ),
+        "sim": ("ldcnd.cli.sim", "Simulate a line of drives behind a pseudo-terminal."),
+    },
+    "Operate": {
+        "list": ("ldcnd.cli.looking:list_axes", "Show every axis: where it is, its state, what is wrong with it."),
+        "move": ("ldcnd.cli.axis:move", "Move an axis to a position, by a distance or at a velocity."),
+        "jog": ("ldcnd.cli.axis:jog", "Run an axis while the space bar is held, or for a time."),
+        "home": ("ldcnd.cli.axis:home", "Find the reference position of an axis."),
+        "halt": ("ldcnd.cli.axis:halt", "Decelerate an axis to standstill; another command may follow."),
+        "stop": ("ldcnd.cli.rig:stop", "Stop every axis of a rig, or one, and latch."),
+        "reset": ("ldcnd.cli.rig:reset", "Clear stop latches and faults of all axes, or of some."),
+        "power": ("ldcnd.cli.rig:power", "Close or open the position loops of all axes, or of some."),
+        "speed": ("ldcnd.cli.rig:speed", "Show or set the speed override of the rig."),
+        "group": ("ldcnd.cli.group", "Move several axes together."),
+        "axis": ("ldcnd.cli.axis", "Send any other command to an axis: probe, set its position, read its drive."),
+        "lease": ("ldcnd.cli.rig:lease", "See who controls which axis; hold control."),
+    },
+    "Look": {
+        "watch": ("ldcnd.cli.looking:watch", "Show the telemetry of an axis as it comes."),
+        "top": ("ldcnd.cli.top", "Show every axis and line of a rig, what is wrong first."),
+        "why": ("ldcnd.cli.looking:why", "Tell why an axis cannot move, and what would clear that."),
+        "fault": ("ldcnd.cli.looking:fault", "Explain a fault or an error code: what to check, how to clear it."),
+        "events": ("ldcnd.cli.looking:events", "Show who moved what, when, with which result."),
+        "fleet": ("ldcnd.cli.looking:fleet", "Show every rig, axis, version and health that can be reached."),
+        "bus": ("ldcnd.cli.bus", "Show the lines of a running daemon, and what was on them."),
+        "trace": ("ldcnd.cli.trace", "Record an axis against time, show the result, draw it."),
+        "record": ("ldcnd.cli.record:record", "Record a rig to MCAP; recover and convert recordings."),
+        "plot": ("ldcnd.cli.record:plot", "Draw an axis of a recording."),
+        "shadow": (
+            "ldcnd.cli.commission:shadow",
+            "Watch axes for growing friction, a changed load, a coupling that slips.",
+        ),
+    },
+    "Set up": {
+        "scan": ("ldcnd.cli.examine:scan", "Find out which drives are on a port, at which rate and in which state."),
+        "doctor": ("ldcnd.cli.examine:doctor", "Examine a line by reading only, before a daemon uses it."),
+        "commission": (
+            "ldcnd.cli.commission:commission",
+            "Go through the checklist of an axis: from its first motion to a report.",
+        ),
+        "tune": (
+            "ldcnd.cli.commission:tune",
+            "Find gains for an axis: move it a little, identify it, apply, verify.",
+        ),
+        "params": ("ldcnd.cli.params", "Read, write, save and compare the parameters of a drive."),
+        "accept": (
+            "ldcnd.cli.examine:accept",
+            "Try real drives against what the documents say, and keep a report of it.",
+        ),
+        "drill": ("ldcnd.cli.rig:drill", "Rehearse the loss of a client, a line or the daemon."),
+    },
+    "Connect": {
+        "console": ("ldcnd.cli.serve:console", "Show rigs in a browser."),
+        "metrics": ("ldcnd.cli.serve:metrics", "Serve the health of a running daemon to Prometheus."),
+        "epics": ("ldcnd.cli.serve:epics", "Serve axes as EPICS motor records."),
+        "ros2": ("ldcnd.cli.serve:ros2", "Publish joint states and diagnostics to a ROS 2 graph."),
+        "foxglove": ("ldcnd.cli.serve:foxglove", "Show a running rig live in Foxglove, read-only."),
+        "pki": ("ldcnd.cli.pki", "Make certificates and access rules for a network with mutual TLS."),
+    },
+}
+"""Every command by its group, in the order of the help: its module, behind a colon its name there (`command`
+otherwise), and what it does."""
+COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
+    name: entry for group in GROUPS.values() for name, entry in group.items()
+}
+
+EXAMPLES: Final[Mapping[str, str]] = {
+    "run": "--config config/simulated.toml --console",
+    "check-config": "rig.toml",
+    "plan": "rig.toml",
+    "sim": "--pty ./port --chain pic-servo-sc,pic-io",
+    "list": "",
+    "move": "x 10 --wait",
+    "jog": "x -5",
+    "home": "x --wait",
+    "halt": "x",
+    "stop": "",
+    "reset": "x",
+    "power": "on x",
+    "speed": "50",
+    "group": "move x=10 y=20 --wait",
+    "group move": "x=10 y=20 --wait",
+    "group path": "z=20,20,0 c=0,15,0",
+    "group preview": "x=10 y=20",
+    "axis": "probe x --source index --distance 5 --wait",
+    "axis alarms": "feed",
+    "axis clear-counter": "feed feedback",
+    "axis gains": "x --kp 400",
+    "axis monitors": "feed --read",
+    "axis move-analog": "x 512",
+    "axis outputs": "x --limit1 high",
+    "axis preview": "x --position 10",
+    "axis probe": "x --source index --distance 5 --wait",
+    "axis pwm": "x 0.1 0.5",
+    "axis quick-stop": "x",
+    "axis set-position": "x 0",
+    "axis track": "x 10.01",
+    "lease": "hold --axis x -- python move.py",
+    "lease hold": "--axis x -- python move.py",
+    "lease list": "",
+    "watch": "x --item position",
+    "top": "",
+    "why": "x",
+    "fault": "not_referenced",
+    "events": "--axis x --follow",
+    "fleet": "--watch 2",
+    "bus": "list",
+    "bus convert": "line0.capture --format words",
+    "bus list": "",
+    "bus set-io": "io 4=high 9=low",
+    "bus set-io-timer": "io counter --prescale 4",
+    "bus snapshot": "line0",
+    "bus wire-log": "line0 --seconds 2 --format words",
+    "trace": "take x -c position --samples 200 --out x.csv",
+    "trace abort": "x",
+    "trace channels": "x",
+    "trace last": "x --out x.csv",
+    "trace plot": "x.csv -o x.png",
+    "trace show": "x.csv",
+    "trace take": "x -c position --samples 200 --out x.csv",
+    "record": "--out run.mcap",
+    "record export": "run.mcap run.csv",
+    "record recover": "run.mcap whole.mcap",
+    "plot": "run.mcap x -o x.png",
+    "shadow": "x",
+    "scan": "/dev/ttyUSB0 --write rig.toml",
+    "doctor": "ldcn --config rig.toml --bus line0",
+    "doctor ldcn": "--config rig.toml --bus line0",
+    "doctor smartstep": "--config rig.toml --bus line1",
+    "doctor verify": "--config rig.toml --bus line1 --axis feed",
+    "commission": "x --config rig.toml",
+    "tune": "x --within 5",
+    "params": "get feed Pn100",
+    "params check": "feed.toml",
+    "params clone": "feed spare --dry-run",
+    "params diff": "feed feed.toml",
+    "params dump": "feed feed.toml",
+    "params get": "feed Pn100",
+    "params list": "feed",
+    "params restart-count": "feed",
+    "params restore": "feed feed.toml --dry-run",
+    "params save": "feed --dry-run",
+    "params set": "feed Pn100 50",
+    "accept": "rig.toml",
+    "drill": "client-loss x --velocity 5 --yes",
+    "console": "--listen 127.0.0.1:8470",
+    "metrics": "--listen 127.0.0.1:9470",
+    "epics": "--prefix rig:",
+    "ros2": "--router tcp/127.0.0.1:7447",
+    "foxglove": "",
+    "pki": "init ./pki",
+    "pki add": "./pki ada --role operator",
+    "pki init": "./pki",
+    "pki revoke": "./pki ada",
+}
+"""One example of each command, as it is typed behind its name."""
+
+
+def example_of(path: str) -> str | None:
+    """Return the line of the help that shows a command at work; None for one without an example.
+
+    Args:
+        path: its words behind `ldcnd`.
+    """
+    given = EXAMPLES.get(path)
+    return None if given is None else f"Example: ldcnd {path} {given}".rstrip()
+
+
+TYPED = {
+    "power": "power {on} {axis}",
+    "set_position": "axis set-position {axis} POSITION",
+    "set_speed_override": "speed PERCENT",
+    "set_gains": "axis gains {axis} --kp KP --el EL",
+    "set_outputs": "axis outputs {axis} --limit1 input --limit2 input",
+    "move_relative": "move {axis} DISTANCE --relative",
+    "jog": "jog {axis} VELOCITY",
+    "trace_abort": "trace abort {axis}",
+    "clear_counter": "axis clear-counter {axis} COUNTER",
+    "restart_eeprom_count": "params restart-count {axis}",
+    "list_parameters": "params list {axis}",
+    "acquire": "lease hold --axis {axis} -- COMMAND",
+    "events": "events",
+}
+"""How a command that a remedy names is typed; what is missing is its verb, behind `axis` if the program has it not."""
+OPTIONS_TYPED: ContextVar[str] = ContextVar("options that name daemon and rig", default="")
+"""Those of the command that runs, as they were typed: without them what a remedy names would reach another rig."""
+
+
+def typed(step: RemedyCommand, axis: str | None) -> str:
+    """Return a step of a remedy as it is typed.
+
+    Args:
+        step: the command.
+        axis: what it is about; None when it is not about one axis.
+    """
+    name = step.verb.replace("_", "-")
+    words = TYPED.get(step.verb, f"{name} {{axis}}" if name in COMMANDS else f"axis {name} {{axis}}")
+    on = "on" if step.arguments.get("on", True) else "off"
+    words, separator, program = words.format(axis=shlex.quote(axis) if axis else "AXIS", on=on).partition(" -- ")
+    force = " --force" if step.arguments.get("force") else ""
+    return f"ldcnd {words}{force}{OPTIONS_TYPED.get()}{separator}{program}"
+
+
+def whose(rig: str, among: int = 1) -> str:
+    """Return a rig in front of a line that tells what was done, where it could be meant of another one.
+
+    Args:
+        rig: its name.
+        among: how many rigs the command has reached.
+    """
+    return f"{rig}: " if among > 1 or OPTIONS_TYPED.get() else ""
