@@ -76,7 +76,7 @@ def check_stands(axis: AxisTracker) -> None:
     """Refuse while a motion runs: a trapezoid loaded in mid-move is erratic on most drives (PIC-SERVO manual, 4.4)."""
     if axis.state in MOTION_STATES:
         raise WrongState(
-            f"axis {axis.name} is in {axis.state}",
+            f"axis {axis.name} is {axis.state.words}",
             axis=axis.name,
             value=axis.state,
             remedy=Remedy("{} and wait", step("halt")),
@@ -206,7 +206,7 @@ def fault(axis: str, entry: FaultEntry) -> DriveFault:
 def _faulted(axis: AxisTracker) -> WrongState:
     causes = _said(axis) or "a command ended badly"
     return WrongState(
-        f"axis {axis.name} is in error_stop: {causes}",
+        f"axis {axis.name} is in error stop: {causes}",
         axis=axis.name,
         value=axis.state,
         remedy=Remedy("remove the cause, then {}", step("reset")),

@@ -5,7 +5,7 @@ it, as an answer names the one that has answered; the daemon is the one whose de
 """
 
 import asyncio
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Awaitable, Callable
 
 from ldcnd.contract.errors import LdcndError
@@ -18,6 +18,8 @@ TRIES, RETRY_S = 4, 0.5
 may publish before it answers."""
 RIVAL_S = 1.0
 """Time for which a session that is not the daemon's counts as another one without a further query, in seconds."""
+KEPT_RIVALS = 64
+"""Maximum number of sessions that are known as others; one that comes back behind so many counts as new."""
 
 
 def _ignore() -> None:
@@ -29,22 +31,28 @@ class Origin:
 
     Attributes:
         source: names it; None until the daemon is found, empty where the network does not say.
-        rivals: number of samples of other sessions that were dropped, by session.
-        on_rival: called when the first sample of a session was dropped.
+        rivals: the other sessions, the one that published last behind; at most `KEPT_RIVALS`.
+        dropped: number of samples of other sessions that were dropped.
+        on_rival: called when a sample of a session that was not known was dropped.
     """
 
     def __init__(self, find: Callable[[], Awaitable[object]]) -> None:
         self.source: str | None = None
-        self.rivals: Counter[str] = Counter()
+        self.rivals: dict[str, None] = {}
+        self.dropped = 0
         self.on_rival: Callable[[], None] = _ignore
         self._find = find
         self._gates: list[OwnSamples] = []
 
     def drop(self, sample: Publication) -> None:
         """Count a sample that is not the daemon's."""
-        is_first = not self.rivals[sample.source]
-        self.rivals[sample.source] += 1
-        if is_first:
+        self.dropped += 1
+        is_new = sample.source not in self.rivals
+        self.rivals.pop(sample.source, None)
+        self.rivals[sample.source] = None
+        if len(self.rivals) > KEPT_RIVALS:
+            del self.rivals[next(iter(self.rivals))]
+        if is_new:
             self.on_rival()
 
     def found(self, source: str) -> None:
@@ -117,7 +125,9 @@ class OwnSamples:
                 break
             except LdcndError:
                 await asyncio.sleep(RETRY_S)
-        again_s = asyncio.get_running_loop().time() + RIVAL_S
+        now_s = asyncio.get_running_loop().time()
+        again_s = now_s + RIVAL_S
+        self._until_s = {source: until_s for source, until_s in self._until_s.items() if until_s > now_s}
         for sample in self._held:
             self._origin.drop(sample)
             self._until_s[sample.source] = again_s

@@ -131,7 +131,7 @@ class RigClient:
     @property
     def rivals(self) -> str | None:
         """What was dropped because other programs than the daemon have published it, in words; None if nothing was."""
-        count = self._origin.rivals.total()
+        count = self._origin.dropped
         who = "another program publishes" if len(self._origin.rivals) == 1 else "other programs publish"
         return f"{who} on the keys of rig {self.rig}; such values are left out, {count} so far" if count else None
 

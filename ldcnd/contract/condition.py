@@ -114,7 +114,7 @@ class Condition:
     Attributes:
         place: whether its position says where it is.
         mark: what goes beside the number where it does not, in a few words; empty where it does.
-        state: the state in a word, for people.
+        state: the state in words, for people.
         live: state and velocity are to be believed.
         alarm: how bad it is.
         troubles: everything that is to be said, the worst first.
@@ -168,11 +168,6 @@ class Condition:
 
 
 _AGED = frozenset({Place.OLD, Place.NOT_ANSWERING, Place.CONTRADICTED})
-STATE_WORDS = {
-    AxisState.DISCRETE_MOTION: "moving",
-    AxisState.CONTINUOUS_MOTION: "running",
-    AxisState.ERROR_STOP: "error stop",
-}
 
 
 class KnownState(Protocol):
@@ -323,7 +318,7 @@ def assess(
     if state is None:
         lost = (_silent(silence),) if silence else () if line_up else (_ON_DEAD_LINE,)
         return _unanswered("unknown", lost or (_NEVER_SEEN,), lost[0].short if lost else "no data")
-    word = state_word(state.state)
+    word = state.state.words
     holder = UNKNOWN_HOLDER if silence else state.holder
     control = _control(holder, moves=state.moving is Moving.YES and state.command is not None)
     gone = _unreachable(state, faults, silence=silence, line_up=line_up)
@@ -337,11 +332,6 @@ def assess(
     worst = max((trouble.severity for trouble in troubles), default=_FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
     return Condition(place, mark, word, place is not Place.OLD, alarm, troubles, holder, control)
-
-
-def state_word(state: AxisState) -> str:
-    """Return a state in a word."""
-    return STATE_WORDS.get(state, state.value.replace("_", " "))
 
 
 def _unanswered(state: str, troubles: tuple[Trouble, ...], mark: str) -> Condition:

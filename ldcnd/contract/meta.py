@@ -44,6 +44,8 @@ class CommandInfo(Frozen):
     """Effect of the request."""
     effect: Effect | None = None
     """What the command may do to the rig; null from a daemon of an earlier version."""
+    needs_lease: bool | None = None
+    """Whether the command needs a lease where leases are required; null from a daemon of an earlier version."""
     request_schema: str
     """Name of the payload's schema under `meta/schema/`."""
     reply_schema: str

@@ -73,11 +73,20 @@ def read_number(text: str, unit: str = "") -> float:
     digits = parts.whole + parts.fraction
     if not digits:
         raise NotANumber(f"{quote} is not a number")
-    if parts.rest and not _same_unit(parts.rest, unit):
-        raise NotANumber(_about_rest(written, parts.rest, unit))
+    is_other = bool(parts.rest) and not _same_unit(parts.rest, unit)
+    if is_other and (several := _about_several(written, parts.rest)):
+        raise NotANumber(several)
     if parts.mark == "," and re.fullmatch(r"[1-9][0-9]{0,2}", parts.whole) and len(parts.fraction) == len("000"):
-        one, other = f"{parts.whole}.{parts.fraction}", digits
+        one, other = f"{parts.sign}{parts.whole}.{parts.fraction}", f"{parts.sign}{digits}"
         raise NotANumber(f"{quote} can mean {one} or {other}: type one of them")
+    if is_other and unit:
+        raise NotANumber(f"{_quoted(parts.rest)} is not the unit here, which is {unit}: type the value in {unit}")
+    if is_other:
+        plain = f"{parts.sign}{parts.whole or '0'}{f'.{parts.fraction}' if parts.fraction else ''}"
+        power = "" if parts.power == "0" else f"e{parts.power}"
+        raise NotANumber(
+            f"{_quoted(parts.rest)} is not taken behind the number: type {plain}{power}, in the unit that is named here"
+        )
     value = float(f"{parts.sign}{parts.whole or '0'}.{parts.fraction or '0'}e{parts.power}")
     if not math.isfinite(value):
         raise NotANumber(f"{quote} is too large")
@@ -116,15 +125,18 @@ def _parts_of(written: str) -> _Parts:
     found = _NUMBER.match(written)
     groups = found.groups() if found else ("", "", "", "", "", written)
     sign, whole, mark, fraction, power, rest = (each or "" for each in groups)
-    return _Parts(sign.replace("\u2212", "-"), whole, mark, fraction, power.replace("\u2212", "-") or "0", rest)
+    return _Parts(
+        sign.replace("\u2212", "-").replace("+", ""), whole, mark, fraction, power.replace("\u2212", "-") or "0", rest
+    )
 
 
-def _about_rest(written: str, rest: str, unit: str) -> str:
+def _about_several(written: str, rest: str) -> str:
+    """Return why a text is not one number; empty when one stands before something else."""
     if _SEPARATED.match(rest):
         return f"{_quoted(written)} is more than one number, or has thousands separators: type one number without them"
     if any(each.isdecimal() for each in rest) or rest[0] in ".,+-\u2212":
         return f"{_quoted(written)} is not one number"
-    return f"{_quoted(rest)} is not the unit here, {f'which is {unit}' if unit else 'there is none'}"
+    return ""
 
 
 def _same_unit(written: str, unit: str) -> bool:

@@ -18,6 +18,17 @@ class AxisState(StrEnum):
     STOPPING = "stopping"
     ERROR_STOP = "error_stop"
 
+    @property
+    def words(self) -> str:
+        """The state as every face says it to people."""
+        return _STATE_WORDS.get(self, self.value.replace("_", " "))
+
+
+_STATE_WORDS = {
+    AxisState.DISCRETE_MOTION: "moving to a target",
+    AxisState.CONTINUOUS_MOTION: "moving at a velocity",
+}
+
 
 class Moving(StrEnum):
     """Whether the axis moves; unknown is an answer of its own and never means no."""

@@ -122,7 +122,7 @@ async def test_a_page_whose_axis_moves_asks_before_it_goes(house):
 
     async with house.desk() as desk:
         await jogging(house, desk)
-        await expect(desk.panel("Now")).to_contain_text("running")
+        await expect(desk.panel("Now")).to_contain_text("moving at a velocity")
         desk.page.on("dialog", stay)
         await desk.page.close(run_before_unload=True)
         async with asyncio.timeout(20):

@@ -3,7 +3,7 @@
 import asyncio
 
 from ldcnd.contract.codec import Encoding, encode
-from ldcnd.contract.commands import Home, Power, SetGains
+from ldcnd.contract.commands import Effect, Home, Power, SetGains
 from ldcnd.contract.keys import Keys
 from ldcnd.daemon.meta import COUNTERS_HZ, axis_info, command_list
 from tests.support.rig import RunningRig, running_rig
@@ -74,3 +74,12 @@ async def test_a_description_in_msgpack_is_not_the_one_in_json():
         (answer,) = await rig.session.query(KEYS.commands, parameters={"enc": "msgpack"})
 
     assert (answer.payload, answer.encoding) == encode(command_list(), Encoding.MSGPACK)
+
+
+def test_the_list_of_commands_says_what_each_does_and_whether_it_needs_a_lease():
+    told = {each.verb: (each.effect, each.needs_lease) for each in command_list().commands}
+
+    assert told["halt"] == (Effect.REST, False)
+    assert told["move_absolute"] == (Effect.MOTION, True)
+    assert told["read_parameter"] == (Effect.QUESTION, False)
+    assert told["move_together"] == (Effect.MOTION, True)

@@ -152,7 +152,7 @@ async def test_an_axis_in_error_stop_is_in_error_stop_in_the_next_daemon_with_it
     async with rig_on(chain, config) as rig:
         await up(rig)
         state, fault = await rig.client.state("x"), await rig.client.last("x", "fault")
-        with pytest.raises(WrongState, match="error_stop"):
+        with pytest.raises(WrongState, match="error stop"):
             await rig.client.command("x", Power(on=True))
         await rig.client.command("x", Reset())
         await rig.client.command("x", Power(on=True))

@@ -104,7 +104,7 @@ async def test_after_a_lost_line_nothing_resumes_and_nothing_is_believed():
 
         assert (state.state, state.referenced, state.enabled) == (AxisState.ERROR_STOP, False, True)
         assert state.last_error.startswith("move_velocity: the drive does not answer")
-        with pytest.raises(WrongState, match="error_stop"):
+        with pytest.raises(WrongState, match="error stop"):
             await rig.client.command("x", MoveAbsolute(position=0.0))
         await rig.client.command("x", Reset())
         await rig.client.command("x", Power(on=True))

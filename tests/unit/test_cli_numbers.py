@@ -6,6 +6,7 @@ from click.testing import CliRunner
 
 from ldcnd.cli.main import CommandGroup, cli
 from ldcnd.cli.typed import Finite, WholeNumber
+from tests.support.command_line import run_here
 
 
 @click.group(cls=CommandGroup, homes={})
@@ -55,3 +56,20 @@ def test_places_of_a_group_are_held_to_the_same(moves):
     ended = CliRunner().invoke(cli, ["group", "move", moves])
 
     assert ended.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("speed 50%", "type 50,"),
+        ("move x 1,5mm", "type 1.5,"),
+        ("move x -1,234", "can mean -1.234 or -1234: type one of them"),
+        ("home x --velocity 2mm/s", "type 2,"),
+        ("group move x=1mm", "type 1,"),
+    ],
+)
+def test_a_number_that_is_not_taken_is_refused_with_what_to_type(line, said):
+    ran = run_here(*line.split())
+
+    assert (ran.code, ran.printed) == (2, "")
+    assert said in ran.errors

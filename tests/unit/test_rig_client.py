@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import pytest
 
+from ldcnd.client.own_samples import KEPT_RIVALS, Origin
 from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.contract.commands import Power
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError
 from ldcnd.contract.samples import PositionSample
 from ldcnd.net.hand_over import Query
 from ldcnd.net.memory_session import MemoryBroker, MemorySession
-from ldcnd.net.session import Declaration, Qos
+from ldcnd.net.session import Declaration, Publication, Qos, SampleKind
 from tests.support.session_pair import JSON, KEYS, POSITION
 
 POWER = Power(on=True)
@@ -154,3 +155,19 @@ async def test_a_command_whose_daemon_has_disappeared_has_an_unknown_outcome(new
 
     with pytest.raises(OutcomeUnknown, match="no daemon serves rig bench1"):
         await newer.client.command("x", POWER)
+
+
+async def test_other_sessions_without_number_take_no_memory_without_end() -> None:
+    told = []
+
+    async def find() -> None:
+        raise AssertionError("nothing waits for the daemon")
+
+    origin = Origin(find)
+    origin.on_rival = lambda: told.append(origin.dropped)
+    for number in (*range(1000), 999, 999):
+        origin.drop(Publication(POSITION, b"", JSON, SampleKind.PUT, None, f"session {number}"))
+
+    assert len(told) == 1000
+    assert origin.dropped == 1002
+    assert len(origin.rivals) == KEPT_RIVALS

@@ -149,8 +149,8 @@ async def check_off(axis: Axis) -> None:
         raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy=Remedy("{}", step("reset")))
     if state.enabled or state.state is not AxisState.DISABLED:
         raise WrongState(
-            f"axis {axis.name} is in {state.state.value}: tuning begins with the loop open, and opens it between moves,"
-            " so the axis must stay where it is without power",
+            f"axis {axis.name} is in state {state.state.words}: tuning begins with the loop open, and opens it between"
+            " moves, so the axis must stay where it is without power",
             axis=axis.name,
             value=state.state.value,
             remedy=Remedy("secure the load, then {}", step("reset"))

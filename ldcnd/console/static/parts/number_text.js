@@ -47,19 +47,26 @@ function numberOf(written, unit) {
   const quote = quoted(written);
   if (NOT_FINITE.test(written)) return new Unread(`${quote} is not a finite number`);
   if (/^[+\-−]?0[xX]/.test(written)) return new Unread(`${quote} is not a decimal number`);
-  const [, sign, whole, mark, part = "", power = "0", rest] = NUMBER.exec(written);
+  const [, signed, whole, mark, part = "", raised = "0", rest] = NUMBER.exec(written);
+  const [sign, power] = [signed.replace("−", "-").replace("+", ""), raised.replace("−", "-")];
   const digits = whole + part;
   if (/(?![0-9])\p{Nd}/u.test(written)) return new Unread(`${quote} has other digits than 0 to 9`);
   if (!digits) return new Unread(`${quote} is not a number`);
-  if (rest && !sameUnit(rest, unit)) {
+  const isOther = rest !== "" && !sameUnit(rest, unit);
+  if (isOther) {
     if (SEPARATED.test(rest))
       return new Unread(`${quote} is more than one number, or has thousands separators: type one number without them`);
     if (/\d/.test(rest) || /^[.,+\-−]/.test(rest)) return new Unread(`${quote} is not one number`);
-    return new Unread(`${quoted(rest)} is not the unit here, ${unit ? `which is ${unit}` : "there is none"}`);
   }
   if (mark === "," && /^[1-9]\d{0,2}$/.test(whole) && part.length === 3)
-    return new Unread(`${quote} can mean ${whole}.${part} or ${whole}${part}: type one of them`);
-  const value = Number(`${sign.replace("−", "-")}${whole || "0"}.${part || "0"}e${power.replace("−", "-")}`);
+    return new Unread(`${quote} can mean ${sign}${whole}.${part} or ${sign}${whole}${part}: type one of them`);
+  if (isOther && unit)
+    return new Unread(`${quoted(rest)} is not the unit here, which is ${unit}: type the value in ${unit}`);
+  if (isOther) {
+    const plain = `${sign}${whole || "0"}${part && `.${part}`}${power === "0" ? "" : `e${power}`}`;
+    return new Unread(`${quoted(rest)} is not taken behind the number: type ${plain}, in the unit that is named here`);
+  }
+  const value = Number(`${sign}${whole || "0"}.${part || "0"}e${power}`);
   if (!Number.isFinite(value)) return new Unread(`${quote} is too large`);
   if (!value && /[1-9]/.test(digits)) return new Unread(`${quote} is too close to 0`);
   return value || 0; // no minus zero
