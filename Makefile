@@ -29,16 +29,17 @@ check: .venv/ready
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
+	.venv/bin/mypy examples/*.py
 	.venv/bin/lint-imports
 	$(PY) -m tests.words
 	$(PY) -m tools check
 
 fix: .venv/ready
 	$(PY) -m tools client
+	$(PY) -m tools
 	.venv/bin/ruff format .
 	.venv/bin/ruff check --fix .
 	.venv/bin/ruff format .
-	$(PY) -m tools
 
 # the site in build/docs, warnings as errors
 docs: .venv/ready

@@ -15,9 +15,10 @@ def ask(session: zenoh.Session, verb: str, **payload: object) -> dict[str, objec
     """Send one command and return its one answer."""
     for reply in session.get(f"{COMMAND}/{verb}", payload=json.dumps(payload), encoding="application/json"):
         if reply.ok is None:
-            sys.exit(f"{verb}: {reply.err.payload.to_string()}")
-        return json.loads(reply.ok.payload.to_string())
-    sys.exit(f"{verb}: nobody answers; is the daemon running?")
+            sys.exit(f"{verb}: {reply.err.payload.to_string() if reply.err else 'no reply'}")
+        answer: dict[str, object] = json.loads(reply.ok.payload.to_string())
+        return answer
+    sys.exit(f"{verb}: no daemon answers; is it running?")
 
 
 endpoint = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"

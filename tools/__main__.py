@@ -10,6 +10,7 @@ import ast
 import sys
 from pathlib import Path
 
+import ldcnd
 from ldcnd.contract.errors import ERRORS
 from ldcnd.daemon.contract import all_schemas, write_schemas
 from tools.channels import keys_table
@@ -18,6 +19,7 @@ from tools.verb_methods import verb_methods, with_blocking_methods
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "docs" / "reference"
 SCHEMAS = ROOT / "schemas"
+STUB = ROOT / "ldcnd" / "__init__.pyi"
 
 
 def main() -> None:
@@ -45,8 +47,19 @@ def write_client() -> None:
     blocking.write_text(with_blocking_methods(blocking.read_text(encoding="utf-8")), encoding="utf-8")
 
 
+def package_stub() -> str:
+    """Return `ldcnd/__init__.pyi`, which tells type checkers and editors what `ldcnd` names; as ruff formats it."""
+    named = {name: getattr(ldcnd, name) for name in dir(ldcnd)}
+    found = sorted((value.__module__, value.__name__, name) for name, value in named.items())
+    lines = ["# made by `make fix` from what `__init__.py` names; not edited"]
+    lines += [f"from {module} import {own}{f' as {name}' if own != name else ''}" for module, own, name in found]
+    names = [f'    "{name}",' for name in sorted(named)]
+    return "\n".join([*lines, "", "__all__ = [", *names, "]"]) + "\n"
+
+
 def write_all() -> None:
-    """Write the schemas and the reference pages."""
+    """Write the schemas, what the package names, and the reference pages."""
+    STUB.write_text(package_stub(), encoding="utf-8")
     # not above: the client's methods can be written also when those that there are cannot be loaded
     from tools.client_reference import client_reference  # noqa: PLC0415
     from tools.config_reference import config_reference  # noqa: PLC0415
@@ -68,6 +81,10 @@ def check() -> None:
     differing = sorted(name for name in schemas.keys() | on_disk.keys() if schemas.get(name) != on_disk.get(name))
     if differing:
         sys.exit(f"{SCHEMAS} differs from the models in: {', '.join(differing)}; run `make fix`")
+    namespace: dict[str, object] = {}
+    exec(STUB.read_text(encoding="utf-8"), namespace)  # noqa: S102 - our own code
+    if namespace["__all__"] != sorted(dir(ldcnd)):
+        sys.exit(f"{STUB} is not what `ldcnd` names; run `make fix`")
 
 
 def write_man_pages(folder: Path) -> None:

@@ -7,7 +7,6 @@ import shlex
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import partial, wraps
 from pathlib import Path
 from typing import NoReturn, TypeVar
@@ -20,14 +19,13 @@ from pydantic import ValidationError
 from ldcnd.cli.names import OPTIONS_TYPED
 from ldcnd.cli.output import show_lines
 from ldcnd.client.lease import inherited_lease
-from ldcnd.client.rig_client import RigClient, find_rigs, on_each_rig
-from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis
+from ldcnd.client.rig_client import RigClient, find_rig, no_rig_answers, on_each_rig
+from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_session import open_zenoh_session
-from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, ZenohSettings, user_settings
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 COMPLETION_S = 2.0
 """Longest time that a shell waits for the names of axes."""
 ResultT = TypeVar("ResultT")
@@ -134,7 +132,7 @@ class Target:
         return self.run_session(within) or self._unreached()
 
     def _unreached(self) -> NoReturn:
-        raise no_rig_answers(self._settings())
+        raise no_rig_answers(self._settings().connect)
 
     def run_session(self, work: Callable[[Session], Awaitable[ResultT]]) -> ResultT:
         """Open a session, do the work with it, and close; no rig needs to be there."""
@@ -152,14 +150,7 @@ class Target:
         show_lines(*lines)
 
     def _settings(self) -> ZenohSettings:
-        named = tuple(each if "/" in each else f"tcp/{each}" for each in self.connect)
-        endpoints = named or (() if self.listen or self.config else (DEFAULT_ENDPOINT,))
-        return ZenohSettings(
-            mode="client" if endpoints else None if self.config else "peer",
-            connect=endpoints,
-            listen=self.listen,
-            config_file=self.config,
-        )
+        return user_settings(self.connect, self.listen, self.config)
 
 
 def _target_options(command: CommandT) -> CommandT:
@@ -208,15 +199,6 @@ def _options_typed(context: click.Context) -> str:
     return "".join(words)
 
 
-def no_rig_answers(settings: ZenohSettings) -> SessionError:
-    """Return the error for a network without a rig."""
-    return SessionError(
-        f"no daemon answers at {', '.join(settings.connect) or 'the configured endpoints'}",
-        remedy="start one with `ldcnd run`, or name its endpoint with --connect; a login without a role sees none"
-        " either",
-    )
-
-
 @asynccontextmanager
 async def open_rig(settings: ZenohSettings, rig: str | None = None) -> AsyncIterator[RigClient]:
     """Join the network and use one rig for as long as the context lasts.
@@ -230,17 +212,6 @@ async def open_rig(settings: ZenohSettings, rig: str | None = None) -> AsyncIter
         UnknownAxis: several rigs can be reached and none was named.
     """
     async with open_zenoh_session(settings) as session:
-        rigs = sorted({daemon.rig for daemon in await find_rigs(session)})
-        if rig not in rigs:
-            if not rigs:
-                raise no_rig_answers(settings)
-            there = f"there are: {', '.join(rigs)}"
-            if rig is not None:
-                near = next(iter(get_close_matches(rig, rigs, 1)), None)
-                meant = f"; did you mean {near!r}?" if near else ""
-                raise SessionError(f"no rig {rig!r} answers{meant}", value=rig, remedy=there)
-            if len(rigs) > 1:
-                raise UnknownAxis(f"several rigs answer; {there}", remedy="choose one with --rig")
-            rig = rigs[0]
+        found = await find_rig(session, rig, settings.connect)
         # what is sent under $LDCND_LEASE is so for every command, whatever it sends
-        yield RigClient(session, rig, inherited_lease())
+        yield RigClient(session, found.rig, inherited_lease())

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import click
 
-from ldcnd.cli.connection import DEFAULT_ENDPOINT
 from ldcnd.cli.output import Terminal, show_lines
 from ldcnd.cli.typed import CONSOLE_ADDRESS, parsed_address
 from ldcnd.config.plan import require_plan
@@ -25,6 +24,7 @@ from ldcnd.daemon.service import Service, held_awake, last_words, loop_factory, 
 from ldcnd.daemon.systemd import Notifier
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging, get_logger
+from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT
 from ldcnd.net.zenoh_threads import senders_wait
 
 LINK_S = 20.0

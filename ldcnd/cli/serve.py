@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ldcnd.cli.connection import DEFAULT_ENDPOINT, Target, with_target
+from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.output import on_end
 from ldcnd.cli.typed import CONSOLE_ADDRESS, WholeNumber, address_option
 from ldcnd.client.health import health_reports
@@ -18,7 +18,7 @@ from ldcnd.contract.errors import ConfigError, UnknownAxis
 from ldcnd.contract.samples import FaultSample, ShadowSample, StateSample, TelemetryItem
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging
-from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, ZenohSettings, endpoint_of
 from ldcnd.parts import require
 
 if TYPE_CHECKING:
@@ -233,7 +233,7 @@ async def _serve_ros2(client: RigClient, axes: tuple[str, ...], router: str, dom
             raise UnknownAxis(
                 f"rig {rig.name} has no axis {axis!r}; it has {', '.join(rig.axes)}", axis=axis, value=axis
             )
-    endpoint = router if "/" in router else f"tcp/{router}"
+    endpoint = endpoint_of(router)
     async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
         running = asyncio.create_task(run_bridge(rig, session, axes, domain), name="bridge")
         on_end(lambda: _cancel(running))

@@ -20,7 +20,7 @@ from ldcnd.contract.codec import decode_received, explained
 from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
 from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError
-from ldcnd.contract.events import CommandOutcome, ReadOutcome
+from ldcnd.contract.events import FINAL, CommandOutcome, ReadOutcome
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
 from ldcnd.contract.traces import TakeTrace, TraceTrigger
@@ -230,6 +230,15 @@ class Axis(AxisVerbs):
         with contextlib.suppress(LdcndError, TimeoutError):
             async with asyncio.timeout(HALT_S):
                 await self._client.command(self.name, Halt(client=self._who))
+
+    async def under_way(self) -> Motion | None:
+        """Return the last motion that was begun here if it has not ended; None also where that cannot be known."""
+        last = self._last
+        if last is None or last.ended is not None or (self.control and self.control.lost):
+            return None
+        with contextlib.suppress(LdcndError):
+            return None if (await self.outcome(last.command_id)).status in FINAL else last
+        return None
 
     async def halt_unfinished(self) -> None:
         """Halt if a motion that was begun here may not have ended."""

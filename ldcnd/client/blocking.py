@@ -4,33 +4,32 @@ Nothing is implemented twice: a call runs the asyncio client's own method on a l
 arguments, its result and its errors. Safe to use from several threads. An interrupted wait for a motion halts the axis.
 """
 
+import atexit
 from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
-from contextlib import AbstractAsyncContextManager, AbstractContextManager, contextmanager
+from contextlib import AbstractAsyncContextManager, AbstractContextManager, ExitStack, contextmanager
 from functools import wraps
 from pathlib import Path
+from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 
 from ldcnd.client import axis as asynchronous
 from ldcnd.client import jog, motion, rig
-from ldcnd.client.fleet import RigReport, survey
 from ldcnd.client.loop_thread import LoopThread, loop_thread
 from ldcnd.client.notebook import table
 from ldcnd.contract.events import CommandEvent
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.rig_commands import LinePath
 from ldcnd.contract.samples import PositionSample, Sample
-from ldcnd.net.zenoh_session import open_zenoh_session
-from ldcnd.net.zenoh_settings import ZenohSettings
 
 P = ParamSpec("P")
 ResultT = TypeVar("ResultT")
-WrappedT = TypeVar("WrappedT")
+WrappedT_co = TypeVar("WrappedT_co", covariant=True)
 
 
-class Facade(Generic[WrappedT]):
+class Facade(Generic[WrappedT_co]):
     """Base of the facades: an object of the asyncio client, and the loop on which it runs."""
 
-    def __init__(self, loop: LoopThread, wrapped: WrappedT) -> None:
+    def __init__(self, loop: LoopThread, wrapped: WrappedT_co) -> None:
         self._loop = loop
         self._wrapped = wrapped
 
@@ -39,24 +38,24 @@ class Facade(Generic[WrappedT]):
 
 
 def _waiting(
-    method: Callable[Concatenate[WrappedT, P], Coroutine[Any, Any, ResultT]],
-) -> Callable[Concatenate[Facade[WrappedT], P], ResultT]:
+    method: Callable[Concatenate[WrappedT_co, P], Coroutine[Any, Any, ResultT]],
+) -> Callable[Concatenate[Facade[WrappedT_co], P], ResultT]:
     """Return a method that waits for the result of another one."""
 
     @wraps(method)
-    def call(facade: Facade[WrappedT], /, *args: P.args, **kwargs: P.kwargs) -> ResultT:
+    def call(facade: Facade[WrappedT_co], /, *args: P.args, **kwargs: P.kwargs) -> ResultT:
         return facade._loop.run(method(facade._wrapped, *args, **kwargs))  # noqa: SLF001 - the facade is ours
 
     return call
 
 
 def _moving(
-    method: Callable[Concatenate[WrappedT, P], Coroutine[Any, Any, motion.Motion]],
-) -> Callable[Concatenate[Facade[WrappedT], P], "BlockingMotion"]:
+    method: Callable[Concatenate[WrappedT_co, P], Coroutine[Any, Any, motion.Motion]],
+) -> Callable[Concatenate[Facade[WrappedT_co], P], "BlockingMotion"]:
     """Return a method that waits until the drive has acknowledged a motion."""
 
     @wraps(method)
-    def call(facade: Facade[WrappedT], /, *args: P.args, **kwargs: P.kwargs) -> BlockingMotion:
+    def call(facade: Facade[WrappedT_co], /, *args: P.args, **kwargs: P.kwargs) -> BlockingMotion:
         return BlockingMotion(facade._loop, facade._loop.run(method(facade._wrapped, *args, **kwargs)))  # noqa: SLF001
 
     return call
@@ -157,7 +156,15 @@ class BlockingAxis(Facade[asynchronous.Axis]):
 
 
 class BlockingRig(Facade[rig.Rig]):
-    """A rig that a program uses; made by `connect`."""
+    """A rig that a program uses; made by `connect`, and by `ldcnd.open`."""
+
+    def __init__(self, loop: LoopThread, wrapped: rig.Rig, close: Callable[[], None]) -> None:
+        super().__init__(loop, wrapped)
+        self._close = close
+
+    def close(self) -> None:
+        """Leave the rig, which gives up control over its axes; once is enough."""
+        self._close()
 
     stop = _waiting(rig.Rig.stop)
     daemon = _waiting(rig.Rig.daemon)
@@ -222,44 +229,38 @@ class BlockingRig(Facade[rig.Rig]):
     @overload
     def control(
         self, axis: str, /, *, client: str, lease_s: float = 1.0, force: bool = False
-    ) -> AbstractContextManager[BlockingAxis]: ...
+    ) -> "Opened[BlockingAxis]": ...
 
     @overload
     def control(
         self, first: str, second: str, /, *more: str, client: str, lease_s: float = 1.0, force: bool = False
-    ) -> AbstractContextManager[tuple[BlockingAxis, ...]]: ...
+    ) -> "Opened[tuple[BlockingAxis, ...]]": ...
 
     def control(
         self, *axes: str, client: str, lease_s: float = 1.0, force: bool = False
-    ) -> AbstractContextManager[BlockingAxis] | AbstractContextManager[tuple[BlockingAxis, ...]]:
-        """Control axes until the context ends; see `ldcnd.Rig.control`."""
+    ) -> "Opened[BlockingAxis] | Opened[tuple[BlockingAxis, ...]]":
+        """Control axes until the context ends, or until `close` after `open`; see `ldcnd.Rig.control`."""
         held = self._axes(self._wrapped.controlled(axes, client, lease_s, force=force))
-        return _only(held) if len(axes) == 1 else held
+        return Opened(_only(held)) if len(axes) == 1 else Opened(held)
 
     @overload
-    def watch(self, axis: str, /) -> AbstractContextManager[BlockingAxis]: ...
+    def watch(self, axis: str, /) -> "Opened[BlockingAxis]": ...
 
     @overload
-    def watch(self, first: str, second: str, /, *more: str) -> AbstractContextManager[tuple[BlockingAxis, ...]]: ...
+    def watch(self, first: str, second: str, /, *more: str) -> "Opened[tuple[BlockingAxis, ...]]": ...
 
-    def watch(
-        self, *axes: str
-    ) -> AbstractContextManager[BlockingAxis] | AbstractContextManager[tuple[BlockingAxis, ...]]:
-        """Watch axes until the context ends; see `ldcnd.Rig.watch`."""
+    def watch(self, *axes: str) -> "Opened[BlockingAxis] | Opened[tuple[BlockingAxis, ...]]":
+        """Watch axes until the context ends, or until `close` after `open`; see `ldcnd.Rig.watch`."""
         watched = self._axes(self._wrapped.watched(axes))
-        return _only(watched) if len(axes) == 1 else watched
+        return Opened(_only(watched)) if len(axes) == 1 else Opened(watched)
 
-    @contextmanager
-    def events(self, axis: str | None = None, *, history: bool = False) -> Iterator[Iterator[CommandEvent]]:
-        """Follow what happens to commands; see `ldcnd.Rig.events`."""
-        with self._loop.inside(self._wrapped.events(axis, history=history)) as following:
-            yield self._loop.each(following)
+    def events(self, axis: str | None = None, *, history: bool = False) -> "BlockingStream[CommandEvent]":
+        """Follow what happens to commands: `for event in rig.events()`; see `ldcnd.Rig.events`."""
+        return BlockingStream(self._loop, self._wrapped.events(axis, history=history))
 
-    @contextmanager
-    def samples(self, axis: str = "*", item: str = "*") -> Iterator[Iterator[tuple[str, Sample]]]:
-        """Take telemetry of any item: pairs of the axis and its sample."""
-        with self._loop.inside(self._wrapped.samples(axis, item)) as samples:
-            yield self._loop.each(samples)
+    def samples(self, axis: str = "*", item: str = "*") -> "BlockingStream[tuple[str, Sample]]":
+        """Take telemetry of any item: `for axis, sample in rig.samples()`; see `ldcnd.Rig.samples`."""
+        return BlockingStream(self._loop, self._wrapped.samples(axis, item))
 
     @contextmanager
     def _axes(
@@ -274,22 +275,76 @@ class BlockingRig(Facade[rig.Rig]):
         return table(f"rig {self.name}", rows, ("axis", "drive", "unit"))
 
 
-@contextmanager
+class BlockingStream(Generic[ResultT]):
+    """What arrives from now on: to be iterated over, or to be entered, which yields an iterator until it is left."""
+
+    def __init__(self, loop: LoopThread, stream: rig.Stream[ResultT]) -> None:
+        self._loop = loop
+        self._stream = stream
+        self._entered = ExitStack()
+
+    def __enter__(self) -> Iterator[ResultT]:
+        return self._loop.each(self._entered.enter_context(self._loop.inside(self._stream)))
+
+    def __exit__(self, *_error: object) -> None:
+        self._entered.close()
+
+    def __iter__(self) -> Iterator[ResultT]:
+        """Yield each item for as long as the loop goes on."""
+        with self as items:
+            yield from items
+
+
+class Opened(AbstractContextManager[ResultT, None]):
+    """What lasts as long as a context; or, in a notebook, from `open` to `close`, in which it may be used in any cell.
+
+    What is still open when the program ends is closed then.
+    """
+
+    def __init__(self, context: AbstractContextManager[ResultT]) -> None:
+        self._context = context
+        self._entered = ExitStack()
+
+    def __enter__(self) -> ResultT:
+        return self._entered.enter_context(self._context)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._entered.__exit__(kind, error, trace)
+
+    def open(self) -> ResultT:
+        """Begin; the caller closes it."""
+        value = self.__enter__()
+        atexit.register(self.close)
+        return value
+
+    def close(self) -> None:
+        """End; once is enough."""
+        atexit.unregister(self.close)
+        self._entered.close()
+
+
 def connect(
-    endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None
-) -> Iterator[BlockingRig]:
-    """Use one rig for as long as the context lasts; see `ldcnd.connect`."""
-    with loop_thread() as loop, loop.inside(_connect(endpoint, rig=rig, config=config)) as found:
-        yield BlockingRig(loop, found)
+    endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None, wait_s: float = 0.0
+) -> Opened[BlockingRig]:
+    """Use one rig for as long as the context lasts, or until `close` after `open`; see `ldcnd.connect`."""
+    return Opened(_rig(endpoint, rig, config, wait_s))
 
 
-def fleet(settings: ZenohSettings, rig: str | None = None) -> tuple[RigReport, ...]:
-    """Return how every rig is that can be reached."""
-    with loop_thread() as loop, loop.inside(open_zenoh_session(settings)) as session:
-        return loop.run(survey(session, rig))
+def open_rig(
+    endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None, wait_s: float = 0.0
+) -> BlockingRig:
+    """Use one rig until its `close`, for notebooks; see `ldcnd.connect`."""
+    return connect(endpoint, rig=rig, config=config, wait_s=wait_s).open()
 
 
-_connect = rig.connect
+@contextmanager
+def _rig(endpoint: str | None, name: str | None, config: Path | str | None, wait_s: float) -> Iterator[BlockingRig]:
+    connected = rig.connect(endpoint, rig=name, config=config, wait_s=wait_s)
+    with ExitStack() as entered:
+        loop = entered.enter_context(loop_thread())
+        yield BlockingRig(loop, entered.enter_context(loop.inside(connected)), entered.close)
 
 
 @contextmanager

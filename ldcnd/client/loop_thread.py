@@ -2,6 +2,7 @@
 
 import asyncio
 import concurrent.futures
+import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import AbstractAsyncContextManager, contextmanager
 from typing import Any, TypeVar, TypeVarTuple
@@ -83,18 +84,21 @@ def loop_thread() -> Iterator[LoopThread]:
         await ending.wait()
 
     def live() -> None:
-        with asyncio.Runner() as runner:
-            runner.get_loop()  # before there is a coroutine that would never run
-            runner.run(stay())
-
-    with concurrent.futures.ThreadPoolExecutor(1, "ldcnd client") as threads:
-        living = threads.submit(live)
-        first: set[concurrent.futures.Future[Any]] = {running, living}
-        concurrent.futures.wait(first, return_when=concurrent.futures.FIRST_COMPLETED)
-        if not running.done():
-            living.result()  # raises why there is no loop
-        loop, ending = running.result()
         try:
-            yield LoopThread(loop)
-        finally:
-            loop.call_soon_threadsafe(ending.set)
+            with asyncio.Runner() as runner:
+                runner.get_loop()  # before there is a coroutine that would never run
+                runner.run(stay())
+        except BaseException as error:
+            if running.done():
+                raise
+            running.set_exception(error)
+
+    # a daemon: the end of a program that has left it open waits for no thread but closes it, see `blocking.Opened`
+    thread = threading.Thread(target=live, name="ldcnd client", daemon=True)
+    thread.start()
+    loop, ending = running.result()
+    try:
+        yield LoopThread(loop)
+    finally:
+        loop.call_soon_threadsafe(ending.set)
+        thread.join()

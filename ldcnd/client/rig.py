@@ -3,19 +3,21 @@
 import asyncio
 import contextlib
 import os
+import warnings
 from collections.abc import AsyncIterator, Iterable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from pathlib import Path
-from typing import Literal, overload
+from types import TracebackType
+from typing import Generic, Literal, TypeVar, overload
 
 from ldcnd.client.axis import Axis
-from ldcnd.client.events import Events, follow_events
+from ldcnd.client.events import follow_events
 from ldcnd.client.lease import Control, inherited_lease, take_control
 from ldcnd.client.motion import Motion
-from ldcnd.client.rig_client import RigClient, Samples, find_rigs
+from ldcnd.client.rig_client import RigClient, find_rig
 from ldcnd.contract.commands import StopReply
 from ldcnd.contract.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
-from ldcnd.contract.events import CommandOutcome, ReadOutcome
+from ldcnd.contract.events import FINAL, CommandEvent, CommandOutcome, ReadOutcome
 from ldcnd.contract.leases import HolderList, ListHolders
 from ldcnd.contract.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.contract.rig_commands import (
@@ -37,17 +39,48 @@ from ldcnd.contract.rig_commands import (
 )
 from ldcnd.contract.samples import FaultSample, Sample, StateSample
 from ldcnd.net.zenoh_session import open_zenoh_session
-from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.net.zenoh_settings import user_settings
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 ENDPOINT_VARIABLE = "LDCND_CONNECT"
 DESCRIBE_PERIOD_S = 1.0
 """Period of queries for what the axes are, for programs that outlive a daemon or its configuration, seconds."""
+RETRY_S = 0.2
+"""Pause before the next try to reach a daemon that is awaited, seconds."""
+ENDED_S, CHECK_PERIOD_S = 0.5, 0.05
+"""Longest wait for the end of a motion whose axis is not controlled any more, and between queries for it, seconds."""
+ItemT_co = TypeVar("ItemT_co", covariant=True)
+
+
+class Stream(Generic[ItemT_co]):
+    """What arrives from now on: to be iterated over, or to be entered, which yields an iterator until it is left.
+
+    Nothing is received before either begins, and nothing after it ends.
+
+    Args:
+        opened: receives while it is entered.
+    """
+
+    def __init__(self, opened: AbstractAsyncContextManager[AsyncIterator[ItemT_co]]) -> None:
+        self._opened = opened
+
+    async def __aenter__(self) -> AsyncIterator[ItemT_co]:
+        return await self._opened.__aenter__()
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> bool | None:
+        return await self._opened.__aexit__(kind, error, trace)
+
+    async def __aiter__(self) -> AsyncIterator[ItemT_co]:
+        """Yield each item for as long as the loop goes on."""
+        async with self as items:
+            async for item in items:
+                yield item
 
 
 @asynccontextmanager
 async def connect(
-    endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None
+    endpoint: str | None = None, *, rig: str | None = None, config: Path | str | None = None, wait_s: float = 0.0
 ) -> AsyncIterator["Rig"]:
     """Use one rig for as long as the context lasts.
 
@@ -59,32 +92,35 @@ async def connect(
             `tcp/127.0.0.1:7447`, when missing.
         rig: which one; needed only when several can be reached.
         config: a Zenoh configuration file with a login, as `ldcnd pki` makes it; its endpoint counts without one.
+        wait_s: longest wait for a daemon that may be starting, and then for its lines to come up, seconds.
 
     Raises:
         SessionError: no connection, or no daemon answers.
         UnknownAxis: several rigs can be reached and none was named.
     """
-    async with open_zenoh_session(_settings(endpoint, config)) as session:
-        daemons = {daemon.rig: daemon for daemon in await find_rigs(session)}
-        if rig is None and len(daemons) > 1:
-            raise UnknownAxis(f"there are several rigs: {', '.join(sorted(daemons))}", remedy="name one with rig=")
-        found = daemons.get(rig) if rig else next(iter(daemons.values()), None)
-        if found is None:
-            raise SessionError(
-                f"no daemon serves rig {rig}; reachable: {', '.join(sorted(daemons)) or 'none'}"
-                if rig
-                else "no daemon answers",
-                remedy="start one with `ldcnd run`, or name its endpoint; a login without a role sees none either",
-            )
-        yield Rig(RigClient(session, found.rig, inherited_lease()), found)
+    given = endpoint or os.environ.get(ENDPOINT_VARIABLE)
+    settings = user_settings((given,) if given else (), (), config)
+    loop = asyncio.get_running_loop()
+    until_s = loop.time() + wait_s
+    async with AsyncExitStack() as joined:
+        while True:
+            try:
+                session = await joined.enter_async_context(open_zenoh_session(settings))
+                found = await find_rig(session, rig, settings.connect)
+                break
+            except SessionError:
+                await joined.aclose()
+                if loop.time() >= until_s:
+                    raise
+                await asyncio.sleep(RETRY_S)
+        client = RigClient(session, found.rig, inherited_lease())
+        while loop.time() < until_s and not all(bus.up for bus in await client.buses()):  # noqa: ASYNC110 - happens in the daemon
+            await asyncio.sleep(RETRY_S)
+        yield Rig(client, found)
 
 
-def _settings(endpoint: str | None, config: Path | str | None) -> ZenohSettings:
-    wanted = endpoint or os.environ.get(ENDPOINT_VARIABLE) or (None if config else DEFAULT_ENDPOINT)
-    endpoints = () if wanted is None else (wanted if "/" in wanted else f"tcp/{wanted}",)
-    return ZenohSettings(
-        mode="client" if endpoints else None, connect=endpoints, config_file=Path(config) if config else None
-    )
+class UnfinishedMotion(RuntimeWarning):
+    """A program has left its control over an axis while a motion of its own was under way."""
 
 
 class Rig:
@@ -119,7 +155,8 @@ class Rig:
         """Control axes until the context ends: no other client moves them, and they halt when this program disappears.
 
         Yields the axis, or a tuple when several are named. When control is lost, `LeaseExpired` is raised where the
-        program waits. An exception that leaves the context halts the axes whose motions have not ended. Inside
+        program waits. An exception that leaves the context halts the axes whose motions have not ended. At its other
+        ends these do what their `loss.client` says, and the warning `UnfinishedMotion` names them. Inside
         `ldcnd lease hold -- PROGRAM` the program shares the control that is held for it.
 
         Args:
@@ -337,22 +374,28 @@ class Rig:
         """Return what became of a command."""
         return await self._client.ask(ReadOutcome(command_id=command_id))
 
-    def events(self, axis: str | None = None, *, history: bool = False) -> AbstractAsyncContextManager[Events]:
+    def events(self, axis: str | None = None, *, history: bool = False) -> Stream[CommandEvent]:
         """Follow what happens to commands, each event once: what the network drops is fetched.
+
+        `async for event in rig.events()`; `async with` yields an iterator, which counts in `lost` what is not there.
 
         Args:
             axis: only this one.
             history: begin with what the daemon remembers instead of now.
         """
-        return follow_events(self._client, axis, history=history)
+        return Stream(follow_events(self._client, axis, history=history))
 
     async def latest(self, axis: str, item: str) -> Sample | None:
         """Return the last sample of an item, such as `velocity` or `monitor/speed_feedback`; None without one."""
         return await self._client.last(axis, item)
 
-    def samples(self, axis: str = "*", item: str = "*") -> AbstractAsyncContextManager[Samples]:
-        """Take telemetry of any item, `*` for all but monitors: pairs of the axis and its sample."""
-        return self._client.samples(axis, item)
+    def samples(self, axis: str = "*", item: str = "*") -> Stream[tuple[str, Sample]]:
+        """Take telemetry of any item, `*` for all but monitors: pairs of the axis and its sample.
+
+        `async for axis, sample in rig.samples()`; `async with` yields an iterator, which counts in `dropped` what its
+        reader was too slow for.
+        """
+        return Stream(self._client.samples(axis, item))
 
     # -- making axes -------------------------------------------------------------------------------------------------
 
@@ -384,6 +427,7 @@ class Rig:
         control = await take_control(self._client, who, names, lease_s, force=force)
         lease = control.lease
         wanted = names if control.inherited and names else lease.axes
+        unfinished: dict[Axis, Motion] = {}
         try:
             async with self.watched(wanted) as covered, asyncio.TaskGroup() as group:
                 axes = (
@@ -401,6 +445,8 @@ class Rig:
                     await _halt_unfinished(axes)
                     raise
                 else:
+                    under_way = {axis: await axis.under_way() for axis in axes}
+                    unfinished = {axis: motion for axis, motion in under_way.items() if motion}
                     if control.inherited:  # the daemon does so when a lease is released
                         await _halt_unfinished(axes)
                 finally:
@@ -413,6 +459,7 @@ class Rig:
             raise errors.exceptions[0] from None
         finally:
             await control.release()
+        await _warn_of_unfinished(unfinished)
 
     def __repr__(self) -> str:
         return f"<rig {self.name}: axes {', '.join(self.axes)}>"
@@ -435,6 +482,24 @@ async def _keep(control: Control, axes: tuple[Axis, ...]) -> None:
         axis.lost()
     if control.lost:
         raise control.lost
+
+
+async def _warn_of_unfinished(unfinished: Mapping[Axis, Motion]) -> None:
+    """Say what control has ended, too: a program that did not wait for it may not have meant that."""
+    for axis, motion in unfinished.items():
+        ended = f"goes on or is halted, as the `loss.client` of {axis.name} says"
+        with contextlib.suppress(LdcndError, TimeoutError):
+            async with asyncio.timeout(ENDED_S):
+                while (outcome := await axis.outcome(motion.command_id)).status not in FINAL:  # noqa: ASYNC110 - happens in the daemon
+                    await asyncio.sleep(CHECK_PERIOD_S)
+            ended = f"was {outcome.status}: {outcome.reason}"
+        target = "" if motion.reply.position is None else f" to {motion.reply.position:g}"
+        warnings.warn(
+            f"axis {axis.name}: {motion.reply.verb}{target} was under way when its control ended, and {ended}; wait for"
+            " it with `done()`",
+            UnfinishedMotion,
+            stacklevel=2,
+        )
 
 
 async def _halt_unfinished(axes: tuple[Axis, ...]) -> None:

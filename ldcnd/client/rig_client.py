@@ -2,14 +2,15 @@
 
 import asyncio
 from collections import deque
-from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from difflib import get_close_matches
 from typing import TypeVar
 
 from ldcnd.client.own_samples import Origin
 from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
-from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownCommand
+from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownAxis, UnknownCommand
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import ALL_DAEMONS, ALL_RUNS, RIG_ITSELF, Keys
 from ldcnd.contract.meta import AxisInfo, BusInfo, DaemonInfo
@@ -415,6 +416,39 @@ async def find_rigs(session: Session) -> list[DaemonInfo]:
     answers = await session.query(ALL_DAEMONS)
     found = (decode_received(DaemonInfo, answer.payload, answer.encoding) for answer in answers if not answer.is_error)
     return sorted(found, key=lambda daemon: daemon.started)
+
+
+async def find_rig(session: Session, rig: str | None = None, at: Sequence[str] = ()) -> DaemonInfo:
+    """Return the daemon of a rig.
+
+    Args:
+        session: where it is looked for.
+        rig: which one; not needed when only one can be reached.
+        at: the endpoints of the session, for the message.
+
+    Raises:
+        SessionError: no daemon answers, or none of this rig.
+        UnknownAxis: several rigs can be reached and none was named.
+    """
+    daemons = {daemon.rig: daemon for daemon in await find_rigs(session)}
+    there = f"there are: {', '.join(sorted(daemons))}"
+    if not daemons:
+        raise no_rig_answers(at)
+    if rig is None and len(daemons) > 1:
+        raise UnknownAxis(f"several rigs answer; {there}", remedy="name one of them: --rig, or `rig=` in Python")
+    if rig is not None and rig not in daemons:
+        near = next(iter(get_close_matches(rig, daemons, 1)), None)
+        meant = f"; did you mean {near!r}?" if near else ""
+        raise SessionError(f"no rig {rig!r} answers{meant}", value=rig, remedy=there)
+    return daemons[rig] if rig else next(iter(daemons.values()))
+
+
+def no_rig_answers(at: Sequence[str]) -> SessionError:
+    """Return the error for a network without a rig; `at` are the endpoints."""
+    return SessionError(
+        f"no daemon answers at {', '.join(at) or 'the configured endpoints'}",
+        remedy="start one with `ldcnd run`, or name its endpoint (--connect); a login without a role sees none either",
+    )
 
 
 @asynccontextmanager

@@ -3,10 +3,13 @@
 Zenoh's own defaults are not fit for hardware: it listens on every interface, scouts by multicast and shares memory.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+"""Endpoint of a daemon, and of programs that look for one where nothing names another."""
 LEASE_MS = 2000
 """The others learn within this time that this process has frozen or that its cable was pulled."""
 
@@ -62,3 +65,27 @@ class ZenohSettings:
             "scouting/multicast/enabled": False,
             "scouting/gossip/enabled": False,
         }
+
+
+def endpoint_of(written: str) -> str:
+    """Return an endpoint that may be written as HOST:PORT."""
+    return written if "/" in written else f"tcp/{written}"
+
+
+def user_settings(
+    connect: Sequence[str], listen: Sequence[str] = (), config_file: Path | str | None = None
+) -> ZenohSettings:
+    """Return how a program that uses rigs joins the network: at the default endpoint unless it names another way.
+
+    Args:
+        connect: endpoints, or HOST:PORT.
+        listen: endpoints to listen on.
+        config_file: a Zenoh configuration with a login; its endpoints count when none are given here.
+    """
+    endpoints = tuple(map(endpoint_of, connect)) or (() if listen or config_file else (DEFAULT_ENDPOINT,))
+    return ZenohSettings(
+        mode="client" if endpoints else None if config_file else "peer",
+        connect=endpoints,
+        listen=tuple(listen),
+        config_file=Path(config_file) if config_file else None,
+    )

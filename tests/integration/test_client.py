@@ -7,6 +7,7 @@ import inspect
 import os
 import sys
 import threading
+import warnings
 from collections.abc import AsyncIterator
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
@@ -21,14 +22,22 @@ from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.catalogue import COMMANDS
 from ldcnd.contract.commands import About, Halt
-from ldcnd.contract.errors import CommandAborted, LeaseExpired, LeaseHeld, MalformedRequest, SessionError, UnknownAxis
+from ldcnd.contract.errors import (
+    ERRORS,
+    CommandAborted,
+    LeaseExpired,
+    LeaseHeld,
+    MalformedRequest,
+    SessionError,
+    UnknownAxis,
+)
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.net.memory_session import MemoryBroker
-from tests.support.process import ROOT, daemon
+from tests.support.process import ROOT, answering, daemon, process
 from tests.support.rig import EPOCH_NS, RunningRig, running_rig, two_axes
 from tests.support.session_pair import free_endpoint
 from tools.client_reference import client_reference
@@ -76,6 +85,7 @@ def test_no_call_of_the_asyncio_client_is_missing_from_the_blocking_one():
             "begun",
             "lost",
             "outcome",
+            "under_way",
             "follow_descriptions",
         }
         assert public - inner <= set(dir(ours)), theirs
@@ -88,7 +98,13 @@ def test_the_reference_is_made_of_the_docstrings():
 
 
 def test_what_is_promised_at_the_top_is_there():
-    assert {name: getattr(ldcnd, name) for name in ldcnd.__all__}
+    named = {name: getattr(ldcnd, name) for name in dir(ldcnd)}
+
+    assert set(ERRORS.values()) <= set(named.values())
+    assert {"Axis", "AxisState", "LinePath", "Memory", "PositionSample", "TraceTrigger", "connect", "open"} <= set(
+        named
+    )
+    assert not {"Halt", "MoveAbsolute"} & set(named)  # an axis has a method for each
     with pytest.raises(AttributeError, match="unknown"):
         ldcnd.unknown  # noqa: B018
 
@@ -297,6 +313,86 @@ def test_a_thread_that_cannot_have_a_loop_is_an_error(monkeypatch):
 
     with pytest.raises(OSError, match="too many"), loop_thread():
         pass
+
+
+async def test_control_that_is_left_in_mid_motion_says_so():
+    async with client_rig() as (_, rig):
+        with pytest.warns(ldcnd.UnfinishedMotion, match=r"axis x: move_absolute to 30 was under way .* was aborted: "):
+            await begin_to_move(rig)
+        async with rig.watch("x") as x:
+            while x.state.moving is not Moving.NO:
+                await x.news(1.0)
+            assert 0 < x.position.value < 10
+
+
+async def begin_to_move(rig: Rig) -> None:
+    async with rig.control("x", client="ann") as x:
+        await x.power(on=True)
+        await x.move_absolute(30, velocity=5)
+        await asyncio.sleep(0.5)
+
+
+async def test_control_whose_motions_have_ended_is_left_without_a_word():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        async with client_rig() as (_, rig), rig.control("x", "y", client="ann") as (x, y):
+            await x.power(on=True)
+            await y.power(on=True)
+            await (await x.move_absolute(2)).done()
+            moved = await y.move_absolute(2)
+            async for _ in moved:
+                pass
+
+
+async def test_telemetry_and_events_are_iterated_over_with_and_without_a_context():
+    async with client_rig() as (_, rig), rig.control("x", client="ann") as x:
+        async for axis, sample in rig.samples("x", "position"):
+            first = axis, sample.unit
+            break
+        async with rig.samples("x", "state") as states:
+            _, state = await anext(states)
+        async with asyncio.TaskGroup() as group:
+            follower = group.create_task(first_event(rig))
+            await asyncio.sleep(0.1)
+            await x.power(on=True)
+        event = follower.result()
+
+    assert first == ("x", "mm")
+    assert state.state is AxisState.DISABLED
+    assert (event.axis, event.verb) == ("x", "power")
+
+
+async def first_event(rig: Rig) -> ldcnd.CommandEvent:
+    async for event in rig.events("x"):
+        return event
+    raise AssertionError("it is endless")
+
+
+@pytest.mark.real_time
+async def test_a_program_waits_for_a_daemon_that_starts_and_may_leave_it_open():
+    endpoint = free_endpoint()
+    program = """
+        import ldcnd
+        rig = ldcnd.open(wait_s=30)
+        x = rig.control("x", client="demo").open()
+        x.power(on=True)
+        for axis, sample in rig.samples(item="state"):
+            print(axis in rig.axes, type(sample) is ldcnd.StateSample)
+            break
+        with rig.events("x", history=True) as events:
+            print(next(events).verb)
+        other = ldcnd.open()
+        other.close()
+        other.close()
+        x.move_absolute(90)  # and the end of the program gives up control
+    """
+    running = asyncio.create_task(run_program(inspect.cleandoc(program), endpoint))
+    await asyncio.sleep(2)
+    async with process("run", "--config", str(ROOT / "config" / "simulated.toml"), "--listen", endpoint) as started:
+        await answering(started, endpoint)
+        printed = await running
+
+    assert printed == ["True True", "power"]
 
 
 async def run_program(text: str, endpoint: str) -> list[str]:
