@@ -8,24 +8,30 @@ import asyncio
 import contextlib
 import math
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 
 from ldcnd.axis import guards
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.commands import AxisCommands
+from ldcnd.axis.events import LoopSeen, PlaceKnown, PlaceUnknown, ReferenceRefused, SpeedOverridden
+from ldcnd.axis.faults import REFERENCE_REFUSED
 from ldcnd.axis.host_tracer import HostTracer, host_channels
 from ldcnd.axis.kept import KeptFiles
-from ldcnd.axis.motion import AxisMotion, MotionPlan, preview
+from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.parameters import Parameters
 from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right
 from ldcnd.axis.plausibility import PlausibilityGate
+from ldcnd.axis.preview import preview
 from ldcnd.axis.procedures.jog import Hold
 from ldcnd.axis.quiet_drive import Unmoved
-from ldcnd.axis.readings import AxisReadings, ReadingOutOfTurn
+from ldcnd.axis.readings import AxisReadings, OnEnded, ReadingOutOfTurn
 from ldcnd.axis.recorder import TraceRecorder
 from ldcnd.axis.reference import ReferenceKeeper
-from ldcnd.axis.state import REFERENCE_REFUSED, AxisTracker, ObservedTracker
+from ldcnd.axis.scale import AxisScale
+from ldcnd.axis.status import AxisStatus
 from ldcnd.axis.stopping import AxisStops, takes_energy_out
-from ldcnd.axis.telemetry import Arrivals, AxisTelemetry, Note, OnEnded
+from ldcnd.axis.telemetry import AxisTelemetry, Note
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.axis.turns import CommandQueue
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import (
@@ -107,49 +113,33 @@ class AxisService:
         self._next_command_id = next_command_id
         self._note = note
         self._moves = moves = driver if isinstance(driver, Moves) else Unmoved(driver)
-        tracker = AxisTracker if Verb.STOP in driver.capabilities else ObservedTracker
         proof = bus.proofs.expect(driver.spec.address, f"axis {config.name}", config.name)
-        arrivals = Arrivals(config, self._shown_at, ended, note)
-        self.tracker = tracker(config.name, config.unit, arrivals.ended, proof)
-        self.telemetry = AxisTelemetry(
-            publisher,
-            self.tracker,
-            config.signed_counts_per_unit,
-            adc_full_scale=driver.adc_full_scale,
-            adc_volts=config.adc_volts,
-            shows_inputs=driver.shows_inputs,
-            modulo=config.modulo,
-        )
+        status = AxisStatus(config.name, AxisScale.of(config), commanded=Verb.STOP in driver.capabilities)
+        self.tracker = AxisTracker(status, proof)
+        self.telemetry = AxisTelemetry(publisher, config.name, driver, adc_volts=config.adc_volts)
         self._plausibility = plausibility = PlausibilityGate(config)
         self._gate = Gate(moves, self.tracker, plausibility.expect)
-        self.reference = ReferenceKeeper(
-            config, driver, self.tracker, self.telemetry, clock, kept, references=keeps_reference
-        )
+        self.reference = ReferenceKeeper(config, driver, self.tracker, clock, kept, references=keeps_reference)
         self._recalled: float | None = None
-        read = ReadingOutOfTurn(moves, bus, plausibility, self.telemetry, config.unit, clock)
+        read = ReadingOutOfTurn(moves, bus, plausibility, self.tracker, clock)
         self._motion = AxisMotion(config, moves, self.tracker, self.telemetry, clock, read, self.reference)
         self._commands = AxisCommands(self._motion)
         self._queue = CommandQueue(config.name)
         self.stops = AxisStops(self._motion, bus, self._gate, self._queue, self._commands, next_command_id, note)
         self.readings = AxisReadings(
-            self._motion, bus, plausibility, self._queue, self._commands, self.stops, arrivals, note
+            self._motion, bus, plausibility, self._queue, self._commands, self.stops, ended, note
         )
         self._parameters = Parameters(driver, driver.parameters) if driver.parameters else None
         self.traces = TraceRecorder(config.name, self._tracer(driver), publisher, clock)
         self._successors = asyncio.Lock()
         self._last_in_turn = ""  # the last move that came to wait for its turn
 
-    def _shown_at(self, counts: int) -> float:
-        return self.telemetry.within_turn(self.telemetry.position(counts))[0]
-
     def _tracer(self, driver: Drive) -> Tracer:
         """Return the drive's own recorder, or the host's."""
         if driver.tracer:
             return driver.tracer
         readable = driver if isinstance(driver, Readable) else self._moves
-        channels = host_channels(
-            readable, self.config.unit, self.config.signed_counts_per_unit, self.telemetry.position
-        )
+        channels = host_channels(readable, lambda: self.tracker.status.scale)
         return HostTracer(self._bus, readable, channels, self._require_reachable)
 
     # -- life ----------------------------------------------------------------------------------------------------------
@@ -196,7 +186,7 @@ class AxisService:
         if not refused:
             return
         log.warning("kept reference refused", axis=name, reason=refused)
-        self.tracker.refuse_reference(refused)
+        self.tracker.take(ReferenceRefused(refused))
         self._note(name, REFERENCE, CommandStatus.REFUSED, f"not kept: {refused}", REFERENCE_REFUSED.code)
         try:
             await self.reference.forget()
@@ -206,10 +196,11 @@ class AxisService:
     def connected(self, *, placed: bool) -> None:
         """The line came up; `placed` when 0 is where the drive was powered on, and that is the reference."""
         self.stops.line_up = True
-        self.tracker.referenced = placed or self._recalled is not None
-        if self.tracker.referenced:
-            self.telemetry.origin_counts = 0.0 if placed else self._recalled or 0.0
-        self._recalled = None
+        origin_counts, self._recalled = 0.0 if placed else self._recalled, None
+        if origin_counts is None:
+            self.tracker.take(PlaceUnknown())
+        else:
+            self.tracker.take(PlaceKnown(replace(self.tracker.status.scale, origin_counts=origin_counts)))
         self.reference.woken.set()
 
     def disconnected(self) -> None:
@@ -219,7 +210,7 @@ class AxisService:
 
     def explain_loss(self) -> None:
         """Say of a drive that is out of reach what is known by now of the reason."""
-        if self.tracker.link is LinkState.DOWN:
+        if self.tracker.status.link is LinkState.DOWN:
             self.tracker.disconnected(self._clock.now_ns())
             self.telemetry.state(self._clock.now_ns())
 
@@ -231,14 +222,14 @@ class AxisService:
         """
         self.stops.inherit()
         if self.stops.possible and not self.readings.seen:
-            self.tracker.enabled = True
+            self.tracker.take(LoopSeen(enabled=True))
 
     # -- commands ------------------------------------------------------------------------------------------------------
 
     @property
     def at_work(self) -> bool:
         """Whether it carries out a command, moves, or may move for all that is known."""
-        return self.tracker.command is not None or self.tracker.moving is not Moving.NO
+        return self.tracker.status.command is not None or self.tracker.status.moving is not Moving.NO
 
     def permit(self, command_id: str, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
         """Return permission for a command that was admitted just now; a stop makes it void."""
@@ -295,7 +286,7 @@ class AxisService:
         found = list(guards.obstacles(row, self.tracker, self._moves))
         name = self.config.name
         first = [error for error, guard in found if guard in (guards.check_reachable, guards.check_not_latched)]
-        faults = [guards.fault(name, each) for each in self.tracker.active_faults if each.source == "drive"]
+        faults = [guards.fault(name, each) for each in self.tracker.status.active_faults if each.source == "drive"]
         causes = [(error, False) for error in (*first, *faults)]
         causes += [(error, guard is guards.check_stands) for error, guard in found if error not in first]
         if not moves:
@@ -350,7 +341,7 @@ class AxisService:
         """
         ahead = self._last_in_turn if self._successors.locked() else self._active_id
         patience_s = math.inf
-        if move.buffer_mode is BufferMode.ABORTING and self.tracker.command:
+        if move.buffer_mode is BufferMode.ABORTING and self.tracker.status.command:
             permit.ask_to_move()
             self._commands.check(move)
             if self._commands.retargets(move):
@@ -360,13 +351,17 @@ class AxisService:
             patience_s = HALTS_WITHIN_S
         elif move.buffer_mode is BufferMode.BUFFERED and ahead is not None:
             permit.ask()
-            if self.tracker.command and self.tracker.command.verb is not Verb.HOME and isinstance(move, MoveAbsolute):
+            if (
+                self.tracker.status.command
+                and self.tracker.status.command.verb is not Verb.HOME
+                and isinstance(move, MoveAbsolute)
+            ):
                 self._commands.check(move)  # what can be told now is not kept for later
             waits(ahead)
         self._last_in_turn = permit.command_id
         async with self._successors:  # those who wait are served in the order in which they came
             deadline_s = self._clock.now_s() + patience_s
-            while self.tracker.command:
+            while self.tracker.status.command:
                 self._queue.changed.clear()
                 try:
                     async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
@@ -380,7 +375,7 @@ class AxisService:
 
     @property
     def _active_id(self) -> str | None:
-        return self.tracker.command.command_id if self.tracker.command else None
+        return self.tracker.status.command.command_id if self.tracker.status.command else None
 
     def controlled_by(self, client: str | None) -> None:
         """Publish who controls the axis from now on; None when no client does."""
@@ -393,10 +388,9 @@ class AxisService:
         Raises:
             LdcndError: a motion under way could not be changed; those that begin have the new one all the same.
         """
-        self.tracker.speed_share = share
-        self.telemetry.state(self._clock.now_ns())
+        self.telemetry.publish_state(self.tracker.take(SpeedOverridden(share)), self._clock.now_ns())
         if share <= 0:
-            if not self.at_work or self.tracker.state is AxisState.DISABLED:
+            if not self.at_work or self.tracker.status.state is AxisState.DISABLED:
                 return False, False
             await self.stops.bring_to_rest(StopMode.SMOOTH)
             return False, True
@@ -451,23 +445,23 @@ class AxisService:
 
     def report_shadow(self, report: ReportShadow) -> ShadowReply:
         """Publish what an observer says of this axis; no effect."""
-        self.telemetry.shadow(report)
+        self.telemetry.publish_shadow(report)
         return ShadowReply(axis=self.config.name)
 
     async def send_pending_stop(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
-        if not self.tracker.stop_pending:
+        if not self.tracker.status.stop_pending:
             return
         try:
             # a stop would close an open loop: see how a drive was left, or what became of it while it was out of reach
-            if not self.readings.seen or self.tracker.link is LinkState.DOWN:
+            if not self.readings.seen or self.tracker.status.link is LinkState.DOWN:
                 asked_s = self._clock.now_s()
                 reading = await self._motion.read()
                 now_s = self._clock.now_s()
                 if self.readings.are_of_the_drive:
                     self.readings.take(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
                 else:
-                    self.tracker.enabled = reading.enabled
+                    self.tracker.take(LoopSeen(reading.enabled))
         except LdcndError as error:
             if not self.readings.seen:  # a stop that comes now withdraws the reading, and is sent itself
                 log.warning("stop not sent again", axis=self.config.name, reason=error.message)
@@ -484,9 +478,9 @@ class AxisService:
         try:
             return await self._commands.carry_out(permit, command)
         finally:
-            if self.tracker.settle or not math.isinf(
-                self._commands.watch_s
-            ):  # the caller that waits for the reply goes first
+            begun = self.tracker.status.command
+            if (begun and begun.settling) or not math.isinf(self._commands.watch_s):
+                # the caller that waits for the reply goes first
                 asyncio.get_running_loop().call_later(FIRST_READING_DELAY_S, self.readings.ask_soon)
 
     def _require_reachable(self) -> None:

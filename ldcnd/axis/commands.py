@@ -4,6 +4,15 @@ import math
 from dataclasses import replace
 
 from ldcnd.axis import guards
+from ldcnd.axis.events import (
+    CommandFailing,
+    CommandOver,
+    LoopSwitched,
+    PlaceKnown,
+    PowerSwitched,
+    ResetDone,
+    SpeedChanged,
+)
 from ldcnd.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import NEVER_S, Procedure
@@ -17,7 +26,7 @@ from ldcnd.axis.procedures.probe import ProbeMove
 from ldcnd.axis.procedures.pwm import PwmRun
 from ldcnd.axis.procedures.track import SetPoint
 from ldcnd.axis.procedures.velocity import COUNTER_SHARE, VelocityChange
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
@@ -178,7 +187,6 @@ class AxisCommands:
     def switched_off(self) -> None:
         """The drive acknowledged that its motor is off: nothing that was under way goes on."""
         self._drop_procedure()
-        self._motion.target_counts = None
 
     # -- procedures --------------------------------------------------------------------------------------------------
 
@@ -201,7 +209,7 @@ class AxisCommands:
             return
         if procedure.outlived(self._tracker):
             self._drop_procedure()
-        elif self._tracker.concerns(timing) and procedure.calls_for_step(reading):
+        elif self._tracker.status.concerns(timing) and procedure.calls_for_step(reading):
             self.step_due = True
 
     async def step(self) -> None:
@@ -217,7 +225,7 @@ class AxisCommands:
         if procedure.outlived(self._tracker):
             self._drop_procedure()
             return
-        delay_s = STEP_RETRY_S if self._tracker.link is LinkState.UP else BLIND_RETRY_S
+        delay_s = STEP_RETRY_S if self._tracker.status.link is LinkState.UP else BLIND_RETRY_S
         self._retry_s = self._motion.clock.now_s() + delay_s
         try:
             goes_on = await self._take_step(procedure)
@@ -233,16 +241,19 @@ class AxisCommands:
             return await procedure.step()
         except OutcomeUnknown:
             # what was started must not be started again: the readings tell how it goes
-            return self._tracker.command is not None and self._tracker.command.completion is Completion.PROCEDURE
+            return (
+                self._tracker.status.command is not None
+                and self._tracker.status.command.completion is Completion.PROCEDURE
+            )
         except (StopLatched, CommandAborted):
             raise
         except (RequestRefused, DriveFault) as error:
-            if self._tracker.energised and not procedure.outlived(self._tracker):
+            if self._tracker.status.energised and not procedure.outlived(self._tracker):
                 await self._driver.stop(StopMode.SMOOTH)  # of the step before something may still run
                 self._motion.stopping(procedure.permit.command_id, procedure.permit.verb)
-                self._tracker.failing(error.message)
+                self._tracker.take(CommandFailing(error.message))
             elif not procedure.outlived(self._tracker):
-                self._tracker.finished(error.message)
+                self._tracker.take(CommandOver(error.message))
             return False
 
     def _drop_procedure(self) -> None:
@@ -258,7 +269,7 @@ class AxisCommands:
         except OutcomeUnknown:
             self._take_up(procedure)
             raise
-        command = self._tracker.command
+        command = self._tracker.status.command
         if command and command.command_id == procedure.permit.command_id:  # else a stop has ended it meanwhile
             self._take_up(procedure)
         return reply
@@ -271,8 +282,7 @@ class AxisCommands:
         guards.check_has_gains(self._driver)
         await permit.power_on()
         self._drop_procedure()
-        self._motion.target_counts = None
-        self._tracker.powered(on=True, now_s=self._motion.clock.now_s())
+        self._tracker.take(PowerSwitched(on=True, now_s=self._motion.clock.now_s()))
         self._motion.publish_state()
         return self._motion.reply(permit)
 
@@ -287,15 +297,17 @@ class AxisCommands:
             guards.check_reachable(tracker)
             guards.check_not_latched(tracker)
         permit.check_state()  # a stop that is under way keeps its latch
-        stopped = tracker.state is AxisState.ERROR_STOP or any(fault.stops for fault in tracker.active_faults)
-        if stopped or not tracker.energised:
+        stopped = tracker.status.state is AxisState.ERROR_STOP or any(
+            fault.stops for fault in tracker.status.active_faults
+        )
+        if stopped or not tracker.status.energised:
             await self._driver.reset()
             self._drop_procedure()
-            tracker.switched(on=False, now_s=self._motion.clock.now_s())
-        elif tracker.active_faults:
+            tracker.take(LoopSwitched(on=False, now_s=self._motion.clock.now_s()))
+        elif tracker.status.active_faults:
             await self._driver.clear_warnings()
         permit.still_wanted()  # a stop that came meanwhile keeps its latch
-        tracker.cleared(self._motion.clock.now_s())
+        tracker.take(ResetDone(self._motion.clock.now_s()))
         self._motion.publish_state()
         return self._motion.reply(permit)
 
@@ -314,9 +326,9 @@ class AxisCommands:
             and not isinstance(request, Jog)
             and not isinstance(self.procedure, PathMember)
             and request.buffer_mode is BufferMode.ABORTING
-            and tracker.command is not None
-            and tracker.command.verb in MOVES
-            and tracker.state in (AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION)
+            and tracker.status.command is not None
+            and tracker.status.command.verb in MOVES
+            and tracker.status.state in (AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION)
         )
 
     def _check_may_start(self, permit: Permit, request: Move) -> None:
@@ -347,7 +359,7 @@ class AxisCommands:
 
     async def _move_relative(self, permit: Permit, request: MoveRelative) -> CommandReply:
         self._check_may_start(permit, request)
-        if self._motion.target_counts is None:
+        if self._tracker.status.target_counts is None:
             here = (await self._motion.read()).position_counts  # one reading alone may be wrong
             permit.still_wanted()
             self._check_may_start(permit, request)
@@ -374,19 +386,17 @@ class AxisCommands:
 
     def _plan_relative(self, request: MoveRelative, here_counts: int | None = None) -> MotionPlan:
         motion = self._motion
-        from_counts = here_counts if motion.target_counts is None else motion.target_counts
-        if from_counts is None:
-            from_counts = motion.latest().position_counts
-        position = motion.telemetry.position(from_counts) + request.distance
+        from_counts = motion.commanded_counts if here_counts is None else here_counts
+        position = motion.scale.position(from_counts) + request.distance
         return motion.plan_to(position, request.velocity, request.acceleration)
 
     def _plan_velocity(self, request: MoveVelocity) -> tuple[float, MotionPlan]:
         """Return the velocity as the drive will have it, and a trapezoid that ends by itself even if this host dies."""
         motion = self._motion
         plan = motion.plan_at(request.velocity, request.acceleration)
-        end = motion.limit_ahead(request.velocity) if self._tracker.referenced else None
+        end = motion.limit_ahead(request.velocity) if self._tracker.status.referenced else None
         if end is None:
-            here = motion.telemetry.position(motion.latest().position_counts)
+            here = motion.here
             longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(plan.motion.velocity_counts_per_s)
             end = here + plan.velocity * min(motion.config.jog_horizon_s, longest_s)
         return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration)
@@ -399,10 +409,8 @@ class AxisCommands:
         completion: Completion = Completion.PROFILE,
     ) -> CommandReply:
         await permit.load(plan.motion)
-        self._moved = permit, plan.motion, self._tracker.speed_share
+        self._moved = permit, plan.motion, self._tracker.status.speed_share
         await self._motion.start(permit, state, completion, plan=plan)
-        if state is AxisState.DISCRETE_MOTION:  # the end of a motion at a velocity is only there for a host that dies
-            self._motion.target_counts, self._motion.approached = plan.motion.target_counts, True
         return self._motion.reply(permit, plan)
 
     async def change_speed(self) -> bool:
@@ -414,8 +422,8 @@ class AxisCommands:
             RequestRefused: it may not be moved any more.
             BusError: the line failed; it goes on at the one velocity or the other.
         """
-        tracker, share = self._tracker, self._tracker.speed_share
-        command = tracker.command
+        tracker, share = self._tracker, self._tracker.status.speed_share
+        command = tracker.status.command
         if isinstance(self.procedure, HeldJog):
             self.step_due = self.step_due or self.procedure.wants_step
             return self.step_due
@@ -428,18 +436,15 @@ class AxisCommands:
             replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / before)
         )
         await permit.load(changed)
-        if tracker.command is not command:
+        if tracker.status.command is not command:
             return False  # it has ended meanwhile: what was loaded is not started
         await permit.start()
         self._moved = permit, changed, share
         way = abs((changed.target_counts or 0) - self._motion.latest().position_counts)
-        tracker.ends_after(
-            rest_of_profile_s(
-                way, motion.velocity_counts_per_s, changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
-            ),
-            self._motion.clock.now_s(),
-            self._motion.clock.now_ns(),
+        rest_s = rest_of_profile_s(
+            way, motion.velocity_counts_per_s, changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
         )
+        tracker.take(SpeedChanged(rest_s, self._motion.clock.now_s(), self._motion.clock.now_ns()))
         return True
 
     # -- registers ---------------------------------------------------------------------------------------------------
@@ -451,8 +456,7 @@ class AxisCommands:
         await motion.reference.forget()
         permit.still_wanted()
         guards.check_position_kept(self._tracker)
-        motion.telemetry.origin_counts = here.position_counts - position * motion.counts_per_unit
-        self._tracker.referenced, self._tracker.target = True, None
+        self._tracker.take(PlaceKnown(motion.scale.with_position(here.position_counts, position), resting=True))
         motion.publish_state()
         return motion.reply(permit, position=position)
 
@@ -508,7 +512,7 @@ class AxisCommands:
         config = self._motion.config
         if config.tracking is None:
             return
-        step_counts = math.ceil(config.tracking.step * abs(self._motion.counts_per_unit))
+        step_counts = math.ceil(config.tracking.step * abs(self._motion.scale.counts_per_unit))
         if gains.el <= step_counts:
             raise ValueOutOfRange(
                 f"axis {config.name}: el {gains.el} is not above a tracking step of {step_counts} counts",

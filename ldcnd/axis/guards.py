@@ -8,7 +8,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 from ldcnd.axis.quiet_drive import QuietDrive
-from ldcnd.axis.state import MOTION_STATES, AxisTracker
+from ldcnd.axis.status import MOTION_STATES
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.errors import (
@@ -30,9 +31,9 @@ from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving
 
 def check_reachable(axis: AxisTracker) -> None:
     """Refuse when the drive does not answer, or is not known to be the one that is configured."""
-    if axis.proof and not axis.proof.holds:
+    if not axis.proof.holds:
         raise axis.proof.refusal()
-    if axis.link is LinkState.DOWN:
+    if axis.status.link is LinkState.DOWN:
         raise AxisUnreachable(
             f"axis {axis.name}: the drive does not answer", axis=axis.name, remedy="check its power and the line"
         )
@@ -41,13 +42,13 @@ def check_reachable(axis: AxisTracker) -> None:
 def check_not_latched(axis: AxisTracker) -> None:
     """Refuse while a stop is latched, or not confirmed by the drive."""
     check_stop_confirmed(axis)
-    if axis.stop_latched:
+    if axis.status.stop_latched:
         raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy=Remedy("{}", step("reset")))
 
 
 def check_stop_confirmed(axis: AxisTracker) -> None:
     """Refuse while the drive has not confirmed a stop."""
-    if axis.stop_pending:
+    if axis.status.stop_pending:
         raise StopLatched(
             f"axis {axis.name}: the drive has not confirmed a stop yet",
             axis=axis.name,
@@ -57,28 +58,28 @@ def check_stop_confirmed(axis: AxisTracker) -> None:
 
 def check_not_in_error(axis: AxisTracker) -> None:
     """Refuse while a fault, or a command that ended badly, waits to be acknowledged."""
-    if axis.state is AxisState.ERROR_STOP:
+    if axis.status.state is AxisState.ERROR_STOP:
         raise _faulted(axis)
 
 
 def check_enabled(axis: AxisTracker) -> None:
     """Refuse a motion while the position loop is open."""
-    if axis.state is AxisState.DISABLED:
+    if axis.status.state is AxisState.DISABLED:
         raise WrongState(
             f"axis {axis.name} is disabled",
             axis=axis.name,
-            value=axis.state,
+            value=axis.status.state,
             remedy=Remedy("{}", step("power", 'send power {"on": true}', on=True)),
         )
 
 
 def check_stands(axis: AxisTracker) -> None:
     """Refuse while a motion runs: a trapezoid loaded in mid-move is erratic on most drives (PIC-SERVO manual, 4.4)."""
-    if axis.state in MOTION_STATES:
+    if axis.status.state in MOTION_STATES:
         raise WrongState(
-            f"axis {axis.name} is {axis.state.words}",
+            f"axis {axis.name} is {axis.status.state.words}",
             axis=axis.name,
-            value=axis.state,
+            value=axis.status.state,
             remedy=Remedy("{} and wait", step("halt")),
         )
 
@@ -89,7 +90,7 @@ def check_does_not_coast(axis: AxisTracker) -> None:
     A shaft turns when its drive shows a velocity, which is more than a count in a servo cycle: one that creeps, as a
     load that sinks, can be caught.
     """
-    if axis.coasts:
+    if axis.status.coasts:
         raise WrongState(
             f"axis {axis.name} turns with its motor off: its drive would hold it at once, whatever its speed",
             axis=axis.name,
@@ -99,8 +100,8 @@ def check_does_not_coast(axis: AxisTracker) -> None:
 
 def check_referenced(axis: AxisTracker) -> None:
     """Refuse an absolute position on an axis that is not referenced."""
-    if not axis.referenced:
-        kept = f"; what was kept of it was refused: {axis.refused}" if axis.refused else ""
+    if not axis.status.referenced:
+        kept = f"; what was kept of it was refused: {axis.status.refused}" if axis.status.refused else ""
         raise NotReferenced(
             f"axis {axis.name} is not homed: its position is not known{kept}",
             axis=axis.name,
@@ -110,7 +111,7 @@ def check_referenced(axis: AxisTracker) -> None:
 
 def check_position_kept(axis: AxisTracker) -> None:
     """Refuse to give the position a meaning while the drive says that it has lost it."""
-    if axis.position_lost:
+    if axis.status.position_lost:
         raise WrongState(
             f"axis {axis.name}: its position is lost: {_said(axis)}",
             axis=axis.name,
@@ -127,7 +128,7 @@ def check_position(axis: AxisTracker, limits: AxisLimits, position: float) -> No
     else:
         return
     raise PositionLimit(
-        f"axis {axis.name}: target {position:g} {axis.unit} is {side} the limit {limit:g} {axis.unit}",
+        f"axis {axis.name}: target {position:g} {axis.status.unit} is {side} the limit {limit:g} {axis.status.unit}",
         axis=axis.name,
         value=position,
         limit=limit,
@@ -139,8 +140,8 @@ def check_velocity(axis: AxisTracker, limits: AxisLimits, velocity: float) -> No
     """Refuse a speed above the limit."""
     if limits.velocity is not None and abs(velocity) > limits.velocity:
         raise VelocityLimit(
-            f"axis {axis.name}: velocity {velocity:g} {axis.unit}/s is above the limit"
-            f" {limits.velocity:g} {axis.unit}/s",
+            f"axis {axis.name}: velocity {velocity:g} {axis.status.unit}/s is above the limit"
+            f" {limits.velocity:g} {axis.status.unit}/s",
             axis=axis.name,
             value=velocity,
             limit=limits.velocity,
@@ -152,8 +153,8 @@ def check_acceleration(axis: AxisTracker, limits: AxisLimits, acceleration: floa
     """Refuse an acceleration above the limit."""
     if limits.acceleration is not None and acceleration > limits.acceleration:
         raise AccelerationLimit(
-            f"axis {axis.name}: acceleration {acceleration:g} {axis.unit}/s2 is above the limit"
-            f" {limits.acceleration:g} {axis.unit}/s2",
+            f"axis {axis.name}: acceleration {acceleration:g} {axis.status.unit}/s2 is above the limit"
+            f" {limits.acceleration:g} {axis.status.unit}/s2",
             axis=axis.name,
             value=acceleration,
             limit=limits.acceleration,
@@ -161,9 +162,16 @@ def check_acceleration(axis: AxisTracker, limits: AxisLimits, acceleration: floa
         )
 
 
+def check_rates(axis: AxisTracker, limits: AxisLimits, velocity: float, acceleration: float) -> None:
+    """Refuse a speed or an acceleration above its limit, and any while the speed override of the rig is 0."""
+    check_velocity(axis, limits, velocity)
+    check_acceleration(axis, limits, acceleration)
+    check_speed(axis)
+
+
 def check_speed(axis: AxisTracker) -> None:
     """Refuse a motion while the speed override of the rig is 0."""
-    if axis.speed_share <= 0:
+    if axis.status.speed_share <= 0:
         raise WrongState(
             f"axis {axis.name}: the speed override of the rig is 0 %",
             axis=axis.name,
@@ -174,11 +182,11 @@ def check_speed(axis: AxisTracker) -> None:
 
 def check_not_forced(axis: AxisTracker) -> None:
     """Refuse to reset a faulted axis whose motor has voltage and turns, or may, whatever the state says."""
-    if axis.state is AxisState.ERROR_STOP and axis.energised and axis.moving is not Moving.NO:
+    if axis.status.state is AxisState.ERROR_STOP and axis.status.energised and axis.status.moving is not Moving.NO:
         raise WrongState(
             f"axis {axis.name} still moves, or may: a reset would switch its motor off at speed",
             axis=axis.name,
-            value=axis.moving.value,
+            value=axis.status.moving.value,
             remedy=Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
         )
 
@@ -208,14 +216,14 @@ def _faulted(axis: AxisTracker) -> WrongState:
     return WrongState(
         f"axis {axis.name} is in error stop: {causes}",
         axis=axis.name,
-        value=axis.state,
+        value=axis.status.state,
         remedy=Remedy("remove the cause, then {}", step("reset")),
     )
 
 
 def _said(axis: AxisTracker) -> str:
-    first = (axis.first_fault,) if axis.first_fault else ()
-    return "; ".join(fault.text for fault in axis.active_faults or first)
+    first = (axis.status.first_fault,) if axis.status.first_fault else ()
+    return "; ".join(fault.text for fault in axis.status.active_faults or first)
 
 
 # -- what each command needs -----------------------------------------------------------------------------------------
@@ -281,7 +289,11 @@ GOES_ON: Mapping[Verb, frozenset[AxisState]] = {
 
 def goes_on(verb: Verb, axis: AxisTracker) -> bool:
     """Tell whether a command takes over one of its own that is under way."""
-    return axis.command is not None and axis.command.verb is verb and axis.state in GOES_ON.get(verb, ())
+    return (
+        axis.status.command is not None
+        and axis.status.command.verb is verb
+        and axis.status.state in GOES_ON.get(verb, ())
+    )
 
 
 def check(verb: Verb, axis: AxisTracker, *, follows: bool = False) -> None:
@@ -290,6 +302,12 @@ def check(verb: Verb, axis: AxisTracker, *, follows: bool = False) -> None:
     for guard in needs(verb).to_begin:
         if not (follows and guard is check_stands):
             guard(axis)
+
+
+def require(guards: tuple[Guard, ...], axis: AxisTracker) -> None:
+    """Refuse while the axis does not hold what one of these guards asks for; the first says why."""
+    for guard in guards:
+        guard(axis)
 
 
 def obstacles(row: Needs, axis: AxisTracker, drive: QuietDrive) -> Iterator[tuple[LdcndError, Guard | None]]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from typing_extensions import override
 
+from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.errors import BusDown, BusError, TraceTimedOut, ValueOutOfRange
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.contract.traces import TakeTrace, TraceChannel, TracePhase, TraceSource, TraceTrigger
@@ -171,18 +172,18 @@ class HostChannel:
     signal: bool = False
 
 
-def host_channels(
-    driver: Readable, unit: str, counts_per_unit: float, position: Callable[[float], float]
-) -> tuple[HostChannel, ...]:
+def host_channels(driver: Readable, scale_of: Callable[[], AxisScale]) -> tuple[HostChannel, ...]:
     """Return what can be sampled of a drive.
 
     Args:
         driver: the drive.
-        unit: of the axis.
-        counts_per_unit: negative where forward in units is backward in counts.
-        position: the present position in units that a count stands for.
+        scale_of: returns the coordinates of the axis as they are when a sample is taken.
     """
+    unit, counts_per_unit = scale_of().unit, scale_of().counts_per_unit
     factor = 1.0 / counts_per_unit
+
+    def position(counts: float) -> float:
+        return scale_of().position(counts)
 
     def to_units(counts: float) -> float:
         return counts / counts_per_unit

@@ -9,8 +9,10 @@ import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
 
+from ldcnd.axis.events import LatchRecalled
 from ldcnd.axis.kept import KeptFiles, KeptLatch
-from ldcnd.axis.state import AxisTracker
+from ldcnd.axis.status import AxisStatus
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import StopMode
 from ldcnd.durable import DamagedFile
@@ -44,7 +46,7 @@ class LatchKeeper:
         if files is None:
             return
         for tracker in trackers.values():
-            tracker.latch_changed = self._changed.set
+            tracker.watch(self._watch, "stop_latched", "stop", "state", "first_fault")
         try:
             kept = files.latches()
         except DamagedFile as error:
@@ -56,10 +58,12 @@ class LatchKeeper:
         for name in kept.keys() & trackers.keys():
             latch = kept[name]
             again = latch.again or (StopMode.SMOOTH if latch.stopped else None)
-            trackers[name].recall(
-                stopped=latch.stopped, again=again, in_error=latch.in_error, first=latch.first_fault, now_ns=now_ns()
-            )
+            trackers[name].take(LatchRecalled(latch.stopped, again, latch.in_error, latch.first_fault, now_ns()))
             log.warning("latched since an earlier daemon", axis=name, stopped=latch.stopped, in_error=latch.in_error)
+
+    def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
+        if _latch_of(before) != _latch_of(after):
+            self._changed.set()
 
     async def run(self) -> None:
         """Keep what comes and goes until cancelled; without a place for it there is nothing to do."""
@@ -86,7 +90,9 @@ class LatchKeeper:
         """Write the latches unless they are on the disk as they are; tell whether they are."""
         async with self._writing:  # those who wait find that it was done for all
             self._changed.clear()
-            now = self._others | {name: latch for name, each in self._trackers.items() if (latch := _latch_of(each))}
+            now = self._others | {
+                name: latch for name, each in self._trackers.items() if (latch := _latch_of(each.status))
+            }
             if now == self._on_disk:
                 return True
             self._on_disk = None
@@ -102,14 +108,14 @@ class LatchKeeper:
             return True
 
 
-def _latch_of(tracker: AxisTracker) -> KeptLatch | None:
+def _latch_of(status: AxisStatus) -> KeptLatch | None:
     """Return what is to be kept of an axis; None while nothing forbids it to move."""
-    again = tracker.unconfirmed if tracker.stop_pending else None
-    in_error, first = tracker.state is AxisState.ERROR_STOP, tracker.first_fault
-    if not (tracker.stop_latched or again or in_error):
+    again = status.stop.mode if status.stop and status.stop_pending else None
+    in_error, first = status.state is AxisState.ERROR_STOP, status.first_fault
+    if not (status.stop_latched or again or in_error):
         return None
     return KeptLatch(
-        stopped=tracker.stop_latched,
+        stopped=status.stop_latched,
         again=again,
         in_error=in_error,
         first_fault=first.past if first and in_error else None,

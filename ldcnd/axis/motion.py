@@ -1,7 +1,7 @@
 """Motion of one axis, for all commands: plan, load, check the permit, start, bring to rest.
 
 A plan goes from a request in axis units to a motion in counts, checked against limits and quantised to the drive's
-registers. A preview is computed by the same code, and nothing is sent.
+registers; preview.py says with the same code what a motion would do.
 """
 
 import asyncio
@@ -10,30 +10,30 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.guards import check_acceleration, check_does_not_coast, check_position, check_speed, check_velocity
+from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted
+from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.reference import ReferenceKeeper
-from ldcnd.axis.state import ActiveCommand, AxisTracker, Completion, Settling, window_counts
+from ldcnd.axis.rest import Settling, window_counts
+from ldcnd.axis.scale import AxisScale
+from ldcnd.axis.status import ActiveCommand, Completion
 from ldcnd.axis.straight import LineAxis
 from ldcnd.axis.telemetry import AxisTelemetry
-from ldcnd.contract.codec import error_reply
-from ldcnd.contract.commands import CommandReply, Direction, Preview, PreviewReply, Verb
+from ldcnd.axis.tracker import AxisTracker
+from ldcnd.contract.commands import CommandReply, Direction, Verb
 from ldcnd.contract.errors import (
     BusError,
-    MalformedRequest,
     NotSupported,
     OutcomeUnknown,
     Remedy,
     RequestRefused,
     ValueOutOfRange,
-    WrongState,
     step,
 )
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, StopMode
-from ldcnd.line.bus import Bus
 
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
@@ -83,10 +83,13 @@ class AxisMotion:
     """Motions of one axis, shared by its commands and their procedures.
 
     Attributes:
-        counts_per_unit: negative where forward in axis units is backward in counts.
-        reading: the latest; None before the first.
-        target_counts: target of the last motion; None when it had no end or was followed by something else.
-        approached: that motion came from the side that the configuration names.
+        config: of the axis, as it is now.
+        driver: its drive.
+        tracker: of its state.
+        telemetry: publishes it.
+        clock: of the daemon.
+        read: reads the drive's state at once.
+        reference: keeps its reference.
     """
 
     def __init__(
@@ -114,14 +117,10 @@ class AxisMotion:
         self.config = config
         self._window_counts = window_counts(config)
         self.driver = driver
-        self.counts_per_unit = config.signed_counts_per_unit
         self.tracker = tracker
         self.telemetry = telemetry
         self.clock = clock
         self.read = read
-        self.reading: AxisReading | None = None
-        self.target_counts: int | None = None
-        self.approached = False
         self._loop = asyncio.get_running_loop()
 
     def reconfigure(self, config: AxisConfig) -> None:
@@ -140,31 +139,36 @@ class AxisMotion:
             BusError: the line failed.
         """
         until_s = self._loop.time() + within_s
-        while not (self.tracker.enabled or self.tracker.at_rest):
-            self.tracker.looked_at(await self.read())
-            if not self.tracker.coasts or self._loop.time() >= until_s:
+        while not (self.tracker.status.enabled or self.tracker.status.at_rest):
+            self.tracker.take(LookTaken(await self.read()))
+            if not self.tracker.status.coasts or self._loop.time() >= until_s:
                 break
             await asyncio.sleep(LOOK_AGAIN_S)
         check_does_not_coast(self.tracker)
 
-    def latest(self) -> AxisReading:
-        """Return the latest reading.
+    @property
+    def scale(self) -> AxisScale:
+        """Its coordinates."""
+        return self.tracker.status.scale
 
-        Raises:
-            WrongState: there is none yet.
-        """
-        if self.reading is None:
-            raise WrongState(
-                f"axis {self.config.name}: its position has not been read yet",
-                axis=self.config.name,
-                remedy="wait a moment",
-            )
-        return self.reading
+    def latest(self) -> AxisReading:
+        """Return the latest reading; see `AxisTracker.latest`."""
+        return self.tracker.latest()
+
+    @property
+    def here(self) -> float:
+        """Where the axis is by its latest reading, in axis units, counted through all turns."""
+        return self.scale.position(self.latest().position_counts)
+
+    @property
+    def commanded_counts(self) -> int:
+        """Where the axis was sent last, counts; where it is when that has no end, or when something else followed."""
+        target_counts = self.tracker.status.target_counts
+        return self.latest().position_counts if target_counts is None else target_counts
 
     def counts_of(self, position: float) -> int:
         """Return the count of the drive that a position stands for; on an axis with a modulo the nearest of them."""
-        position = self.unwrapped(position)
-        return round(position * self.counts_per_unit + self.telemetry.origin_counts)
+        return self.scale.counts(self.unwrapped(position))
 
     def unwrapped(
         self, position: float, direction: Direction | None = None, *, from_counts: int | None = None
@@ -193,11 +197,9 @@ class AxisMotion:
                     remedy="leave direction out, or configure modulo",
                 )
             return position
-        if from_counts is None:
-            from_counts = self.latest().position_counts if self.target_counts is None else self.target_counts
-        here = self.telemetry.position(from_counts)
+        here = self.scale.position(self.commanded_counts if from_counts is None else from_counts)
         forward = (position - here) % modulo
-        count = 1.0 / abs(self.counts_per_unit)
+        count = 1.0 / abs(self.scale.counts_per_unit)
         if forward < count or modulo - forward < count:
             way = forward if forward < count else forward - modulo
         elif direction is Direction.NEGATIVE or (direction is not Direction.POSITIVE and forward > modulo / 2):
@@ -208,7 +210,7 @@ class AxisMotion:
 
     def shown(self, position: float | None) -> float | None:
         """Return a position as clients see it: on an axis with a modulo from 0 up to it."""
-        return None if position is None else self.telemetry.within_turn(position)[0]
+        return None if position is None else self.scale.shown(position)
 
     # -- plans -------------------------------------------------------------------------------------------------------
 
@@ -222,7 +224,7 @@ class AxisMotion:
         """
         if velocity is not None and velocity <= 0:
             raise ValueOutOfRange(
-                f"axis {self.tracker.name}: velocity {velocity:g} {self.tracker.unit}/s is not above 0;"
+                f"axis {self.tracker.name}: velocity {velocity:g} {self.tracker.status.unit}/s is not above 0;"
                 " the target gives the direction",
                 axis=self.tracker.name,
                 value=velocity,
@@ -230,30 +232,30 @@ class AxisMotion:
                 nearest=-velocity if velocity < 0 else None,
                 remedy="send a velocity above 0",
             )
-        tracker, origin_counts, from_counts = self.tracker, self.telemetry.origin_counts, self.latest().position_counts
+        tracker, scale, from_counts = self.tracker, self.scale, self.latest().position_counts
         speed, rate = self._checked(velocity, acceleration)
-        if tracker.referenced:
+        if tracker.status.referenced:
             check_position(tracker, self.config.limits, position)
-        target = round(position * self.counts_per_unit + origin_counts)
+        target = scale.counts(position)
         if abs(target - from_counts) > LARGEST_COUNT:
             nearest = from_counts + math.copysign(LARGEST_COUNT, target - from_counts)
             raise ValueOutOfRange(
-                f"axis {tracker.name}: target {position:g} {tracker.unit} is {abs(target - from_counts)} counts away,"
+                f"axis {tracker.name}: target {position:g} {scale.unit} is {abs(target - from_counts)} counts away,"
                 " farther than the drive's 32-bit counter reaches",
                 axis=tracker.name,
                 value=position,
                 limit=LARGEST_COUNT,
-                nearest=(nearest - origin_counts) / self.counts_per_unit,
+                nearest=scale.position(nearest),
                 remedy="move there in parts",
             )
-        counts_per_unit = abs(self.counts_per_unit)
+        counts_per_unit = abs(scale.counts_per_unit)
         motion = self.quantise(CountsMotion(target, speed * counts_per_unit, rate * counts_per_unit))
         duration_s = profile_duration_s(
             abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
         )
         return MotionPlan(
             motion,
-            (target - origin_counts) / self.counts_per_unit,
+            scale.position(target),
             motion.velocity_counts_per_s / counts_per_unit,
             motion.acceleration_counts_per_s2 / counts_per_unit,
             duration_s,
@@ -274,7 +276,7 @@ class AxisMotion:
                 remedy=Remedy("{}", step("halt")),
             )
         speed, rate = self._checked(velocity, acceleration)
-        counts_per_unit = self.counts_per_unit
+        counts_per_unit = self.scale.counts_per_unit
         motion = self.quantise(CountsMotion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
         return MotionPlan(
             motion,
@@ -291,7 +293,7 @@ class AxisMotion:
             ValueOutOfRange: a register cannot hold it within the limits; names the nearest value.
             RegisterUnknown: the scale of the registers is not known.
         """
-        limits, counts = self.config.limits, abs(self.counts_per_unit)
+        limits, counts = self.config.limits, abs(self.scale.counts_per_unit)
         return self.driver.quantise(
             motion,
             Ceiling(
@@ -309,10 +311,8 @@ class AxisMotion:
         """Return the speed that the speed override leaves, and the acceleration, both within their limits."""
         speed = self.config.velocity if velocity is None else velocity
         rate = self.config.acceleration if acceleration is None else acceleration
-        check_velocity(self.tracker, self.config.limits, speed)
-        check_acceleration(self.tracker, self.config.limits, rate)
-        check_speed(self.tracker)
-        return speed * self.tracker.speed_share, rate
+        check_rates(self.tracker, self.config.limits, speed, rate)
+        return speed * self.tracker.status.speed_share, rate
 
     def before_approach(
         self, goal: MotionPlan, velocity: float | None, acceleration: float | None
@@ -331,21 +331,20 @@ class AxisMotion:
         if approach is None or goal.position is None:
             return None
         forward = approach.direction == "positive"
-        here_counts = self.target_counts
-        here = self.telemetry.position(self.latest().position_counts if here_counts is None else here_counts)
+        here = self.scale.position(self.commanded_counts)
         way = goal.position - here if forward else here - goal.position
-        if way >= approach.distance or (way >= 0 and self.approached and here_counts is not None):
+        if way >= approach.distance or (way >= 0 and self.tracker.status.approached):
             return None
         begin = goal.position - approach.signed
         return self.plan_to(begin, velocity, acceleration)
 
     def on_line(self, plan: MotionPlan) -> LineAxis:
         """Return the share of this axis in a straight line that ends where a plan does, no faster than the plan."""
-        motion, here = plan.motion, self.target_counts
+        motion = plan.motion
         return LineAxis(
-            from_counts=self.latest().position_counts if here is None else here,
+            from_counts=self.commanded_counts,
             target_counts=motion.target_counts or 0,
-            counts_per_unit=abs(self.counts_per_unit),
+            counts_per_unit=abs(self.scale.counts_per_unit),
             most_velocity=motion.velocity_counts_per_s,
             most_acceleration=motion.acceleration_counts_per_s2,
             quantise=self.quantise,
@@ -355,7 +354,7 @@ class AxisMotion:
     def replanned(self, plan: MotionPlan, motion: CountsMotion) -> MotionPlan:
         """Return a plan with another velocity and acceleration, to the same target."""
         share = self.on_line(replace(plan, motion=motion))
-        counts_per_unit = abs(self.counts_per_unit)
+        counts_per_unit = abs(self.scale.counts_per_unit)
         return replace(
             plan,
             motion=motion,
@@ -377,33 +376,37 @@ class AxisMotion:
     ) -> None:
         """Start what was loaded, if that is still permitted; the state says so before the drive does."""
         permit.ask_to_move()
-        in_motion = self.tracker.command is not None and not self.tracker.at_rest
+        in_motion = self.tracker.status.command is not None and not self.tracker.status.at_rest
         self.begin(permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan)
         try:
             await permit.start()
         except OutcomeUnknown:
-            self.tracker.started(self.clock.now_s())  # the next readings tell
+            self.tracker.take(MotionStarted(self.clock.now_s()))  # the next readings tell
             raise
         except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent
             if in_motion:
                 await self._end_what_went_before(permit, error)
             else:
-                self.tracker.finished(error.message)
+                self.tracker.take(CommandOver(error.message))
             self.publish_state()
             raise
-        self.tracker.started(self.clock.now_s())
+        # the end of a motion at a velocity is only there for a host that dies, and a procedure goes on from its own
+        ends = plan and completion is Completion.PROFILE and state is not AxisState.CONTINUOUS_MOTION
+        target_counts = plan.motion.target_counts if plan and ends else None
+        approached = state is AxisState.DISCRETE_MOTION
+        self.tracker.take(MotionStarted(self.clock.now_s(), target_counts, approached))
 
     async def _end_what_went_before(self, permit: Permit, error: BusError | RequestRefused) -> None:
         """The motion that was to be replaced still runs, and no command stands for it any more: bring it to rest."""
-        command = self.tracker.command
+        command = self.tracker.status.command
         if command is None or command.command_id != permit.command_id:
             return  # a stop has taken over
-        self.tracker.started(self.clock.now_s())
-        self.tracker.failing(error.message)
+        self.tracker.take(MotionStarted(self.clock.now_s()))
+        self.tracker.take(CommandFailing(error.message))
         await self.driver.stop(StopMode.SMOOTH)
-        if self.tracker.command is command:
+        if self.tracker.status.command is command:
             self.stopping(permit.command_id, permit.verb)
-            self.tracker.failing(error.message)
+            self.tracker.take(CommandFailing(error.message))
 
     def begin(
         self,
@@ -415,13 +418,12 @@ class AxisMotion:
         opens_loop: bool = False,
         plan: MotionPlan | None = None,
     ) -> None:
-        """Say what the axis is about to do; readings count again once `AxisTracker.started` was called."""
-        self.target_counts, self.approached = None, False
+        """Say what the axis is about to do; readings count again once it has started, see `MotionStarted`."""
         target, duration_s = (self.shown(plan.position), plan.duration_s) if plan else (None, None)
         now_ns = self.clock.now_ns()
         settling = self._settling(plan) if plan and completion is Completion.PROFILE else None
         command = ActiveCommand(command_id, verb, now_ns, state, completion, opens_loop, target, duration_s, settling)
-        self.tracker.begin(command, float("inf"))
+        self.tracker.take(CommandBegun(command))
         self.publish_state()
 
     def _settling(self, plan: MotionPlan) -> Settling | None:
@@ -440,9 +442,9 @@ class AxisMotion:
         completion: Completion = Completion.REST,
     ) -> None:
         """The drive acknowledged a stop: watch the axis come to rest; only reset leads out of error_stop, though."""
-        if self.tracker.energised and self.tracker.state is not AxisState.ERROR_STOP:
+        if self.tracker.status.energised and self.tracker.status.state is not AxisState.ERROR_STOP:
             self.begin(command_id, verb, state, completion)
-            self.tracker.started(self.clock.now_s())
+            self.tracker.take(MotionStarted(self.clock.now_s()))
 
     async def end(self, permit: Permit, failure: str = "") -> None:
         """Bring the motion of a command to rest; an axis that has lost its loop meanwhile is switched off instead.
@@ -451,12 +453,12 @@ class AxisMotion:
             permit: of the command.
             failure: why the command has failed; empty when it has not.
         """
-        ours = self.tracker.command is not None
-        await self.driver.stop(StopMode.SMOOTH if self.tracker.enabled else StopMode.OFF)
+        ours = self.tracker.status.command is not None
+        await self.driver.stop(StopMode.SMOOTH if self.tracker.status.enabled else StopMode.OFF)
         if ours:
             self.stopping(permit.command_id, permit.verb)
             if failure:
-                self.tracker.failing(failure)
+                self.tracker.take(CommandFailing(failure))
 
     def publish_state(self) -> None:
         """Publish the state if it changed, once what is under way waits for the drive or its answer is on its way."""
@@ -464,7 +466,7 @@ class AxisMotion:
 
     def _publish_now(self) -> None:
         self.reference.woken.set()
-        self.telemetry.state(self.clock.now_ns())
+        self.telemetry.publish_state(self.tracker.status, self.clock.now_ns())
 
     def reply(self, permit: Permit, plan: MotionPlan | None = None, **values: float | None) -> CommandReply:
         """Return the reply to a command: what is planned, and what it says besides or instead, by field."""
@@ -476,7 +478,7 @@ class AxisMotion:
                 "acceleration": plan.acceleration,
                 "duration_s": plan.duration_s,
             }
-        command = self.tracker.command
+        command = self.tracker.status.command
         return CommandReply(
             command_id=permit.command_id,
             axis=self.config.name,
@@ -484,58 +486,3 @@ class AxisMotion:
             since=command.since_ns if command and command.command_id == permit.command_id else None,
             **{**planned, **values},
         )
-
-
-def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
-    """Plan a motion without sending anything.
-
-    Args:
-        motion: of the axis.
-        bus: its line.
-        request: the motion.
-        obstacles: the other obstacles now.
-
-    Raises:
-        MalformedRequest: it does not say which motion is meant.
-        WrongState: the position has not been read yet.
-    """
-    name = motion.config.name
-    try:
-        plan = _plan(motion, request)
-        first = motion.before_approach(plan, request.velocity, request.acceleration)
-    except MalformedRequest:
-        raise
-    except RequestRefused as error:
-        return PreviewReply(axis=name, refusal=error_reply(error), obstacles=obstacles)
-    exchanges = [each for leg in (first, plan) if leg for each in motion.driver.exchanges(leg.motion)]
-    asked_velocity = motion.config.velocity if request.velocity is None else request.velocity
-    asked_acceleration = motion.config.acceleration if request.acceleration is None else request.acceleration
-    return PreviewReply(
-        axis=name,
-        refusal=None,
-        obstacles=obstacles,
-        position=motion.shown(plan.position),
-        approach_from=motion.shown(first.position) if first else None,
-        velocity=plan.velocity,
-        velocity_error=plan.velocity - asked_velocity,
-        acceleration=plan.acceleration,
-        acceleration_error=plan.acceleration - asked_acceleration,
-        duration_s=both_s(first, plan) if first else plan.duration_s,
-        packets=tuple(exchange.request.hex(" ") for exchange in exchanges),
-        bus_s=sum(bus.longest_s(exchange) for exchange in exchanges),
-    )
-
-
-def _plan(motion: AxisMotion, request: Preview) -> MotionPlan:
-    match request.position, request.distance, request.velocity:
-        case float() as position, None, velocity:
-            return motion.plan_to(motion.unwrapped(position, request.direction), velocity, request.acceleration)
-        case None, float() as distance, velocity:
-            here = motion.telemetry.position(motion.latest().position_counts)
-            return motion.plan_to(here + distance, velocity, request.acceleration)
-        case None, None, float() as velocity:
-            return motion.plan_at(velocity, request.acceleration)
-    raise MalformedRequest(
-        f"axis {motion.config.name}: a plan needs exactly one of position, distance, or velocity alone",
-        axis=motion.config.name,
-    )

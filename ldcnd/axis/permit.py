@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from ldcnd.axis.guards import TO_MOVE, TO_POWER, Guard, check
-from ldcnd.axis.state import AxisTracker
+from ldcnd.axis.guards import TO_MOVE, TO_POWER, Guard, check, require
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import PinMode, Verb
 from ldcnd.contract.errors import CommandAborted, Remedy, RequestRefused, ShuttingDown, StopLatched, step
 from ldcnd.contract.samples import AxisState
@@ -137,8 +137,7 @@ class Permit:
 
         def condition() -> None:
             self._ask(begun=begun)
-            for guard in guards:
-                guard(tracker)
+            require(guards, tracker)
 
         return condition
 
@@ -184,7 +183,7 @@ class Permit:
         """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
         condition = self._condition(TO_POWER)
         condition()
-        was_on = self._gate.tracker.enabled
+        was_on = self._gate.tracker.status.enabled
         try:
             self.begin()
             with only_while(condition):
@@ -264,13 +263,13 @@ class Gate:
     def overtaken(self, what: str) -> StopLatched | CommandAborted:
         """Return the refusal of a command that a stop has overtaken, or the latest cause that latches nothing."""
         tracker = self.tracker
-        if tracker.stop_latched:
+        if tracker.status.stop_latched:
             return StopLatched(
                 f"axis {tracker.name}: {what} was overtaken by a stop",
                 axis=tracker.name,
                 remedy=Remedy("{}", step("reset")),
             )
-        in_error = tracker.state is AxisState.ERROR_STOP
+        in_error = tracker.status.state is AxisState.ERROR_STOP
         return CommandAborted(
             f"axis {tracker.name}: {what} was overtaken by {self._cause}",
             axis=tracker.name,

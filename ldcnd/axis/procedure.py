@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.state import AxisTracker
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import CommandReply
 from ldcnd.drives.driver import AxisReading
 
@@ -48,4 +48,4 @@ class Procedure(ABC):
 
     def outlived(self, tracker: AxisTracker) -> bool:
         """Tell whether the axis has left its command: a fault, a stop or another command ended it."""
-        return tracker.command is None or tracker.command.command_id != self.permit.command_id
+        return not tracker.status.is_at(self.permit.command_id)

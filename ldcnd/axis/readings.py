@@ -6,18 +6,23 @@ is reported, and what is not understood any more is stopped.
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.commands import AxisCommands
+from ldcnd.axis.events import DriveLost, FaultFound, PollMissed, ReadingsContradicted, ReplyUnusable
+from ldcnd.axis.faults import DRIVE_CHANGED, DRIVE_RESET, JUMPED, NOT_SETTLED
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.plausibility import ROUNDS, CounterStep, PlausibilityGate, ReadingVerdict, agree
-from ldcnd.axis.state import DRIVE_CHANGED, DRIVE_RESET
+from ldcnd.axis.scale import AxisScale
+from ldcnd.axis.status import ActiveCommand, AxisStatus, CommandEnd
 from ldcnd.axis.stopping import AxisStops
-from ldcnd.axis.telemetry import Arrivals, AxisTelemetry, Note
+from ldcnd.axis.telemetry import Note
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.axis.turns import CommandQueue
 from ldcnd.contract import events
 from ldcnd.contract.errors import BadReply, BusError, PacketRejected
-from ldcnd.contract.events import ALARM_HISTORY, CommandStatus
+from ldcnd.contract.events import ALARM_HISTORY, UNSETTLED, CommandStatus
 from ldcnd.contract.rig_commands import FrozenPosition
 from ldcnd.contract.samples import LinkState, TelemetryItem
 from ldcnd.drives.driver import AxisReading, Fault, Moves
@@ -32,17 +37,44 @@ END_ITEMS = frozenset({TelemetryItem.POSITION, TelemetryItem.VELOCITY})
 """Items published with the reading that ends a command, besides those requested."""
 
 
+@dataclass(frozen=True, slots=True)
+class Arrival:
+    """Where a command has ended, in axis units.
+
+    Attributes:
+        position: as clients see it.
+        following_error: target minus position; without a target what the drive reports, None where it does not.
+        settled: whether the axis came to rest within its window in time; None for what has no target.
+    """
+
+    position: float | None
+    following_error: float | None
+    settled: bool | None
+
+
+OnEnded = Callable[[ActiveCommand, CommandStatus, str | None, Arrival | None], None]
+"""Takes a command that is over, how it ended, why when it was not done, and where; None where no reading shows it."""
+
+
+def arrival_of(end: CommandEnd, reading: AxisReading, scale: AxisScale) -> Arrival:
+    """Return where a command has ended that a reading has ended."""
+    lag, settling = reading.following_error_counts, end.command.settling
+    if settling:
+        lag = settling.target_counts - reading.position_counts
+    following_error = None if lag is None else lag / scale.counts_per_unit
+    return Arrival(scale.shown_at(reading.position_counts), following_error, end.settled)
+
+
 class ReadingOutOfTurn:
     """Reads the state of a drive out of turn, until two readings agree."""
 
     def __init__(
-        self, drive: Moves, bus: Bus, plausibility: PlausibilityGate, telemetry: AxisTelemetry, unit: str, clock: Clock
+        self, drive: Moves, bus: Bus, plausibility: PlausibilityGate, tracker: AxisTracker, clock: Clock
     ) -> None:
         self._drive = drive
         self._bus = bus
         self._plausibility = plausibility
-        self._telemetry = telemetry
-        self._unit = unit
+        self._tracker = tracker
         self._clock = clock
 
     async def __call__(self) -> AxisReading:
@@ -60,9 +92,10 @@ class ReadingOutOfTurn:
                 if not self._plausibility.is_out_of_reach(reading, self._clock.now_s()):
                     return reading
                 self._bus.distrust()
-                place = self._telemetry.position(reading.position_counts)
+                scale = self._tracker.status.scale
+                place = scale.position(reading.position_counts)
                 raise BadReply(
-                    f"axis {name}: it shows {place:g} {self._unit}, where no motion can have led since its last"
+                    f"axis {name}: it shows {place:g} {scale.unit}, where no motion can have led since its last"
                     " reading; nothing was started",
                     axis=name,
                     value=place,
@@ -92,7 +125,7 @@ class AxisReadings:
         queue: CommandQueue,
         commands: AxisCommands,
         stops: AxisStops,
-        arrivals: Arrivals,
+        on_ended: OnEnded,
         note: Note,
     ) -> None:
         self.returned: Callable[[], None] | None = None
@@ -108,13 +141,16 @@ class AxisReadings:
         self._queue = queue
         self._commands = commands
         self._stops = stops
-        self._arrivals = arrivals
+        self._on_ended = on_ended
         self._note = note
+        self._digested: AxisReading | None = None
+        self._over: tuple[CommandEnd, Arrival] | None = None
+        motion.tracker.watch(self._watch, "last_end")
 
     @property
     def seen(self) -> bool:
         """Whether the drive was read at all."""
-        return self._motion.reading is not None
+        return self._tracker.reading is not None
 
     @property
     def are_of_the_drive(self) -> bool:
@@ -126,13 +162,13 @@ class AxisReadings:
     def judge(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
         """Take a reading if the drive can have got there; true when it has to be read again first."""
         tracker = self._tracker
-        if tracker.stop_pending:
+        if tracker.status.stop_pending:
             self._stops.wanted.set()  # it replies again, whatever it says
         if not self._proof.holds:
             self._count_miss()  # from its drive: who answers was not identified
             return False
         # a command that waits has sent nothing yet
-        standing = tracker.command is None and tracker.at_rest and not self._queue.at_work.locked()
+        standing = tracker.status.command is None and tracker.status.at_rest and not self._queue.at_work.locked()
         judged = self._plausibility.judge(reading, timing, standing=standing)
         if judged.verdict is ReadingVerdict.BELIEVED:
             if judged.confirmed:
@@ -145,11 +181,12 @@ class AxisReadings:
             return False
         if judged.verdict is ReadingVerdict.CONTRADICTS:
             now_ns = self._clock.now_ns()
-            if tracker.contradicted(now_ns):
+            before = tracker.status
+            if tracker.take(ReadingsContradicted(now_ns)).contradicts and not before.contradicts:
                 log.error("readings contradict each other", axis=self._name, counts=reading.position_counts)
                 self._stops.stop_what_is_not_understood(self._motion.config.loss.bus)
             self._queue.changed.set()
-            self._telemetry.stale(now_ns)
+            self._telemetry.publish_stale(tracker.status, now_ns)
         if judged.foreign:
             self._bus.distrust()  # another drive's reply that came late would be followed by others
         return judged.verdict is ReadingVerdict.ASK_AGAIN
@@ -166,17 +203,17 @@ class AxisReadings:
         if not (self._proof.holds and isinstance(error, PacketRejected | BadReply)):
             self._count_miss()
             return
-        now_ns = self._clock.now_ns()
-        if self._tracker.replied_in_vain(now_ns):
+        now_ns, before = self._clock.now_ns(), self._tracker.status
+        if self._tracker.take(ReplyUnusable(now_ns)).replies_unusable and not before.replies_unusable:
             log.error("replies cannot be used", axis=self._name, reason=error.message)
             self._stops.stop_what_is_not_understood(self._motion.config.loss.bus)
             self._queue.changed.set()
-        self._telemetry.stale(now_ns)
+        self._telemetry.publish_stale(self._tracker.status, now_ns)
 
     def take_monitor(self, value: MonitorValue, timing: Timing) -> None:
         """Take a monitor from the family's own poller."""
         t, t_error_ns = self._clock.stamp(timing)
-        self._telemetry.monitor(value, t, t_error_ns)
+        self._telemetry.publish_monitor(value, self._tracker.status.quality, t, t_error_ns)
 
     def take_alarm(self, alarm: Fault) -> None:
         """Take an alarm that the drive has entered in its own history."""
@@ -189,12 +226,13 @@ class AxisReadings:
 
     def frozen_at(self, counts: int) -> FrozenPosition:
         """Return a position that was frozen in the drive, as the reply to a snapshot has it."""
+        scale = self._tracker.status.scale
         return FrozenPosition(
             axis=self._name,
-            position=self._telemetry.within_turn(self._telemetry.position(counts))[0],
+            position=scale.shown_at(counts),
             counts=counts,
-            unit=self._tracker.unit,
-            referenced=self._tracker.referenced,
+            unit=scale.unit,
+            referenced=self._tracker.status.referenced,
         )
 
     # -- what the line says ------------------------------------------------------------------------------------------
@@ -202,8 +240,8 @@ class AxisReadings:
     def disconnect(self) -> None:
         """The drive is out of reach, or has lost power."""
         self._plausibility.after_gap()
-        self._tracker.disconnected(self._clock.now_ns())
-        self._telemetry.stale(self._clock.now_ns())
+        now_ns = self._clock.now_ns()
+        self._telemetry.publish_stale(self._tracker.take(DriveLost(now_ns, self._proof.is_another)), now_ns)
 
     def report_restart(self) -> None:
         """Its drive has lost power or was reset, and is about to answer again."""
@@ -212,35 +250,60 @@ class AxisReadings:
     # -- digesting ---------------------------------------------------------------------------------------------------
 
     def _digest(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
-        tracker, arrivals, before = self._tracker, self._arrivals, self._motion.reading
-        was_away = before is not None and tracker.link is LinkState.DOWN
-        had_lost_reference = tracker.reference_lost
-        if tracker.command:
-            arrivals.reading = reading
-        altered = before.altered if before else ""
+        tracker, before, earlier = self._tracker, self._tracker.status, self._tracker.reading
+        altered = earlier.altered if earlier else ""
         if reading.altered != altered or not reading.profile_done:  # a call less for each poll of what stands
             self._audit(reading, timing, altered)
         t, t_error_ns = self._clock.stamp(timing)
-        tracker.observed(reading, timing, t)
-        if was_away and self.returned:
+        self._digested = reading
+        status = tracker.observe(reading, timing, t)
+        self._digested = None
+        if before.link is LinkState.DOWN and earlier is not None and self.returned:
             self.returned()
-        if tracker.reference_lost and not had_lost_reference:
+        if status.reference_lost and not before.reference_lost:
             log.warning("reference lost", axis=self._name, faults=[fault.code for fault in reading.faults])
         self._queue.changed.set()
-        self._motion.reading = reading
         if self._commands.procedure is not None:
             self._commands.observed(reading, timing)
             if self._commands.step_due:
                 self._queue.wake()
         if self._stops.inherited:
             self._stops.watch_inherited(reading, timing.sent_at_s)
-        if arrivals.over:
+        if self._over:
             asked |= END_ITEMS
-        self._telemetry.reading(reading, asked, t, t_error_ns)
-        if arrivals.reading:
-            arrivals.report()
+        self._telemetry.publish(tracker.status, reading, asked, t, t_error_ns)
+        if before.command:
+            self._report_end()
             self._ask_in_time(timing.sent_at_s)
             self._motion.reference.woken.set()
+
+    def _watch(self, _before: AxisStatus, after: AxisStatus) -> None:
+        """Report a command that is over; one that a reading has ended is reported behind the reading."""
+        end, reading = after.last_end, self._digested
+        if end is None:
+            return
+        if reading is None:  # nothing shows where
+            self._on_ended(end.command, end.status, end.reason, None)
+        else:
+            self._over = end, arrival_of(end, reading, after.scale)
+
+    def _report_end(self) -> None:
+        """Report the command that the reading has ended, now that the reading is published."""
+        over, self._over = self._over, None
+        if over is None:
+            return
+        end, arrival = over
+        self._on_ended(end.command, end.status, end.reason, arrival)
+        settling = end.command.settling
+        if end.settled is False and settling:
+            scale = self._tracker.status.scale
+            said = (
+                f"{end.command.verb} did not stay within {abs(settling.window_counts / scale.counts_per_unit):.6g}"
+                f" {scale.unit} of its target for {settling.time_s:g} s in {settling.timeout_s:g} s; it is"
+                f" {arrival.following_error:.6g} {scale.unit} off"
+            )
+            log.warning("not settled", axis=self._name, reason=said)
+            self._note(self._name, UNSETTLED, CommandStatus.FAILED, said, NOT_SETTLED.code)
 
     def _audit(self, reading: AxisReading, timing: Timing, altered: str) -> None:
         """Report changes of the drive that this daemon has not made; the tracker has not seen the reading yet."""
@@ -250,18 +313,23 @@ class AxisReadings:
                 self._report_change(DRIVE_CHANGED, reading.altered)
         elif reading.profile_done or not reading.enabled or not self._stops.possible:
             return
-        elif tracker.at_rest and not tracker.command and self._queue.free and tracker.concerns(timing):
-            tracker.changed_by_another(DRIVE_CHANGED)
+        elif (
+            tracker.status.at_rest
+            and not tracker.status.command
+            and self._queue.free
+            and tracker.status.concerns(timing)
+        ):
+            tracker.take(FaultFound(DRIVE_CHANGED))
             self._report_change(DRIVE_CHANGED, "it began to move without a command of this daemon")
 
     def _take_step(self, step: CounterStep, reading: AxisReading) -> None:
         """No motion has led to where the drive is: its counter was set, or the encoder slips."""
         if step is CounterStep.ZEROED:
-            self._tracker.changed_by_another(DRIVE_RESET)
+            self._tracker.take(FaultFound(DRIVE_RESET))
             self._report_change(DRIVE_RESET, "its position counter has restarted at 0")
         else:
             log.error("position jumped", axis=self._name, counts=reading.position_counts)
-            self._tracker.jumped()
+            self._tracker.take(FaultFound(JUMPED))
         self._stops.stop_what_is_not_understood(self._motion.config.loss.bus)
 
     def _report_change(self, fault: Fault, what: str) -> None:
@@ -269,16 +337,16 @@ class AxisReadings:
         self._note(self._name, events.DRIVE_CHANGED, CommandStatus.FAILED, what, fault.code)
 
     def _count_miss(self) -> None:
-        before = self._tracker.link
-        self._tracker.missed(self._clock.now_ns())
-        if self._tracker.link is not before:
-            log.warning("drive does not answer", axis=self._name, link=self._tracker.link.value)
-            if self._tracker.link is LinkState.DOWN:
+        before, now_ns = self._tracker.status, self._clock.now_ns()
+        status = self._tracker.take(PollMissed(now_ns, self._proof.is_another))
+        if status.link is not before.link:
+            log.warning("drive does not answer", axis=self._name, link=status.link.value)
+            if status.link is LinkState.DOWN:
                 self._plausibility.after_gap()
-            self._telemetry.stale(self._clock.now_ns())
+            self._telemetry.publish_stale(status, now_ns)
 
     def _ask_in_time(self, at_s: float) -> None:
         """Have the drive read when the motion under way should end, and while it settles, whatever the rates."""
-        read_at_s = min(self._tracker.next_reading_s(at_s) or math.inf, at_s + self._commands.watch_s)
+        read_at_s = min(self._tracker.status.next_reading_s(at_s), at_s + self._commands.watch_s)
         if self.ask_at and not math.isinf(read_at_s):
             self.ask_at(read_at_s)

@@ -12,8 +12,9 @@ import contextlib
 
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.kept import FORMAT, KeptFiles, KeptReference, ReferenceEvidence
-from ldcnd.axis.state import AxisTracker, window_counts
-from ldcnd.axis.telemetry import AxisTelemetry
+from ldcnd.axis.rest import window_counts
+from ldcnd.axis.status import AxisStatus, new_faults
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.errors import LdcndError, WrongState
 from ldcnd.contract.samples import AxisState, PastFault
 from ldcnd.drives.axis_config import AxisConfig
@@ -76,7 +77,6 @@ class ReferenceKeeper:
         config: AxisConfig,
         drive: Drive,
         tracker: AxisTracker,
-        telemetry: AxisTelemetry,
         clock: Clock,
         files: KeptFiles | None,
         *,
@@ -88,7 +88,6 @@ class ReferenceKeeper:
             config: of the axis.
             drive: its drive.
             tracker: of its state.
-            telemetry: holds its origin.
             clock: of the daemon.
             files: where things are kept; None where nothing is.
             references: references are kept, too.
@@ -97,7 +96,6 @@ class ReferenceKeeper:
         self._config = config
         self._drive = drive if references and isinstance(drive, Moves) and drive.keeps_mark else None
         self._tracker = tracker
-        self._telemetry = telemetry
         self._clock = clock
         self._files = files
         self._kept: KeptReference | None = None  # as it is on the disk
@@ -108,7 +106,7 @@ class ReferenceKeeper:
         self.woken = asyncio.Event()
         self._closed = False
         self._trouble = ""
-        tracker.found = self._found
+        tracker.watch(self._watch, "faults")
         if self._drive and files:
             self._drive.about_to_renumber = self.forget
 
@@ -237,7 +235,7 @@ class ReferenceKeeper:
             return
         try:
             async with asyncio.timeout(END_TIME_S):
-                while self._tracker.state is AxisState.STOPPING:
+                while self._tracker.status.state is AxisState.STOPPING:
                     self.woken.clear()
                     await self._woken_within(STOPPING_S)
                 if not self._moves:
@@ -253,7 +251,7 @@ class ReferenceKeeper:
 
     @property
     def _moves(self) -> bool:
-        return self._tracker.command is not None or not self._tracker.at_rest
+        return self._tracker.status.command is not None or not self._tracker.status.at_rest
 
     @property
     def _near_counts(self) -> float:
@@ -261,8 +259,8 @@ class ReferenceKeeper:
 
     async def _keep_motion(self) -> None:
         """Widen what is kept by where the motion under way ends, so that a crash in it costs no reference."""
-        kept, command = self._kept, self._tracker.command
-        if kept is None or command is None or command.settling is None or not self._tracker.referenced:
+        kept, command = self._kept, self._tracker.status.command
+        if kept is None or command is None or command.settling is None or not self._tracker.status.referenced:
             return
         target = command.settling.target_counts - self._offset_counts(kept)
         low, high = min(kept.low, target), max(kept.high, target)
@@ -271,14 +269,14 @@ class ReferenceKeeper:
 
     def _offset_counts(self, kept: KeptReference) -> int:
         """Return what the daemon's counts are ahead of the drive's counter."""
-        return round(self._telemetry.origin_counts - kept.origin)
+        return round(self._tracker.status.scale.origin_counts - kept.origin)
 
     async def _keep(self) -> None:
         """Keep where an axis stands, with what its drive shows there."""
         if self._files is None or self._drive is None or self._proof is None:
             return
         tracker, generation = self._tracker, self._generation
-        if not tracker.referenced:
+        if not tracker.status.referenced:
             await self._give_up()
             return
         try:
@@ -302,7 +300,7 @@ class ReferenceKeeper:
             format=FORMAT,
             written=self._clock.now_ns(),
             **dict(self._proof),
-            origin=self._telemetry.origin_counts - (shown.counts - shown.counter),
+            origin=self._tracker.status.scale.origin_counts - (shown.counts - shown.counter),
             mark=shown.mark,
             enabled=shown.enabled,
             low=low,
@@ -312,7 +310,7 @@ class ReferenceKeeper:
             await self._write(reference, generation)
 
     def _stands_referenced(self) -> bool:
-        return not self._moves and self._tracker.referenced
+        return not self._moves and self._tracker.status.referenced
 
     async def _write(self, reference: KeptReference, generation: int) -> None:
         if self._files is None or generation != self._generation:
@@ -347,10 +345,11 @@ class ReferenceKeeper:
             self._complain(f"faults not kept: {_words(error)}")
         self._faults_kept = len(faults)
 
-    def _found(self, fault: PastFault) -> None:
-        self.faults = (*self.faults, fault)
-        self._faults_kept = -1
-        self.woken.set()
+    def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
+        for entry in new_faults(before, after):
+            self.faults = (*self.faults, entry.past)
+            self._faults_kept = -1
+            self.woken.set()
 
     def _complain(self, trouble: str) -> None:
         if trouble != self._trouble:

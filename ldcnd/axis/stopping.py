@@ -9,10 +9,11 @@ import asyncio
 from collections.abc import Callable
 
 from ldcnd.axis.commands import AxisCommands
+from ldcnd.axis.events import PowerSwitched, StopConfirmed, StopLatch, StopSent, StopUnconfirmed
 from ldcnd.axis.latches import LatchKeeper
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Gate, Permit
-from ldcnd.axis.state import REST_COUNTS
+from ldcnd.axis.rest import REST_COUNTS
 from ldcnd.axis.telemetry import Note
 from ldcnd.axis.turns import CommandQueue
 from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Power, QuickStop, Stop, Verb
@@ -97,7 +98,7 @@ class AxisStops:
         if not self.possible:
             log.warning("this drive cannot be stopped over its line", axis=self._name)
             return False
-        self._tracker.latch_stop()
+        self._tracker.take(StopLatch())
         log.info("stop", axis=self._name, mode=mode.value)
         confirmed = await self.bring_to_rest(mode, Verb.STOP)
         if self.latches:
@@ -123,16 +124,16 @@ class AxisStops:
         if not self.possible:
             return False
         overtaken = self.overtake(by, by.verb if by else OVERTAKES.get(verb, verb))
-        mode = self._tracker.stop_sent(mode)
+        stop = self._tracker.take(StopSent(mode)).stop
         try:
             if not self.line_up:
                 return False  # its line is being brought up, or is down: it is the first thing that is sent then
             self._bus.withdraw(self._drive.spec.address, overtaken)
-            return await self._send(mode, verb, STOP_ROUNDS, command_id)
+            return await self._send(stop.mode if stop else mode, verb, STOP_ROUNDS, command_id)
         finally:
-            if self._tracker.unconfirmed is not None:
-                self.require(self._tracker.unconfirmed)
-            self._telemetry.state(self._clock.now_ns())
+            if still := self._tracker.status.stop:
+                self.require(still.mode)
+            self._publish()
 
     def overtake(self, by: Permit | None, cause: str) -> StopLatched | CommandAborted:
         """Make all queued commands and permits void, except the caller's; return the refusal, which names the cause."""
@@ -143,30 +144,30 @@ class AxisStops:
 
     def require(self, mode: StopMode) -> None:
         """Have a stop sent by the line, before anything else to this drive, until the drive confirms it."""
-        self._tracker.stop_unconfirmed(self._clock.now_ns(), mode)
+        self._tracker.take(StopUnconfirmed(self._clock.now_ns(), mode))
         self.wanted.set()
 
     def stop_what_is_not_understood(self, policy: LossPolicy) -> None:
         """Have a motor that may have voltage stopped at once; its line sends that again until the drive confirms it."""
-        if not self._tracker.energised or not self.possible:
+        if not self._tracker.status.energised or not self.possible:
             return
         self.overtake(None, "the stop of a motion that is not understood")
         self.require(UNDERSTOOD_NO_MORE.get(policy, StopMode.SMOOTH))
 
     async def send_pending(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
-        mode = self._tracker.unconfirmed
-        if mode is None:
+        stop = self._tracker.status.stop
+        if stop is None:
             return  # such a stop was confirmed while the axis was read
-        if await self._send(mode, Verb.STOP, rounds=1):
+        if await self._send(stop.mode, Verb.STOP, rounds=1):
             log.warning("stop confirmed late", axis=self._name)
             self._note(self._name, Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again", None)
-        self._telemetry.state(self._clock.now_ns())
+        self._publish()
 
     def switch_off(self) -> None:
         """Have the motor switched off by the first packet to its drive."""
         if self.possible:
-            self._tracker.stop_unconfirmed(self._clock.now_ns(), StopMode.OFF)
+            self._tracker.take(StopUnconfirmed(self._clock.now_ns(), StopMode.OFF))
 
     def inherit(self) -> None:
         """Its drive is as another host has left it: what moves in it without an end is to be brought to rest."""
@@ -175,15 +176,15 @@ class AxisStops:
     def note_power_loss(self) -> None:
         """Note that the drive was reset or had no power: the motion to be stopped has ended."""
         self.inherited = False
-        self._tracker.stop_confirmed()
+        self._tracker.take(StopConfirmed())
 
     def watch_inherited(self, reading: AxisReading, at_s: float) -> None:
         """Have a motion stopped that an earlier host has left, if its profile is done and yet it goes on.
 
         So does velocity mode as soon as its velocity is reached; a trapezoid is done when it stands, and settles.
         """
-        tracker, position = self._tracker, reading.position_counts
-        if tracker.command is not None or tracker.at_rest:
+        status, position = self._tracker.status, reading.position_counts
+        if status.command is not None or status.at_rest:
             self.inherited, self._done = False, None
         elif not (reading.enabled and reading.profile_done):
             self._done = None
@@ -202,10 +203,10 @@ class AxisStops:
 
     async def _send(self, mode: StopMode, verb: Verb, rounds: int, command_id: str | None = None) -> bool:
         """Send a stop, in rounds, until the drive confirms it; return whether it has."""
-        tracker = self._tracker
-        if not tracker.energised:
+        tracker, status = self._tracker, self._tracker.status
+        if not status.energised:
             mode = StopMode.OFF  # a stop must not close the loop of a disabled axis
-        stands = verb is Verb.HALT and tracker.command is None and tracker.moving is Moving.NO
+        stands = verb is Verb.HALT and status.command is None and status.moving is Moving.NO
         for _ in range(rounds):
             try:
                 mode = await self._drive.stop(mode)
@@ -216,9 +217,12 @@ class AxisStops:
                 return False
             if mode is StopMode.OFF:
                 self._commands.switched_off()
-                tracker.powered(on=False, now_s=self._clock.now_s())
+                tracker.take(PowerSwitched(on=False, now_s=self._clock.now_s()))
             elif not stands:  # what was proven to stand is not watched coming to rest, and keeps its target
                 self._commands.brought_to_rest(command_id or self._next_command_id(), verb)
-            tracker.stop_confirmed(mode)
+            tracker.take(StopConfirmed(mode))
             return True
         return False
+
+    def _publish(self) -> None:
+        self._telemetry.publish_state(self._tracker.status, self._clock.now_ns())

@@ -246,9 +246,9 @@ def _causes(line: BusService, now_s: float) -> Iterator[str]:
     """Yield what is wrong with a line now, or was since its axes were reset last."""
     for axis in line.axes:
         tracker = axis.tracker
-        if (first := tracker.first_fault) is not None:
+        if (first := tracker.status.first_fault) is not None:
             yield f"{axis.config.name} {first.code}"
-        for fault in tracker.active_faults:
+        for fault in tracker.status.active_faults:
             yield f"{axis.config.name} {fault.code}"
     if line.bus.statistics.losses:
         yield f"line down {line.bus.statistics.losses}"

@@ -232,12 +232,12 @@ class Daemon:
         except TimeoutError:
             log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
         for name, axis in self.rig.axes.items():
-            if axis.tracker.stop_pending:
+            if axis.tracker.status.stop_pending:
                 log.error("stop not confirmed at the end of the daemon, the axis may move", axis=name)
 
     async def _bring_to_rest(self, axis: AxisService) -> None:
         await apply_policy(axis, axis.config.loss.daemon, "the daemon ends")
-        while axis.tracker.stop_pending:  # as long as there is time for it: after that nothing sends it again
+        while axis.tracker.status.stop_pending:  # as long as there is time for it: after that nothing sends it again
             await axis.send_pending_stop()
             await asyncio.sleep(STOP_AGAIN_S)
         await axis.take_gains_back()
@@ -259,7 +259,7 @@ class Daemon:
         try:
             while True:
                 for name, axis in self.rig.axes.items():
-                    alive = axis.tracker.link is not LinkState.DOWN
+                    alive = axis.tracker.status.link is not LinkState.DOWN
                     if alive and name not in tokens:
                         tokens[name] = await self._session.declare_token(
                             self._keys.alive_axis(self._run.instance, name)

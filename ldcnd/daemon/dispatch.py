@@ -12,6 +12,7 @@ from functools import partial
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
+from ldcnd.axis.events import StopLatch
 from ldcnd.axis.permit import UNCONDITIONAL, Permit, Right
 from ldcnd.contract.catalogue import BY_VERB, RENAMED
 from ldcnd.contract.codec import decode, encode, reply_encoding, to_json, understand
@@ -261,7 +262,7 @@ class Requests:
             # a reset that was under way has taken the latch from this stop
         for axis in (self._rig.axes[name] for name in names):
             if axis.stops.possible:
-                axis.tracker.latch_stop()  # at once, for requests of this same loop iteration
+                axis.tracker.take(StopLatch())  # at once, for requests of this same loop iteration
         own: asyncio.Future[tuple[str, ...]] = asyncio.get_running_loop().create_future()
         under_way.append(own)
         try:
@@ -290,7 +291,7 @@ class Requests:
 
     def _are_latched(self, names: tuple[str, ...]) -> bool:
         axes = (self._rig.axes[name] for name in names)
-        return all(axis.tracker.stop_latched or not axis.stops.possible for axis in axes)
+        return all(axis.tracker.status.stop_latched or not axis.stops.possible for axis in axes)
 
     def _refuse(self, query: Query, error: LdcndError) -> None:
         if query.answered:
@@ -443,7 +444,7 @@ class Dispatcher:
 
     async def _start(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
         reply = await axis.execute(command, permit)
-        moving = axis.tracker.command is not None and axis.tracker.command.command_id == permit.command_id
+        moving = axis.tracker.status.is_at(permit.command_id)
         ends_later = command.ends is Ends.BY_READING and moving
         status = CommandStatus.EXECUTING if ends_later else CommandStatus.DONE
         self._ledger.answered(permit.command_id, reply, status)

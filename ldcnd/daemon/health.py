@@ -186,11 +186,11 @@ class HealthWatch:
         position = self._topic(name, TelemetryItem.POSITION)
         return AxisHealth(
             axis=name,
-            link=axis.tracker.link,
+            link=axis.tracker.status.link,
             sample_age_s=None if position.at_ns is None else max(0.0, (t - position.at_ns) / 1e9),
             rate_wanted_hz=axis.config.rates.position,
             rate_hz=self._granted_hz(position, asked_hz.get(TelemetryItem.POSITION, 0.0)),
-            faults=len(axis.tracker.active_faults),
+            faults=len(axis.tracker.status.active_faults),
             eeprom_writes=parameters.eeprom_writes if (parameters := axis.driver.parameters) else None,
             items=tuple(
                 ItemHealth(item=item.value, asked_hz=hz, granted_hz=self._granted_hz(self._topic(name, item), hz))

@@ -127,7 +127,7 @@ class Heartbeat:
         if not line.bus.on_time(now_s):
             return f"{name}: the line does not keep to its plan"
         for axis in line.axes:
-            for trouble in assess(axis.tracker).troubles:
+            for trouble in assess(axis.tracker.status).troubles:
                 if trouble.kind in HOLDING:
                     return f"{axis.config.name}: {trouble.text}"
         return ""

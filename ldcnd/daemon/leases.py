@@ -317,7 +317,7 @@ class LeaseWatch:
         lease = self._authority.release(token, self._clock.now_s())
         self._show(lease.axes)
         log.info("control released", client=lease.client, axes=sorted(lease.axes), leave_running=leave_running)
-        moving = [name for name in lease.axes if self._rig.axes[name].tracker.moving is not Moving.NO]
+        moving = [name for name in lease.axes if self._rig.axes[name].tracker.status.moving is not Moving.NO]
         if not leave_running:
             self._lost(lease, moving, "released while it moved", None)
         self._take_gains_back(lease.axes)
@@ -373,11 +373,11 @@ class LeaseWatch:
 async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> None:
     """Do to an axis that moves, or may move, what its policy says; a latched stop outranks it."""
     tracker = axis.tracker
-    if tracker.stop_pending:
+    if tracker.status.stop_pending:
         return  # it is sent again until the drive confirms it, whatever the policy
-    if tracker.stop_latched and policy is LossPolicy.RUN_TO_TARGET:
+    if tracker.status.stop_latched and policy is LossPolicy.RUN_TO_TARGET:
         policy = LossPolicy.HALT
-    if policy is LossPolicy.RUN_TO_TARGET or tracker.moving is Moving.NO:
+    if policy is LossPolicy.RUN_TO_TARGET or tracker.status.moving is Moving.NO:
         return
     log.warning("loss policy", axis=axis.config.name, policy=policy.value, cause=cause)
     await axis.stops.bring_to_rest(STOP_MODES[policy])

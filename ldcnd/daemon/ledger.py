@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from itertools import count
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.state import ActiveCommand
-from ldcnd.axis.telemetry import Arrival
+from ldcnd.axis.readings import Arrival
+from ldcnd.axis.status import ActiveCommand
 from ldcnd.contract.codec import to_json
 from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Verb
 from ldcnd.contract.errors import (

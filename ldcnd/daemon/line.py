@@ -6,6 +6,7 @@ from typing import Any
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
+from ldcnd.axis.events import CommandOver, PowerSwitched
 from ldcnd.axis.polling import AxisPoller
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch, WrongState
@@ -134,7 +135,7 @@ class BusService:
             WrongState: an axis is homing or probing.
         """
         for axis in self.axes:
-            command = axis.tracker.command
+            command = axis.tracker.status.command
             if command and command.verb in CAPTURING:
                 name = axis.config.name
                 raise WrongState(
@@ -207,7 +208,7 @@ class BusService:
     async def _send_pending_stops(self) -> None:
         """Send what no drive has confirmed, to all axes that wait for it at once."""
         self._stop_wanted.clear()
-        waiting = [axis for axis in self.axes if axis.tracker.stop_pending]
+        waiting = [axis for axis in self.axes if axis.tracker.status.stop_pending]
         if not waiting:
             return
         async with asyncio.TaskGroup() as stops:
@@ -312,8 +313,8 @@ class BusService:
         axis.readings.report_restart()
         axis.disconnected()
         axis.stops.note_power_loss()
-        axis.tracker.powered(on=False, now_s=asyncio.get_running_loop().time())
-        axis.tracker.finished()
+        axis.tracker.take(PowerSwitched(on=False, now_s=asyncio.get_running_loop().time()))
+        axis.tracker.take(CommandOver())
 
     def _connect(self, report: BringUpReport) -> None:
         """Start polling. Only the very first reset can be a reference, and only where its place is proven."""

@@ -91,7 +91,9 @@ class OwnedRig:
         chosen = [self.axes[name] for name in names]
         async with asyncio.TaskGroup() as group:
             for bus in self.buses:
-                closed = frozenset(axis.config.name for axis in bus.axes if axis in chosen and axis.tracker.enabled)
+                closed = frozenset(
+                    axis.config.name for axis in bus.axes if axis in chosen and axis.tracker.status.enabled
+                )
                 if len(closed) > 1:
                     group.create_task(bus.stop_together(mode, closed), name=f"stop line {bus.bus.settings.name}")
             stops = {name: group.create_task(self.axes[name].stops.stop(mode), name=f"stop {name}") for name in names}

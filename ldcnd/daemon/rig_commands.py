@@ -192,7 +192,7 @@ class RigCommands:
         """Scale the velocities of all axes; to lower them needs no right, as a stop needs none."""
         share = command.percent / 100.0
         axes = list(self._rig.axes.values())
-        if any(share > axis.tracker.speed_share for axis in axes):
+        if any(share > axis.tracker.status.speed_share for axis in axes):
             for name in self._rig.axes:
                 self._admit(name, self._own(name, command.leases))
         log.info("speed override", percent=command.percent, client=command.client)
@@ -435,7 +435,7 @@ def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyRe
         others = alike[texts].verbs if texts in alike else ()
         alike[texts] = Hindered(verbs=(*others, verb.value), causes=causes)
     causes = _causes(axis, not_admitted + axis.obstacles_to_motion(absolute=request.absolute))
-    first = axis.tracker.first_fault
+    first = axis.tracker.status.first_fault
     return WhyReply(
         axis=axis.config.name,
         can_move=not causes,

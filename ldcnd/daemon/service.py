@@ -287,12 +287,12 @@ def describe(rig: OwnedRig) -> str:
         for trouble in line_troubles(up=up, problem=why):
             wrong.setdefault(trouble.text, []).append(name)
         for axis in bus.axes if up else ():
-            tracker = axis.tracker
-            troubles = assess(tracker, _Faults(tracker.active_faults, tracker.first_fault)).wrong
+            status = axis.tracker.status
+            troubles = assess(status, _Faults(status.active_faults, status.first_fault)).wrong
             for trouble in [each for each in troubles if each.kind is not TroubleKind.MISSED_POLLS][:1]:
                 wrong.setdefault(trouble.text, []).append(axis.config.name)
     buses_up = sum(bus.report is not None for bus in rig.buses)
-    axes_up = sum(axis.tracker.link is not LinkState.DOWN for axis in rig.axes.values())
+    axes_up = sum(axis.tracker.status.link is not LinkState.DOWN for axis in rig.axes.values())
     parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {axes_up}/{len(rig.axes)} axes up"]
     return "; ".join(parts + [f"{', '.join(names)}: {text}" for text, names in wrong.items()])
 

@@ -50,8 +50,14 @@ async def settle_figures(rig: RunningRig, axis: str, distance: float) -> SettleF
     observed = service.readings.take
 
     def watch(reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
-        command = service.tracker.command
-        if command and command.settling and reading.profile_done and service.tracker.concerns(timing) and not at_end:
+        command = service.tracker.status.command
+        if (
+            command
+            and command.settling
+            and reading.profile_done
+            and service.tracker.status.concerns(timing)
+            and not at_end
+        ):
             at_end.extend((timing.sent_at_s, command.settling.target_counts - reading.position_counts))
         observed(reading, asked, timing)
 

@@ -49,10 +49,10 @@ class Bench:
         """Wait until every axis is up."""
         for _ in range(BACK_TURNS):
             trackers = [self.rig.daemon.rig.axes[axis].tracker for axis in AXES]
-            if all(tracker.link is LinkState.UP for tracker in trackers):
+            if all(tracker.status.link is LinkState.UP for tracker in trackers):
                 return
             await asyncio.sleep(TURN_S)
-        raise AssertionError(f"not back: {[tracker.link for tracker in trackers]}")
+        raise AssertionError(f"not back: {[tracker.status.link for tracker in trackers]}")
 
     async def moving(self, axis: str, velocity: float) -> None:
         """Let an axis move slowly towards the end of its travel."""

@@ -3,6 +3,7 @@
 import asyncio
 from typing import Any
 
+from ldcnd.axis.status import AxisStatus
 from ldcnd.axis.turns import QUEUED_COMMANDS
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
@@ -106,19 +107,18 @@ async def test_a_state_is_published_once_the_packet_that_brings_it_about_is_on_t
         bus = rig.daemon.rig.buses[0].bus
         sent_when_begun: list[int] = []
         sent_when_told: list[int] = []
-        begin, publish = axis.tracker.begin, axis.telemetry.state
+        publish = axis.telemetry.publish_state
 
-        def note_begin(*args: Any) -> None:
+        def note_begin(_before: AxisStatus, _after: AxisStatus) -> None:
             sent_when_begun.append(bus.statistics.exchanges)
-            begin(*args)
 
-        def note_state(*args: int, due: bool = False) -> None:
-            if axis.tracker.state is AxisState.CONTINUOUS_MOTION:
+        def note_state(*args: Any, due: bool = False) -> None:
+            if axis.tracker.status.state is AxisState.CONTINUOUS_MOTION:
                 sent_when_told.append(bus.statistics.exchanges)
             publish(*args, due=due)
 
-        monkeypatch.setattr(axis.tracker, "begin", note_begin)
-        monkeypatch.setattr(axis.telemetry, "state", note_state)
+        axis.tracker.watch(note_begin, "command")
+        monkeypatch.setattr(axis.telemetry, "publish_state", note_state)
         await rig.client.command("x", MoveVelocity(velocity=1.0))
 
     assert sent_when_told[0] == sent_when_begun[0] + 1

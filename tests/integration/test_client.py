@@ -157,7 +157,7 @@ async def test_a_program_goes_on_with_the_daemon_that_follows_a_restart():
             made = build_daemon(two_axes(), session, lambda: EPOCH_NS, instance)
             running = group.create_task(made.run(), name=instance)
             async with asyncio.timeout(60):
-                while any(axis.tracker.link is not LinkState.UP for axis in made.rig.axes.values()):
+                while any(axis.tracker.status.link is not LinkState.UP for axis in made.rig.axes.values()):
                     await asyncio.sleep(0.05)
             yield made
             made.end()

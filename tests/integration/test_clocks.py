@@ -45,7 +45,7 @@ async def test_a_drive_with_another_clock_moves_at_the_speed_that_was_asked_for(
         await asyncio.sleep(1.0)
         rig.chain.advance(loop.time())
         rig.drive.catch_up(loop.time())
-        reading = rig.rig.daemon.rig.axes["x"]._motion.latest()
+        reading = rig.rig.daemon.rig.axes["x"].tracker.latest()
 
         assert rig.position_mm - before == pytest.approx(5.0, rel=0.01)
         assert reading.velocity_counts_per_s == pytest.approx(5000, abs=reading.velocity_resolution_counts_per_s)

@@ -12,6 +12,7 @@ from ldcnd.drives.driver import AxisReading
 from ldcnd.line.exchange import Timing
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import Chain, ChainSpec, ModuleSpec, build_chain
+from tests.support.axis_bench import put
 from tests.support.rig import SIMULATED, running_rig
 
 FALSE_FROM_S = 5.0
@@ -61,7 +62,7 @@ async def test_relative_moves_go_as_far_as_they_are_told():
         await asyncio.sleep(FALSE_FROM_S)
         came: list[float] = []
         for number in range(1, 16):
-            line._motion.target_counts = None  # as after a stop: it plans from where the axis is
+            put(line.tracker, target_counts=None)  # as after a stop: it plans from where the axis is
             await rig.client.command("x", MoveRelative(distance=1.0))
             await rig.until("x", lambda state: state.state is AxisState.STANDSTILL)
             await asyncio.sleep(0.5)

@@ -56,7 +56,7 @@ async def test_axes_start_together_and_end_like_any_move():
         await powered(rig, "x", "y")
 
         x, y = await together(rig, x=10.0, y=-10.0)
-        under_way = [rig.daemon.rig.axes[name].tracker.state for name in ("x", "y")]
+        under_way = [rig.daemon.rig.axes[name].tracker.status.state for name in ("x", "y")]
         ended = [await rig.client.wait_for_end(name, reply.command_id) for name, reply in (("x", x), ("y", y))]
         await asyncio.sleep(2)
 
@@ -76,7 +76,7 @@ async def test_a_member_beyond_its_limit_keeps_all_at_rest():
         with pytest.raises(PositionLimit, match="axis y"):
             await together(rig, x=10.0, y=-1000.0)
         await asyncio.sleep(1)
-        states = [rig.daemon.rig.axes[name].tracker.state for name in ("x", "y")]
+        states = [rig.daemon.rig.axes[name].tracker.status.state for name in ("x", "y")]
 
     assert starts(rig) == []
     assert states == [AxisState.STANDSTILL] * 2

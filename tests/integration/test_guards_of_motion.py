@@ -17,13 +17,14 @@ from ldcnd.contract.commands import (
     MoveRelative,
     MoveVelocity,
     Power,
+    Preview,
     Reset,
     SetPosition,
     SetPwm,
     Stop,
     Track,
 )
-from ldcnd.contract.errors import CommandExpired, LdcndError, StopLatched, ValueOutOfRange, WrongState
+from ldcnd.contract.errors import CommandExpired, ErrorCode, LdcndError, StopLatched, WrongState
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import StopMode
 from tests.support.dialect_rig import AXIS, V4, dialect_rig
@@ -156,10 +157,10 @@ async def test_a_duty_that_replaces_another_is_refused_during_a_stop():
 async def test_a_target_that_the_drive_would_wrap_is_refused():
     async with dialect_rig(V4) as rig:
         await rig.power_on()
-        motion = rig.rig.daemon.rig.axes[AXIS]._motion
-        motion.reading = replace(motion.latest(), position_counts=-0x70000000)
-        with pytest.raises(ValueOutOfRange):
-            motion.plan_to(0x60000000 / 1000, None, None)
+        axis = rig.rig.daemon.rig.axes[AXIS]
+        axis.tracker.reading = replace(axis.tracker.latest(), position_counts=-0x70000000)
+        refusal = axis.preview(Preview(position=0x60000000 / 1000), ()).refusal
+        assert refusal.code == ErrorCode.VALUE_OUT_OF_RANGE
 
 
 async def test_a_buffered_move_does_not_start_after_a_loss_policy_has_stopped_the_axis():

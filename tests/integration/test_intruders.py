@@ -67,7 +67,7 @@ async def said(rig: ChainRig, axis: str) -> list[CommandEvent]:
 
 def codes(rig: ChainRig, axis: str) -> set[str]:
     service = next(each for each in rig.line.axes if each.config.name == axis)
-    return {fault.code for fault in service.tracker.active_faults}
+    return {fault.code for fault in service.tracker.status.active_faults}
 
 
 def four_drives() -> ChainSpec:

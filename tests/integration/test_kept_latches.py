@@ -56,7 +56,7 @@ async def refused_motion(rig: ChainRig, axis: str = "x") -> list[str]:
 
 
 def shown(rig: ChainRig, axis: str) -> float:
-    reading = rig.daemon.rig.axes[axis]._motion.reading
+    reading = rig.daemon.rig.axes[axis].tracker.reading
     assert reading
     return reading.position_counts
 
@@ -145,7 +145,7 @@ async def test_an_axis_in_error_stop_is_in_error_stop_in_the_next_daemon_with_it
         now_s = asyncio.get_running_loop().time()
         drive(chain, 1).set_condition(FaultCondition.STALLED, present=True, at_s=now_s)
         await rig.until("x", lambda state: state.state is AxisState.ERROR_STOP)
-        first = rig.daemon.rig.axes["x"].tracker.first_fault
+        first = rig.daemon.rig.axes["x"].tracker.status.first_fault
         await asyncio.sleep(0.2)
         await end(rig, how)
     drive(chain, 1).set_condition(FaultCondition.STALLED, present=False, at_s=asyncio.get_running_loop().time())
@@ -253,7 +253,7 @@ async def test_a_disk_that_hangs_delays_the_answer_by_a_bounded_time_and_the_pac
         monkeypatch.setattr(kept_files.KeptFiles, "keep_latches", keep)
         stop = asyncio.create_task(rig.client.stop("x"))
         await asyncio.sleep(0.1)
-        confirmed = not rig.daemon.rig.axes["x"].tracker.unconfirmed
+        confirmed = not rig.daemon.rig.axes["x"].tracker.status.stop
         async with asyncio.timeout(1.0):
             reply = await stop
         hangs.set()

@@ -5,7 +5,9 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from ldcnd.axis.state import STOP_UNCONFIRMED
+from ldcnd.axis.events import StopLatch, StopUnconfirmed
+from ldcnd.axis.faults import STOP_UNCONFIRMED
+from ldcnd.axis.rest import RestEvidence
 from ldcnd.client.events import latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
@@ -21,6 +23,7 @@ from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from tests.support.axis_bench import put
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, openers_of, running_rig
 
 RUN_ON = LossConfig(client=LossPolicy.RUN_TO_TARGET, bus=LossPolicy.RUN_TO_TARGET, daemon=LossPolicy.RUN_TO_TARGET)
@@ -162,7 +165,7 @@ async def test_a_slow_motion_that_counts_as_rest_is_stopped_all_the_same():
         await unplugged(rig, chain)
         await rig.client.stop("x")
         await asyncio.sleep(1.0)
-        rig.daemon.rig.axes["x"].tracker._rest.forget(rests=True)
+        put(rig.daemon.rig.axes["x"].tracker, rest=RestEvidence(rests=True))
         chain.replug()
         await rig.until("x", lambda state: not state.stop_pending)
         await asyncio.sleep(0.3)
@@ -212,9 +215,9 @@ async def test_a_drive_that_had_no_power_meanwhile_has_nothing_to_confirm():
     chain = chain_of_four()
     async with jogging(chain) as rig:
         axis = rig.daemon.rig.axes["x"]
-        axis.tracker.stop_unconfirmed(0)
+        axis.tracker.take(StopUnconfirmed(0))
         axis.stops.note_power_loss()
-        assert not axis.tracker.stop_pending
+        assert not axis.tracker.status.stop_pending
 
 
 @asynccontextmanager
@@ -314,7 +317,7 @@ async def test_a_moving_axis_in_error_stop_is_not_switched_off_by_a_reset():
 async def test_a_latched_axis_that_moves_when_its_line_is_back_comes_to_rest_whatever_the_policy_says():
     chain = chain_of_four()
     async with jogging(chain) as rig:
-        rig.daemon.rig.axes["x"].tracker.latch_stop()  # latched and confirmed, as far as anyone knows
+        rig.daemon.rig.axes["x"].tracker.take(StopLatch())  # latched and confirmed, as far as anyone knows
         await unplugged(rig, chain)
         chain.replug()
         await rig.until("x", lambda state: state.link is LinkState.UP)

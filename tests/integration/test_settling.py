@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ldcnd.axis.state import window_counts
+from ldcnd.axis.rest import window_counts
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig, load_config

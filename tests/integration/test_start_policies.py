@@ -373,7 +373,7 @@ async def test_the_simulated_rig_publishes_its_first_position_within_a_second_of
 async def referenced_after(chain, **bus):
     async with rig_on(chain, simulated_config(**bus)) as rig:
         await asyncio.sleep(1.0)
-        return {name: axis.tracker.referenced for name, axis in rig.daemon.rig.axes.items()}
+        return {name: axis.tracker.status.referenced for name, axis in rig.daemon.rig.axes.items()}
 
 
 @pytest.mark.promise("reference-at-reset")

@@ -107,7 +107,7 @@ async def test_a_stop_that_comes_before_there_is_a_daemon_is_answered_by_it():
         running = group.create_task(daemon.run(), name="daemon")
 
         (answer,) = await early
-        latched = daemon.rig.axes["x"].tracker.stop_latched
+        latched = daemon.rig.axes["x"].tracker.status.stop_latched
         (later,) = await client.query("ldcn/sim/@stop/y", urgent=True)
         daemon.end()
         await running

@@ -1,11 +1,14 @@
 """One table: in which state of an axis each command is taken, and with which refusal it is not."""
 
 from collections.abc import Awaitable, Callable
+from dataclasses import replace
 
 import pytest
 
 from ldcnd.axis.axis import AxisService
-from ldcnd.axis.state import ActiveCommand, Completion
+from ldcnd.axis.events import CommandBegun, StopUnconfirmed
+from ldcnd.axis.rest import RestEvidence
+from ldcnd.axis.status import ActiveCommand, AxisStatus, Completion
 from ldcnd.contract.commands import (
     Halt,
     Home,
@@ -89,38 +92,33 @@ async def put(axis: AxisService, name: str) -> None:
     """Bring what the daemon knows of the axis into a state."""
     tracker, commands = axis.tracker, axis._commands
     commands._drop_procedure()
-    tracker.command = None
-    tracker.link, tracker.referenced, tracker.enabled = LinkState.UP, True, True
-    tracker.stop_latched = tracker.position_lost = False
-    tracker.stop_confirmed()
-    tracker.active_faults, tracker.first_fault = (), None
-    tracker.state = AxisState.STANDSTILL
-    axis._motion.target_counts = None
+    stands = AxisStatus(AXIS, tracker.status.scale, link=LinkState.UP, referenced=True, enabled=True)
+    tracker.status = replace(stands, state=AxisState.STANDSTILL)
     motion = {"moving": AxisState.DISCRETE_MOTION, "continuous": AxisState.CONTINUOUS_MOTION}
     motion |= {"stopping": AxisState.STOPPING, "homing": AxisState.HOMING}
     kind = name.partition(",")[0]
     if kind in motion:
-        tracker.begin(ActiveCommand("other", Verb.MOVE_ABSOLUTE, 0, motion[kind], Completion.PROFILE), 0.0)
+        tracker.take(CommandBegun(ActiveCommand("other", Verb.MOVE_ABSOLUTE, 0, motion[kind], Completion.PROFILE)))
     elif kind in ("tracking", "pwm"):
         await axis.execute(MOTIONS["track" if kind == "tracking" else "set_pwm"])
         if kind == "tracking":
             commands.procedure._due_s = float("-inf")  # as if it had come long ago
     elif kind == "error":
-        tracker.state, tracker.enabled = AxisState.ERROR_STOP, name == "error, moving"
+        tracker.status = replace(tracker.status, state=AxisState.ERROR_STOP, enabled=name == "error, moving")
     elif kind == "disabled":
-        tracker.state, tracker.enabled = AxisState.DISABLED, False
+        tracker.status = replace(tracker.status, state=AxisState.DISABLED, enabled=False)
     elif kind == "away":
-        tracker.link = LinkState.DOWN
-    tracker.stop_latched = "latched" in name
+        tracker.status = replace(tracker.status, link=LinkState.DOWN)
+    tracker.status = replace(tracker.status, stop_latched="latched" in name)
     if name == "stop pending":
-        tracker.stop_unconfirmed(0)
+        tracker.take(StopUnconfirmed(0))
     set_at_rest(
         axis, kind in ("standstill", "disabled", "latched", "stop pending") or name in ("error", "error, latched")
     )
 
 
 def set_at_rest(axis: AxisService, at_rest: bool) -> None:  # noqa: FBT001
-    axis.tracker._rest.forget(rests=at_rest)
+    axis.tracker.status = replace(axis.tracker.status, rest=RestEvidence(rests=at_rest))
 
 
 async def outcome(send: Callable[[], Awaitable[object]]) -> object:
@@ -137,7 +135,7 @@ async def test_each_command_is_taken_or_refused_as_the_table_says(state):
     async with dialect_rig(V4, pwm={"duty": 0.5, "duration_s": 5.0}, tracking={"step": 0.4, "rate": 50.0}) as rig:
         await rig.power_on()
         axis = rig.rig.daemon.rig.axes[AXIS]
-        reading = axis._motion.latest()
+        reading = axis.tracker.latest()
         for name in ("load", "start", "track", "power", "reset", "clear_warnings", "set_gains", "set_outputs"):
             setattr(axis.driver, name, nothing)
         axis.driver.stop = _value  # as asked

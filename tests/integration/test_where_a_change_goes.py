@@ -106,9 +106,9 @@ def add_item(house: Path) -> None:
     insert(
         house / "ldcnd" / "axis" / "telemetry.py",
         "        if TelemetryItem.VELOCITY in asked:\n",
-        "        topic = self._publisher.item(self._tracker.name, TelemetryItem.DOUBLED)\n"
+        "        topic = self._publisher.item(self._name, TelemetryItem.DOUBLED)\n"
         '        doubled = {"t": t, "t_error_ns": t_error_ns, "seq": 0, "quality": quality}\n'
-        '        topic.publish(doubled | {"value": 2.0 * self.position(reading.position_counts)})\n',
+        '        topic.publish(doubled | {"value": 2.0 * scale.position(reading.position_counts)})\n',
     )
     words = house / "ldcnd" / "cli" / "quantities.py"
     insert(words, "    LatchSample,\n", "    DoubledSample,\n")

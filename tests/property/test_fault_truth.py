@@ -10,13 +10,13 @@ import random
 
 import pytest
 
-from ldcnd.axis.state import AxisTracker
 from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.faults import WARNINGS, FaultCode
 from ldcnd.drives.ldcn.record import DriveState
 from ldcnd.drives.ldcn.registers import ServoRegisters
 from ldcnd.line.exchange import Timing
 from ldcnd.sim.ldcn.power import FaultCondition, LogosolPower, Trip
+from tests.support.axis_bench import put, tracked
 from tests.support.simulated_axis import ON, ONE, SimulatedAxis
 
 STEPS = 25
@@ -51,7 +51,7 @@ class History:
 
     def _new_daemon(self) -> None:
         self.known = DriveState("x", self.axis.profile, ServoRegisters(self.axis.profile, None, lambda: 0.0))
-        self.tracker = AxisTracker("x", "mm")
+        self.tracker = tracked()
 
     @property
     def stage(self):
@@ -141,14 +141,14 @@ class History:
     def read(self) -> None:
         reading = self.known.reading(self.axis.status())
         now_s = self.axis.now_s
-        self.tracker.observed(reading, Timing(now_s, now_s, now_s, now_s), 0)
+        self.tracker.observe(reading, Timing(now_s, now_s, now_s, now_s), 0)
         named = {fault.code for fault in reading.faults} - WARNINGS - {FaultCode.LATCHED_FAULT}
         assert named <= self.true_causes(), self.story
         if isinstance(self.stage, LogosolPower) and self.stage.latched is Trip.ENCODER:
-            assert not self.tracker.referenced, self.story
-            assert self.tracker.position_lost, self.story
-        if not self.tracker.position_lost:
-            self.tracker.referenced = True  # as set_position would have it, which is admitted now
+            assert not self.tracker.status.referenced, self.story
+            assert self.tracker.status.position_lost, self.story
+        if not self.tracker.status.position_lost:
+            put(self.tracker, referenced=True)  # as set_position would have it, which is admitted now
 
     def true_causes(self) -> set[str]:
         stage = self.stage

@@ -259,10 +259,10 @@ async def play(ann: Client, bob: Client, places: dict[str, float], witness: Witn
 def check_homed(witness: Witness, daemon: Daemon) -> None:
     """Hold what z says of its place against its index pulses, once it was homed."""
     z = daemon.rig.axes["z"]
-    if not z.tracker.referenced or z.telemetry.origin_counts == 0:
+    if not z.tracker.status.referenced or z.tracker.status.scale.origin_counts == 0:
         return
     drive = witness.drive("z")
-    at_zero = drive.shaft.position_counts - (drive.loop.position - z.telemetry.origin_counts)
+    at_zero = drive.shaft.position_counts - (drive.loop.position - z.tracker.status.scale.origin_counts)
     off = (at_zero - INDEX_AT + INDEX_SPACING / 2) % INDEX_SPACING - INDEX_SPACING / 2
     if abs(off) > 20:
         witness.wrong.append(f"z is referenced {off:g} counts beside an index pulse")

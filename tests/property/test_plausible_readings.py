@@ -143,7 +143,7 @@ class Story:
                     continue
                 now_s = asyncio.get_running_loop().time()
                 self._look(now_s)
-                known = rig.daemon.rig.axes["a"].tracker.referenced  # without one it is what the counter shows
+                known = rig.daemon.rig.axes["a"].tracker.status.referenced  # without one it is what the counter shows
                 places = [shaft if known else counter for at_s, shaft, counter in self.seen if at_s > now_s - LINE_S]
                 self.judged += 1
                 if not min(places) - self.tolerance <= sample.counts <= max(places) + self.tolerance:
@@ -158,7 +158,7 @@ class Story:
                     self.flaws.append("the link is down though the drive replies")
 
     def codes(self, rig: ChainRig) -> set[str]:
-        return {fault.code for fault in rig.daemon.rig.axes["a"].tracker.active_faults} - {"stop_unconfirmed"}
+        return {fault.code for fault in rig.daemon.rig.axes["a"].tracker.status.active_faults} - {"stop_unconfirmed"}
 
     # -- what happens ------------------------------------------------------------------------------------------------
 

@@ -15,8 +15,10 @@ from typing_extensions import override
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.permit import UNCONDITIONAL, Right
-from ldcnd.axis.state import ActiveCommand
-from ldcnd.axis.telemetry import Arrival
+from ldcnd.axis.readings import Arrival
+from ldcnd.axis.scale import AxisScale
+from ldcnd.axis.status import ActiveCommand, AxisStatus
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.codec import Encoding
 from ldcnd.contract.commands import AxisCommand, CommandReply, HomeMethod, PinMode, Power, Verb
 from ldcnd.contract.errors import LdcndError
@@ -188,6 +190,18 @@ class IdleBus:
     def withdraw(self, node: int, error: LdcndError) -> None:
         """Take note."""
         self.withdrawn.append((node, error))
+
+
+def tracked(name: str = "x", unit: str = "mm", **fields: Any) -> AxisTracker:
+    """Return the tracker of an axis whose drive is known to be the one that is meant."""
+    proof = Proofs().expect(1, f"axis {name}", name)
+    proof.prove()
+    return AxisTracker(AxisStatus(name, AxisScale(unit), **fields), proof)
+
+
+def put(tracker: AxisTracker, **fields: Any) -> None:
+    """Have a tracker know something else, as if it had been observed or commanded."""
+    tracker.status = replace(tracker.status, **fields)
 
 
 class AxisBench:

@@ -46,7 +46,7 @@ class PositionJudge:
 
     def _judge(self, axis: str, sample: PositionSample) -> None:
         drive = self.drive(axis)
-        referenced = axis in self.zero and self.rig.daemon.rig.axes[axis].tracker.referenced
+        referenced = axis in self.zero and self.rig.daemon.rig.axes[axis].tracker.status.referenced
         said, true = sample.counts / COUNTS_PER_MM, drive.loop.position / COUNTS_PER_MM
         if referenced:
             said, true = sample.value, (drive.shaft.position_counts - self.zero[axis]) / COUNTS_PER_MM

@@ -597,9 +597,9 @@ class Play:
         turning = [name for name, axis in judge.settings.items() if axis.modulo is not None]
         await judge.look(daemon, {name: zero for name, zero in places.items() if name not in turning})
         return [
-            f"{name} stands and carries out {axis.tracker.command.verb}"
+            f"{name} stands and carries out {axis.tracker.status.command.verb}"
             for name, axis in daemon.rig.axes.items()
-            if axis.tracker.command is not None
+            if axis.tracker.status.command is not None
         ]
 
     async def _switch_one_off_and_on(self) -> None:
@@ -619,14 +619,14 @@ class Play:
                     return ""
             if "not proven" not in line.problem:
                 break
-        links = {name: axis.tracker.link.value for name, axis in daemon.rig.axes.items()}
+        links = {name: axis.tracker.status.link.value for name, axis in daemon.rig.axes.items()}
         return f"{links}, {within_s:g} s after everything was plugged in: {line.problem or 'no problem'}"
 
 
 async def all_up(daemon: Daemon) -> None:
     """Return as soon as every drive answers."""
     await daemon.wait_up()
-    while any(axis.tracker.link is not LinkState.UP for axis in daemon.rig.axes.values()):
+    while any(axis.tracker.status.link is not LinkState.UP for axis in daemon.rig.axes.values()):
         await asyncio.sleep(0.05)
 
 

@@ -283,12 +283,12 @@ class ShaftJudge(Witness):
         self.motions += 1
         self.came_up(daemon)
         tracker = daemon.rig.axes[name].tracker
-        command = tracker.command
+        command = tracker.status.command
         asked = self.asked.get(command.command_id) if command else None
         if command is None or asked is None:
             self.wrong.append(f"{now_s:.4f}: {name} is moved by {command and command.command_id}, which was not sent")
             return
-        self._next[name] = Begun(command.command_id, tracker.referenced, now_s)
+        self._next[name] = Begun(command.command_id, tracker.status.referenced, now_s)
         if not isinstance(asked.command, Jog):
             super()._count(daemon, name, now_s)
         if why := self._unexplained(daemon, asked, name, now_s):

@@ -107,12 +107,12 @@ class Witness:
         lease = dispatcher.authority.holder(name)
         if lease is None or lease.ends_at_s <= now_s:
             return "nobody holds it"
-        if tracker.stop_latched or tracker.stop_pending:
+        if tracker.status.stop_latched or tracker.status.stop_pending:
             return "a stop is latched"
         return f"there are other daemons, {dispatcher.rivals}" if dispatcher.rivals else None
 
     def _count(self, daemon: Daemon, name: str, now_s: float) -> None:
-        command = daemon.rig.axes[name].tracker.command
+        command = daemon.rig.axes[name].tracker.status.command
         if command is None:
             self.wrong.append(f"{now_s:.4f}: {name} is moved by no command")
             return
@@ -139,13 +139,13 @@ class Witness:
             tracker, counts = axis.tracker, self.drive(name).shaft.position_counts
             moved = abs(counts - before[name]) >= STANDING_COUNTS
             if moved:
-                self.wrong.append(f"{name} moves with nobody in charge, {tracker.state} {tracker.moving}")
-            if moved and tracker.moving is Moving.NO:
+                self.wrong.append(f"{name} moves with nobody in charge, {tracker.status.state} {tracker.status.moving}")
+            if moved and tracker.status.moving is Moving.NO:
                 self.wrong.append(f"{name} moves and is said to stand")
-            if tracker.link is not LinkState.UP:
-                self.wrong.append(f"{name} is {tracker.link}")
-            if tracker.referenced and name in places and not moved:
-                said = axis.telemetry.position(self.drive(name).loop.position)
+            if tracker.status.link is not LinkState.UP:
+                self.wrong.append(f"{name} is {tracker.status.link}")
+            if tracker.status.referenced and name in places and not moved:
+                said = axis.tracker.status.scale.position(self.drive(name).loop.position)
                 true = (counts - places[name]) / axis.config.signed_counts_per_unit
                 if abs(said - true) > TRUE_WITHIN_UNITS:
                     self.wrong.append(f"{name} is said to be at {said:g} and is at {true:g}")

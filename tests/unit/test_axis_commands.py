@@ -5,6 +5,8 @@ from dataclasses import replace
 
 import pytest
 
+from ldcnd.axis.events import StopUnconfirmed
+from ldcnd.axis.faults import entry_of
 from ldcnd.contract.commands import (
     Halt,
     MoveAbsolute,
@@ -34,7 +36,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, Moving
 from ldcnd.drives.driver import CountsMotion, Fault, Gains, StopMode
-from tests.support.axis_bench import GAINS, RUNNING, AxisBench, axis_bench, raising
+from tests.support.axis_bench import GAINS, RUNNING, AxisBench, axis_bench, put, raising
 
 WARNING = Fault("position_wrap", "the counter has wrapped", stops=False)
 OVERHEAT = Fault("overheat", "let it cool down")
@@ -53,12 +55,12 @@ async def test_power_closes_and_opens_the_loop():
     async with axis_bench() as bench:
         await bench.send(Power(on=False))
         assert bench.drive.told == [("stop", StopMode.OFF)]
-        assert (bench.tracker.state, bench.tracker.enabled) == (AxisState.DISABLED, False)
+        assert (bench.tracker.status.state, bench.tracker.status.enabled) == (AxisState.DISABLED, False)
         await bench.settled(enabled=False)
 
         await bench.send(Power(on=True))
         assert bench.drive.told[1:] == [("power", True)]
-        assert (bench.tracker.state, bench.tracker.enabled) == (AxisState.STANDSTILL, True)
+        assert (bench.tracker.status.state, bench.tracker.status.enabled) == (AxisState.STANDSTILL, True)
 
 
 async def test_a_loop_that_was_to_be_closed_is_opened_again_when_permission_ends_among_the_packets():
@@ -91,7 +93,7 @@ async def test_power_in_mid_stop_is_refused_by_the_latch():
         await bench.pass_s(0.1, **RUNNING)
         await bench.stop()
 
-        assert bench.tracker.state is AxisState.STOPPING
+        assert bench.tracker.status.state is AxisState.STOPPING
         with pytest.raises(StopLatched):
             await bench.send(Power(on=True))
 
@@ -103,10 +105,10 @@ async def test_an_axis_that_is_switched_off_in_motion_is_not_said_to_stand():
 
         await bench.send(Power(on=False))
 
-        assert bench.tracker.moving is not Moving.NO
-        assert not bench.tracker.at_rest
+        assert bench.tracker.status.moving is not Moving.NO
+        assert not bench.tracker.status.at_rest
         await bench.pass_s(0.1, enabled=False, profile_done=True)
-        assert bench.tracker.moving is Moving.YES  # it coasts
+        assert bench.tracker.status.moving is Moving.YES  # it coasts
 
 
 async def test_power_off_ends_the_motion_and_its_target_is_forgotten():
@@ -152,9 +154,9 @@ async def test_a_halt_is_always_sent_also_to_a_motor_that_seems_to_stand():
         await bench.send(Halt(), "halt")
 
         assert bench.drive.told == [("stop", StopMode.SMOOTH)]
-        assert (bench.tracker.state, bench.tracker.stop_latched) == (AxisState.STOPPING, False)
+        assert (bench.tracker.status.state, bench.tracker.status.stop_latched) == (AxisState.STOPPING, False)
         await bench.settled(position_counts=3000)
-        assert bench.tracker.state is AxisState.STANDSTILL
+        assert bench.tracker.status.state is AxisState.STANDSTILL
         bench.drive.told.clear()
         await bench.send(MoveRelative(distance=1.0))
         assert loaded(bench).target_counts == 4000
@@ -164,7 +166,7 @@ async def test_a_halt_stops_an_axis_in_error_that_still_turns():
     async with axis_bench() as bench:
         await bench.send(MoveVelocity(velocity=10.0))
         await bench.pass_s(0.1, faults=(OVERHEAT,), **RUNNING)
-        assert bench.tracker.state is AxisState.ERROR_STOP
+        assert bench.tracker.status.state is AxisState.ERROR_STOP
         bench.drive.told.clear()
         with pytest.raises(WrongState, match="still moves"):
             await bench.send(Reset())
@@ -172,7 +174,7 @@ async def test_a_halt_stops_an_axis_in_error_that_still_turns():
         await bench.send(Halt())
 
         assert bench.drive.told == [("stop", StopMode.SMOOTH)]
-        assert bench.tracker.state is AxisState.ERROR_STOP  # only a reset leads out of it
+        assert bench.tracker.status.state is AxisState.ERROR_STOP  # only a reset leads out of it
 
 
 async def test_a_reset_in_mid_stop_keeps_the_latch():
@@ -184,30 +186,30 @@ async def test_a_reset_in_mid_stop_keeps_the_latch():
 
         with pytest.raises(WrongState):
             await bench.send(Reset())
-        assert bench.tracker.stop_latched
+        assert bench.tracker.status.stop_latched
 
         await bench.settled()
         await bench.send(Reset())
-        assert (bench.tracker.stop_latched, bench.drive.calls) == (False, [])
-        assert bench.tracker.enabled  # nothing was wrong with the drive
+        assert (bench.tracker.status.stop_latched, bench.drive.calls) == (False, [])
+        assert bench.tracker.status.enabled  # nothing was wrong with the drive
 
 
 async def test_a_reset_clears_a_fault_and_leaves_the_loop_open():
     async with axis_bench() as bench:
         await bench.settled(enabled=False, faults=(OVERHEAT,))
-        assert bench.tracker.state is AxisState.ERROR_STOP
+        assert bench.tracker.status.state is AxisState.ERROR_STOP
 
         await bench.send(Reset())
 
         assert bench.drive.calls == ["reset"]
-        assert (bench.tracker.state, bench.tracker.active_faults) == (AxisState.DISABLED, ())
+        assert (bench.tracker.status.state, bench.tracker.status.active_faults) == (AxisState.DISABLED, ())
 
 
 async def test_a_fault_that_shows_while_the_loop_is_open_is_reset_as_well():
     async with axis_bench(powered=False) as bench:
         await bench.settled()
-        bench.tracker.state = AxisState.DISABLED
-        bench.tracker._faults((OVERHEAT,), 0)
+        put(bench.tracker, state=AxisState.DISABLED)
+        put(bench.tracker, faults=(entry_of(OVERHEAT, 0),))
 
         await bench.send(Reset())
 
@@ -225,7 +227,7 @@ async def test_a_stop_that_comes_during_a_reset_keeps_its_latch(fault, call):
             await bench.send(Reset())
 
         assert bench.drive.calls[-2:] == [call, "stop"]
-        assert bench.tracker.stop_latched
+        assert bench.tracker.status.stop_latched
 
 
 async def test_a_reset_of_a_mere_warning_leaves_the_loop_as_it_is():
@@ -235,12 +237,12 @@ async def test_a_reset_of_a_mere_warning_leaves_the_loop_as_it_is():
         await bench.send(Reset())
 
         assert bench.drive.calls == ["clear_warnings"]
-        assert (bench.tracker.state, bench.tracker.enabled) == (AxisState.STANDSTILL, True)
+        assert (bench.tracker.status.state, bench.tracker.status.enabled) == (AxisState.STANDSTILL, True)
 
 
 async def test_a_reset_waits_for_a_stop_that_no_drive_has_confirmed():
     async with axis_bench() as bench:
-        bench.tracker.stop_unconfirmed(0)
+        bench.tracker.take(StopUnconfirmed(0))
 
         with pytest.raises(StopLatched, match="not confirmed"):
             await bench.send(Reset())
@@ -257,10 +259,10 @@ async def test_a_reset_of_faults_only_clears_no_latch():
         with pytest.raises(StopLatched, match="latched"):
             await bench.send(Reset(faults_only=True))
         assert "reset" not in bench.drive.calls
-        assert bench.tracker.stop_latched
+        assert bench.tracker.status.stop_latched
 
         await bench.send(Reset())
-        assert not bench.tracker.stop_latched
+        assert not bench.tracker.status.stop_latched
 
 
 # -- moves -------------------------------------------------------------------------------------------------------------
@@ -312,7 +314,7 @@ async def test_a_stop_that_comes_while_a_relative_move_reads_the_position_wins()
 
 async def test_an_absolute_move_needs_a_reference_and_a_relative_one_does_not():
     async with axis_bench(limits={"position_max": 5.0}) as bench:
-        bench.tracker.referenced = False
+        put(bench.tracker, referenced=False)
         with pytest.raises(NotReferenced):
             await bench.send(MoveAbsolute(position=1.0))
         assert bench.drive.calls == []
@@ -347,11 +349,11 @@ async def test_a_jog_ends_at_the_limit_ahead_and_without_one_at_its_horizon(velo
         reply = await bench.send(MoveVelocity(velocity=velocity))
         assert loaded(bench) == CountsMotion(round(end * 1000), 10_000.0, 200_000.0)
         assert reply.velocity == velocity
-        assert bench.tracker.state is AxisState.CONTINUOUS_MOTION
+        assert bench.tracker.status.state is AxisState.CONTINUOUS_MOTION
         await bench.settled(position_counts=5000)
         bench.drive.told.clear()
 
-        bench.tracker.referenced = False
+        put(bench.tracker, referenced=False)
         await bench.send(MoveVelocity(velocity=velocity))
         assert loaded(bench).target_counts == 5000 + round(2 * velocity * 1000)
 
@@ -406,23 +408,23 @@ async def test_before_the_first_reading_nothing_is_planned():
 
 async def test_a_position_is_given_to_an_axis_that_stands_and_makes_it_referenced():
     async with axis_bench() as bench:
-        bench.tracker.referenced = False
+        put(bench.tracker, referenced=False)
         await bench.settled(position_counts=7000)
 
         reply = await bench.send(SetPosition(position=100.0))
 
-        assert (reply.position, bench.tracker.referenced) == (100.0, True)
-        assert bench.axis.telemetry.position(7000) == 100.0
-        assert bench.axis.telemetry.position(8000) == 101.0
+        assert (reply.position, bench.tracker.status.referenced) == (100.0, True)
+        assert bench.tracker.status.scale.position(7000) == 100.0
+        assert bench.tracker.status.scale.position(8000) == 101.0
 
 
 @pytest.mark.parametrize("what", ["moving", "lost", "lost meanwhile", "stopped meanwhile"])
 async def test_a_position_is_not_given_to_an_axis_that_moves_or_does_not_know_where_it_is(what):
     async with axis_bench() as bench:
-        bench.tracker.referenced = False
+        put(bench.tracker, referenced=False)
 
         async def lose() -> None:
-            bench.tracker.position_lost = True
+            put(bench.tracker, position_lost=True)
 
         if what == "moving":
             await bench.send(MoveRelative(distance=10.0))
@@ -434,7 +436,7 @@ async def test_a_position_is_not_given_to_an_axis_that_moves_or_does_not_know_wh
         with pytest.raises((WrongState, StopLatched)):
             await bench.send(SetPosition(position=0.0))
 
-        assert not bench.tracker.referenced
+        assert not bench.tracker.status.referenced
 
 
 async def test_gains_change_one_by_one_and_the_servo_rate_only_at_rest():
@@ -516,7 +518,7 @@ async def test_an_unknown_outcome_of_a_start_keeps_the_command_and_a_stop_ends_i
         bench.drive.during["start"] = raising(OutcomeUnknown("no reply"))
         with contextlib.suppress(OutcomeUnknown):
             await bench.send(MoveAbsolute(position=10.0), "first")
-        assert bench.tracker.command.command_id == "first"
+        assert bench.tracker.status.command.command_id == "first"
 
         await bench.stop()
 
@@ -537,12 +539,12 @@ async def test_an_aborting_move_that_is_not_started_in_mid_move_brings_the_one_b
             await bench.axis.in_turn(
                 then, bench.axis.permit("second", Verb.MOVE_ABSOLUTE), lambda: bench.send(then, "second")
             )
-        state, told = bench.tracker.state, bench.drive.calls
+        state, told = bench.tracker.status.state, bench.drive.calls
         await bench.settled(enabled=True)
 
         assert told == ["load", "start", "stop"]
         assert state is AxisState.STOPPING
-        assert bench.tracker.state is AxisState.STANDSTILL
+        assert bench.tracker.status.state is AxisState.STANDSTILL
         assert bench.ended == [
             ("first", CommandStatus.ABORTED, "aborted by move_absolute"),
             ("second", CommandStatus.FAILED, error.message),

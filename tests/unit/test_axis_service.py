@@ -46,7 +46,7 @@ from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality, Teleme
 from ldcnd.drives.driver import Fault, StopMode
 from ldcnd.drives.network import BringUpReport
 from ldcnd.line.exchange import Timing
-from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, raising
+from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, put, raising
 
 THERE = MoveAbsolute(position=10.0)
 LOST = ReplyTimeout("no reply")
@@ -75,11 +75,11 @@ async def test_a_stop_is_the_only_thing_that_is_sent_and_ends_the_motion(command
 
         assert bench.drive.told == [("stop", mode)]
         assert (reply.axis, reply.verb) == ("x", command.verb)
-        assert (bench.tracker.state, bench.tracker.stop_latched) == (AxisState.STOPPING, True)
+        assert (bench.tracker.status.state, bench.tracker.status.stop_latched) == (AxisState.STOPPING, True)
         assert [node for node, _ in bench.bus.withdrawn] == [1]
         assert ("first", CommandStatus.ABORTED) in {ended[:2] for ended in bench.ended}
         await bench.settled()
-        assert (bench.tracker.state, bench.tracker.command) == (AxisState.STANDSTILL, None)
+        assert (bench.tracker.status.state, bench.tracker.status.command) == (AxisState.STANDSTILL, None)
 
 
 async def test_a_stop_refuses_what_waits_and_what_is_under_way():
@@ -134,7 +134,7 @@ async def test_a_stop_of_a_disabled_axis_leaves_its_loop_open():
         await bench.stop()
 
         assert bench.drive.told == [("stop", StopMode.OFF)]
-        assert (bench.tracker.state, bench.tracker.stop_latched) == (AxisState.DISABLED, True)
+        assert (bench.tracker.status.state, bench.tracker.status.stop_latched) == (AxisState.DISABLED, True)
 
 
 async def test_a_stop_is_sent_a_few_times_and_then_stays_pending_until_the_drive_confirms_it():
@@ -149,21 +149,21 @@ async def test_a_stop_is_sent_a_few_times_and_then_stays_pending_until_the_drive
         stop, bench.drive.stop = bench.drive.stop, lost
         assert not await bench.axis.stops.stop(StopMode.ABRUPT)
         assert sent == [StopMode.ABRUPT] * STOP_ROUNDS
-        assert bench.tracker.stop_pending
+        assert bench.tracker.status.stop_pending
         assert bench.axis.stops.wanted.is_set()
-        assert [fault.code for fault in bench.tracker.active_faults] == ["stop_unconfirmed"]
+        assert [fault.code for fault in bench.tracker.status.active_faults] == ["stop_unconfirmed"]
 
         await bench.axis.stops.bring_to_rest(StopMode.SMOOTH)
         await bench.axis.send_pending_stop()
         assert sent[-1] is StopMode.ABRUPT  # the stronger one is still owed
         assert len(sent) == 2 * STOP_ROUNDS + 1
-        assert bench.tracker.stop_pending
+        assert bench.tracker.status.stop_pending
 
         bench.drive.stop = stop
         await bench.axis.send_pending_stop()
         assert bench.drive.told == [("stop", StopMode.ABRUPT)]
-        assert not bench.tracker.stop_pending
-        assert bench.tracker.active_faults == ()
+        assert not bench.tracker.status.stop_pending
+        assert bench.tracker.status.active_faults == ()
         assert bench.notes == [(Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again")]
 
         await bench.axis.send_pending_stop()
@@ -184,8 +184,8 @@ async def test_of_two_stops_the_stronger_one_is_sent_while_it_is_owed():
         )  # it may be off already: a weaker one would close it
 
         assert bench.drive.told[-1] == ("stop", StopMode.OFF)
-        assert bench.tracker.state is AxisState.DISABLED
-        assert not bench.tracker.stop_pending
+        assert bench.tracker.status.state is AxisState.DISABLED
+        assert not bench.tracker.status.stop_pending
 
 
 async def test_a_drive_that_was_switched_off_instead_is_disabled():
@@ -199,8 +199,8 @@ async def test_a_drive_that_was_switched_off_instead_is_disabled():
 
         assert await bench.axis.stops.stop(StopMode.SMOOTH)
 
-        assert (bench.tracker.state, bench.tracker.enabled) == (AxisState.DISABLED, False)
-        assert not bench.tracker.stop_pending
+        assert (bench.tracker.status.state, bench.tracker.status.enabled) == (AxisState.DISABLED, False)
+        assert not bench.tracker.status.stop_pending
 
 
 async def test_a_stop_while_the_line_is_down_is_not_sent_and_waits_for_it():
@@ -212,10 +212,10 @@ async def test_a_stop_while_the_line_is_down_is_not_sent_and_waits_for_it():
 
         assert bench.drive.calls == []
         assert bench.bus.withdrawn == []
-        assert bench.tracker.stop_pending
+        assert bench.tracker.status.stop_pending
         bench.axis.stops.note_power_loss()  # it had no power
-        assert not bench.tracker.stop_pending
-        assert not bench.tracker.stop_pending
+        assert not bench.tracker.status.stop_pending
+        assert not bench.tracker.status.stop_pending
 
 
 async def test_an_axis_that_was_never_seen_is_read_before_a_pending_stop_is_sent():
@@ -227,11 +227,11 @@ async def test_an_axis_that_was_never_seen_is_read_before_a_pending_stop_is_sent
 
         await bench.axis.send_pending_stop()
         assert bench.drive.calls == []  # how it was left is not known: a smooth stop would close an open loop
-        assert bench.tracker.stop_pending
+        assert bench.tracker.status.stop_pending
 
         await bench.axis.send_pending_stop()
         assert bench.drive.told == [("stop", StopMode.OFF)]
-        assert not bench.tracker.stop_pending
+        assert not bench.tracker.status.stop_pending
 
 
 async def test_a_motor_that_was_taken_over_with_a_closed_loop_is_not_switched_off_by_a_stop_before_its_first_reading():
@@ -256,12 +256,12 @@ async def test_a_line_that_is_taken_over_again_changes_nothing_that_was_seen():
 async def test_a_motor_that_must_be_off_first_is_switched_off():
     async with axis_bench() as bench:
         bench.axis.stops.switch_off()
-        assert bench.tracker.stop_pending
+        assert bench.tracker.status.stop_pending
 
         await bench.axis.send_pending_stop()
 
         assert bench.drive.told == [("stop", StopMode.OFF)]
-        assert bench.tracker.state is AxisState.DISABLED
+        assert bench.tracker.status.state is AxisState.DISABLED
 
 
 async def test_a_reading_from_a_drive_that_owes_a_confirmation_calls_for_the_stop():
@@ -285,7 +285,11 @@ async def test_a_drive_that_takes_no_stop_over_its_line_is_neither_latched_nor_t
         assert not await bench.axis.stops.bring_to_rest(StopMode.SMOOTH)
         bench.axis.stops.switch_off()
 
-        assert (bench.tracker.stop_latched, bench.tracker.stop_pending, bench.drive.calls) == (False, False, [])
+        assert (bench.tracker.status.stop_latched, bench.tracker.status.stop_pending, bench.drive.calls) == (
+            False,
+            False,
+            [],
+        )
 
 
 # -- successors --------------------------------------------------------------------------------------------------------
@@ -311,7 +315,7 @@ async def test_a_buffered_move_begins_when_the_one_before_it_has_ended():
             await waiting
 
         assert bench.drive.calls == ["load", "start"]
-        assert bench.tracker.command.command_id == "next"
+        assert bench.tracker.status.command.command_id == "next"
 
 
 async def test_a_buffered_move_does_not_begin_after_a_policy_has_brought_the_axis_to_rest():
@@ -358,11 +362,11 @@ async def test_buffered_moves_follow_each_other_in_the_order_in_which_they_came(
                 group.create_task(in_turn(bench, buffered(position), command_id=f"to {position}"), name="next")
                 await asyncio.sleep(0)
             await bench.pass_s(0.1, **STANDING)
-            assert bench.tracker.command.command_id == "to 11.0"
+            assert bench.tracker.status.command.command_id == "to 11.0"
             await bench.pass_s(0.1, **RUNNING)
             await bench.pass_s(0.1, **STANDING)
 
-        assert bench.tracker.command.command_id == "to 12.0"
+        assert bench.tracker.status.command.command_id == "to 12.0"
 
 
 async def test_an_aborting_move_halts_what_runs_and_then_begins():
@@ -452,7 +456,7 @@ async def test_a_command_is_late_only_until_its_motion_has_begun():
 async def test_a_drive_that_answers_again_after_it_was_away_is_reported_once():
     async with axis_bench() as bench:
         returned = []
-        bench.axis.readings.returned = lambda: returned.append(bench.tracker.link)
+        bench.axis.readings.returned = lambda: returned.append(bench.tracker.status.link)
         bench.show()
         bench.axis.disconnected()
         bench.show()
@@ -477,8 +481,8 @@ async def test_a_jump_without_a_command_is_a_fault_and_takes_the_reference_away(
             await asyncio.sleep(0.05)
 
         assert not asks_again
-        assert bench.tracker.state is AxisState.ERROR_STOP
-        assert not bench.tracker.referenced
+        assert bench.tracker.status.state is AxisState.ERROR_STOP
+        assert not bench.tracker.status.referenced
 
 
 async def test_a_jump_during_a_command_ends_it_costs_the_reference_and_has_the_motor_stopped():
@@ -489,10 +493,10 @@ async def test_a_jump_during_a_command_ends_it_costs_the_reference_and_has_the_m
             bench.axis.readings.judge(slow, frozenset(), now())
             await asyncio.sleep(0.05)
 
-        assert bench.tracker.state is AxisState.ERROR_STOP
-        assert not bench.tracker.referenced
-        assert bench.tracker.quality is Quality.UNCERTAIN
-        assert bench.tracker.stop_pending
+        assert bench.tracker.status.state is AxisState.ERROR_STOP
+        assert not bench.tracker.status.referenced
+        assert bench.tracker.status.quality is Quality.UNCERTAIN
+        assert bench.tracker.status.stop_pending
 
 
 @pytest.mark.parametrize("gap", ["disconnected", "missed"])
@@ -510,7 +514,7 @@ async def test_a_drive_that_was_moved_while_it_was_out_of_reach_has_not_jumped(g
             bench.axis.readings.judge(_reading(bench, position_counts=counts), frozenset(), now())
             await asyncio.sleep(0.05)
 
-        assert "position_jump" not in [fault.code for fault in bench.tracker.active_faults]
+        assert "position_jump" not in [fault.code for fault in bench.tracker.status.active_faults]
 
 
 @pytest.mark.promise("contradiction-stops")
@@ -523,11 +527,14 @@ async def test_a_reading_that_contradicts_the_one_before_is_asked_again_and_in_t
 
         assert verdicts == [False, True, True, True, False]
         assert bench.bus.distrusted == 4
-        assert (bench.tracker.link, bench.tracker.quality) == (LinkState.UP, Quality.UNCERTAIN)
-        assert [fault.code for fault in bench.tracker.active_faults] == ["readings_contradict", "stop_unconfirmed"]
-        assert bench.tracker.moving is not Moving.NO
-        assert not bench.tracker.referenced
-        assert bench.tracker.stop_pending
+        assert (bench.tracker.status.link, bench.tracker.status.quality) == (LinkState.UP, Quality.UNCERTAIN)
+        assert [fault.code for fault in bench.tracker.status.active_faults] == [
+            "readings_contradict",
+            "stop_unconfirmed",
+        ]
+        assert bench.tracker.status.moving is not Moving.NO
+        assert not bench.tracker.status.referenced
+        assert bench.tracker.status.stop_pending
         await bench.axis.send_pending_stop()
         assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
         await bench.send(Power(on=False))
@@ -539,15 +546,15 @@ async def test_nothing_is_planned_from_two_readings_that_agree_where_no_motion_c
     async with axis_bench() as bench:
         for _ in range(2):
             bench.axis.readings.judge(bench.drive.shown, frozenset(), now())
-        origin = bench.axis.telemetry.origin_counts
+        origin = bench.tracker.status.scale.origin_counts
         bench.drive.shown = _reading(bench, position_counts=60_000)
 
         with pytest.raises(BadReply, match="no motion can have led") as refusal:
             await bench.send(command)
 
-        assert refusal.value.value == bench.axis.telemetry.position(60_000)
+        assert refusal.value.value == bench.tracker.status.scale.position(60_000)
         assert bench.drive.told == []
-        assert bench.axis.telemetry.origin_counts == origin
+        assert bench.tracker.status.scale.origin_counts == origin
         assert bench.bus.distrusted == 1
 
 
@@ -560,7 +567,7 @@ async def test_a_shaft_that_is_turned_by_hand_is_believed_where_its_velocity_lea
             turned = _reading(bench, velocity_counts_per_s=20_000.0, position_counts=counts)
             verdicts.append(bench.axis.readings.judge(turned, frozenset(), now()))
 
-        assert (bench.tracker.command, bench.tracker.at_rest) == (None, False)
+        assert (bench.tracker.status.command, bench.tracker.status.at_rest) == (None, False)
         assert verdicts == [True, False, False]  # so sudden a velocity is asked for again, once
 
 
@@ -584,20 +591,20 @@ async def test_a_drive_that_replies_with_nothing_that_can_be_used_is_not_silent_
         await moving(bench)
         for _ in range(2):
             bench.axis.readings.miss(error)
-        assert (bench.tracker.link, bench.tracker.stop_pending) == (LinkState.DEGRADED, False)
+        assert (bench.tracker.status.link, bench.tracker.status.stop_pending) == (LinkState.DEGRADED, False)
 
         for _ in range(8):
             bench.axis.readings.miss(error)
 
-        assert (bench.tracker.link, bench.tracker.moving) == (LinkState.DEGRADED, Moving.UNKNOWN)
-        assert bench.tracker.quality is Quality.UNCERTAIN
-        assert "replies_unusable" in [fault.code for fault in bench.tracker.active_faults]
-        assert bench.tracker.state is AxisState.ERROR_STOP
-        assert bench.tracker.stop_pending
+        assert (bench.tracker.status.link, bench.tracker.status.moving) == (LinkState.DEGRADED, Moving.UNKNOWN)
+        assert bench.tracker.status.quality is Quality.UNCERTAIN
+        assert "replies_unusable" in [fault.code for fault in bench.tracker.status.active_faults]
+        assert bench.tracker.status.state is AxisState.ERROR_STOP
+        assert bench.tracker.status.stop_pending
         await bench.axis.send_pending_stop()
         assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
         bench.show()
-        assert (bench.tracker.link, bench.tracker.referenced) == (LinkState.UP, True)
+        assert (bench.tracker.status.link, bench.tracker.status.referenced) == (LinkState.UP, True)
 
 
 @pytest.mark.parametrize(
@@ -637,13 +644,13 @@ async def test_misses_take_an_axis_down_only_in_a_row():
             bench.axis.readings.miss(LOST)
             bench.axis.readings.miss(LOST)
             bench.show()
-        assert bench.tracker.link is LinkState.UP
-        assert bench.tracker.referenced
+        assert bench.tracker.status.link is LinkState.UP
+        assert bench.tracker.status.referenced
 
         for _ in range(3):
             bench.axis.readings.miss(LOST)
-        assert bench.tracker.link is LinkState.DOWN
-        assert not bench.tracker.referenced
+        assert bench.tracker.status.link is LinkState.DOWN
+        assert not bench.tracker.status.referenced
 
 
 async def test_an_axis_is_at_work_while_it_has_a_command_or_may_move():
@@ -654,18 +661,18 @@ async def test_an_axis_is_at_work_while_it_has_a_command_or_may_move():
         await bench.settled()
         assert not bench.axis.at_work
         bench.axis.disconnected()
-        assert (bench.tracker.command, bench.tracker.moving) == (None, Moving.UNKNOWN)
+        assert (bench.tracker.status.command, bench.tracker.status.moving) == (None, Moving.UNKNOWN)
         assert bench.axis.at_work
 
 
 async def test_a_referenced_line_counts_from_the_drives_zero_again():
     async with axis_bench() as bench:
-        bench.axis.telemetry.origin_counts = 77.0
+        put(bench.tracker, scale=replace(bench.tracker.status.scale, origin_counts=77.0))
         bench.axis.connected(placed=False)
-        assert (bench.tracker.referenced, bench.axis.telemetry.origin_counts) == (False, 77.0)
+        assert (bench.tracker.status.referenced, bench.tracker.status.scale.origin_counts) == (False, 77.0)
 
         bench.axis.connected(placed=True)
-        assert (bench.tracker.referenced, bench.axis.telemetry.origin_counts) == (True, 0.0)
+        assert (bench.tracker.status.referenced, bench.tracker.status.scale.origin_counts) == (True, 0.0)
 
 
 @pytest.mark.promise("energy-out-always-sent")
@@ -697,8 +704,8 @@ async def test_what_a_silent_drive_has_not_confirmed_is_said_to_be_so_and_waits_
             await bench.send(command)
 
         assert set(bench.drive.calls) == {"stop"}
-        assert bench.tracker.stop_pending
-        assert bench.tracker.stop_pending
+        assert bench.tracker.status.stop_pending
+        assert bench.tracker.status.stop_pending
 
 
 async def test_a_fault_during_a_motion_ends_it_and_nothing_follows():
@@ -706,7 +713,7 @@ async def test_a_fault_during_a_motion_ends_it_and_nothing_follows():
         await moving(bench)
         bench.show(enabled=False, faults=(Fault("position_error", "stuck"),), **STANDING)
 
-        assert bench.tracker.state is AxisState.ERROR_STOP
+        assert bench.tracker.status.state is AxisState.ERROR_STOP
         with pytest.raises(WrongState):
             await bench.send(THERE)
         assert bench.drive.calls == []
@@ -718,9 +725,9 @@ async def test_a_start_with_an_unknown_outcome_is_left_to_the_readings():
         with pytest.raises(OutcomeUnknown):
             await bench.send(THERE, "first")
 
-        assert bench.tracker.command.command_id == "first"
+        assert bench.tracker.status.command.command_id == "first"
         await bench.pass_s(0.1, **RUNNING)
-        assert bench.tracker.state is AxisState.DISCRETE_MOTION
+        assert bench.tracker.status.state is AxisState.DISCRETE_MOTION
         await bench.pass_s(0.1, **STANDING)
         assert bench.ended[-1] == ("first", CommandStatus.DONE, None)
 
@@ -736,7 +743,7 @@ async def test_a_start_that_was_not_taken_ends_the_command_at_once():
         with contextlib.suppress(ReplyTimeout):
             await bench.send(THERE, "first")
 
-        assert (bench.tracker.command, bench.tracker.state) == (None, AxisState.STANDSTILL)
+        assert (bench.tracker.status.command, bench.tracker.status.state) == (None, AxisState.STANDSTILL)
         assert bench.ended[-1] == ("first", CommandStatus.FAILED, "no reply")
         await asyncio.sleep(0)
         assert bench.published(TelemetryItem.STATE).state is AxisState.STANDSTILL
@@ -773,9 +780,9 @@ async def test_a_kept_reference_is_in_force_once_the_line_is_up_and_not_the_next
         monkeypatch.setattr(bench.axis.reference, "recall", recall)
         await bench.axis.recall(BringUpReport(19200, {}, reset=False))
         bench.axis.connected(placed=False)
-        assert (bench.tracker.referenced, bench.axis.telemetry.position(2500)) == (True, 1.0)
+        assert (bench.tracker.status.referenced, bench.tracker.status.scale.position(2500)) == (True, 1.0)
         bench.axis.connected(placed=False)
-        assert not bench.tracker.referenced
+        assert not bench.tracker.status.referenced
 
 
 def _reading(bench: AxisBench, **changes):

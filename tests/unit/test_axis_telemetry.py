@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from ldcnd.axis.events import StopLatch
 from ldcnd.contract.commands import MoveAbsolute
 from ldcnd.contract.parameters import MonitorReading
 from ldcnd.contract.samples import AxisState, MonitorName, Quality, TelemetryItem
@@ -11,7 +12,7 @@ from ldcnd.contract.traces import TraceChunk
 from ldcnd.drives.driver import Fault
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.line.exchange import Timing
-from tests.support.axis_bench import KEYS, RUNNING, AxisBench, axis_bench
+from tests.support.axis_bench import KEYS, RUNNING, AxisBench, axis_bench, put
 
 POSITION, VELOCITY, ADC = TelemetryItem.POSITION, TelemetryItem.VELOCITY, TelemetryItem.ADC
 STATE, FAULT = TelemetryItem.STATE, TelemetryItem.FAULT
@@ -37,7 +38,7 @@ async def test_only_what_was_asked_for_is_published(item):
 
 async def test_values_are_in_axis_units_and_stamped_with_the_middle_of_when_they_can_have_been_true():
     async with axis_bench(adc_volts=10.0, direction="reverse") as bench:
-        bench.axis.telemetry.origin_counts = 1000.0
+        put(bench.tracker, scale=replace(bench.tracker.status.scale, origin_counts=1000.0))
         poll(
             bench, POSITION, VELOCITY, ADC, position_counts=3000, velocity_counts_per_s=500.0, adc_counts=512,
             following_error_counts=20,
@@ -69,7 +70,7 @@ async def test_state_and_faults_are_published_when_they_change_and_when_they_are
         poll(bench, faults=(Fault("position_wrap", "wrapped", stops=False),))
         assert bench.published(STATE).seq == state.seq + 1
         assert [entry.code for entry in bench.published(FAULT).active] == ["position_wrap"]
-        bench.tracker.latch_stop()
+        bench.tracker.take(StopLatch())
         poll(bench, faults=(Fault("position_wrap", "wrapped", stops=False),))
         assert bench.published(STATE).stop_latched
 

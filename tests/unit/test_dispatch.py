@@ -64,7 +64,7 @@ from ldcnd.daemon.ledger import EventLog, Ledger
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.driver import Fault, StopMode
 from ldcnd.net.hand_over import Query
-from tests.support.axis_bench import KEYS, RUNNING, STANDING, AxisBench, axis_bench, raising
+from tests.support.axis_bench import KEYS, RUNNING, STANDING, AxisBench, axis_bench, put, raising
 
 THERE = MoveAbsolute(position=10.0)
 INSTANCE = "run-1"
@@ -99,7 +99,7 @@ class Commanded:
         self.dispatcher.leases.group = group
         self.requests = Requests(self.rig, KEYS, group, self.dispatcher)
         for bench in (x, y):
-            bench.axis.readings._arrivals._on_ended = ledger.ended
+            bench.axis.readings._on_ended = ledger.ended
         self.answers: list[dict] = []
 
     async def send(self, command, axis: str = "x", login: str | None = None):
@@ -209,10 +209,10 @@ async def refused(sent) -> LdcndError | None:
 async def test_a_repeated_refusal_stays_a_refusal():
     command = THERE.model_copy(update={"command_id": "c1"})
     async with commanded() as rig:
-        rig.x.tracker.referenced = False
+        put(rig.x.tracker, referenced=False)
         with pytest.raises(NotReferenced):
             await rig.send(command)
-        rig.x.tracker.referenced = True
+        put(rig.x.tracker, referenced=True)
         with pytest.raises(NotReferenced):
             await rig.send(command)
 
@@ -367,7 +367,7 @@ async def test_why_and_preview_tell_what_the_sender_would_be_refused_with_and_do
         assert (await rig.send(Why(lease=mine.lease))).can_move
         rig.dispatcher.rivals.add("another")
         assert [cause.code for cause in (await rig.send(Why(lease=mine.lease))).causes] == ["duplicate_daemon"]
-        rig.x.tracker.referenced = False
+        put(rig.x.tracker, referenced=False)
         obstacles = (await rig.send(Preview(position=1.0))).obstacles
         assert len(obstacles) == 2
         assert len((await rig.send(Preview(distance=1.0))).obstacles) == 1
@@ -436,8 +436,7 @@ async def _two_daemons(rig: Commanded) -> None:
 
 
 async def _put(rig: Commanded, **fields: object) -> None:
-    for name, value in fields.items():
-        setattr(rig.x.tracker, name, value)
+    put(rig.x.tracker, **fields)
 
 
 STATES = {
@@ -707,10 +706,10 @@ async def test_a_stop_of_the_rig_latches_every_axis_and_enters_one_event_for_eac
         rig.y.drive.during["stop"] = raising(ReplyTimeout("no reply"))
         rig.y.bus.is_open = False
         rig.requests.on_stop(rig.query(KEYS.stop(None), b'{"client": "ann"}'))
-        assert not rig.x.tracker.stop_latched  # callbacks only hand over
+        assert not rig.x.tracker.status.stop_latched  # callbacks only hand over
         await asyncio.sleep(0.01)
 
-        assert (rig.x.tracker.stop_latched, rig.y.tracker.stop_latched) == (True, True)
+        assert (rig.x.tracker.status.stop_latched, rig.y.tracker.status.stop_latched) == (True, True)
         assert rig.answers[0]["axes"] == ["x", "y"]
         assert rig.answers[0]["confirmed"] == ["x"]
         assert rig.page() == [("x", "stop", "done"), ("y", "stop", "unknown")]
@@ -725,7 +724,7 @@ async def test_commands_are_noted_on_the_wire_log_and_questions_are_not():
         await rig.acquired("x")
 
         assert [line.split(b" ")[0] for line in rig.wire] == [b"x/move_absolute", b"_/acquire"]
-        assert rig.x.tracker.state is AxisState.DISCRETE_MOTION
+        assert rig.x.tracker.status.state is AxisState.DISCRETE_MOTION
 
 
 async def _outcome(call):

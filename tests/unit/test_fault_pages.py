@@ -5,14 +5,17 @@ import re
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.axis.state import OF_DAEMON, AxisTracker
+from ldcnd.axis.events import DriveLost
+from ldcnd.axis.faults import OF_DAEMON
 from ldcnd.cli.main import cli, main
 from ldcnd.contract import errors
 from ldcnd.contract.codec import error_reply
 from ldcnd.contract.errors import DriveFault, ErrorCode, LdcndError
 from ldcnd.contract.fault_pages import FOLDER, UNLISTED_ALARM, codes, page_of, page_text
+from ldcnd.contract.samples import LinkState
 from ldcnd.drives.ldcn.faults import FaultCode
 from ldcnd.drives.smartstep.monitors import ALARMS, AlarmKind
+from tests.support.axis_bench import tracked
 from tests.support.pages import command_lines, require_command_line
 
 DAEMON_FAULTS = {fault.code for fault in OF_DAEMON}
@@ -95,12 +98,11 @@ def test_a_fault_leads_to_its_page(code, page):
 
 
 def test_the_published_fault_names_its_page():
-    tracker = AxisTracker("x", "mm")
-    tracker.link = type(tracker.link).UP
+    tracker = tracked(link=LinkState.UP)
 
-    tracker.disconnected(now_ns=1)
+    tracker.take(DriveLost(now_ns=1, another=False))
 
-    assert [fault.page for fault in tracker.active_faults] == ["faults/link_lost"]
+    assert [fault.page for fault in tracker.status.active_faults] == ["faults/link_lost"]
 
 
 def test_a_code_without_a_page_has_none():

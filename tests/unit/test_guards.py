@@ -1,7 +1,9 @@
 import pytest
 
 from ldcnd.axis import guards
-from ldcnd.axis.state import AxisTracker
+from ldcnd.axis.faults import STOP_UNCONFIRMED, entry_of
+from ldcnd.axis.status import OpenStop
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import (
     AccelerationLimit,
@@ -14,16 +16,15 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState
+from ldcnd.drives.driver import StopMode
+from tests.support.axis_bench import tracked
 
 
 def ready(*faults: str, **changes: object) -> AxisTracker:
     """Return an axis that stands and is powered, but for what is changed."""
-    tracker = AxisTracker("x", "mm")
-    tracker.state, tracker.enabled, tracker.referenced, tracker.link = AxisState.STANDSTILL, True, True, LinkState.UP
-    tracker.active_faults = tuple(FaultEntry(code=text, text=text, since=0, source="drive") for text in faults)
-    for name, value in changes.items():
-        setattr(tracker, name, value)
-    return tracker
+    entries = tuple(FaultEntry(code=text, text=text, since=0, source="drive") for text in faults)
+    stands = {"state": AxisState.STANDSTILL, "enabled": True, "referenced": True, "link": LinkState.UP}
+    return tracked(faults=entries, **(stands | changes))
 
 
 READY = ready()
@@ -39,7 +40,7 @@ def test_an_axis_that_stands_and_is_powered_may_move():
     [
         ({"link": LinkState.DOWN}, AxisUnreachable, "power"),
         ({"stop_latched": True}, StopLatched, "reset"),
-        ({"stop_pending": True}, StopLatched, "wait"),
+        ({"stop": OpenStop(StopMode.SMOOTH, entry_of(STOP_UNCONFIRMED, 0))}, StopLatched, "wait"),
         ({"state": AxisState.ERROR_STOP}, WrongState, "reset"),
         ({"state": AxisState.DISABLED, "enabled": False}, WrongState, "power"),
         ({"state": AxisState.DISCRETE_MOTION}, WrongState, "halt"),

@@ -1,6 +1,6 @@
 import pytest
 
-from ldcnd.axis.state import ActiveCommand, Completion
+from ldcnd.axis.status import ActiveCommand, Completion
 from ldcnd.contract.commands import REPLAYED_WITHIN_S, CommandReply, Halt, MoveAbsolute, Verb
 from ldcnd.contract.errors import CommandIdReused, StopLatched, TooManyRequests, UnknownCommand
 from ldcnd.contract.events import CommandStatus

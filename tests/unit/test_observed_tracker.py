@@ -1,7 +1,9 @@
-from ldcnd.axis.state import ObservedTracker
+from ldcnd.axis.events import DriveLost
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.driver import AxisReading, Fault
 from ldcnd.line.exchange import Timing
+from tests.support.axis_bench import tracked
 
 ALARM = Fault("alarm_0010", "Overcurrent")
 
@@ -20,42 +22,46 @@ def reading(*, enabled: bool = True, velocity: float = 0.0, faults: tuple[Fault,
     )
 
 
-def observed(*readings: AxisReading) -> ObservedTracker:
-    tracker = ObservedTracker("feed", "rev")
+def observed(*readings: AxisReading) -> AxisTracker:
+    tracker = tracked("feed", "rev", commanded=False)
     for at_s, each in enumerate(readings):
-        tracker.observed(each, Timing(at_s, at_s, at_s, at_s), at_s)
+        tracker.observe(each, Timing(at_s, at_s, at_s, at_s), at_s)
     return tracker
 
 
 def test_states_follow_what_the_drive_shows():
-    assert observed(reading(enabled=False)).state is AxisState.DISABLED
-    assert observed(reading()).state is AxisState.STANDSTILL
-    assert observed(reading(velocity=800.0)).state is AxisState.DISCRETE_MOTION
-    assert observed(reading(faults=(ALARM,))).state is AxisState.ERROR_STOP
+    assert observed(reading(enabled=False)).status.state is AxisState.DISABLED
+    assert observed(reading()).status.state is AxisState.STANDSTILL
+    assert observed(reading(velocity=800.0)).status.state is AxisState.DISCRETE_MOTION
+    assert observed(reading(faults=(ALARM,))).status.state is AxisState.ERROR_STOP
 
 
 def test_run_switched_off_by_others_is_no_fault():
     tracker = observed(reading(velocity=800.0), reading(enabled=False))
 
-    assert (tracker.state, tracker.active_faults) == (AxisState.DISABLED, ())
+    assert (tracker.status.state, tracker.status.active_faults) == (AxisState.DISABLED, ())
 
 
 def test_a_coasting_motor_moves_though_it_is_disabled():
-    assert observed(reading(enabled=False, velocity=800.0)).moving is Moving.YES
+    assert observed(reading(enabled=False, velocity=800.0)).status.moving is Moving.YES
 
 
 def test_an_alarm_that_is_gone_leaves_nothing_to_reset():
     tracker = observed(reading(faults=(ALARM,)), reading())
 
-    assert (tracker.state, tracker.first_fault) == (AxisState.STANDSTILL, None)
+    assert (tracker.status.state, tracker.status.first_fault) == (AxisState.STANDSTILL, None)
 
 
 def test_a_drive_that_answers_again_needs_no_reset():
     tracker = observed(reading())
-    tracker.disconnected(5)
+    tracker.take(DriveLost(5, another=False))
 
-    assert (tracker.link, tracker.state) == (LinkState.DOWN, AxisState.ERROR_STOP)
+    assert (tracker.status.link, tracker.status.state) == (LinkState.DOWN, AxisState.ERROR_STOP)
 
-    tracker.observed(reading(), Timing(9, 9, 9, 9), 9)
+    tracker.observe(reading(), Timing(9, 9, 9, 9), 9)
 
-    assert (tracker.link, tracker.state, tracker.active_faults) == (LinkState.UP, AxisState.STANDSTILL, ())
+    assert (tracker.status.link, tracker.status.state, tracker.status.active_faults) == (
+        LinkState.UP,
+        AxisState.STANDSTILL,
+        (),
+    )

@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import pytest
 
+from ldcnd.axis.events import ResetDone, StopLatch
 from ldcnd.axis.permit import Right
 from ldcnd.axis.procedures.group import GroupMoveRequest, Meeting
 from ldcnd.contract.commands import (
@@ -43,7 +44,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, TelemetryItem
 from ldcnd.drives.driver import AnalogMotion, CountsMotion, Fault, HomeCapture, PwmOutput, StopMode
-from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, raising
+from tests.support.axis_bench import RUNNING, STANDING, AxisBench, axis_bench, put, raising
 
 LOST = ReplyTimeout("no reply")
 OVERHEAT = Fault("overheat", "let it cool down")
@@ -75,17 +76,20 @@ async def test_a_search_is_armed_started_once_and_taken_over_when_it_has_capture
         motion, capture = loads(bench)[0]
         assert capture == HomeCapture(HomeMethod.INDEX, StopMode.SMOOTH)
         assert motion == CountsMotion(round(5000 * 60.0 * 1.1), 5000.0, 200_000.0)
-        assert (bench.tracker.state, bench.tracker.referenced) == (AxisState.HOMING, False)
+        assert (bench.tracker.status.state, bench.tracker.status.referenced) == (AxisState.HOMING, False)
 
         await bench.pass_s(0.5, **SEARCHING)
         assert bench.drive.calls == ["load", "start"]
         await bench.pass_s(0.5, position_counts=1300, **CAPTURED)
         assert bench.drive.calls == ["load", "start", "stop", "captured_home", "clear_warnings"]
-        assert bench.tracker.referenced
-        assert bench.axis.telemetry.position(1234) == 100.0
-        assert bench.tracker.state is AxisState.HOMING  # until it has come to rest
+        assert bench.tracker.status.referenced
+        assert bench.tracker.status.scale.position(1234) == 100.0
+        assert bench.tracker.status.state is AxisState.HOMING  # until it has come to rest
         await bench.settled(position_counts=1300)
-        assert (bench.tracker.state, status(bench, "home")) == (AxisState.STANDSTILL, [(CommandStatus.DONE, None)])
+        assert (bench.tracker.status.state, status(bench, "home")) == (
+            AxisState.STANDSTILL,
+            [(CommandStatus.DONE, None)],
+        )
 
 
 async def test_a_search_that_comes_to_rest_without_a_capture_has_failed():
@@ -97,7 +101,7 @@ async def test_a_search_that_comes_to_rest_without_a_capture_has_failed():
 
         assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
         assert status(bench, "home") == [(CommandStatus.FAILED, "no index within 3 mm")]
-        assert not bench.tracker.referenced
+        assert not bench.tracker.status.referenced
 
 
 async def test_a_search_is_given_up_at_its_deadline():
@@ -130,9 +134,9 @@ async def test_a_stop_at_any_step_of_a_search_leaves_no_reference_and_no_command
         await bench.pass_s(0.1, **CAPTURED)
         await bench.settled(homing=False)
 
-        assert not bench.tracker.referenced
-        assert (bench.tracker.command, bench.tracker.state) == (None, AxisState.STANDSTILL)
-        assert bench.tracker.stop_latched
+        assert not bench.tracker.status.referenced
+        assert (bench.tracker.status.command, bench.tracker.status.state) == (None, AxisState.STANDSTILL)
+        assert bench.tracker.status.stop_latched
         assert bench.drive.calls.count("start") == (0 if call == "load" else 1)
 
 
@@ -143,7 +147,7 @@ async def test_a_stop_while_a_search_looks_at_its_switch_starts_nothing():
             await bench.send(ONTO_SWITCH)
 
         assert bench.drive.calls == ["stop"]
-        assert bench.tracker.referenced  # as before
+        assert bench.tracker.status.referenced  # as before
 
 
 async def test_a_stop_while_a_search_that_failed_is_ended_leaves_the_command_of_the_stop():
@@ -152,7 +156,7 @@ async def test_a_stop_while_a_search_that_failed_is_ended_leaves_the_command_of_
         await bench.pass_s(0.1, **SEARCHING)
         bench.drive.during["stop"] = bench.stop
         await bench.pass_s(1.0, **SEARCHING)
-        assert bench.tracker.command.verb == "stop"
+        assert bench.tracker.status.command.verb == "stop"
         await bench.settled(homing=False)
 
     assert status(bench, "home") == [(CommandStatus.ABORTED, "aborted by stop")]
@@ -165,10 +169,10 @@ async def test_a_stop_while_an_axis_brakes_off_its_switch_leaves_no_homing_behin
         await bench.pass_s(0.1, **SEARCHING)
         bench.drive.during["stop"] = bench.stop
         await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
-        assert bench.tracker.state is AxisState.STOPPING
+        assert bench.tracker.status.state is AxisState.STOPPING
         await bench.settled(homing=False)
 
-        assert (bench.tracker.command, bench.tracker.state) == (None, AxisState.STANDSTILL)
+        assert (bench.tracker.status.command, bench.tracker.status.state) == (None, AxisState.STANDSTILL)
         assert bench.drive.calls == ["load", "start", "stop", "stop"]
 
 
@@ -182,13 +186,13 @@ async def test_an_axis_on_its_switch_leaves_it_before_it_searches():
         await bench.pass_s(0.5, **SEARCHING)
         await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
         assert bench.drive.calls == ["load", "start", "stop"]
-        assert bench.tracker.state is AxisState.HOMING
+        assert bench.tracker.status.state is AxisState.HOMING
         await bench.pass_s(0.1, **RESTING)
         assert bench.drive.calls == ["load", "start", "stop", "load", "start"]
         assert loads(bench)[1][0].target_counts > 0
         await bench.pass_s(0.1, **SEARCHING)
         await bench.pass_s(0.1, forward_limit=True, **CAPTURED)
-        assert bench.tracker.referenced
+        assert bench.tracker.status.referenced
 
 
 async def test_an_axis_that_does_not_come_off_its_switch_gives_up():
@@ -223,7 +227,7 @@ async def test_a_switch_is_found_fast_then_left_and_then_searched_slowly():
         assert loads(bench)[0][0].velocity_counts_per_s == 15_000.0
         await bench.pass_s(0.1, **SEARCHING)
         await bench.pass_s(0.1, forward_limit=True, **CAPTURED)
-        assert not bench.tracker.referenced
+        assert not bench.tracker.status.referenced
         await bench.pass_s(0.1, **RESTING)
         assert [load[0].velocity_counts_per_s for load in loads(bench)] == [15_000.0, 5000.0]
         assert loads(bench)[1][0].target_counts < 0
@@ -300,7 +304,7 @@ async def test_a_step_that_nobody_knows_to_have_started_is_not_taken_twice_and_t
         await bench.pass_s(0.1, forward_limit=False, **CAPTURED)
         await bench.settled(homing=False)
 
-        assert bench.tracker.referenced
+        assert bench.tracker.status.referenced
         assert status(bench, "home") == [(CommandStatus.DONE, None)]
 
 
@@ -319,7 +323,7 @@ async def test_a_stop_ends_a_procedure_whose_step_nobody_knows_to_have_started()
         await bench.settled(homing=False)
 
         assert bench.axis._commands.procedure is None
-        assert not bench.tracker.referenced
+        assert not bench.tracker.status.referenced
 
 
 async def test_an_axis_that_does_not_rest_after_its_search_does_not_move_on():
@@ -341,7 +345,7 @@ async def test_a_search_that_opens_the_loop_ends_with_the_loop_open():
         await bench.pass_s(0.1, enabled=False, **CAPTURED)
 
         assert ("stop", StopMode.OFF) in bench.drive.told
-        assert (bench.tracker.state, bench.tracker.referenced) == (AxisState.DISABLED, True)
+        assert (bench.tracker.status.state, bench.tracker.status.referenced) == (AxisState.DISABLED, True)
         assert status(bench, "home") == [(CommandStatus.DONE, None)]
 
 
@@ -357,7 +361,7 @@ async def test_a_search_by_position_error_resets_the_drive_and_closes_the_loop_a
 
         assert bench.drive.calls[2:4] == ["reset", "stop" if stopped == "reset" else "captured_home"]
         assert ("power" in bench.drive.calls) is (stopped != "reset")
-        assert bench.tracker.referenced is not bool(stopped)
+        assert bench.tracker.status.referenced is not bool(stopped)
 
 
 async def test_the_preset_completes_a_request_and_the_request_outranks_it():
@@ -371,7 +375,7 @@ async def test_the_preset_completes_a_request_and_the_request_outranks_it():
         assert loads(bench)[0][0] == CountsMotion(4000, 10_000.0, 200_000.0)
         await bench.stop()
         await bench.settled()
-        bench.tracker.cleared(0.0)
+        bench.tracker.take(ResetDone(0.0))
         await bench.settled()
         bench.drive.told.clear()
         await bench.send(Home(method=HomeMethod.INDEX, velocity=2.0, position=0.0, distance=8.0, stop=HomeStop.SMOOTH))
@@ -401,7 +405,7 @@ async def test_a_search_that_cannot_be_is_refused_before_anything_is_sent(reques
             await bench.send(request_)
 
         assert bench.drive.calls == []
-        assert bench.tracker.referenced
+        assert bench.tracker.status.referenced
 
 
 async def test_an_index_search_as_fast_as_the_drive_can_see_is_taken_and_other_captures_do_not_care():
@@ -413,7 +417,7 @@ async def test_an_index_search_as_fast_as_the_drive_can_see_is_taken_and_other_c
         await bench.send(INDEX.model_copy(update={"velocity": -7.5}))
         await bench.stop()
         await bench.settled()
-        bench.tracker.cleared(0.0)
+        bench.tracker.take(ResetDone(0.0))
         await bench.settled()
         await bench.send(Home(method=HomeMethod.CURRENT, velocity=8.0))
 
@@ -424,13 +428,13 @@ async def test_a_step_whose_packets_were_lost_is_taken_again():
         await bench.pass_s(0.1, **SEARCHING)
         bench.drive.during["captured_home"] = raising(LOST)
         await bench.pass_s(0.1, **CAPTURED)
-        assert not bench.tracker.referenced
+        assert not bench.tracker.status.referenced
         await asyncio.sleep(0.19)
         assert bench.drive.calls.count("captured_home") == 1
         await asyncio.sleep(0.02)
 
         assert bench.drive.calls.count("captured_home") == 2
-        assert bench.tracker.referenced
+        assert bench.tracker.status.referenced
 
 
 async def test_a_step_of_a_drive_that_does_not_answer_is_taken_again_more_slowly():
@@ -532,7 +536,7 @@ async def test_a_jog_is_not_made_faster_where_the_limit_is_too_near():
             await bench.send(MoveVelocity(velocity=10.0))
         assert bench.drive.calls == []
 
-        bench.tracker.referenced = False
+        put(bench.tracker, referenced=False)
         await bench.send(MoveVelocity(velocity=10.0))
 
 
@@ -588,13 +592,13 @@ async def test_a_duty_is_ended_after_its_time():
         assert bench.drive.told == [("load", PwmOutput(0.2, 200_000.0)), ("start", None)]
         assert (reply.duty, reply.duration_s) == (0.2, 2.0)
         await bench.pass_s(1.9, enabled=False, **RUNNING)
-        assert bench.tracker.state is AxisState.CONTINUOUS_MOTION  # an open loop is what was asked for
+        assert bench.tracker.status.state is AxisState.CONTINUOUS_MOTION  # an open loop is what was asked for
         assert "stop" not in bench.drive.calls
         await asyncio.sleep(0.2)
         assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH)
         await bench.settled(enabled=True)
 
-    assert bench.tracker.state is AxisState.STANDSTILL
+    assert bench.tracker.status.state is AxisState.STANDSTILL
 
 
 async def test_a_duty_on_a_reversed_axis_goes_the_other_way():
@@ -656,7 +660,7 @@ async def test_set_points_follow_each_other_within_their_step_and_rate():
     async with axis_bench(tracking=TRACKING) as bench:
         reply = await bench.send(Track(position=0.5), "one")
         assert reply.position == 0.5
-        assert bench.tracker.state is AxisState.CONTINUOUS_MOTION
+        assert bench.tracker.status.state is AxisState.CONTINUOUS_MOTION
         await asyncio.sleep(0.02)
         await bench.send(Track(position=1.0), "two")  # from the set-point before, wherever the axis is
         assert [what for name, what in bench.drive.told if name == "track"] == [500, 1000]
@@ -675,10 +679,10 @@ async def test_a_stream_is_over_when_nothing_comes_any_more():
     async with axis_bench(tracking=TRACKING) as bench:
         await bench.send(Track(position=0.1), "one")
         await bench.pass_s(0.45)
-        assert bench.tracker.command
+        assert bench.tracker.status.command
         await bench.pass_s(0.1)
 
-        assert (bench.tracker.command, bench.tracker.state) == (None, AxisState.STANDSTILL)
+        assert (bench.tracker.status.command, bench.tracker.status.state) == (None, AxisState.STANDSTILL)
         assert status(bench, "one") == [(CommandStatus.DONE, None)]
         assert bench.drive.calls == ["track"]
 
@@ -710,7 +714,7 @@ async def test_a_set_point_needs_a_closed_referenced_loop_at_rest_and_bounds(sta
             await bench.stop()
             await bench.settled()
         elif state == "not referenced":
-            bench.tracker.referenced = False
+            put(bench.tracker, referenced=False)
         with pytest.raises(NotSupported if state == "unconfigured" else expected.get(state, WrongState)):
             await bench.send(Track(position=0.4 if state == "beyond" else 0.1))
 
@@ -731,7 +735,7 @@ async def test_a_set_point_whose_sender_has_lost_the_axis_leaves_the_stream_as_i
         with pytest.raises(LeaseExpired):
             await bench.send(Track(position=0.2), "two", Right(holds=holds))
 
-        assert bench.tracker.command.command_id == "one"
+        assert bench.tracker.status.command.command_id == "one"
         assert bench.drive.calls == ["track"]
 
 
@@ -758,7 +762,7 @@ async def test_a_set_point_with_an_unknown_outcome_counts_for_the_next_one_and_a
         with pytest.raises(ReplyTimeout):
             await bench.send(Track(position=0.9), "three")
 
-        assert bench.tracker.command is None
+        assert bench.tracker.status.command is None
         assert status(bench, "three") == [(CommandStatus.FAILED, "no reply")]
 
 
@@ -792,7 +796,7 @@ async def test_an_analog_move_ends_when_the_drive_says_so():
 async def test_an_analog_move_is_stopped_at_each_of_its_bounds(seconds, counts, limit, failure):
     limits = {"position_min": -limit, "position_max": limit}
     async with axis_bench(analog={"timeout_s": 2.0, "distance": 3.0}, limits=limits) as bench:
-        bench.tracker.referenced = failure is None or "limit" in failure
+        put(bench.tracker, referenced=failure is None or "limit" in failure)
         failure = None if failure == "not referenced" else failure
         await bench.send(MoveAnalog(target=500), "analog")
         await bench.pass_s(seconds, position_counts=counts, **RUNNING)
@@ -835,8 +839,8 @@ async def test_an_analog_move_that_was_lost_from_sight_is_stopped_or_switched_of
         await bench.send(MoveAnalog(target=500))
         bench.axis.disconnected()
         await bench.pass_s(0.5, enabled=enabled, **RUNNING)
-        assert bench.tracker.command is None
-        assert bench.tracker.state is AxisState.ERROR_STOP
+        assert bench.tracker.status.command is None
+        assert bench.tracker.status.state is AxisState.ERROR_STOP
 
     assert bench.drive.told[-1] == ("stop", StopMode.SMOOTH if enabled else StopMode.OFF)
 
@@ -884,7 +888,7 @@ async def test_a_group_starts_once_all_its_members_have_their_turn():
 
         assert network.started == [{"x", "y"}]
         assert (reply.position, first.result().position) == (20.0, 10.0)
-        assert one.tracker.state is other.tracker.state is AxisState.DISCRETE_MOTION
+        assert one.tracker.status.state is other.tracker.status.state is AxisState.DISCRETE_MOTION
 
 
 async def test_a_member_whose_turn_does_not_come_keeps_all_from_moving():
@@ -893,7 +897,7 @@ async def test_a_member_whose_turn_does_not_come_keeps_all_from_moving():
         with pytest.raises(WrongState, match="y did not get their turn"):
             await joined(one, Meeting(network, frozenset({"x", "y"})))
 
-        assert (network.started, one.tracker.command) == ([], None)
+        assert (network.started, one.tracker.status.command) == ([], None)
 
 
 async def test_a_member_that_cannot_move_keeps_all_from_moving_and_gives_the_cause():
@@ -922,17 +926,17 @@ async def test_a_member_that_leaves_while_the_drives_are_loaded_keeps_all_from_m
             await joined(one, meeting)
         await one.pass_s(0.1)
 
-        assert (network.started, one.tracker.command) == ([], None)
+        assert (network.started, one.tracker.status.command) == ([], None)
 
 
 async def test_a_stop_of_a_member_while_the_drives_are_loaded_keeps_all_from_moving():
     network = FakeNetwork()
     async with axis_bench() as one:
-        network.meanwhile = lambda: (one.tracker.latch_stop(), one.axis._gate.overtake(None, "a stop"))
+        network.meanwhile = lambda: (one.tracker.take(StopLatch()), one.axis._gate.overtake(None, "a stop"))
         with pytest.raises(StopLatched):
             await joined(one, Meeting(network, frozenset({"x"})))
 
-        assert (network.started, one.tracker.command) == ([], None)
+        assert (network.started, one.tracker.status.command) == ([], None)
 
 
 async def test_a_failure_that_no_member_is_left_to_see_is_no_error_of_the_loop():
@@ -957,9 +961,9 @@ async def test_a_group_that_failed_to_start_is_over_unless_it_may_have_started(e
             await joined(one, Meeting(network, frozenset({"x"})))
 
         if isinstance(error, OutcomeUnknown):
-            assert one.tracker.command.command_id == "group"
+            assert one.tracker.status.command.command_id == "group"
             await one.pass_s(0.1, **STANDING)  # readings tell how it went
-        assert one.tracker.command is None
+        assert one.tracker.status.command is None
         await asyncio.sleep(0)
         assert one.published(TelemetryItem.STATE).command is None
 
@@ -967,7 +971,7 @@ async def test_a_group_that_failed_to_start_is_over_unless_it_may_have_started(e
 async def test_a_group_move_needs_a_reference():
     network = FakeNetwork()
     async with axis_bench() as one:
-        one.tracker.referenced = False
+        put(one.tracker, referenced=False)
         with pytest.raises(NotReferenced):
             await joined(one, Meeting(network, frozenset({"x"})))
 
@@ -977,7 +981,7 @@ async def test_a_relative_move_counts_from_the_target_of_a_group_move():
         await joined(one, Meeting(FakeNetwork(), frozenset({"x"})))
         await one.settled(position_counts=10_004)
 
-        assert one.axis._motion.target_counts == 10_000
+        assert one.tracker.status.target_counts == 10_000
         assert replace(one.drive.shown).position_counts == 10_004
 
 
@@ -1015,7 +1019,7 @@ async def test_a_jog_that_turns_round_on_a_drive_that_must_stand_for_it_waits_un
         assert bench.drive.calls == ["load", "start", "stop"]  # the profile is done, the shaft still follows it
         while bench.drive.calls.count("load") == 1:
             await bench.pass_s(0.1, **STANDING)
-        assert bench.tracker.state is AxisState.CONTINUOUS_MOTION
+        assert bench.tracker.status.state is AxisState.CONTINUOUS_MOTION
         assert bench.drive.calls == ["load", "start", "stop", "load", "start"]
         assert loads(bench)[1].target_counts < 0
 
@@ -1051,4 +1055,4 @@ async def test_a_probe_publishes_what_was_latched_and_stops(distance):
         latched = bench.published(TelemetryItem.LATCH)
         assert (latched.counts, latched.value, latched.command_id) == (777, 0.777, "probe")
         assert status(bench, "probe") == [(CommandStatus.DONE, None)]
-        assert bench.tracker.referenced
+        assert bench.tracker.status.referenced

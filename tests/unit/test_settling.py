@@ -4,15 +4,18 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.axis.state import SettleJudge, Settling
+from ldcnd.axis.rest import SettleProgress, Settling
 from tests.support.axis_bench import AT_REST
 
 SETTLING = Settling(target_counts=1000, window_counts=10, time_s=0.05, timeout_s=1.0)
 
 
 def verdicts(settling: Settling, *positions: tuple[float, int]) -> list[bool | None]:
-    judge = SettleJudge(settling)
-    return [judge.observed(replace(AT_REST, position_counts=counts), at_s) for at_s, counts in positions]
+    progress, found = SettleProgress(until_s=positions[0][0] + settling.timeout_s), []
+    for at_s, counts in positions:
+        progress, settled = progress.observe(settling, replace(AT_REST, position_counts=counts), at_s)
+        found.append(settled)
+    return found
 
 
 @pytest.mark.parametrize("off", [10, -10, 0])

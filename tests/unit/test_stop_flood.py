@@ -12,19 +12,10 @@ from ldcnd.contract.errors import InternalError
 from ldcnd.contract.keys import Keys
 from ldcnd.daemon.dispatch import STOPS_AT_ONCE, Requests
 from ldcnd.net.hand_over import Answer, Query
+from tests.support.axis_bench import put, tracked
 from tests.support.session_pair import error_of
 
 KEYS = Keys("bench1")
-
-
-@dataclass
-class Tracker:
-    """Remembers the latch."""
-
-    stop_latched: bool = False
-
-    def latch_stop(self) -> None:
-        self.stop_latched = True
 
 
 @dataclass
@@ -39,7 +30,7 @@ class SlowRig:
 
     def __post_init__(self) -> None:
         axis = SimpleNamespace(
-            tracker=Tracker(),
+            tracker=tracked(),
             stops=SimpleNamespace(possible=True, latch_is_kept=False),
             config=SimpleNamespace(name="x"),
         )
@@ -47,7 +38,7 @@ class SlowRig:
         self.buses = (SimpleNamespace(bus=SimpleNamespace(wire_log=self.wire_log), axes=tuple(self.axes.values())),)
 
     def reset(self) -> None:
-        self.axes["x"].tracker.stop_latched = False
+        put(self.axes["x"].tracker, stop_latched=False)
 
     async def stop(self, names: tuple[str, ...]) -> tuple[str, ...]:
         self.stops += 1
@@ -113,7 +104,7 @@ async def test_a_stop_after_a_reset_is_sent_although_others_are_under_way():
         rig.confirmed.set()
 
     assert sent == STOPS_AT_ONCE + 1
-    assert rig.axes["x"].tracker.stop_latched
+    assert rig.axes["x"].tracker.status.stop_latched
 
 
 async def test_a_stop_that_has_joined_is_sent_after_all_when_a_reset_takes_its_latch():
@@ -126,7 +117,7 @@ async def test_a_stop_that_has_joined_is_sent_after_all_when_a_reset_takes_its_l
         rig.confirmed.set()
 
     assert rig.stops == STOPS_AT_ONCE + 1
-    assert rig.axes["x"].tracker.stop_latched
+    assert rig.axes["x"].tracker.status.stop_latched
 
 
 async def test_a_stop_whose_companion_fails_is_told_so():

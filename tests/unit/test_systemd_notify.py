@@ -215,12 +215,12 @@ async def test_end_brings_a_moving_axis_to_rest(manager: Manager):
         await client.command("x", Power(on=True))
         await client.command("x", MoveAbsolute(position=90))
         await asyncio.sleep(1)
-        assert daemon.rig.axes["x"].tracker.state is AxisState.DISCRETE_MOTION
+        assert daemon.rig.axes["x"].tracker.status.state is AxisState.DISCRETE_MOTION
 
         service.end()
         await asyncio.sleep(3)
 
-        assert daemon.rig.axes["x"].tracker.state is not AxisState.DISCRETE_MOTION
+        assert daemon.rig.axes["x"].tracker.status.state is not AxisState.DISCRETE_MOTION
 
 
 # -- reloading -------------------------------------------------------------------------------------------------------

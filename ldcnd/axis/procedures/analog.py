@@ -10,7 +10,7 @@ from typing_extensions import override
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAnalog
 from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.contract.samples import AxisState
@@ -56,9 +56,9 @@ class AnalogMove(EndlessMotion):
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: a bound is reached, or the axis lost its command while it was out of sight and may run."""
         motion, tracker = self._motion, self._motion.tracker
-        if tracker.command is None:
+        if tracker.status.command is None:
             return True
-        travelled = abs((reading.position_counts - self._from_counts) / motion.counts_per_unit)
+        travelled = abs((reading.position_counts - self._from_counts) / motion.scale.counts_per_unit)
         if self._distance is not None and travelled > self._distance:
             self._failure = f"not there within {self._distance:g} {motion.config.unit}"
             return True

@@ -8,10 +8,11 @@ from dataclasses import replace
 
 from typing_extensions import override
 
+from ldcnd.axis.events import CommandOver
 from ldcnd.axis.motion import AxisMotion, MotionPlan, both_s
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAbsolute, MoveRelative
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import AxisReading
@@ -44,16 +45,15 @@ class ApproachMove(Procedure):
 
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:
-        return reading.profile_done and self._motion.tracker.at_rest
+        return reading.profile_done and self._motion.tracker.status.at_rest
 
     async def step(self) -> bool:
         """See `Procedure`: go to the goal, if nothing has cut the first motion short; it ends like any move."""
         motion = self._motion
         if motion.latest().cut_short:
-            motion.tracker.finished()
+            motion.tracker.take(CommandOver())
             return False
         goal = motion.plan_to(self._goal.position or 0.0, self._request.velocity, self._request.acceleration)
         await self.permit.load(goal.motion)
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=goal)
-        motion.target_counts, motion.approached = goal.motion.target_counts, True
         return False

@@ -11,7 +11,7 @@ from typing_extensions import override
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import NEVER_S, Procedure
-from ldcnd.axis.state import AxisTracker
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.errors import PositionLimit
 from ldcnd.drives.driver import AxisReading
 
@@ -54,10 +54,10 @@ class EndlessMotion(Procedure):
         """Tell whether it must be stopped now to stand before a software limit; if not, work out by when at last."""
         motion, limits = self._motion, self._motion.config.limits
         self._stop_at_s = NEVER_S
-        if not motion.tracker.referenced:
+        if not motion.tracker.status.referenced:
             return False
-        here = motion.telemetry.position(reading.position_counts)
-        forward, backward = self.fastest(reading.velocity_counts_per_s / motion.counts_per_unit)
+        here = motion.scale.position(reading.position_counts)
+        forward, backward = self.fastest(reading.velocity_counts_per_s / motion.scale.counts_per_unit)
         spare_s = NEVER_S
         if limits.position_max is not None and forward > 0:
             spare_s = self._spare_s(limits.position_max - here, forward)
@@ -78,13 +78,13 @@ class EndlessMotion(Procedure):
             PositionLimit: there is not enough way left.
         """
         motion, tracker = self._motion, self._motion.tracker
-        limit = motion.limit_ahead(velocity) if tracker.referenced else None
+        limit = motion.limit_ahead(velocity) if tracker.status.referenced else None
         if limit is None:
             return
-        here = motion.telemetry.position(motion.latest().position_counts)
+        here, unit = motion.here, motion.scale.unit
         if self.ends_before_limit(motion.latest()) or (here >= limit if velocity > 0 else here <= limit):
             raise PositionLimit(
-                f"axis {tracker.name} is at {here:g} {tracker.unit}: its limit {limit:g} {tracker.unit} is too near",
+                f"axis {tracker.name} is at {here:g} {unit}: its limit {limit:g} {unit} is too near",
                 axis=tracker.name,
                 value=here,
                 limit=limit,
@@ -94,7 +94,7 @@ class EndlessMotion(Procedure):
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: a limit is near, the drive has stopped, or the command was lost while out of sight."""
-        lost = self._motion.tracker.command is None
+        lost = self._motion.tracker.status.command is None
         return self.ends_before_limit(reading) or lost or bool(reading.cut_short)
 
     async def step(self) -> bool:
@@ -104,4 +104,4 @@ class EndlessMotion(Procedure):
 
     def outlived(self, tracker: AxisTracker) -> bool:
         """See `Procedure`; without a command the drive may still run until it is seen at rest."""
-        return tracker.at_rest if tracker.command is None else super().outlived(tracker)
+        return tracker.status.at_rest if tracker.status.command is None else super().outlived(tracker)

@@ -11,10 +11,11 @@ from collections.abc import Mapping
 
 from typing_extensions import override
 
+from ldcnd.axis.events import CommandOver, MotionStarted
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit, start_together
 from ldcnd.axis.procedure import Procedure
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.axis.straight import straight_line
 from ldcnd.contract.commands import CommandReply, MoveAbsolute
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown, ShuttingDown, ValueOutOfRange, WrongState
@@ -220,8 +221,7 @@ class GroupMember(Procedure):
             meeting.fail(error)
             self._not_started(error)
             raise
-        motion.tracker.started(motion.clock.now_s())
-        motion.target_counts = self.plan.motion.target_counts
+        motion.tracker.take(MotionStarted(motion.clock.now_s(), self.plan.motion.target_counts))
         return motion.reply(self.permit, self.plan)
 
     def announce(self) -> None:
@@ -246,9 +246,9 @@ class GroupMember(Procedure):
         if not self._announced:
             return
         if isinstance(error, OutcomeUnknown):
-            motion.tracker.started(motion.clock.now_s())
+            motion.tracker.take(MotionStarted(motion.clock.now_s()))
             return
-        motion.tracker.finished(error.message)
+        motion.tracker.take(CommandOver(error.message))
         motion.publish_state()
 
 

@@ -10,12 +10,13 @@ from enum import Enum
 from typing_extensions import override
 
 from ldcnd.axis import guards
+from ldcnd.axis.events import CommandFailing, CommandOver, LoopSwitched, PlaceKnown, PlaceUnknown
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.probe import check_index_is_seen
 from ldcnd.axis.quiet_drive import QuietDrive, homing
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, Home, HomeMethod, HomeStop
 from ldcnd.contract.errors import MalformedRequest, NotSupported
 from ldcnd.contract.samples import AxisState
@@ -111,9 +112,9 @@ class HomeSequence(Procedure):
         if search.move_to is not None:
             guards.check_position(tracker, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
-        off_switch = runs_onto_switch(search, motion.counts_per_unit) and self._on_switch(await motion.read())
+        off_switch = runs_onto_switch(search, motion.scale.counts_per_unit) and self._on_switch(await motion.read())
         await motion.reference.forget()  # before the drive captures: the kept reference has another origin
-        finds = search.find_velocity is not None and runs_onto_switch(search, motion.counts_per_unit)
+        finds = search.find_velocity is not None and runs_onto_switch(search, motion.scale.counts_per_unit)
         await self._set_out(Leg.OFF_SWITCH if off_switch else Leg.FIND if finds else Leg.SEARCH)
         return motion.reply(
             self.permit, position=search.position, velocity=plan.velocity, acceleration=plan.acceleration
@@ -121,7 +122,7 @@ class HomeSequence(Procedure):
 
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:
-        resting = reading.profile_done and self._motion.tracker.at_rest
+        resting = reading.profile_done and self._motion.tracker.status.at_rest
         if self._leg in (Leg.BRAKE, Leg.CLEAR, Leg.FOUND):
             return resting
         return not reading.homing or resting
@@ -168,7 +169,7 @@ class HomeSequence(Procedure):
         )
         await self.permit.load(leg_motion, home=capture)
         self._leg = leg
-        motion.tracker.referenced = False
+        motion.tracker.take(PlaceUnknown())
         opens_loop = search.stop is HomeStop.OFF or search.method is HomeMethod.POSITION_ERROR
         self.deadline_s = motion.clock.now_s() + search.timeout_s
         await motion.start(
@@ -181,7 +182,7 @@ class HomeSequence(Procedure):
         if search.distance is None:
             reach = abs(speed) * search.timeout_s * BEYOND
         else:
-            reach = search.distance * abs(self._motion.counts_per_unit)
+            reach = search.distance * abs(self._motion.scale.counts_per_unit)
         return here + round(math.copysign(min(reach, LARGEST_COUNT), speed))
 
     def _failure(self) -> str:
@@ -195,7 +196,7 @@ class HomeSequence(Procedure):
         self.permit.still_wanted()
         log.warning("homing failed", axis=self._motion.config.name, reason=failure)
         self._motion.stopping(self.permit.command_id, self.permit.verb)
-        self._motion.tracker.failing(failure)
+        self._motion.tracker.take(CommandFailing(failure))
         return False
 
     async def _take_over(self) -> bool:
@@ -213,11 +214,10 @@ class HomeSequence(Procedure):
         if search.method is HomeMethod.POSITION_ERROR and closed:
             await motion.check_does_not_coast(REBOUND_S)
             await self.permit.power_on()
-        tracker.switched(on=closed, now_s=motion.clock.now_s())
-        motion.telemetry.origin_counts = captured - search.position * motion.counts_per_unit
-        tracker.referenced = True
+        tracker.take(LoopSwitched(on=closed, now_s=motion.clock.now_s()))
+        tracker.take(PlaceKnown(motion.scale.with_position(captured, search.position)))
         if not closed:
-            tracker.finished()
+            tracker.take(CommandOver())
             motion.publish_state()
             return False
         if search.move_to is None:
@@ -228,12 +228,11 @@ class HomeSequence(Procedure):
 
     async def _move_on(self) -> bool:
         motion, move_to = self._motion, self._search.move_to
-        if move_to is None or not motion.tracker.at_rest:
+        if move_to is None or not motion.tracker.status.at_rest:
             return await self._give_up(f"not at rest within {self._search.timeout_s:g} s")
         plan = motion.plan_to(motion.unwrapped(move_to), None, None)
         await self.permit.load(plan.motion)
         await motion.start(self.permit, AxisState.HOMING, Completion.PROFILE, plan=plan)
-        motion.target_counts = plan.motion.target_counts
         return False
 
     def _on_switch(self, reading: AxisReading) -> bool:

@@ -12,11 +12,12 @@ from enum import Enum
 
 from typing_extensions import override
 
+from ldcnd.axis.events import CommandOver, MotionStarted
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.velocity import COUNTER_SHARE
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, Jog
 from ldcnd.contract.errors import LeaseExpired, PositionLimit, Remedy, step
 from ldcnd.contract.samples import AxisState
@@ -141,7 +142,7 @@ class HeldJog(Procedure):
         try:
             return await self._run()
         finally:
-            command = self._motion.tracker.command
+            command = self._motion.tracker.status.command
             self._hold.begun = command is not None and command.command_id == self.permit.command_id
 
     def is_of(self, hold: Hold) -> bool:
@@ -155,7 +156,7 @@ class HeldJog(Procedure):
 
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: the drive has reached its goal, or was stopped by a limit switch."""
-        if reading.profile_done and (self._phase is not _Phase.SLOWS or self._motion.tracker.at_rest):
+        if reading.profile_done and (self._phase is not _Phase.SLOWS or self._motion.tracker.status.at_rest):
             self._extend_at_s = math.inf
             if self._phase is not _Phase.ENDS:
                 self._phase = _Phase.RESTS
@@ -171,7 +172,7 @@ class HeldJog(Procedure):
         if reading.cut_short:
             return await self._stop(reading.cut_short)
         if self._phase is _Phase.ENDS and reading.profile_done and not self.wants_step:
-            motion.tracker.finished()
+            motion.tracker.take(CommandOver())
             return False
         if self._phase is not _Phase.RESTS and not motion.driver.retargets:
             if self.wants_step:
@@ -184,14 +185,14 @@ class HeldJog(Procedure):
     @property
     def _asked(self) -> tuple[float, float | None, float]:
         """Velocity and acceleration, and the share of the velocity that the speed override leaves."""
-        return self._hold.velocity, self._hold.acceleration, self._motion.tracker.speed_share
+        return self._hold.velocity, self._hold.acceleration, self._motion.tracker.status.speed_share
 
     async def _run(self) -> CommandReply:
         """Have the drive run to a goal that is as far ahead as it may be."""
         motion, asked = self._motion, self._asked
         here = (await motion.read()).position_counts  # the latest reading may be as old as the rates let it be
         self.permit.ask_to_move()
-        plan, velocity, reach_s, at_limit = self._plan(motion.telemetry.position(here), *asked[:2])
+        plan, velocity, reach_s, at_limit = self._plan(motion.scale.position(here), *asked[:2])
         await self.permit.load(plan.motion)
         self._wanted = asked
         self._phase = _Phase.ENDS if at_limit else _Phase.RUNS  # also if it is unknown whether the drive has started
@@ -210,13 +211,13 @@ class HeldJog(Procedure):
         way = abs(steady.velocity) * reach_s + steady.velocity**2 / (2 * steady.acceleration)
         end = here + way if forward else here - way
         at_limit = False
-        if tracker.referenced:
+        if tracker.status.referenced:
             limits, limit = motion.config.limits, motion.limit_ahead(velocity)
             if limit is not None and (end >= limit if forward else end <= limit):
                 end, at_limit = limit, True
                 if here >= limit if forward else here <= limit:
                     raise PositionLimit(
-                        f"axis {tracker.name} is at its limit {limit:g} {tracker.unit}",
+                        f"axis {tracker.name} is at its limit {limit:g} {tracker.status.unit}",
                         axis=tracker.name,
                         value=here,
                         limit=limit,
@@ -237,7 +238,7 @@ class HeldJog(Procedure):
         motion = self._motion
         await motion.driver.stop(StopMode.SMOOTH)
         motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        motion.tracker.started(motion.clock.now_s())
+        motion.tracker.take(MotionStarted(motion.clock.now_s()))
         self._phase = _Phase.SLOWS
 
     async def _stop(self, reason: str) -> bool:

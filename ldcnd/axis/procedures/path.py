@@ -10,13 +10,14 @@ from dataclasses import dataclass
 
 from typing_extensions import override
 
+from ldcnd.axis.events import CommandFailing, CommandOver, MotionStarted
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit, start_path
 from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.group import Rendezvous
 from ldcnd.axis.quiet_drive import walking
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAbsolute
 from ldcnd.contract.errors import (
     BusError,
@@ -241,7 +242,9 @@ class SharedPath(Rendezvous):
         self.broken = reason
         log.warning("path stopped", axes=sorted(self._names), reason=reason)
         closed = {
-            name for name, share in self._shares.items() if share.member.motion.tracker.energised and not share.tripped
+            name
+            for name, share in self._shares.items()
+            if share.member.motion.tracker.status.energised and not share.tripped
         }
         try:
             await self._network.stop_together(StopMode.SMOOTH, frozenset(closed))
@@ -298,7 +301,7 @@ class PathMember(Procedure):
             path.fail(error)
             self._not_started(error)
             raise
-        motion.tracker.started(motion.clock.now_s())
+        motion.tracker.take(MotionStarted(motion.clock.now_s()))
         self._wait(path.share_of(self).sent)
         return motion.reply(self.permit, self.plan, duration_s=path.plan.duration_s if path.plan else None)
 
@@ -317,7 +320,7 @@ class PathMember(Procedure):
         motion = self.plan.motion
         return PathAxis(
             self._corners,
-            abs(self.motion.counts_per_unit),
+            abs(self.motion.scale.counts_per_unit),
             abs(motion.velocity_counts_per_s),
             motion.acceleration_counts_per_s2,
         )
@@ -391,15 +394,14 @@ class PathMember(Procedure):
         motion, target = self.motion, self.plan.motion.target_counts
         name = motion.config.name
         if target is None or abs(commanded_counts - target) > 1:
-            motion.tracker.finished(f"the drive ended its path at {commanded_counts} counts, not at {target}")
+            motion.tracker.take(CommandOver(f"the drive ended its path at {commanded_counts} counts, not at {target}"))
             motion.publish_state()
             return False
         at_end = MotionPlan(self.plan.motion, self.plan.position, self.plan.velocity, self.plan.acceleration, 0.0)
         motion.begin(
             self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end
         )
-        motion.tracker.started(motion.clock.now_s())
-        motion.target_counts = target
+        motion.tracker.take(MotionStarted(motion.clock.now_s(), target))
         log.debug("path walked", axis=name)
         return False
 
@@ -409,7 +411,7 @@ class PathMember(Procedure):
             return
         if isinstance(error, OutcomeUnknown):
             motion.stopping(self.permit.command_id, self.permit.verb)
-            motion.tracker.failing(error.message)
+            motion.tracker.take(CommandFailing(error.message))
             return
-        motion.tracker.finished(error.message)
+        motion.tracker.take(CommandOver(error.message))
         motion.publish_state()

@@ -7,11 +7,12 @@ target, so it ends in the drive also when no input comes and this host is dead.
 import math
 
 from ldcnd.axis import guards
+from ldcnd.axis.events import CommandFailing
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.quiet_drive import homing
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, HomeMethod, Probe, ProbeStop
 from ldcnd.contract.errors import MalformedRequest, NotSupported, VelocityLimit
 from ldcnd.contract.samples import AxisState, LatchSample
@@ -64,7 +65,7 @@ class ProbeMove(Procedure):
 
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: something was latched, or the move has ended without."""
-        return not reading.homing or (reading.profile_done and self._motion.tracker.at_rest)
+        return not reading.homing or (reading.profile_done and self._motion.tracker.status.at_rest)
 
     async def step(self) -> bool:
         """See `Procedure`: take what was latched; a drive that does not stop by itself is stopped here."""
@@ -81,16 +82,16 @@ class ProbeMove(Procedure):
             self._end(f"the drive stopped at the {self._ahead.value.replace('_', ' ')} switch")
             return False
         now_ns = motion.clock.now_ns()
-        motion.telemetry.latched(
+        motion.telemetry.publish_latch(
             LatchSample(
                 t=now_ns,
                 t_error_ns=0,
                 seq=0,
-                quality=motion.tracker.quality,
-                value=motion.telemetry.within_turn(motion.telemetry.position(latched))[0],
+                quality=motion.tracker.status.quality,
+                value=motion.scale.shown_at(latched),
                 unit=motion.config.unit,
                 counts=latched,
-                error=self._error_counts / abs(motion.counts_per_unit),
+                error=self._error_counts / abs(motion.scale.counts_per_unit),
                 sources=tuple(source.value for source in self._request.sources),
                 command_id=self.permit.command_id,
             )
@@ -101,7 +102,7 @@ class ProbeMove(Procedure):
     def _end(self, failure: str = "") -> None:
         self._motion.stopping(self.permit.command_id, self.permit.verb)
         if failure:
-            self._motion.tracker.failing(failure)
+            self._motion.tracker.take(CommandFailing(failure))
 
     def _check_sources(self) -> None:
         motion = self._motion
@@ -123,7 +124,7 @@ class ProbeMove(Procedure):
                 guards.check_referenced(motion.tracker)
                 position = motion.unwrapped(position)
             case None, float() as distance:
-                position = motion.telemetry.position(here_counts) + distance
+                position = motion.scale.position(here_counts) + distance
             case _:
                 raise MalformedRequest(
                     f"axis {motion.config.name}: a probe needs exactly one of position and distance",
@@ -148,7 +149,7 @@ def check_index_is_seen(motion: AxisMotion, plan: MotionPlan, width: int) -> Non
     sample_s = homing(motion.driver).capture_s
     if not sample_s:
         return
-    limit = INDEX_SHARE * width / sample_s / abs(motion.counts_per_unit)
+    limit = INDEX_SHARE * width / sample_s / abs(motion.scale.counts_per_unit)
     if abs(plan.velocity) > limit:
         raise VelocityLimit(
             f"axis {motion.config.name}: at {abs(plan.velocity):g} {motion.config.unit}/s the drive can miss an index"

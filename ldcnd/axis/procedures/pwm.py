@@ -9,7 +9,8 @@ from typing_extensions import override
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
-from ldcnd.axis.state import AxisTracker, Completion
+from ldcnd.axis.status import Completion
+from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import CommandReply, SetPwm
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.samples import AxisState
@@ -34,11 +35,11 @@ class PwmRun(EndlessMotion):
         self.permit.check_state()
         self._check_bounds()
         speed, rate = motion.config.velocity, motion.config.acceleration
-        counts_per_unit = abs(motion.counts_per_unit)
+        counts_per_unit = abs(motion.scale.counts_per_unit)
         acceleration = motion.quantise(CountsMotion(None, speed * counts_per_unit, rate * counts_per_unit))
         self.acceleration = acceleration.acceleration_counts_per_s2 / counts_per_unit
         self.check_room(request.duty)
-        duty = request.duty if motion.counts_per_unit > 0 else -request.duty
+        duty = request.duty if motion.scale.counts_per_unit > 0 else -request.duty
         await self.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
         self._until_s = motion.clock.now_s() + request.duration_s
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
@@ -59,11 +60,11 @@ class PwmRun(EndlessMotion):
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:
         """See `Procedure`: a limit is near, or the command was lost while out of sight; it may still be running."""
-        return self.ends_before_limit(reading) or self._motion.tracker.command is None
+        return self.ends_before_limit(reading) or self._motion.tracker.status.command is None
 
     async def step(self) -> bool:
         """See `Procedure`: its time is over, or a limit near. An axis that has failed meanwhile is switched off."""
-        ours = self._motion.tracker.command is not None
+        ours = self._motion.tracker.status.command is not None
         await self._motion.driver.stop(StopMode.SMOOTH if ours else StopMode.OFF)
         if ours:
             self._motion.stopping(self.permit.command_id, self.permit.verb)
@@ -71,7 +72,7 @@ class PwmRun(EndlessMotion):
 
     def outlived(self, tracker: AxisTracker) -> bool:
         """See `Procedure`; without a command it is unknown whether the motor still runs."""
-        return tracker.command is not None and super().outlived(tracker)
+        return tracker.status.command is not None and super().outlived(tracker)
 
     def _check_bounds(self) -> None:
         name, bounds, request = self._motion.config.name, self._motion.config.pwm, self._request

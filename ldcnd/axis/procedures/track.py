@@ -3,10 +3,11 @@
 from typing_extensions import override
 
 from ldcnd.axis import guards
+from ldcnd.axis.events import CommandOver, MotionStarted
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, Track, Verb
 from ldcnd.contract.errors import (
     BusError,
@@ -53,23 +54,22 @@ class SetPoint(Procedure):
         target = motion.counts_of(position)
         self._check_step(target, bounds)
         self.permit.ask_to_move()
-        if tracker.command and tracker.command.verb is Verb.TRACK:
-            tracker.finished()  # the stream goes on under the new command's name
+        if tracker.status.command and tracker.status.command.verb is Verb.TRACK:
+            tracker.take(CommandOver())  # the stream goes on under the new command's name
         motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         self.deadline_s = motion.clock.now_s() + max(SHORTEST_IDLE_S, IDLE_PERIODS / bounds.rate)
         try:
             await self.permit.track(target)
         except OutcomeUnknown:
-            motion.target_counts = target  # if it was not executed the next set-point is still near enough
-            tracker.started(motion.clock.now_s())
+            # if it was not executed the next set-point is still near enough
+            tracker.take(MotionStarted(motion.clock.now_s(), target))
             raise
         except (BusError, RequestRefused) as error:
-            tracker.finished(error.message)
+            tracker.take(CommandOver(error.message))
             motion.publish_state()
             raise
-        motion.target_counts = target
-        tracker.started(motion.clock.now_s())
-        return motion.reply(self.permit, position=motion.shown(motion.telemetry.position(target)))
+        tracker.take(MotionStarted(motion.clock.now_s(), target))
+        return motion.reply(self.permit, position=motion.scale.shown_at(target))
 
     @override
     def calls_for_step(self, reading: AxisReading) -> bool:
@@ -77,7 +77,7 @@ class SetPoint(Procedure):
 
     async def step(self) -> bool:
         """See `Procedure`: nothing came any more; the axis holds the last set-point."""
-        self._motion.tracker.finished()
+        self._motion.tracker.take(CommandOver())
         self._motion.publish_state()
         return False
 
@@ -105,10 +105,10 @@ class SetPoint(Procedure):
 
     def _check_step(self, target: int, bounds: TrackingConfig) -> None:
         motion = self._motion
-        last = motion.latest().position_counts if motion.target_counts is None else motion.target_counts
-        step = (target - last) / motion.counts_per_unit
+        last = motion.commanded_counts
+        step = (target - last) / motion.scale.counts_per_unit
         if abs(step) > bounds.step:
-            nearest = motion.telemetry.position(last) + (bounds.step if step > 0 else -bounds.step)
+            nearest = motion.scale.position(last) + (bounds.step if step > 0 else -bounds.step)
             raise ValueOutOfRange(
                 f"axis {motion.config.name}: set-point {self._request.position:g} is {abs(step):g} from the last one,"
                 f" the limit is {bounds.step:g}",

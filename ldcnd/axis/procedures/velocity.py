@@ -11,7 +11,7 @@ from typing_extensions import override
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedures.endless import EndlessMotion
-from ldcnd.axis.state import Completion
+from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveVelocity
 from ldcnd.contract.samples import AxisState
 

@@ -2,15 +2,14 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from enum import Enum
+from dataclasses import replace
 from typing import Any
 
-from ldcnd.contract.commands import Verb
+from ldcnd.axis.rest import Settling
+from ldcnd.axis.status import ActiveCommand, Completion
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.fault_pages import page_of
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, PastFault, Quality
-from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import AxisReading, Fault, StopMode
 from ldcnd.line.exchange import Timing
 from ldcnd.line.proof import Proof
@@ -109,43 +108,6 @@ MOTION_STATES = frozenset(
 )
 
 
-class Completion(Enum):
-    """When a command is done."""
-
-    PROFILE = "profile"
-    """The drive says the profile has ended."""
-    REST = "rest"
-    """The profile has ended and nothing moves."""
-    PROCEDURE = "procedure"
-    """The procedure that follows it says so."""
-
-
-@dataclass(frozen=True, slots=True)
-class Settling:
-    """When a motion to a target has settled.
-
-    Attributes:
-        target_counts: where it ends.
-        window_counts: how far from there the axis may be, in either direction.
-        time_s: for how long it must have stayed within the window.
-        timeout_s: longest time for that, from the end of the profile.
-        faults: an axis that does not settle has a fault.
-    """
-
-    target_counts: int
-    window_counts: float
-    time_s: float
-    timeout_s: float
-    faults: bool = False
-
-
-def window_counts(config: AxisConfig) -> float:
-    """Return how far from its target an axis may be that has settled, in counts."""
-    if config.settle.window is not None:
-        return config.settle.window * abs(config.signed_counts_per_unit)
-    return max(LEAST_WINDOW_COUNTS, WINDOW_OF_EL * config.gains.el if config.gains else 0.0)
-
-
 class SettleJudge:
     """Decides from readings behind the end of a profile whether an axis has settled.
 
@@ -172,33 +134,6 @@ class SettleJudge:
         if self._inside_since_s is not None and at_s - self._inside_since_s >= settling.time_s:
             return True
         return False if at_s >= self._until_s else None
-
-
-@dataclass(frozen=True, slots=True)
-class ActiveCommand:
-    """A motion under way.
-
-    Attributes:
-        command_id: as in the reply.
-        verb: the command.
-        since_ns: when it was accepted, UTC.
-        state: the axis state while it runs.
-        completion: what ends it.
-        opens_loop: it runs or ends with the position loop open, so an open loop is no failure.
-        target: where it ends, in axis units; None when it has no end of its own.
-        duration_s: of its profile, without settling; None when it has no end of its own.
-        settling: when it counts as settled; None when the end of its profile is its end.
-    """
-
-    command_id: str
-    verb: Verb
-    since_ns: int
-    state: AxisState
-    completion: Completion
-    opens_loop: bool = False
-    target: float | None = None
-    duration_s: float | None = None
-    settling: Settling | None = None
 
 
 Ended = Callable[[ActiveCommand, CommandStatus, str | None, bool | None], None]
@@ -751,7 +686,7 @@ class ObservedTracker(AxisTracker):
 
     has_reference = False
 
-    def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:  # noqa: ARG002 - of the contract
+    def observed(self, reading: AxisReading, timing: Timing, now_ns: int) -> None:
         """Digest a reading."""
         self._misses = self._in_vain = 0
         self.link = LinkState.UP

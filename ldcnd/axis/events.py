@@ -1,0 +1,260 @@
+"""What befalls one axis: what is observed of it, what is commanded, and what forbids it to move."""
+
+from dataclasses import dataclass
+
+from ldcnd.axis.scale import AxisScale
+from ldcnd.axis.status import ActiveCommand
+from ldcnd.contract.samples import PastFault
+from ldcnd.drives.driver import AxisReading, Fault, StopMode
+
+# -- what is observed ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingTaken:
+    """A reading was accepted.
+
+    Attributes:
+        reading: what the drive shows.
+        sent_at_s: when it was requested, in loop time.
+        now_ns: when it was true, UTC; it stamps the faults that the reading brings up.
+    """
+
+    reading: AxisReading
+    sent_at_s: float
+    now_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LookTaken:
+    """A reading out of turn shows whether the shaft turns."""
+
+    reading: AxisReading
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSeen:
+    """How the loop of a drive was found that was not read yet."""
+
+    enabled: bool
+
+
+@dataclass(frozen=True, slots=True)
+class PollMissed:
+    """A poll brought nothing; `another` tells that something answers which is not known to be this drive."""
+
+    now_ns: int
+    another: bool
+
+
+@dataclass(frozen=True, slots=True)
+class DriveLost:
+    """The drive is gone: nothing is known any more, and nothing resumes. `another` as of `PollMissed`."""
+
+    now_ns: int
+    another: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ReplyUnusable:
+    """The drive replies, but not with a reading. That is not silence: the link is degraded, never down."""
+
+    now_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ReadingsContradicted:
+    """The drive replies, and what it shows is not understood."""
+
+    now_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class FaultFound:
+    """The next reading shows what this daemon has neither done nor commanded: a fault until reset."""
+
+    fault: Fault
+
+
+@dataclass(frozen=True, slots=True)
+class ReferenceRefused:
+    """The reference that an earlier daemon has kept does not hold: a warning until there is another one."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceKnown:
+    """The place of the axis is known: it was homed, set, or kept.
+
+    Attributes:
+        scale: its coordinates from now on.
+        resting: the axis stands at a place that nothing has sent it to, as after `set_position`.
+    """
+
+    scale: AxisScale
+    resting: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class PlaceUnknown:
+    """The place of the axis is not known any more: its drive is about to get another one."""
+
+
+# -- what is commanded -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class CommandBegun:
+    """A motion is about to start; whatever ran before was aborted by it."""
+
+    command: ActiveCommand
+
+
+@dataclass(frozen=True, slots=True)
+class MotionStarted:
+    """The drive has acknowledged the motion, or may have: only readings requested from now on count for the command.
+
+    Attributes:
+        now_s: when, in loop time.
+        target_counts: where it ends, counts; None when it has no end of its own, or when that is not certain.
+        approached: it comes from the side that the configuration names.
+    """
+
+    now_s: float
+    target_counts: int | None = None
+    approached: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedChanged:
+    """The motion under way goes on at another speed, and ends after `rest_s`."""
+
+    rest_s: float
+    now_s: float
+    now_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class CommandFailing:
+    """The command under way will fail, for a reason, once the axis has come to rest."""
+
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class CommandOver:
+    """The command under way is over: done, or ended as `error` says."""
+
+    error: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class PowerSwitched:
+    """The drive has acknowledged a change of power."""
+
+    on: bool
+    now_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class LoopSwitched:
+    """The loop was opened or closed in the course of a command, which goes on."""
+
+    on: bool
+    now_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class SpeedOverridden:
+    """The rig has another speed override: the share of every velocity, 0 to 1."""
+
+    share: float
+
+
+# -- what forbids motion, and its end --------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class StopLatch:
+    """A stop is latched: nothing moves again before reset."""
+
+
+@dataclass(frozen=True, slots=True)
+class StopSent:
+    """A stop is about to be sent, as the strongest of those that are not confirmed."""
+
+    mode: StopMode
+
+
+@dataclass(frozen=True, slots=True)
+class StopUnconfirmed:
+    """No drive has confirmed a stop, or it is yet to be sent."""
+
+    now_ns: int
+    mode: StopMode = StopMode.SMOOTH
+
+
+@dataclass(frozen=True, slots=True)
+class StopConfirmed:
+    """The drive has confirmed a stop; a stronger one that is not confirmed yet stands.
+
+    A drive that cannot be moving, because it was reset or had no power, has confirmed every stop.
+    """
+
+    mode: StopMode = StopMode.OFF
+
+
+@dataclass(frozen=True, slots=True)
+class LatchRecalled:
+    """The axis begins with the latch that an earlier daemon has kept; what it stopped is to be stopped again.
+
+    Attributes:
+        stopped: a stop is latched.
+        again: how it is to be stopped, if it was not confirmed, or may not have been sent; None when it stood.
+        in_error: it is in error_stop.
+        first: what brought it there.
+        now_ns: when, UTC.
+    """
+
+    stopped: bool
+    again: StopMode | None
+    in_error: bool
+    first: PastFault | None
+    now_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ResetDone:
+    """An axis that stands was reset: latch and first cause are cleared; the next readings show what remains."""
+
+    now_s: float
+
+
+AxisEvent = (
+    ReadingTaken
+    | LookTaken
+    | LoopSeen
+    | PollMissed
+    | DriveLost
+    | ReplyUnusable
+    | ReadingsContradicted
+    | FaultFound
+    | ReferenceRefused
+    | PlaceKnown
+    | PlaceUnknown
+    | CommandBegun
+    | MotionStarted
+    | SpeedChanged
+    | CommandFailing
+    | CommandOver
+    | PowerSwitched
+    | LoopSwitched
+    | SpeedOverridden
+    | StopLatch
+    | StopSent
+    | StopUnconfirmed
+    | StopConfirmed
+    | LatchRecalled
+    | ResetDone
+)

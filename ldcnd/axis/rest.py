@@ -1,0 +1,127 @@
+"""When a shaft stands, and when a motion has settled: decided from readings. Pure; time is an input."""
+
+from dataclasses import dataclass, replace
+
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.driver import AxisReading
+
+REST_S = 0.25
+"""Shortest time within `REST_COUNTS` that proves rest of a shaft without a profile of this daemon, seconds."""
+REST_COUNTS = 5
+"""Highest less lowest position of a shaft at rest: a closed loop hunts by some counts. More than 20 counts/s never pass
+for rest."""
+MOST_REST_S = 2.0
+"""A shaft that crept out of that band must stay in it for twice as long as it took, at most this."""
+LEAST_WINDOW_COUNTS = 5.0
+"""A closed loop hunts by some counts."""
+WINDOW_OF_EL = 1 / 400
+"""Settle window as a fraction of the position error limit: that is some hundred times the error at rest."""
+
+
+@dataclass(frozen=True, slots=True)
+class RestEvidence:
+    """What readings prove of the rest of a shaft.
+
+    The velocity of a status packet has no fraction, and a drive in velocity mode says that its profile is done as soon
+    as the velocity is reached: a shaft that creeps below one count per tick shows velocity 0 and a finished profile. So
+    one reading proves rest only of a closed loop whose profile this daemon commanded, in which done means at rest; of
+    any other it takes positions.
+
+    Attributes:
+        rests: whether it does; None while that is not known.
+        turns: the latest reading shows a velocity.
+        commanded: the drive's profile is one of this daemon's.
+        since_s: from when on positions have stayed together, in loop time; None while they have not.
+        low: lowest of these positions, counts.
+        high: highest of them.
+        quiet_s: for how long they must.
+    """
+
+    rests: bool | None = None
+    turns: bool = False
+    commanded: bool = False
+    since_s: float | None = None
+    low: int = 0
+    high: int = 0
+    quiet_s: float = REST_S
+
+    def observe(self, reading: AxisReading, at_s: float) -> "RestEvidence":
+        """Return the evidence with a reading that was requested at an instant, in loop time."""
+        position = reading.position_counts
+        runs = reading.enabled and not reading.profile_done
+        if runs or shows_velocity(reading):
+            if self.rests is False and self.turns and self.since_s is None and self.quiet_s == REST_S:
+                return self
+            return RestEvidence(rests=False, turns=True, commanded=self.commanded)
+        if self.commanded and reading.enabled:
+            return self if self.rests else replace(self, rests=True)
+        if self.since_s is None:
+            return replace(self, turns=False, since_s=at_s, low=position, high=position)
+        low, high, held_s = min(self.low, position), max(self.high, position), at_s - self.since_s
+        if high - low > REST_COUNTS:
+            quiet_s = min(max(2 * held_s, REST_S), MOST_REST_S)
+            return replace(self, rests=False, quiet_s=quiet_s, since_s=at_s, low=position, high=position)
+        rests = True if held_s >= self.quiet_s else self.rests
+        if rests is self.rests and low == self.low and high == self.high:
+            return self
+        return replace(self, rests=rests, low=low, high=high)
+
+
+NOTHING_SEEN = RestEvidence()
+"""Of a drive that was out of reach, or that was not read since something was commanded."""
+
+
+def shows_velocity(reading: AxisReading) -> bool:
+    """Tell whether a reading shows a velocity that is not within the resolution of its drive."""
+    return abs(reading.velocity_counts_per_s) > reading.velocity_resolution_counts_per_s
+
+
+@dataclass(frozen=True, slots=True)
+class Settling:
+    """When a motion to a target has settled.
+
+    Attributes:
+        target_counts: where it ends.
+        window_counts: how far from there the axis may be, in either direction.
+        time_s: for how long it must have stayed within the window.
+        timeout_s: longest time for that, from the end of the profile.
+        faults: an axis that does not settle has a fault.
+    """
+
+    target_counts: int
+    window_counts: float
+    time_s: float
+    timeout_s: float
+    faults: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class SettleProgress:
+    """How far an axis has settled, from the end of its profile on.
+
+    Attributes:
+        until_s: when it must have settled, in loop time.
+        inside_since_s: since when it is within its window; None while it is not.
+    """
+
+    until_s: float
+    inside_since_s: float | None = None
+
+    def observe(self, settling: Settling, reading: AxisReading, at_s: float) -> tuple["SettleProgress", bool | None]:
+        """Take a reading; return the progress, and whether the axis has settled, None while that is open."""
+        inside_since_s = self.inside_since_s
+        if abs(settling.target_counts - reading.position_counts) > settling.window_counts:
+            inside_since_s = None
+        elif inside_since_s is None:
+            inside_since_s = at_s
+        progress = SettleProgress(self.until_s, inside_since_s)
+        if inside_since_s is not None and at_s - inside_since_s >= settling.time_s:
+            return progress, True
+        return progress, False if at_s >= self.until_s else None
+
+
+def window_counts(config: AxisConfig) -> float:
+    """Return how far from its target an axis may be that has settled, in counts."""
+    if config.settle.window is not None:
+        return config.settle.window * abs(config.signed_counts_per_unit)
+    return max(LEAST_WINDOW_COUNTS, WINDOW_OF_EL * config.gains.el if config.gains else 0.0)

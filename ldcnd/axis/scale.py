@@ -1,0 +1,57 @@
+"""The coordinates of one axis: its unit, its counts per unit, its modulo, and the count at which its position is 0."""
+
+from dataclasses import dataclass, replace
+
+from ldcnd.drives.axis_config import AxisConfig
+
+
+@dataclass(frozen=True, slots=True)
+class AxisScale:
+    """How counts of a drive and positions of its axis belong together.
+
+    Attributes:
+        unit: of the axis.
+        counts_per_unit: negative where forward in axis units is backward in counts.
+        modulo: length of one turn, in axis units; None for an axis without one.
+        origin_counts: count of the drive at position 0. It means something only while the axis is referenced.
+    """
+
+    unit: str
+    counts_per_unit: float = 1.0
+    modulo: float | None = None
+    origin_counts: float = 0.0
+
+    @classmethod
+    def of(cls, config: AxisConfig) -> "AxisScale":
+        """Return the scale that an axis is configured with, with its origin at count 0."""
+        return cls(config.unit, config.signed_counts_per_unit, config.modulo)
+
+    def position(self, counts: float) -> float:
+        """Return the position that a count of the drive stands for, in axis units, counted through all turns."""
+        return (counts - self.origin_counts) / self.counts_per_unit
+
+    def counts(self, position: float) -> int:
+        """Return the count of the drive that is nearest to a position, which is counted through all turns."""
+        return round(position * self.counts_per_unit + self.origin_counts)
+
+    def within_turn(self, position: float) -> tuple[float, int | None]:
+        """Return a position as clients see it, and how many whole turns lie below it; None without a modulo."""
+        modulo = self.modulo
+        if modulo is None:
+            return position, None
+        turns, value = divmod(position, modulo)
+        if value >= modulo:  # so rounds what lies less than a hair below a turn
+            turns, value = turns + 1, 0.0
+        return value, int(turns)
+
+    def shown(self, position: float) -> float:
+        """Return a position as clients see it: on an axis with a modulo from 0 up to it."""
+        return self.within_turn(position)[0]
+
+    def shown_at(self, counts: float) -> float:
+        """Return the position of a count of the drive as clients see it."""
+        return self.within_turn((counts - self.origin_counts) / self.counts_per_unit)[0]
+
+    def with_position(self, counts: float, position: float) -> "AxisScale":
+        """Return the scale by which a count of the drive has a position."""
+        return replace(self, origin_counts=counts - position * self.counts_per_unit)

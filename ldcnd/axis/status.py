@@ -1,0 +1,287 @@
+"""The state of one axis as a value: what was observed of it, what was commanded, and what forbids it to move.
+
+Nothing else knows any of it. step.py has the one function that makes a status from the one before; telemetry.py
+publishes it as it is.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any
+
+from ldcnd.axis.faults import READINGS_CONTRADICT, REPLIES_UNUSABLE
+from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling
+from ldcnd.axis.scale import AxisScale
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Quality
+from ldcnd.drives.driver import Fault, StopMode
+from ldcnd.line.exchange import Timing
+
+SHORTEST_READING_PAUSE_S = 0.005
+"""Shortest time between two readings of an axis that settles."""
+STRENGTH = {StopMode.SMOOTH: 0, StopMode.ABRUPT: 1, StopMode.OFF: 2}
+"""Stop modes, weakest first; a pending stop is only replaced by a stronger one."""
+MOTION_STATES = frozenset(
+    {AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION, AxisState.STOPPING}
+)
+QUALITIES = {LinkState.UP: Quality.GOOD, LinkState.DEGRADED: Quality.UNCERTAIN, LinkState.DOWN: Quality.BAD}
+"""Quality of a value read just now, by the drive's link."""
+
+
+class Completion(Enum):
+    """When a command is done."""
+
+    PROFILE = "profile"
+    """The drive says the profile has ended."""
+    REST = "rest"
+    """The profile has ended and nothing moves."""
+    PROCEDURE = "procedure"
+    """The procedure that follows it says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class ActiveCommand:
+    """A motion under way.
+
+    Attributes:
+        command_id: as in the reply.
+        verb: the command.
+        since_ns: when it was accepted, UTC.
+        state: the axis state while it runs.
+        completion: what ends it.
+        opens_loop: it runs or ends with the position loop open, so an open loop is no failure.
+        target: where it ends, in axis units; None when it has no end of its own.
+        duration_s: of its profile, without settling; None when it has no end of its own.
+        settling: when it counts as settled; None when the end of its profile is its end.
+    """
+
+    command_id: str
+    verb: Verb
+    since_ns: int
+    state: AxisState
+    completion: Completion
+    opens_loop: bool = False
+    target: float | None = None
+    duration_s: float | None = None
+    settling: Settling | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CommandEnd:
+    """A command that is over.
+
+    Attributes:
+        command: as it was.
+        status: how it ended.
+        reason: why it was not done; None when it was.
+        settled: whether it has settled; None where that means nothing.
+    """
+
+    command: ActiveCommand
+    status: CommandStatus
+    reason: str | None
+    settled: bool | None
+
+
+@dataclass(frozen=True, slots=True)
+class OpenStop:
+    """A stop that the drive has not confirmed.
+
+    Attributes:
+        mode: the strongest of those that were sent or are to be.
+        fault: what is published of it, from when on it was sent in vain, or is yet to be sent: nothing moves then until
+            it is confirmed. None while it is on its way for the first time.
+    """
+
+    mode: StopMode
+    fault: FaultEntry | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class AxisStatus:
+    """The state of one axis.
+
+    Attributes:
+        name: of the axis.
+        scale: its coordinates.
+        commanded: this daemon commands its drive. Others send one that is only observed: it has no command, no target
+            and no reference here, and its drive alone says how it is.
+        state: PLCopen state.
+        enabled: its position loop is closed.
+        referenced: its place is known.
+        reference_lost: it was known and is not any more, until it is known again; a reset does not clear it.
+        refused: why the reference that an earlier daemon has kept was refused; empty when none was, and once there is
+            another one.
+        position_lost: a fault says that what the drive counts is not where the axis is.
+        stop_latched: a stop is latched; only a reset clears it.
+        stop: the stop that the drive has not confirmed; None without one.
+        link: whether its drive answers.
+        misses: polls in a row without a reply.
+        in_vain: replies in a row that could not be used.
+        command: what is under way.
+        failure: why that will fail once the axis has come to rest.
+        settle: how far it has settled; None before the end of its profile, and without a target.
+        ends_at_s: when its profile should end, in loop time.
+        effective_from_s: only readings requested from then on show the latest command, in loop time; infinite until the
+            drive has acknowledged it.
+        last_end: how the last command ended.
+        last_error: why, when it was not done, until the next command is accepted or the axis is reset.
+        target: where the axis was sent last, or came to rest after anything else, in axis units; None while it is
+            neither, and while nothing holds it.
+        target_counts: target of the last motion, counts; None when it had no end or was followed by something else.
+        approached: that motion came from the side that the configuration names.
+        faults: what stands now, without a pending stop.
+        own: faults that this daemon has found, until reset.
+        first_fault: the fault that came first since the last reset.
+        speed_share: share of every velocity that the speed override leaves, 0 to 1.
+        rest: what readings prove of its rest.
+    """
+
+    name: str
+    scale: AxisScale
+    commanded: bool = True
+    state: AxisState = AxisState.DISABLED
+    enabled: bool = False
+    referenced: bool = False
+    reference_lost: bool = False
+    refused: str = ""
+    position_lost: bool = False
+    stop_latched: bool = False
+    stop: OpenStop | None = None
+    link: LinkState = LinkState.DOWN
+    misses: int = 0
+    in_vain: int = 0
+    command: ActiveCommand | None = None
+    failure: str | None = None
+    settle: SettleProgress | None = None
+    ends_at_s: float | None = None
+    effective_from_s: float = 0.0
+    last_end: CommandEnd | None = None
+    last_error: str | None = None
+    target: float | None = None
+    target_counts: int | None = None
+    approached: bool = False
+    faults: tuple[FaultEntry, ...] = ()
+    own: tuple[Fault, ...] = ()
+    first_fault: FaultEntry | None = None
+    speed_share: float = 1.0
+    rest: RestEvidence = NOTHING_SEEN
+
+    @property
+    def unit(self) -> str:
+        """The axis unit."""
+        return self.scale.unit
+
+    @property
+    def has_reference(self) -> bool:
+        """Whether its drive can be homed, or its position be set."""
+        return self.commanded
+
+    @property
+    def stop_pending(self) -> bool:
+        """Whether a stop was sent in vain, or is yet to be sent: nothing moves until the drive confirms it."""
+        return self.stop is not None and self.stop.fault is not None
+
+    @property
+    def active_faults(self) -> tuple[FaultEntry, ...]:
+        """What stands now; a stop that is not confirmed comes last."""
+        stop = self.stop
+        return (*self.faults, stop.fault) if stop and stop.fault else self.faults
+
+    @property
+    def speed_override(self) -> float:
+        """Percent of every velocity."""
+        return 100.0 * self.speed_share
+
+    @property
+    def moving(self) -> Moving:
+        """Whether the axis moves, as far as readings tell; never "no" without readings that prove it."""
+        if self.link is not LinkState.UP:
+            return Moving.UNKNOWN
+        rests = self.rest.rests
+        if rests is False or (self.command and self.state in MOTION_STATES):
+            return Moving.YES
+        return Moving.NO if rests else Moving.UNKNOWN
+
+    @property
+    def quality(self) -> Quality:
+        """Quality of a value read just now; never good while it is not known where the axis is."""
+        link = self.link
+        return Quality.UNCERTAIN if self.position_lost and link is LinkState.UP else QUALITIES[link]
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether the readings prove that nothing moves."""
+        return self.rest.rests is True
+
+    @property
+    def coasts(self) -> bool:
+        """Whether the shaft is seen to turn while the motor is off."""
+        return self.rest.turns and not self.enabled
+
+    @property
+    def energised(self) -> bool:
+        """Whether the motor gets voltage: the loop is closed, or open for a command that wants it so."""
+        return self.enabled or (self.command is not None and self.command.opens_loop)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether what its drive shows was not understood since the last reset."""
+        return READINGS_CONTRADICT in self.own
+
+    @property
+    def replies_unusable(self) -> bool:
+        """Whether its drive has replied for too long with what is no reading, since the last reset."""
+        return REPLIES_UNUSABLE in self.own
+
+    def sample_fields(self) -> dict[str, Any]:
+        """Return the fields of a state sample besides when, in its order; compared after every poll, so no model."""
+        return {
+            "quality": self.quality,
+            "state": self.state,
+            "enabled": self.enabled,
+            "referenced": self.referenced,
+            "moving": self.moving,
+            "link": self.link,
+            "stop_latched": self.stop_latched,
+            "stop_pending": self.stop_pending,
+            "command": self.command,
+            "last_error": self.last_error,
+            "has_reference": self.has_reference,
+            "reference_lost": self.reference_lost,
+            "target": self.target,
+            "speed_override": self.speed_override,
+        }
+
+    def is_at(self, command_id: str) -> bool:
+        """Tell whether a command is under way."""
+        return self.command is not None and self.command.command_id == command_id
+
+    def concerns(self, timing: Timing) -> bool:
+        """Tell whether a reading was requested after the latest command took effect."""
+        return timing.sent_at_s >= self.effective_from_s
+
+    def next_reading_s(self, at_s: float) -> float:
+        """Return when to read the axis so that the end of its motion is seen in time; infinite when there is none soon.
+
+        Args:
+            at_s: when it was read last, or is.
+        """
+        settling, ends_at_s = self.command.settling if self.command else None, self.ends_at_s
+        if settling is None or ends_at_s is None:
+            return math.inf
+        if at_s < ends_at_s:
+            return ends_at_s
+        if self.settle is None and at_s > ends_at_s + settling.timeout_s:
+            return math.inf  # not as planned: the ordinary polls tell
+        return at_s + max(settling.time_s / 2, SHORTEST_READING_PAUSE_S)
+
+
+def new_faults(before: AxisStatus, after: AxisStatus) -> Iterator[FaultEntry]:
+    """Yield the faults that have come up from one status to the next."""
+    if after.faults is not before.faults:
+        for entry in after.faults:
+            if not any(entry is each for each in before.faults):
+                yield entry

@@ -1,0 +1,446 @@
+"""What changes the state of an axis: one function from a status and an event to the next status.
+
+Pure; time is an input.
+The states are those of PLCopen, function blocks for motion control, part 1, state diagram.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from types import MappingProxyType
+from typing import Any
+
+from ldcnd.axis.events import (
+    AxisEvent,
+    CommandBegun,
+    CommandFailing,
+    CommandOver,
+    DriveLost,
+    FaultFound,
+    LatchRecalled,
+    LookTaken,
+    LoopSeen,
+    LoopSwitched,
+    MotionStarted,
+    PlaceKnown,
+    PlaceUnknown,
+    PollMissed,
+    PowerSwitched,
+    ReadingsContradicted,
+    ReadingTaken,
+    ReferenceRefused,
+    ReplyUnusable,
+    ResetDone,
+    SpeedChanged,
+    SpeedOverridden,
+    StopConfirmed,
+    StopLatch,
+    StopSent,
+    StopUnconfirmed,
+)
+from ldcnd.axis.faults import (
+    DRIVE_CHANGED,
+    LINK_LOST,
+    LOOP_OPENED,
+    NOT_IDENTIFIED,
+    NOT_SETTLED,
+    READINGS_CONTRADICT,
+    REFERENCE_REFUSED,
+    REPLIES_UNUSABLE,
+    STOP_UNCONFIRMED,
+    entry_again,
+    entry_of,
+)
+from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, shows_velocity
+from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, CommandEnd, Completion, OpenStop
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.drives.driver import Fault
+
+MISSES_UNTIL_DOWN = 3
+"""Consecutive polls without a reply after which the drive counts as lost, or with replies that cannot be used after
+which what it does is not understood."""
+
+
+def step(status: AxisStatus, event: AxisEvent) -> AxisStatus:
+    """Return the status after an event; the same object where nothing changes."""
+    return STEPS[type(event)](status, event)
+
+
+# -- the steps -------------------------------------------------------------------------------------------------------
+
+
+def _take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
+    if not status.commanded:
+        return _take_of_others(status, event)
+    reading, now_ns = event.reading, event.now_ns
+    faults = (*reading.faults, *status.own) if status.own else reading.faults
+    if reading.altered and DRIVE_CHANGED not in faults:
+        faults = (*faults, DRIVE_CHANGED)
+    if status.misses or status.in_vain or status.link is not LinkState.UP:
+        status = replace(status, misses=0, in_vain=0, link=LinkState.UP)
+    if faults or status.faults or status.stop:
+        lost = any(fault.loses_position for fault in faults)
+        status = _with(_with_faults(status, faults, now_ns), position_lost=lost)
+        if lost:
+            status = _with(_place_lost(status), target=None)
+    if event.sent_at_s >= status.effective_from_s:  # else it says nothing about the latest command
+        status = _take_effective(status, event, faults)
+    if status.target is None and status.enabled and _came_to_rest(status):
+        return replace(status, target=status.scale.shown_at(reading.position_counts))
+    return status
+
+
+def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
+    """Take what a reading shows that was requested after the latest command took effect."""
+    reading, at_s, now_ns = event.reading, event.sent_at_s, event.now_ns
+    rest, enabled, command = status.rest.observe(reading, at_s), reading.enabled, status.command
+    if rest is not status.rest or enabled is not status.enabled:
+        status = replace(status, rest=rest, enabled=enabled)
+    if reading.cut_short and command:
+        status = _with(status, failure=reading.cut_short)
+    if not enabled and status.target is not None:
+        status = replace(status, target=None)
+    if faults and any(fault.stops for fault in faults):
+        lost = "; its position is lost" if status.position_lost else ""
+        return _fail(status, f"the drive reports a fault{lost}")
+    if enabled:
+        return _take_enabled(status, event, faults)
+    if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
+        return status
+    return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
+
+
+def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
+    """Take a reading of a closed loop that nothing has stopped; `faults` are warnings."""
+    command, rests, reading = status.command, status.rest.rests, event.reading
+    if command is None:
+        if status.state is AxisState.ERROR_STOP or (rests is None and status.state is not AxisState.DISABLED):
+            return status
+        return _with(status, state=AxisState.STANDSTILL if rests else AxisState.DISCRETE_MOTION)
+    match command.completion:
+        case Completion.PROFILE if reading.profile_done:
+            return _take_profile_end(status, command, event, faults)
+        case Completion.REST if reading.profile_done and rests:
+            return _finished(status)
+        case _:
+            return status
+
+
+def _take_profile_end(
+    status: AxisStatus, command: ActiveCommand, event: ReadingTaken, faults: tuple[Fault, ...]
+) -> AxisStatus:
+    settling, reading, at_s = command.settling, event.reading, event.sent_at_s
+    if settling is None or status.failure:
+        return _finished(status)
+    progress, settled = (status.settle or SettleProgress(at_s + settling.timeout_s)).observe(settling, reading, at_s)
+    if settled is None:
+        return _with(status, settle=progress)
+    if settled or not settling.faults:
+        return _finished(status, settled=settled)
+    status = replace(status, own=(*status.own, NOT_SETTLED))
+    status = _with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
+    off = settling.target_counts - reading.position_counts
+    return _fail(status, f"{command.verb} did not settle: {off} counts off", settled=False)
+
+
+def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
+    """Take a reading of a drive that others command: it alone shows whether it is disabled, stands, moves or failed."""
+    reading = event.reading
+    faults = (*reading.faults, DRIVE_CHANGED) if reading.altered else reading.faults
+    status = _with_faults(_with(status, misses=0, in_vain=0, link=LinkState.UP), faults, event.now_ns)
+    # such a drive shows the speed in coarse steps, and its position comes from another poll
+    rest = replace(status.rest, rests=not shows_velocity(reading))
+    state = AxisState.STANDSTILL if rest.rests else AxisState.DISCRETE_MOTION
+    if any(fault.stops for fault in reading.faults):
+        state = AxisState.ERROR_STOP
+    elif not reading.enabled:
+        state = AxisState.DISABLED
+    first = status.first_fault if status.active_faults else None
+    return _with(status, first_fault=first, rest=rest, enabled=reading.enabled, state=state)
+
+
+def _take_look(status: AxisStatus, event: LookTaken) -> AxisStatus:
+    return _with(status, rest=replace(status.rest, turns=shows_velocity(event.reading)))
+
+
+def _see_loop(status: AxisStatus, event: LoopSeen) -> AxisStatus:
+    return _with(status, enabled=event.enabled)
+
+
+def _miss(status: AxisStatus, event: PollMissed) -> AxisStatus:
+    status = _with(status, misses=min(status.misses + 1, MISSES_UNTIL_DOWN))
+    if status.misses >= MISSES_UNTIL_DOWN:
+        return _lose_drive(status, DriveLost(event.now_ns, event.another))
+    return replace(status, link=LinkState.DEGRADED) if status.link is LinkState.UP else status
+
+
+def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
+    was_up = status.link is not LinkState.DOWN
+    fault = NOT_IDENTIFIED if event.another else LINK_LOST
+    if not was_up and (not event.another or any(entry.code == fault.code for entry in status.faults)):
+        return status
+    status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=NOTHING_SEEN)
+    status = _with_faults(status, (fault,), event.now_ns)
+    return _fail(status, LINK_LOST.text) if was_up and status.state is not AxisState.DISABLED else status
+
+
+def _take_unusable(status: AxisStatus, event: ReplyUnusable) -> AxisStatus:
+    link = LinkState.DEGRADED if status.link is LinkState.UP else status.link
+    status = _with(status, misses=0, in_vain=min(status.in_vain + 1, MISSES_UNTIL_DOWN), link=link)
+    if status.in_vain < MISSES_UNTIL_DOWN or status.replies_unusable or link is LinkState.DOWN:
+        return status
+    own = (*status.own, REPLIES_UNUSABLE)
+    status = _with_faults(replace(status, rest=NOTHING_SEEN, own=own), own, event.now_ns)
+    return status if status.state is AxisState.DISABLED else _fail(status, REPLIES_UNUSABLE.text)
+
+
+def _take_contradiction(status: AxisStatus, event: ReadingsContradicted) -> AxisStatus:
+    if not status.contradicts:
+        own = (*status.own, READINGS_CONTRADICT)
+        status = _with_faults(replace(status, own=own), own, event.now_ns)
+    status = _with(_place_lost(status), misses=0, in_vain=0, link=LinkState.UP, rest=NOTHING_SEEN, position_lost=True)
+    return status if status.state is AxisState.DISABLED else _fail(status, READINGS_CONTRADICT.text)
+
+
+def _find_fault(status: AxisStatus, event: FaultFound) -> AxisStatus:
+    own = status.own if event.fault in status.own else (*status.own, event.fault)
+    return _with(status, target=None, own=own)
+
+
+def _refuse_reference(status: AxisStatus, event: ReferenceRefused) -> AxisStatus:
+    text = f"{REFERENCE_REFUSED.text}: {event.reason}; home the axis, or set its position"
+    own = (*status.own, replace(REFERENCE_REFUSED, text=text))
+    return replace(status, refused=event.reason, reference_lost=True, own=own)
+
+
+def _know_place(status: AxisStatus, event: PlaceKnown) -> AxisStatus:
+    own = tuple(fault for fault in status.own if fault.code != REFERENCE_REFUSED.code)
+    target = None if event.resting else status.target
+    return replace(status, scale=event.scale, referenced=True, reference_lost=False, refused="", own=own, target=target)
+
+
+def _unknow_place(status: AxisStatus, _event: PlaceUnknown) -> AxisStatus:
+    return _place_lost(status)
+
+
+def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
+    command, before, last_error = event.command, status.command, status.last_error
+    if before is None:
+        last_error = None
+    elif before.command_id != command.command_id:
+        status = _end(status, CommandStatus.ABORTED, f"aborted by {command.verb}")
+        # what takes a motion over goes on with it as another command's
+        last_error = status.last_error if command.state is AxisState.STOPPING else None
+    return replace(
+        status,
+        command=command,
+        state=command.state,
+        settle=None,
+        ends_at_s=None,
+        effective_from_s=math.inf,
+        last_error=last_error,
+        target=None if command.state is AxisState.CONTINUOUS_MOTION else command.target,
+        target_counts=None,
+        approached=False,
+        rest=RestEvidence(rests=False, commanded=status.rest.commanded),
+    )
+
+
+def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
+    command, ends_at_s = status.command, status.ends_at_s
+    if command and command.duration_s is not None:
+        ends_at_s = event.now_s + command.duration_s
+    status = replace(
+        status,
+        effective_from_s=event.now_s,
+        ends_at_s=ends_at_s,
+        rest=RestEvidence(rests=False, commanded=True),
+    )
+    if event.target_counts is None:
+        return status
+    return replace(status, target_counts=event.target_counts, approached=event.approached)
+
+
+def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
+    command = status.command
+    if command is None:
+        return status
+    duration_s = (event.now_ns - command.since_ns) / 1e9 + event.rest_s
+    return replace(status, command=replace(command, duration_s=duration_s), ends_at_s=event.now_s + event.rest_s)
+
+
+def _note_failure(status: AxisStatus, event: CommandFailing) -> AxisStatus:
+    return _with(status, failure=event.reason)
+
+
+def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:
+    return _finished(status, event.error)
+
+
+def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
+    on, state = event.on, status.state
+    if state is not AxisState.ERROR_STOP:
+        state = AxisState.STANDSTILL if on else AxisState.DISABLED
+    return replace(
+        _end(status, CommandStatus.ABORTED, "aborted by power"),
+        state=state,
+        enabled=on,
+        effective_from_s=event.now_s,
+        target_counts=None,
+        rest=RestEvidence(rests=True if on else None, commanded=on),
+    )
+
+
+def _switch_loop(status: AxisStatus, event: LoopSwitched) -> AxisStatus:
+    rest = RestEvidence(rests=False, commanded=status.rest.commanded)
+    return replace(status, effective_from_s=event.now_s, enabled=event.on, rest=rest)
+
+
+def _override_speed(status: AxisStatus, event: SpeedOverridden) -> AxisStatus:
+    return _with(status, speed_share=event.share)
+
+
+def _latch(status: AxisStatus, _event: StopLatch) -> AxisStatus:
+    return _with(status, stop_latched=True)
+
+
+def _send_stop(status: AxisStatus, event: StopSent) -> AxisStatus:
+    stop = status.stop
+    if stop is None:
+        return replace(status, stop=OpenStop(event.mode))
+    return (
+        status if STRENGTH[event.mode] <= STRENGTH[stop.mode] else replace(status, stop=replace(stop, mode=event.mode))
+    )
+
+
+def _keep_stop(status: AxisStatus, event: StopUnconfirmed) -> AxisStatus:
+    status = _send_stop(status, StopSent(event.mode))
+    stop = status.stop
+    if stop is None or stop.fault:
+        return status
+    return replace(status, stop=OpenStop(stop.mode, entry_of(STOP_UNCONFIRMED, event.now_ns)))
+
+
+def _confirm_stop(status: AxisStatus, event: StopConfirmed) -> AxisStatus:
+    stop = status.stop
+    return status if stop is None or STRENGTH[stop.mode] > STRENGTH[event.mode] else replace(status, stop=None)
+
+
+def _recall_latch(status: AxisStatus, event: LatchRecalled) -> AxisStatus:
+    status = replace(status, stop_latched=event.stopped)
+    if event.again is not None:
+        status = _keep_stop(status, StopUnconfirmed(event.now_ns, event.again))
+    if not event.in_error:
+        return status
+    return replace(status, state=AxisState.ERROR_STOP, first_fault=entry_again(event.first) if event.first else None)
+
+
+def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
+    return replace(
+        status,
+        state=AxisState.STANDSTILL if status.enabled else AxisState.DISABLED,
+        effective_from_s=event.now_s,
+        stop_latched=False,
+        position_lost=False,
+        own=(),
+        faults=(),
+        first_fault=None,
+        last_error=None,
+    )
+
+
+STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType(
+    {
+        ReadingTaken: _take_reading,
+        LookTaken: _take_look,
+        LoopSeen: _see_loop,
+        PollMissed: _miss,
+        DriveLost: _lose_drive,
+        ReplyUnusable: _take_unusable,
+        ReadingsContradicted: _take_contradiction,
+        FaultFound: _find_fault,
+        ReferenceRefused: _refuse_reference,
+        PlaceKnown: _know_place,
+        PlaceUnknown: _unknow_place,
+        CommandBegun: _begin,
+        MotionStarted: _start,
+        SpeedChanged: _change_speed,
+        CommandFailing: _note_failure,
+        CommandOver: _end_command,
+        PowerSwitched: _switch_power,
+        LoopSwitched: _switch_loop,
+        SpeedOverridden: _override_speed,
+        StopLatch: _latch,
+        StopSent: _send_stop,
+        StopUnconfirmed: _keep_stop,
+        StopConfirmed: _confirm_stop,
+        LatchRecalled: _recall_latch,
+        ResetDone: _reset,
+    }
+)
+
+
+# -- parts of steps --------------------------------------------------------------------------------------------------
+
+
+def _with(status: AxisStatus, **changes: Any) -> AxisStatus:  # noqa: ANN401 - fields of a status
+    """Return a status with other fields; the same object where they have these values already."""
+    for name, value in changes.items():
+        if getattr(status, name) != value:
+            return replace(status, **changes)
+    return status
+
+
+def _with_faults(status: AxisStatus, faults: tuple[Fault, ...], now_ns: int) -> AxisStatus:
+    """Return a status in which these faults stand; one that stood before keeps its instant."""
+    known = {entry.code: entry for entry in status.faults}
+    entries = tuple(known.get(fault.code) or entry_of(fault, now_ns) for fault in faults)
+    first = status.first_fault
+    if first is None:
+        pending = (status.stop.fault,) if status.stop and status.stop.fault else ()
+        first = next((entry for entry in (*entries, *pending) if entry.code != REFERENCE_REFUSED.code), None)
+    return _with(status, faults=entries, first_fault=first)
+
+
+def _place_lost(status: AxisStatus) -> AxisStatus:
+    return _with(status, referenced=False, reference_lost=status.referenced or status.reference_lost)
+
+
+def _came_to_rest(status: AxisStatus) -> bool:
+    """Tell whether a closed loop stands at a place to which no command has sent it."""
+    return (
+        status.command is None
+        and not status.position_lost
+        and status.rest.rests is True
+        and (status.link is LinkState.UP)
+    )
+
+
+def _fail(status: AxisStatus, reason: str, *, settled: bool | None = None) -> AxisStatus:
+    return _end(_with(status, state=AxisState.ERROR_STOP), CommandStatus.FAILED, reason, settled=settled)
+
+
+def _finished(status: AxisStatus, error: str | None = None, *, settled: bool | None = None) -> AxisStatus:
+    error = error or status.failure
+    status = _end(status, CommandStatus.FAILED if error else CommandStatus.DONE, error, settled=settled)
+    return _with(status, state=AxisState.STANDSTILL if status.enabled else AxisState.DISABLED)
+
+
+def _end(
+    status: AxisStatus, how: CommandStatus, reason: str | None = None, *, settled: bool | None = None
+) -> AxisStatus:
+    """Return the status behind the command under way, if there is one."""
+    command = status.command
+    # what no drive has taken has no effect to wait for: readings count
+    effective_from_s = 0.0 if math.isinf(status.effective_from_s) else status.effective_from_s
+    target = status.target if how is CommandStatus.DONE else None
+    status = _with(status, failure=None, settle=None, ends_at_s=None, effective_from_s=effective_from_s, target=target)
+    if command is None:
+        return status
+    return replace(
+        status,
+        command=None,
+        last_error=f"{command.verb}: {reason}" if reason else status.last_error,
+        last_end=CommandEnd(command, how, reason, settled),
+    )
