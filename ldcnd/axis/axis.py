@@ -419,15 +419,15 @@ class AxisService:
 
         A closed loop is not given other gains: any position error would become a jump.
         """
-        if not self._commands.take_gains_back():
+        if not self._commands.gains.take_back():
             return
         log.warning("lent gains taken back", axis=self.config.name)
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(GAINS_BACK_S):
-                while self.at_work and self._commands.gains_differ and not self._gate.closed:
+                while self.at_work and self._commands.gains.differ and not self._gate.closed:
                     self._queue.changed.clear()
                     await self._queue.changed.wait()
-        if self._commands.gains_differ:  # else another client's motion has loaded them already
+        if self._commands.gains.differ:  # else another client's motion has loaded them already
             await self.stops.bring_to_rest(StopMode.OFF)
 
     def planned(self, move: MoveAbsolute) -> tuple[AxisMotion, MotionPlan]:

@@ -1,7 +1,8 @@
 """The commands of one axis: check, plan, send to the drive, update the tracker."""
 
-import math
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
+from typing import Any, ClassVar
 
 from ldcnd.axis import guards
 from ldcnd.axis.events import (
@@ -13,6 +14,7 @@ from ldcnd.axis.events import (
     ResetDone,
     SpeedChanged,
 )
+from ldcnd.axis.gains import AxisGains
 from ldcnd.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import NEVER_S, Procedure
@@ -51,18 +53,13 @@ from ldcnd.contract.commands import (
 from ldcnd.contract.errors import (
     CommandAborted,
     DriveFault,
-    LeaseRequired,
     NotSupported,
     OutcomeUnknown,
-    Remedy,
     RequestRefused,
     StopLatched,
-    ValueOutOfRange,
-    WrongState,
-    step,
 )
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, CountsMotion, Gains, StopMode
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, CountsMotion, StopMode
 from ldcnd.line.exchange import Timing
 
 STEP_RETRY_S = 0.2
@@ -73,6 +70,19 @@ MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
 """Trapezoids in the drive."""
 
 
+Carry = Callable[[Any, Permit, Any], Awaitable[CommandReply]]
+"""Carries out one kind of command; takes the `AxisCommands`, the permit and the request."""
+
+
+def _procedure(kind: Callable[[AxisMotion, Permit, Any], Procedure]) -> Carry:
+    """Return what carries out a command that goes on after it was accepted."""
+
+    async def begin(commands: "AxisCommands", permit: Permit, request: AxisCommand[CommandReply]) -> CommandReply:
+        return await commands.undertake(kind, permit, request)
+
+    return begin
+
+
 class AxisCommands:
     """The verbs of one axis, and the procedure that the last one may have begun.
 
@@ -80,7 +90,7 @@ class AxisCommands:
         procedure: what is under way and takes more than one step; None otherwise.
         step_due: its next step is due.
         holds: the jogs that are held.
-        own_gains: those of the axis while a client has lent it others; None otherwise.
+        gains: the gains of the axis, and those that a client has lent it.
     """
 
     def __init__(self, motion: AxisMotion) -> None:
@@ -91,7 +101,7 @@ class AxisCommands:
         self._tracker = motion.tracker
         self.procedure: Procedure | None = None
         self.holds = Holds(motion.config.name)
-        self.own_gains: Gains | None = None
+        self.gains = AxisGains(motion)
         self._moved: tuple[Permit, CountsMotion, float] | None = (
             None  # the last trapezoid, and the speed share of its plan
         )
@@ -105,53 +115,13 @@ class AxisCommands:
             DriveFault: the drive's condition forbids it.
             BusError: the line failed; `OutcomeUnknown` when the drive may have started.
         """
-        if procedure := self._procedure_for(permit, request):
-            return await self._undertake(procedure)
-        match request:
-            case Power(on=True):
-                return await self._power_on(permit)
-            case MoveAbsolute():
-                return await self._move_absolute(permit, request)
-            case MoveRelative():
-                return await self._move_relative(permit, request)
-            case MoveVelocity():
-                return await self._move_velocity(permit, request)
-            case SetPosition():
-                return await self._set_position(permit, request.position)
-            case SetGains():
-                return await self._set_gains(permit, request)
-            case SetOutputs():
-                return await self._set_outputs(permit, request)
-            case Reset():
-                return await self._reset(permit, faults_only=request.faults_only)
-            case _:
-                raise NotSupported(f"axis {self._config.name} cannot {permit.verb}", axis=self._config.name)
+        carry_out = self._CARRIED_OUT.get(type(request))
+        if carry_out is None:
+            raise self._cannot(permit)
+        return await carry_out(self, permit, request)
 
-    def _procedure_for(self, permit: Permit, request: AxisCommand[CommandReply]) -> Procedure | None:
-        """Return what carries out a request that takes more than one step."""
-        match request:
-            case PathShareRequest():
-                return PathMember(self._motion, permit, request)
-            case GroupMoveRequest():
-                return GroupMember(self._motion, permit, request)
-            case Home():
-                return HomeSequence(self._motion, permit, request)
-            case Probe():
-                return ProbeMove(self._motion, permit, request)
-            case MoveAnalog():
-                return AnalogMove(self._motion, permit, request)
-            case SetPwm():
-                return PwmRun(self._motion, permit, request)
-            case Jog():
-                hold = self.holds.get(permit.command_id)
-                now_s = self._motion.clock.now_s()
-                return HeldJog(self._motion, permit, hold or self.holds.begin(permit.command_id, request, now_s))
-            case MoveVelocity() if guards.goes_on(request.verb, self._tracker) and not self._driver.retargets:
-                return VelocityChange(self._motion, permit, request)
-            case Track():
-                return SetPoint(self._motion, permit, request, self.procedure)
-            case _:
-                return None
+    def _cannot(self, permit: Permit) -> NotSupported:
+        return NotSupported(f"axis {self._config.name} cannot {permit.verb}", axis=self._config.name)
 
     def renew_jog(self, request: Jog, command_id: str) -> CommandReply:
         """Take note that a jog is held; what it is to do from now on is its next step.
@@ -262,6 +232,12 @@ class AxisCommands:
     def _take_up(self, procedure: Procedure | None) -> None:
         self.procedure, self._retry_s, self.step_due = procedure, None, False
 
+    async def undertake(
+        self, kind: Callable[[AxisMotion, Permit, Any], Procedure], permit: Permit, request: AxisCommand[CommandReply]
+    ) -> CommandReply:
+        """Begin a procedure of a kind; see `carry_out`."""
+        return await self._undertake(kind(self._motion, permit, request))
+
     async def _undertake(self, procedure: Procedure) -> CommandReply:
         """Begin a procedure; it takes steps only from then on, also when it is unknown whether the drive has begun."""
         try:
@@ -276,7 +252,9 @@ class AxisCommands:
 
     # -- power -------------------------------------------------------------------------------------------------------
 
-    async def _power_on(self, permit: Permit) -> CommandReply:
+    async def _power_on(self, permit: Permit, request: Power) -> CommandReply:
+        if not request.on:
+            raise self._cannot(permit)  # a drive that can be switched off takes that as a stop
         permit.check_state()
         await self._motion.check_does_not_coast()
         guards.check_has_gains(self._driver)
@@ -286,14 +264,14 @@ class AxisCommands:
         self._motion.publish_state()
         return self._motion.reply(permit)
 
-    async def _reset(self, permit: Permit, *, faults_only: bool) -> CommandReply:
+    async def _reset(self, permit: Permit, request: Reset) -> CommandReply:
         """Recover from what has stopped the motor; mere warnings are cleared with a closed loop as it is.
 
         A drive whose loop is open may hold a cause that it does not show: a Logosol drive hides a position error while
         its power driver is off, and a host that took it over has not seen what came before.
         """
         tracker = self._tracker
-        if faults_only:
+        if request.faults_only:
             guards.check_reachable(tracker)
             guards.check_not_latched(tracker)
         permit.check_state()  # a stop that is under way keeps its latch
@@ -341,17 +319,9 @@ class AxisCommands:
             RequestRefused: as the move itself would be, once the axis stands.
         """
         guards.check(request.verb, self._tracker, follows=True)
-        match request:
-            case MoveAbsolute():
-                goal = self._plan_absolute(request)
-                self._motion.before_approach(goal, request.velocity, request.acceleration)
-            case MoveRelative():
-                goal = self._plan_relative(request)
-                self._motion.before_approach(goal, request.velocity, request.acceleration)
-            case MoveVelocity():
-                self._plan_velocity(request)
-            case Jog():
-                self._motion.plan_at(request.velocity, request.acceleration)
+        goal = self._PLANNED[type(request)](self, request)
+        if isinstance(request, MoveAbsolute | MoveRelative):
+            self._motion.before_approach(goal, request.velocity, request.acceleration)
 
     async def _move_absolute(self, permit: Permit, request: MoveAbsolute) -> CommandReply:
         self._check_may_start(permit, request)
@@ -375,10 +345,20 @@ class AxisCommands:
         return await self._move(permit, goal, AxisState.DISCRETE_MOTION)
 
     async def _move_velocity(self, permit: Permit, request: MoveVelocity) -> CommandReply:
+        if guards.goes_on(request.verb, self._tracker) and not self._driver.retargets:
+            return await self._undertake(VelocityChange(self._motion, permit, request))
         self._check_may_start(permit, request)
         velocity, bounded = self._plan_velocity(request)
         reply = await self._move(permit, bounded, AxisState.CONTINUOUS_MOTION)
         return reply.model_copy(update={"velocity": velocity})
+
+    async def _jog(self, permit: Permit, request: Jog) -> CommandReply:
+        now_s = self._motion.clock.now_s()
+        hold = self.holds.get(permit.command_id) or self.holds.begin(permit.command_id, request, now_s)
+        return await self._undertake(HeldJog(self._motion, permit, hold))
+
+    async def _track(self, permit: Permit, request: Track) -> CommandReply:
+        return await self._undertake(SetPoint(self._motion, permit, request, self.procedure))
 
     def _plan_absolute(self, request: MoveAbsolute) -> MotionPlan:
         position = self._motion.unwrapped(request.position, request.direction)
@@ -449,81 +429,46 @@ class AxisCommands:
 
     # -- registers ---------------------------------------------------------------------------------------------------
 
-    async def _set_position(self, permit: Permit, position: float) -> CommandReply:
+    async def _set_position(self, permit: Permit, request: SetPosition) -> CommandReply:
         motion = self._motion
         permit.check_state()
         here = await motion.read()  # one reading alone may be wrong
         await motion.reference.forget()
         permit.still_wanted()
         guards.check_position_kept(self._tracker)
-        self._tracker.take(PlaceKnown(motion.scale.with_position(here.position_counts, position), resting=True))
+        self._tracker.take(PlaceKnown(motion.scale.with_position(here.position_counts, request.position), resting=True))
         motion.publish_state()
-        return motion.reply(permit, position=position)
-
-    async def _set_gains(self, permit: Permit, request: SetGains) -> CommandReply:
-        tracker = self._tracker
-        permit.check_state()
-        asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name, None)) is not None}
-        held = self._driver.gains
-        if held is None and not {"kp", "el"} <= asked.keys():
-            raise WrongState(
-                f"axis {self._config.name} has no gains yet",
-                axis=self._config.name,
-                remedy=Remedy("{}", step("set_gains", "send at least kp and el")),
-            )
-        gains = held or Gains(kp=0, kd=0, ki=0, il=0, ol=250, cl=0, el=0, sr=1, deadband=0)
-        changed = replace(gains, **asked)
-        if changed.sr != gains.sr:
-            guards.check_stands(tracker)
-        self._check_tracking_step(changed)
-        if not request.lent:
-            await permit.set_gains(changed)
-            self.own_gains = None
-            return self._motion.reply(permit)
-        if request.lease is None:
-            raise LeaseRequired(
-                f"axis {self._config.name}: gains are lent for as long as a lease lasts, and the command names none",
-                axis=self._config.name,
-                remedy=Remedy("{}", step("acquire", "acquire one first")),
-            )
-        self.own_gains = self.own_gains or gains  # before they are sent: a lost reply leaves open which ones act
-        await permit.set_gains(changed)
-        return self._motion.reply(permit)
-
-    def take_gains_back(self) -> bool:
-        """Have the drive hold the gains of the axis from its next motion on; tell whether others were lent to it."""
-        own, self.own_gains = self.own_gains, None
-        if own is None:
-            return False
-        self._driver.gains = own
-        return True
-
-    @property
-    def gains_differ(self) -> bool:
-        """Whether the drive holds other gains than it should, or may."""
-        return not self._driver.holds_gains
-
-    def _check_tracking_step(self, gains: Gains) -> None:
-        """Refuse a position error limit that the next set-point of `track` could exceed.
-
-        Raises:
-            ValueOutOfRange: names the lowest `el`.
-        """
-        config = self._motion.config
-        if config.tracking is None:
-            return
-        step_counts = math.ceil(config.tracking.step * abs(self._motion.scale.counts_per_unit))
-        if gains.el <= step_counts:
-            raise ValueOutOfRange(
-                f"axis {config.name}: el {gains.el} is not above a tracking step of {step_counts} counts",
-                axis=config.name,
-                value=gains.el,
-                limit=step_counts,
-                nearest=step_counts + 1,
-                remedy="configure a shorter tracking step",
-            )
+        return motion.reply(permit, position=request.position)
 
     async def _set_outputs(self, permit: Permit, request: SetOutputs) -> CommandReply:
         permit.check_state()
         await permit.set_outputs(request.limit1, request.limit2)
         return self._motion.reply(permit)
+
+    _CARRIED_OUT: ClassVar[Mapping[type, Carry]] = {
+        Power: _power_on,
+        Reset: _reset,
+        MoveAbsolute: _move_absolute,
+        MoveRelative: _move_relative,
+        MoveVelocity: _move_velocity,
+        Jog: _jog,
+        Track: _track,
+        Home: _procedure(HomeSequence),
+        Probe: _procedure(ProbeMove),
+        MoveAnalog: _procedure(AnalogMove),
+        SetPwm: _procedure(PwmRun),
+        GroupMoveRequest: _procedure(GroupMember),
+        PathShareRequest: _procedure(PathMember),
+        SetPosition: _set_position,
+        SetGains: lambda self, permit, request: self.gains.set(permit, request),
+        SetOutputs: _set_outputs,
+    }
+    """What carries out each command in its turn; what brings the axis to rest has none, see stopping.py."""
+
+    _PLANNED: ClassVar[Mapping[type, Callable[[Any, Any], MotionPlan]]] = {
+        MoveAbsolute: _plan_absolute,
+        MoveRelative: _plan_relative,
+        MoveVelocity: lambda self, request: self._plan_velocity(request)[1],
+        Jog: lambda self, request: self._motion.plan_at(request.velocity, request.acceleration),
+    }
+    """How each move is planned that may wait for another one, or take it over."""

@@ -80,8 +80,14 @@ def add_verb(house: Path) -> None:
     insert(axis, "    AxisCommand,\n", "    Blink,\n")
     insert(
         axis,
-        "            case Reset():\n",
-        "            case Blink():\n                return self._motion.reply(permit)\n",
+        "        Home: _procedure(HomeSequence),\n",
+        "        Blink: _blink,\n",
+    )
+    insert(
+        axis,
+        "    async def _set_outputs(",
+        "    async def _blink(self, permit: Permit, _request: Blink) -> CommandReply:\n"
+        "        return self._motion.reply(permit)\n\n",
     )
     cli = house / "ldcnd" / "cli" / "axis.py"
     insert(cli, "    Halt,\n", "    Blink,\n")
