@@ -138,7 +138,7 @@ def _take_profile_end(
         return _with(status, settle=progress)
     if settled or not settling.faults:
         return _finished(status, settled=settled)
-    status = replace(status, own=(*status.own, NOT_SETTLED))
+    status = replace(status, own=_own_and(status, NOT_SETTLED))
     status = _with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
     off = settling.target_counts - reading.position_counts
     return _fail(status, f"{command.verb} did not settle: {off} counts off", settled=False)
@@ -190,27 +190,28 @@ def _take_unusable(status: AxisStatus, event: ReplyUnusable) -> AxisStatus:
     status = _with(status, misses=0, in_vain=min(status.in_vain + 1, MISSES_UNTIL_DOWN), link=link)
     if status.in_vain < MISSES_UNTIL_DOWN or status.replies_unusable or link is LinkState.DOWN:
         return status
-    own = (*status.own, REPLIES_UNUSABLE)
+    own = _own_and(status, REPLIES_UNUSABLE)
     status = _with_faults(replace(status, rest=NOTHING_SEEN, own=own), own, event.now_ns)
     return status if status.state is AxisState.DISABLED else _fail(status, REPLIES_UNUSABLE.text)
 
 
 def _take_contradiction(status: AxisStatus, event: ReadingsContradicted) -> AxisStatus:
     if not status.contradicts:
-        own = (*status.own, READINGS_CONTRADICT)
+        own = _own_and(status, READINGS_CONTRADICT)
         status = _with_faults(replace(status, own=own), own, event.now_ns)
     status = _with(_place_lost(status), misses=0, in_vain=0, link=LinkState.UP, rest=NOTHING_SEEN, position_lost=True)
     return status if status.state is AxisState.DISABLED else _fail(status, READINGS_CONTRADICT.text)
 
 
 def _find_fault(status: AxisStatus, event: FaultFound) -> AxisStatus:
-    own = status.own if event.fault in status.own else (*status.own, event.fault)
-    return _with(status, target=None, own=own)
+    return _with(status, target=None, own=_own_and(status, event.fault))
 
 
 def _refuse_reference(status: AxisStatus, event: ReferenceRefused) -> AxisStatus:
+    if status.referenced:
+        return status  # there is another one
     text = f"{REFERENCE_REFUSED.text}: {event.reason}; home the axis, or set its position"
-    own = (*status.own, replace(REFERENCE_REFUSED, text=text))
+    own = _own_and(status, replace(REFERENCE_REFUSED, text=text))
     return replace(status, refused=event.reason, reference_lost=True, own=own)
 
 
@@ -401,6 +402,11 @@ def _with_faults(status: AxisStatus, faults: tuple[Fault, ...], now_ns: int) -> 
         pending = (status.stop.fault,) if status.stop and status.stop.fault else ()
         first = next((entry for entry in (*entries, *pending) if entry.code != REFERENCE_REFUSED.code), None)
     return _with(status, faults=entries, first_fault=first)
+
+
+def _own_and(status: AxisStatus, fault: Fault) -> tuple[Fault, ...]:
+    """Return the faults that this daemon has found, and another one; each stands once."""
+    return (*(own for own in status.own if own.code != fault.code), fault)
 
 
 def _place_lost(status: AxisStatus) -> AxisStatus:
