@@ -13,7 +13,7 @@ from dataclasses import replace
 from ldcnd.axis import guards
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.commands import AxisCommands
-from ldcnd.axis.events import LoopSeen, PlaceKnown, PlaceUnknown, ReferenceRefused, SpeedOverridden
+from ldcnd.axis.events import ControlChanged, LoopSeen, PlaceKnown, PlaceUnknown, ReferenceRefused, SpeedOverridden
 from ldcnd.axis.faults import REFERENCE_REFUSED
 from ldcnd.axis.host_tracer import HostTracer, host_channels
 from ldcnd.axis.kept import KeptFiles
@@ -208,12 +208,6 @@ class AxisService:
         self.traces.disconnected()
         self.readings.disconnect()
 
-    def explain_loss(self) -> None:
-        """Say of a drive that is out of reach what is known by now of the reason."""
-        if self.tracker.status.link is LinkState.DOWN:
-            self.tracker.disconnected(self._clock.now_ns())
-            self.telemetry.state(self._clock.now_ns())
-
     def taken_over(self) -> None:
         """Its drive is as another host has left it: what moves in it without an end is to be brought to rest.
 
@@ -379,8 +373,7 @@ class AxisService:
 
     def controlled_by(self, client: str | None) -> None:
         """Publish who controls the axis from now on; None when no client does."""
-        self.tracker.holder = client
-        self.telemetry.state(self._clock.now_ns())
+        self.telemetry.publish_state(self.tracker.take(ControlChanged(client)), self._clock.now_ns())
 
     async def set_speed_share(self, share: float) -> tuple[bool, bool]:
         """Take another speed override, 0 to 1; return whether what moves goes on at another speed, or was halted.

@@ -41,18 +41,26 @@ class LoopSeen:
 
 @dataclass(frozen=True, slots=True)
 class PollMissed:
-    """A poll brought nothing; `another` tells that something answers which is not known to be this drive."""
+    """A poll brought nothing.
+
+    Attributes:
+        now_ns: when, UTC.
+        another: something answers which is not known to be this drive.
+        before: the silent drive before it on its line, without which no packet reaches it; empty without one.
+    """
 
     now_ns: int
     another: bool
+    before: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class DriveLost:
-    """The drive is gone: nothing is known any more, and nothing resumes. `another` as of `PollMissed`."""
+    """The drive is gone: nothing is known any more, and nothing resumes. Its fields are those of `PollMissed`."""
 
     now_ns: int
     another: bool
+    before: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,6 +174,13 @@ class LoopSwitched:
 
 
 @dataclass(frozen=True, slots=True)
+class ControlChanged:
+    """Another client is in control from now on; None when none is."""
+
+    holder: str | None
+
+
+@dataclass(frozen=True, slots=True)
 class SpeedOverridden:
     """The rig has another speed override: the share of every velocity, 0 to 1."""
 
@@ -251,6 +266,7 @@ AxisEvent = (
     | PowerSwitched
     | LoopSwitched
     | SpeedOverridden
+    | ControlChanged
     | StopLatch
     | StopSent
     | StopUnconfirmed

@@ -5,6 +5,10 @@ from ldcnd.contract.samples import FaultEntry, PastFault
 from ldcnd.drives.driver import Fault
 
 LINK_LOST = Fault("link_lost", "the drive does not answer; check its power and the line, then send reset")
+LINK_BLOCKED = (
+    "the drive does not answer, nor does {before}, before it on the line and needed to reach it: switch that on first,"
+    " then send reset"
+)
 NOT_IDENTIFIED = Fault(
     "not_identified",
     "what answers is not known to be this drive: only what stops it is sent; correct the wiring or the configuration",

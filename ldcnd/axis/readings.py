@@ -237,11 +237,20 @@ class AxisReadings:
 
     # -- what the line says ------------------------------------------------------------------------------------------
 
+    def explain_loss(self) -> None:
+        """Say of a drive that is out of reach what is known by now of the reason."""
+        if self._tracker.status.link is LinkState.DOWN:
+            now_ns = self._clock.now_ns()
+            lost = DriveLost(now_ns, self._proof.is_another, self._proof.blocked_by)
+            self._telemetry.publish_state(self._tracker.take(lost), now_ns)
+
     def disconnect(self) -> None:
         """The drive is out of reach, or has lost power."""
         self._plausibility.after_gap()
         now_ns = self._clock.now_ns()
-        self._telemetry.publish_stale(self._tracker.take(DriveLost(now_ns, self._proof.is_another)), now_ns)
+        self._telemetry.publish_stale(
+            self._tracker.take(DriveLost(now_ns, self._proof.is_another, self._proof.blocked_by)), now_ns
+        )
 
     def report_restart(self) -> None:
         """Its drive has lost power or was reset, and is about to answer again."""
@@ -338,7 +347,7 @@ class AxisReadings:
 
     def _count_miss(self) -> None:
         before, now_ns = self._tracker.status, self._clock.now_ns()
-        status = self._tracker.take(PollMissed(now_ns, self._proof.is_another))
+        status = self._tracker.take(PollMissed(now_ns, self._proof.is_another, self._proof.blocked_by))
         if status.link is not before.link:
             log.warning("drive does not answer", axis=self._name, link=status.link.value)
             if status.link is LinkState.DOWN:

@@ -136,6 +136,7 @@ class AxisStatus:
         own: faults that this daemon has found, until reset.
         first_fault: the fault that came first since the last reset.
         speed_share: share of every velocity that the speed override leaves, 0 to 1.
+        holder: the client in control; None without one.
         rest: what readings prove of its rest.
     """
 
@@ -167,6 +168,7 @@ class AxisStatus:
     own: tuple[Fault, ...] = ()
     first_fault: FaultEntry | None = None
     speed_share: float = 1.0
+    holder: str | None = None
     rest: RestEvidence = NOTHING_SEEN
 
     @property
@@ -253,6 +255,7 @@ class AxisStatus:
             "reference_lost": self.reference_lost,
             "target": self.target,
             "speed_override": self.speed_override,
+            "holder": self.holder,
         }
 
     def is_at(self, command_id: str) -> bool:

@@ -15,6 +15,7 @@ from ldcnd.axis.events import (
     CommandBegun,
     CommandFailing,
     CommandOver,
+    ControlChanged,
     DriveLost,
     FaultFound,
     LatchRecalled,
@@ -40,6 +41,7 @@ from ldcnd.axis.events import (
 )
 from ldcnd.axis.faults import (
     DRIVE_CHANGED,
+    LINK_BLOCKED,
     LINK_LOST,
     LOOP_OPENED,
     NOT_IDENTIFIED,
@@ -54,7 +56,7 @@ from ldcnd.axis.faults import (
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, shows_velocity
 from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, CommandEnd, Completion, OpenStop
 from ldcnd.contract.events import CommandStatus
-from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.contract.samples import AxisState, FaultEntry, LinkState
 from ldcnd.drives.driver import Fault
 
 MISSES_UNTIL_DOWN = 3
@@ -171,14 +173,17 @@ def _see_loop(status: AxisStatus, event: LoopSeen) -> AxisStatus:
 def _miss(status: AxisStatus, event: PollMissed) -> AxisStatus:
     status = _with(status, misses=min(status.misses + 1, MISSES_UNTIL_DOWN))
     if status.misses >= MISSES_UNTIL_DOWN:
-        return _lose_drive(status, DriveLost(event.now_ns, event.another))
+        return _lose_drive(status, DriveLost(event.now_ns, event.another, event.before))
     return replace(status, link=LinkState.DEGRADED) if status.link is LinkState.UP else status
 
 
 def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
     was_up = status.link is not LinkState.DOWN
-    fault = NOT_IDENTIFIED if event.another else LINK_LOST
-    if not was_up and (not event.another or any(entry.code == fault.code for entry in status.faults)):
+    lost = replace(LINK_LOST, text=LINK_BLOCKED.format(before=event.before)) if event.before else LINK_LOST
+    fault = NOT_IDENTIFIED if event.another else lost
+    if not was_up and any(entry.code == fault.code for entry in status.faults):
+        return _with_faults(status, (fault,), event.now_ns)  # what is before it is known by now, or answers again
+    if not was_up and not event.another:
         return status
     status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=NOTHING_SEEN)
     status = _with_faults(status, (fault,), event.now_ns)
@@ -302,6 +307,10 @@ def _override_speed(status: AxisStatus, event: SpeedOverridden) -> AxisStatus:
     return _with(status, speed_share=event.share)
 
 
+def _change_control(status: AxisStatus, event: ControlChanged) -> AxisStatus:
+    return _with(status, holder=event.holder)
+
+
 def _latch(status: AxisStatus, _event: StopLatch) -> AxisStatus:
     return _with(status, stop_latched=True)
 
@@ -372,6 +381,7 @@ STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType
         PowerSwitched: _switch_power,
         LoopSwitched: _switch_loop,
         SpeedOverridden: _override_speed,
+        ControlChanged: _change_control,
         StopLatch: _latch,
         StopSent: _send_stop,
         StopUnconfirmed: _keep_stop,
@@ -396,12 +406,19 @@ def _with(status: AxisStatus, **changes: Any) -> AxisStatus:  # noqa: ANN401 - f
 def _with_faults(status: AxisStatus, faults: tuple[Fault, ...], now_ns: int) -> AxisStatus:
     """Return a status in which these faults stand; one that stood before keeps its instant."""
     known = {entry.code: entry for entry in status.faults}
-    entries = tuple(known.get(fault.code) or entry_of(fault, now_ns) for fault in faults)
+    entries = tuple(_entry(known.get(fault.code), fault, now_ns) for fault in faults)
     first = status.first_fault
     if first is None:
         pending = (status.stop.fault,) if status.stop and status.stop.fault else ()
         first = next((entry for entry in (*entries, *pending) if entry.code != REFERENCE_REFUSED.code), None)
     return _with(status, faults=entries, first_fault=first)
+
+
+def _entry(known: FaultEntry | None, fault: Fault, now_ns: int) -> FaultEntry:
+    """Return the entry of a fault; one that stood before says what is known of it by now."""
+    if known is None:
+        return entry_of(fault, now_ns)
+    return known if known.text == fault.text else known.model_copy(update={"text": fault.text})
 
 
 def _own_and(status: AxisStatus, fault: Fault) -> tuple[Fault, ...]:

@@ -245,7 +245,7 @@ class BusService:
                 log.warning("search for lost drives failed", bus=self.bus.settings.name, reason=error.message)
             self.problem = self.network.problem
             for axis in self.axes:
-                axis.explain_loss()
+                axis.readings.explain_loss()
             now_s = loop.time()
             if not heard:
                 pause_s = min((now_s - began_s + self.bus.quarantine_s) / SCAN_SHARE, LONGEST_SCAN_PAUSE_S)

@@ -195,7 +195,7 @@ class SimulatedRig:
             UnknownAxis: there is no such axis.
         """
         machine, daemon = self._machine(axis), self._daemon
-        place_of = daemon.rig.axes[axis].telemetry.position if daemon else None
+        place_of = daemon.rig.axes[axis].tracker.status.scale.position if daemon else None
         return machine.look(self._loop.time(), place_of)
 
     async def until(self, condition: Callable[[], bool], within_s: float = 60.0) -> None:

@@ -205,7 +205,7 @@ class ShaftJudge(Witness):
         keeps = daemon.config.state_dir is not None
         for name in daemon.rig.axes:
             self.zeros[name] = (self.resets[name], *(self.zeros[name] if keeps else ()))
-            if name in self.latched and not daemon.rig.axes[name].tracker.stop_latched:
+            if name in self.latched and not daemon.rig.axes[name].tracker.status.stop_latched:
                 self.wrong.append(f"{self.now_s:.4f}: {instance} does not know that {name} is latched")
 
     def _settled_s(self, at_s: float) -> float:
