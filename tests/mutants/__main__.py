@@ -37,7 +37,7 @@ REQUIRED = 0.95
 
 
 def main() -> int:
-    """Run a campaign; the exit status is 1 if too few are killed, or one lives that is not argued to be equivalent."""
+    """Run a campaign; return 1 if too few are killed, one is not judged, or one lives and is not argued for."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=300, help="how many mutants; 0 for all")
     parser.add_argument("--seed", type=int, default=18)
@@ -97,14 +97,16 @@ def report(mutants: Sequence[Mutant], judgements: Sequence[Judgement], took_s: f
             living.append(f"{judgement.verdict}: {mutant}")
         elif is_argued and not lives:
             false_claims.append(f"killed, though it is listed as equivalent: {mutant}")
+    judged = {judgement.number for judgement in judgements}
+    open_ones = [f"not judged: {mutant}" for number, mutant in enumerate(mutants) if number not in judged]
     killed = found[Verdict.KILLED] + found[Verdict.TIMED_OUT]
     share = killed / max(1, len(judgements))
-    print("\n".join(["", *false_claims, *living]))
+    print("\n".join(["", *false_claims, *living, *open_ones]))
     print(", ".join(f"{verdict} {found[verdict]}" for verdict in Verdict))
     argued = len(judgements) - killed - len(living)
     print(f"{killed} of {len(judgements)} killed: {share:.1%}; {argued} argued to be equivalent, {len(living)} not; "
-          f"{took_s / 60:.0f} minutes")  # fmt: skip
-    return 1 if living or false_claims or share < REQUIRED else 0
+          f"{len(open_ones)} not judged; {took_s / 60:.0f} minutes")  # fmt: skip
+    return 1 if living or false_claims or open_ones or share < REQUIRED else 0
 
 
 if __name__ == "__main__":

@@ -95,6 +95,16 @@ def test_a_campaign_fails_on_a_survivor_and_on_too_few_killed(
     assert f"survived: {chosen[0]}" in capsys.readouterr().out
 
 
+def test_a_campaign_fails_that_has_not_judged_every_mutant(
+    mutants: Mapping[str, Mutant], capsys: pytest.CaptureFixture[str]
+):
+    chosen = list(mutants.values())
+    killed = [Judgement(number, Verdict.KILLED, "a test", 0.1) for number in range(len(chosen) - 1)]
+
+    assert report(chosen, killed, 1.0) == 1
+    assert f"not judged: {chosen[-1]}" in capsys.readouterr().out
+
+
 def test_a_change_is_addressed_by_its_function_and_kind_whatever_the_names_in_it(tmp_path: Path):
     def addresses(text: str) -> list[tuple[str, str, str, int]]:
         (tmp_path / "module.py").write_text(text)
