@@ -7,11 +7,9 @@ lived through in a copy of its process. A schedule that is wrong is shortened to
 """
 
 import asyncio
-import contextlib
 import os
 import shutil
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NoReturn
@@ -26,7 +24,7 @@ from ldcnd.contract.leases import Acquire, Release
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.faults import FaultInjector, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from tests.support.interruptions import CopiedLoop, Interruptions, in_new_loop, run_with_copies
+from tests.support.interruptions import CopiedLoop, Interruptions, in_new_loop, own_folder, run_with_copies
 from tests.support.schedules import LINE, RIG, Act, Drawing, Play, Rig, all_up, faults_of
 from tests.support.shaft_judge import ShaftJudge, now_ns
 
@@ -104,18 +102,6 @@ MACHINES = {
     "three": Machine(("ls-182ap", "pic-servo-v4", "ls-173ap"), turning=("z",), keeps=True),
     "slow": Machine(("ls-182ap", "pic-servo-sc"), baud=19_200, rest_s=0.8),
 }
-
-
-@contextlib.contextmanager
-def own_folder() -> Iterator[None]:
-    """Work in a folder of its own: what daemons keep is kept below it."""
-    before, folder = Path.cwd(), tempfile.mkdtemp()
-    os.chdir(folder)
-    try:
-        yield
-    finally:
-        os.chdir(before)
-        shutil.rmtree(folder, ignore_errors=True)
 
 
 class Campaign:

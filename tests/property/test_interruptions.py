@@ -1,14 +1,22 @@
-"""Killed or suspended at any await of a scenario, a daemon moves nothing twice, unasked or with nobody in charge.
+"""Killed, suspended or ended at any await of a scenario, a daemon moves nothing twice, unasked or without control.
 
-The scenario has some forty commands: leases, buffered and aborting moves, a group, a homing, raw duties, a trace,
-set-points, stops. A killed daemon is followed by one that adopts the line, and old commands are sent again. A suspended
-one finds time gone by, its client dead or somebody else in control. Drives live on meanwhile.
+The first scenario has some forty commands: leases, buffered and aborting moves, a group, a homing, raw duties, a trace,
+set-points, stops. In the second one the daemon keeps latches and references, walks a path, and loses a module's power
+and its line. A killed daemon is followed by one that adopts the line, and old commands are sent again. A suspended one
+finds time gone by, its client dead or another one in control. One that is ended begins nothing more, and ends. Drives
+live on meanwhile.
 """
 
 import asyncio
 import contextlib
+import os
 import random
-from collections.abc import AsyncIterator
+import shutil
+import tempfile
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
 from typing import TypeVar
 
 import pytest
@@ -25,6 +33,7 @@ from ldcnd.contract.commands import (
     Halt,
     Home,
     HomeMethod,
+    Jog,
     MoveAbsolute,
     MoveAnalog,
     MoveRelative,
@@ -45,21 +54,31 @@ from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.contract.leases import Acquire, ListHolders, Release, Renew
-from ldcnd.contract.rig_commands import AxisMove, MoveTogether
-from ldcnd.contract.samples import StateSample
+from ldcnd.contract.rig_commands import AxisMove, AxisPath, MoveTogether, WalkPath
+from ldcnd.contract.samples import LinkState, StateSample
 from ldcnd.contract.traces import TakeTrace
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from tests.support.interruptions import Chosen, CopiedLoop, Interruptions, in_new_loop, run_with_copies
+from ldcnd.sim.ldcn.drive import SimulatedDrive
+from tests.support.interruptions import (
+    Chosen,
+    CopiedLoop,
+    EveryAwait,
+    Interruptions,
+    in_new_loop,
+    own_folder,
+    run_with_copies,
+)
 from tests.support.rig import openers_of
 from tests.support.witness import Witness
 
 ReplyT = TypeVar("ReplyT", bound=Frozen)
 LEASE_S = 0.6
 FREEZES_S = (0.3, 1.0, 4.0)
+ENDS_WITHIN_S = 10.0
 LINE_S = 1.0
 """From the end of a lease until an axis stands: one stop, and its deceleration."""
 PROFILE_S = 3.0
@@ -79,40 +98,22 @@ def axis(name: str, address: int, model: str, **more: object) -> dict[str, objec
         "acceleration": 500.0,
         "reference": "at_reset",
         "jog_horizon_s": 1.0,
+        "jog_reach_s": 1.0,
         "gains": GAINS,
         "rates": {"position": 8, "velocity": 0, "adc": 0, "state": 8},
         **more,
     }
 
 
-def config(**bus: object) -> RigConfig:
+def config(models: tuple[str, str, str], *, keeps: bool, **bus: object) -> RigConfig:
     tracking = {"step": 1.0, "rate": 20.0}
-    return RigConfig.model_validate(
-        {
-            "rig": "sim",
-            "authority": "leased",
-            "bus": [
-                {
-                    "name": "a",
-                    "port": "sim:a",
-                    "baud": 115_200,
-                    "margin_ms": 5,
-                    "axis": [
-                        axis("x", 1, "ls-182ap", tracking=tracking),
-                        axis("y", 2, "ls-182ap"),
-                        axis("z", 3, "pic-servo-v4", pwm={"duty": 0.1, "duration_s": 1.0}),
-                    ],
-                    "group": [{"name": "gantry", "axes": ["x", "y"]}],
-                    **bus,
-                }
-            ],
-            "sim": [{"name": "a", "module": [{"model": "ls182ap"}] * 2 + [{"model": "picservo-v4"}]}],
-        }
-    )
-
-
-FIRST = config()
-NEXT = config(start="adopt", adopt_fallback="reset")
+    more = {"tracking": tracking}, {}, {"pwm": {"duty": 0.1, "duration_s": 1.0}}
+    axes = [axis(name, at, models[at - 1], **more[at - 1]) for at, name in enumerate("xyz", 1)]
+    line = {"name": "a", "port": "sim:a", "baud": 115_200, "margin_ms": 5, "axis": axes}
+    line |= {"group": [{"name": "gantry", "axes": ["x", "y"]}], **bus}
+    sim = {"name": "a", "module": [{"model": model} for model in models]}
+    rig = {"rig": "sim", "authority": "leased", "bus": [line], "sim": [sim]}
+    return RigConfig.model_validate(rig | ({"state_dir": "state"} if keeps else {}))
 
 
 def now_ns() -> int:
@@ -125,6 +126,7 @@ class Client:
     Attributes:
         sent: everything it has sent, by axis, as it was sent.
         refused: how many commands failed.
+        latched: axes whose stop outlasts the daemon, as it has said; no reset was sent since.
     """
 
     def __init__(self, rig: RigClient, name: str) -> None:
@@ -134,6 +136,7 @@ class Client:
         self.refused = 0
         self.others = 0
         self.lease: str | None = None
+        self.latched: set[str] = set()
 
     async def acquire(self, *axes: str, force: bool = False) -> None:
         if reply := await self.ask(Acquire(client=self.name, axes=axes, lease_s=LEASE_S, force=force)):
@@ -256,6 +259,58 @@ async def play(ann: Client, bob: Client, places: dict[str, float], witness: Witn
     await ann.send("y", Power(on=False))
 
 
+async def recover(ann: Client, *names: str) -> None:
+    """Wait for axes that were out of reach, and close their loops again."""
+    for name in names:
+        while not (state := await ann.state(name)) or state.link != "up":
+            await asyncio.sleep(0.05)
+        await ann.standing(name)
+        await ann.send(name, Reset())
+        await ann.send(name, Power(on=True))
+
+
+async def play_with_losses(ann: Client, bob: Client, places: dict[str, float], witness: Witness) -> None:
+    """Jog, walk a path, lose the power of one module, stop, lose the line, name a place."""
+    loop = asyncio.get_running_loop()
+    while not (state := await ann.state("z")) or state.link != "up":
+        await asyncio.sleep(0.05)
+    await ann.acquire()
+    await recover(ann, "x", "y", "z")
+    await ann.send("z", Jog(velocity=5.0, hold_s=0.3))
+    for velocity in (5.0, -5.0):
+        await asyncio.sleep(0.15)
+        held = Jog(velocity=velocity, hold_s=0.3, renews=ann.sent[-1][1].command_id, lease=ann.lease)
+        with contextlib.suppress(LdcndError):
+            await ann.rig.command("z", held)
+    await ann.standing("z")
+    moves = tuple(AxisPath(axis=name, via=(1.0, 1.5), position=0.5, lease=ann.lease) for name in "xy")
+    await ann.ask(WalkPath(moves=moves))
+    await ann.send("z", MoveRelative(distance=4.0))
+    await asyncio.sleep(0.1)
+    witness.drive("z").power(on=False, at_s=loop.time())
+    await asyncio.sleep(0.02)
+    witness.drive("z").power(on=True, at_s=loop.time())
+    await ann.standing("x", "y")
+    await asyncio.sleep(0.5)
+    await recover(ann, "z")
+    await ann.send("z", MoveVelocity(velocity=5.0))
+    await ann.send("y", MoveRelative(distance=3.0))
+    with contextlib.suppress(LdcndError):
+        ann.latched |= set((await ann.rig.stop()).kept)
+    await ann.standing("x", "y", "z")
+    ann.latched.clear()
+    await recover(ann, "x", "y", "z")
+    del places["x"]
+    if await ann.send("x", SetPosition(position=1.0)):
+        places["x"] = witness.drive("x").shaft.position_counts - 1000.0
+    await ann.send("x", MoveRelative(distance=4.0))
+    await asyncio.sleep(0.1)
+    witness.chain.unplug(loop.time(), 0.05)
+    await asyncio.sleep(0.5)
+    await recover(ann, "x", "y", "z")
+    await ann.done("x", MoveRelative(distance=-2.0))
+
+
 def check_homed(witness: Witness, daemon: Daemon) -> None:
     """Hold what z says of its place against its index pulses, once it was homed."""
     z = daemon.rig.axes["z"]
@@ -268,24 +323,53 @@ def check_homed(witness: Witness, daemon: Daemon) -> None:
         witness.wrong.append(f"z is referenced {off:g} counts beside an index pulse")
 
 
+@dataclass(frozen=True)
+class Stage:
+    """A rig, and what is done on it.
+
+    Attributes:
+        models: of x, y and z.
+        play: what clients do.
+        keeps: its daemons have a folder for references and latches.
+    """
+
+    models: tuple[str, str, str]
+    play: Callable[[Client, Client, dict[str, float], Witness], Awaitable[None]]
+    keeps: bool = False
+
+
+FORTY = Stage(("ls-182ap", "ls-182ap", "pic-servo-v4"), play)
+LOSSES = Stage(("pic-servo-sc", "pic-servo-sc", "ls-182ap"), play_with_losses, keeps=True)
+
+
+class How(StrEnum):
+    """What is done to a daemon at an await."""
+
+    KILLED = "killed"
+    SUSPENDED = "suspended"
+    ENDED = "ended"
+
+
 @contextlib.asynccontextmanager
-async def life(settings: RigConfig, chain: Chain, instance: str) -> AsyncIterator[tuple[Daemon, MemoryBroker]]:
+async def life(
+    settings: RigConfig, chain: Chain, instance: str
+) -> AsyncIterator[tuple[Daemon, MemoryBroker, asyncio.Task[None]]]:
     broker = MemoryBroker()
     async with broker.session() as session, asyncio.TaskGroup() as group:
         daemon = build_daemon(settings, session, now_ns, instance, openers_of(settings, {"a": chain}))
         running = group.create_task(daemon.run(), name="daemon")
-        yield daemon, broker
+        yield daemon, broker, running
         daemon.end()
         await running
 
 
 class Run:
-    """One run of the scenario, with what is done to its copies."""
+    """One run of a scenario, with what is done to its copies."""
 
-    def __init__(self, seed: int, *, kill: bool) -> None:
+    def __init__(self, stage: Stage, seed: int, how: How) -> None:
         self._dice = random.Random(seed)
-        self._kill = kill
-        specs = (ModuleSpec("ls182ap"), ModuleSpec("ls182ap"), ModuleSpec("picservo-v4"))
+        self._stage, self._how = stage, how
+        specs = tuple(ModuleSpec(model) for model in stage.models)
         self.chain = build_chain(ChainSpec(specs, seed=seed))
         self.witness = Witness(self.chain, {1: ("x",), 2: ("y",), 3: ("z",), 0x81: ("x", "y")})
         self.places: dict[str, float] = {"x": 0.0, "y": 0.0, "z": 0.0}
@@ -294,16 +378,17 @@ class Run:
         self.sent = 0
 
     async def scenario(self) -> None:
-        loop = asyncio.get_running_loop()
+        loop, stage = asyncio.get_running_loop(), self._stage
         assert isinstance(loop, CopiedLoop)
-        async with life(FIRST, self.chain, "first") as (daemon, broker), broker.session() as session:
+        first = config(stage.models, keeps=stage.keeps)
+        async with life(first, self.chain, "first") as (daemon, broker, running), broker.session() as session:
             self.witness.daemon = daemon
-            self._daemon, self._rig = daemon, RigClient(session, "sim")
+            self._daemon, self._running, self._rig = daemon, running, RigClient(session, "sim")
             self._ann, self._bob = ann, bob = Client(self._rig, "ann"), Client(self._rig, "bob")
             async with asyncio.TaskGroup() as group:
                 self._group = group
                 self._playing = [group.create_task(each.keep(), name="renewals") for each in (ann, bob)]
-                player = group.create_task(play(ann, bob, self.places, self.witness), name="player")
+                player = group.create_task(stage.play(ann, bob, self.places, self.witness), name="player")
                 self._playing.append(player)
                 loop.interrupt = self._interrupt
                 await asyncio.wait([player])
@@ -314,16 +399,29 @@ class Run:
                     task.cancel()
             await asyncio.sleep(0.5)
             await self.witness.look(daemon, self.places)
-            check_homed(self.witness, daemon)
+            if not stage.keeps:
+                check_homed(self.witness, daemon)
             self.refused, self.why = ann.refused + bob.refused, getattr(ann, "why", "")
             self.sent = sum(len(each.sent) + each.others for each in (ann, bob))
+            await ann.acquire()
+            await ann.send("x", MoveRelative(distance=1.0))
+            loop.interrupt = self._interrupt if self._how is How.KILLED else None
+        loop.interrupt = None
 
     def _interrupt(self, step: int) -> list[str] | None:
         loop = asyncio.get_running_loop()
         assert isinstance(loop, CopiedLoop)
-        if self._kill:
+        if self._stage.keeps:  # what a copy keeps is its own
+            folder = tempfile.mkdtemp(dir=".")
+            if Path("state").exists():
+                shutil.copytree("state", Path(folder, "state"))
+            os.chdir(folder)
+        if self._how is How.KILLED:
             self.witness.daemon = None
             return in_new_loop(self._next_life, loop.time())
+        if self._how is How.ENDED:
+            self._group.create_task(self._end(loop), name="judge")
+            return None
         self._dice.seed(step)
         loop.hold_up(self._dice.choice(FREEZES_S))
         self._group.create_task(self._after_freeze(loop), name="judge")
@@ -331,12 +429,15 @@ class Run:
 
     async def _next_life(self) -> list[str]:
         """Restart with adoption, send old commands again, and see what comes of it."""
-        witness, loop = self.witness, asyncio.get_running_loop()
+        witness, loop, stage = self.witness, asyncio.get_running_loop(), self._stage
         killed_s = loop.time()
-        async with life(NEXT, self.chain, "second") as (daemon, broker), broker.session() as session:
+        self._give_power()
+        settings = config(stage.models, keeps=stage.keeps, start="adopt", adopt_fallback="reset")
+        async with life(settings, self.chain, "second") as (daemon, broker, _), broker.session() as session:
             rig = RigClient(session, "sim")
-            async with asyncio.timeout(30):
-                await daemon.wait_up()
+            await all_up(daemon, 30.0)
+            unknown = {name for name in self._ann.latched if not daemon.rig.axes[name].tracker.stop_latched}
+            witness.wrong += [f"{name} was latched and is not" for name in unknown]
             for name, command in (*self._ann.sent[-4:], *self._bob.sent[-2:]):
                 if command.effect is not Effect.REST and not command.takes_energy_out:
                     with contextlib.suppress(LdcndError):
@@ -345,6 +446,20 @@ class Run:
             await asyncio.sleep(max(0.0, killed_s + PROFILE_S - loop.time()))
             await witness.look(daemon, self.places)
         return witness.wrong
+
+    async def _end(self, loop: CopiedLoop) -> None:
+        """End the daemon, as SIGTERM does: nothing begins any more, and it ends with everything at rest."""
+        try:
+            self._daemon.end()
+            self.witness.daemon = None
+            await asyncio.wait([self._running], timeout=ENDS_WITHIN_S)
+            if not self._running.done():
+                self.witness.wrong.append("the daemon does not end")
+            await asyncio.sleep(PROFILE_S)  # a line that was lost meanwhile takes no stop: motions end by themselves
+            self.witness.wrong += [f"{name} moves" for name in "xyz" if not await self.witness.stands(name)]
+        except BaseException as error:  # noqa: BLE001 - nothing of this process may be lost
+            self.witness.wrong.append(f"{type(error).__name__}: {error}")
+        loop.leave(self.witness.wrong)
 
     async def _after_freeze(self, loop: CopiedLoop) -> None:
         """Let others act after a freeze, then lose all clients, and see what comes of it."""
@@ -365,37 +480,61 @@ class Run:
             await asyncio.sleep(self._dice.uniform(0.0, 0.6))
             for task in self._playing:
                 task.cancel()
+            self._give_power()
             await asyncio.sleep(LEASE_S + LINE_S)
-            await self._daemon.wait_up()
+            await all_up(self._daemon, 30.0)
             await self.witness.look(self._daemon, self.places)
-            check_homed(self.witness, self._daemon)
+            if not self._stage.keeps:
+                check_homed(self.witness, self._daemon)
         except BaseException as error:  # noqa: BLE001 - nothing of this process may be lost
             self.witness.wrong.append(f"{type(error).__name__}: {error}")
         loop.leave(self.witness.wrong)
 
+    def _give_power(self) -> None:
+        """Switch on again what its player had switched off."""
+        for module in self.chain.modules:
+            if isinstance(module, SimulatedDrive) and not module._powered:
+                module.power(on=True, at_s=asyncio.get_running_loop().time())
 
-def interrupted(seed: int, chosen: Chosen, *, kill: bool) -> Interruptions:
-    """Run the scenario once, interrupted at chosen steps."""
-    run = Run(seed, kill=kill)
-    with capture_logs():
+
+async def all_up(daemon: Daemon, within_s: float) -> None:
+    """Return as soon as every drive answers."""
+    async with asyncio.timeout(within_s):
+        await daemon.wait_up()
+        while any(each.tracker.link is not LinkState.UP for each in daemon.rig.axes.values()):
+            await asyncio.sleep(0.05)
+
+
+def interrupted(stage: Stage, seed: int, chosen: Chosen, how: How) -> Interruptions:
+    """Run a scenario once, interrupted at chosen steps."""
+    run = Run(stage, seed, how)
+    with capture_logs(), own_folder():
         came = run_with_copies(run.scenario, chosen)
-    what = "killed" if kill else "suspended"
-    print(f"seed {seed}: {what} at {came.visited} of {came.steps} steps of {run.sent} commands")
+    print(f"seed {seed}: {how} at {came.visited} of {came.steps} steps of {run.sent} commands")
     assert not run.refused, f"{run.refused} commands of the uninterrupted run were refused: {run.why}"
     assert not run.witness.wrong
     assert not came.wrong, f"seed {seed}, {len(came.wrong)} of {came.visited} points:\n" + "\n".join(came.wrong[:40])
     return came
 
 
+EVERYTHING = pytest.mark.parametrize(
+    ("stage", "how"),
+    [(stage, how) for stage in (FORTY, LOSSES) for how in How],
+    ids=lambda each: getattr(each, "value", ""),
+)
+
+
 @pytest.mark.promise("kill-moves-nothing-twice")
 @pytest.mark.timeout(300)
-@pytest.mark.parametrize("kill", [True, False], ids=["killed", "suspended"])
-def test_a_daemon_may_be_interrupted_anywhere(kill):
-    dice = random.Random(1)
+@EVERYTHING
+def test_a_daemon_may_be_interrupted_at_every_await(stage, how):
+    """At each await that the scenario reaches, once; the awaits are found where tasks are suspended."""
+    awaits = EveryAwait()
 
-    came = interrupted(1, lambda _: dice.random() < 0.006, kill=kill)
+    came = interrupted(stage, 1, awaits, how)
 
-    assert came.visited > 10
+    print(f"{len(awaits.reached)} awaits reached")
+    assert 40 < came.visited <= len(awaits.reached)
 
 
 PARTS = 25
@@ -404,9 +543,9 @@ PARTS = 25
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600)
-@pytest.mark.parametrize("kill", [True, False], ids=["killed", "suspended"])
+@EVERYTHING
 @pytest.mark.parametrize("part", range(PARTS))
-def test_a_daemon_may_be_interrupted_at_every_await(part, kill):
-    came = interrupted(1, lambda step: step % PARTS == part, kill=kill)
+def test_a_daemon_may_be_interrupted_at_every_step(part, stage, how):
+    came = interrupted(stage, 1, lambda step: step % PARTS == part, how)
 
     assert came.visited == sum(step % PARTS == part for step in range(1, came.steps + 1)) > 100

@@ -5,12 +5,16 @@ copy is made by fork, so each interruption costs only what comes after it.
 """
 
 import asyncio
+import contextlib
 import json
 import os
+import shutil
 import signal
+import tempfile
 from collections import deque
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NoReturn, TypeVar
 
 from pydantic import BaseModel
@@ -111,6 +115,52 @@ class CopiedLoop(JumpingLoop):
                 self.leave([f"{type(error).__name__}: {error}"])
             if wrong is not None:
                 self.leave(wrong)
+
+
+@contextlib.contextmanager
+def own_folder() -> Iterator[None]:
+    """Work in a folder of its own: what daemons keep is kept below it."""
+    before, folder = Path.cwd(), tempfile.mkdtemp()
+    os.chdir(folder)
+    try:
+        yield
+    finally:
+        os.chdir(before)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+ROOMS = tuple(f"/ldcnd/{room}/" for room in ("line", "axis", "drives", "daemon", "net"))
+"""Where an await may come between a decision and what it was about."""
+
+
+class EveryAwait:
+    """Chooses a step before which a task goes on from an await in the rooms of the daemon, for each await once.
+
+    Attributes:
+        reached: the awaits at which a task was suspended: file and line.
+    """
+
+    def __init__(self) -> None:
+        self.reached: set[tuple[str, int]] = set()
+
+    def __call__(self, step: int) -> bool:
+        """Tell whether the task whose turn it is waits at an await that was not met before."""
+        loop = asyncio.get_running_loop()
+        assert isinstance(loop, CopiedLoop)
+        task = getattr(loop._ready[0]._callback, "__self__", None)
+        met = set(_awaits_of(task.get_coro())) if isinstance(task, asyncio.Task) else set()
+        is_new = not met <= self.reached
+        self.reached |= met
+        return is_new
+
+
+def _awaits_of(coroutine: Any) -> Iterator[tuple[str, int]]:
+    """Yield where a suspended coroutine waits, and where those wait that wait for it inside."""
+    while coroutine is not None:
+        frame = getattr(coroutine, "cr_frame", None) or getattr(coroutine, "ag_frame", None)
+        if frame is not None and any(room in frame.f_code.co_filename for room in ROOMS):
+            yield frame.f_code.co_filename, frame.f_lineno
+        coroutine = getattr(coroutine, "cr_await", None) or getattr(coroutine, "ag_await", None)
 
 
 def _heard(reading: int, pid: int) -> tuple[list[str], int]:
