@@ -7,6 +7,7 @@ from ldcnd.contract.errors import ConfigError
 EXTRAS = {
     "caproto": ("caproto", "epics"),
     "cryptography": ("cryptography", "ops"),
+    "frappy": ("frappy-core", "secop"),
     "foxglove": ("foxglove-sdk", "foxglove"),
     "markdown_it": ("markdown-it-py", "console"),
     "matplotlib": ("matplotlib", "plot"),

@@ -205,6 +205,46 @@ async def _serve_epics(
             raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
 
 
+SECOP_ADDRESS = "127.0.0.1:10767"
+
+
+@click.command()
+@click.argument("axes", nargs=-1)
+@click.option(
+    "--moves", is_flag=True, help="Let clients move the axes, under a lease of this program; it is read-only otherwise."
+)
+@address_option("--address", SECOP_ADDRESS)
+@with_target
+def secop(target: Target, address: ListenAddress, axes: tuple[str, ...], moves: bool) -> None:  # noqa: FBT001 - click's
+    """Serve AXES (all of them by default) as modules of a SECoP node until SIGTERM or SIGINT.
+
+    SECoP does not authenticate clients: with --moves, any client that reaches the address moves axes.
+    """
+    target.run(lambda client: _serve_secop(client, address, axes, moves=moves))
+
+
+async def _serve_secop(client: RigClient, address: ListenAddress, axes: tuple[str, ...], *, moves: bool) -> None:
+    require("frappy")
+    from ldcnd.lab.secop.node import serve  # noqa: PLC0415 - needs an optional package, under the GPL
+
+    rig, ready = Rig(client, await client.daemon()), asyncio.Event()
+    serving = asyncio.create_task(serve(rig, address, axes, (axes or rig.axes) if moves else (), ready), name="secop")
+    on_end(lambda: _cancel(serving))
+    await asyncio.wait({serving, asyncio.create_task(ready.wait())}, return_when=asyncio.FIRST_COMPLETED)
+    if ready.is_set():
+        served = ",".join(axes or rig.axes)
+        click.echo(
+            f"{'SECoP modules' if moves else 'read-only SECoP modules'} {{{served}}} on {address.in_url}:{address.port}"
+        )
+    try:
+        await serving
+    except asyncio.CancelledError:
+        return
+    except OSError as error:
+        where = f"{address.in_url}:{address.port}"
+        raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
+
+
 def _cancel(task: asyncio.Task[None]) -> None:
     task.cancel()
 

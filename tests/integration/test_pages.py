@@ -13,6 +13,7 @@ from tests.support.pages import ROOT, blocks_of, command_lines, pages, require_c
 FIRST_RIG = "docs/tutorials/first-rig.md"
 MONITOR = "docs/how-to/monitor-a-rig.md"
 EPICS = "docs/how-to/use-epics.md"
+SECOP = "docs/how-to/use-secop.md"
 NEXT = (
     "docs/tutorials/move-from-python.md",
     "docs/tutorials/take-a-trace.md",
@@ -39,6 +40,8 @@ NOT_RUN = {
     ("README.md", "# first.py"): "test_make_run_says_what_to_type_and_the_first_program_moves",
     (EPICS, "ldcnd epics --prefix lab:"): "test_libca_sees_a_record_that_it_cannot_write",
     (EPICS, "ldcnd epics x y --prefix lab: --moves"): "test_an_unmodified_client_uses_the_record",
+    (SECOP, "pip install 'ldcnd[secop]'"): "fetches packages",
+    (SECOP, "ldcnd secop x y --moves"): "test_an_axis_is_a_drivable_that_is_sent_stopped_and_reset",
     ("docs/how-to/use-ros-2.md", "ldcnd ros2 x y --router tcp/127.0.0.1:7448 --domain 0"): (
         "test_a_plain_zenoh_client_sees_node_publishers_and_joint_states"
     ),

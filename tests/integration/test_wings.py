@@ -38,7 +38,8 @@ for found in pkgutil.walk_packages(ldcnd.__path__, "ldcnd.", onerror=lambda _: N
         try:
             importlib.import_module(found.name)
         except ModuleNotFoundError as error:
-            print(found.name, error.name)
+            if error.name.startswith("ldcnd."):  # and no package that an extra brings
+                print(found.name, error.name)
 print(ldcnd.__file__)
 for words in (["--help"], sys.argv[1:]):
     sys.argv = ["ldcnd", *words]

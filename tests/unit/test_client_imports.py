@@ -23,6 +23,7 @@ OURS = {
     "metrics",
     "pki",
     "recording",
+    "secop",
     "sim",
     "transport",
 }
@@ -31,6 +32,7 @@ OTHERS = {
     "caproto",
     "click",
     "cryptography",
+    "frappy",
     "logging_journald",
     "mcap",
     "prometheus_client",

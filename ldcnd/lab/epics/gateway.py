@@ -5,21 +5,19 @@ import logging
 import os
 from collections.abc import AsyncIterator, Coroutine
 from contextlib import asynccontextmanager
+from functools import partial
 
 from caproto.asyncio.server import Context
 
 from ldcnd.client.rig import Rig
 from ldcnd.contract.errors import LdcndError, UnknownAxis
 from ldcnd.contract.meta import AxisInfo
+from ldcnd.lab.borrowed_control import BorrowedControl
 from ldcnd.lab.epics.fields import Put, RecordField, Short, Value
 from ldcnd.lab.epics.motor import MovedRecord
-from ldcnd.lab.epics.record import NO_HOLDER, MotorRecord
+from ldcnd.lab.epics.record import MotorRecord
 from ldcnd.listen_address import ListenAddress
 
-LEASE_S = 1.0
-"""The axes do what their `loss.client` says so soon after this program is gone, in seconds."""
-IDLE_S = 30.0
-"""Control is given back when an axis has not moved and nothing was put to it for so long, seconds."""
 SILENT_S = 5.0
 """Time without samples after which an axis is shown as unknown, seconds."""
 MOTIONLESS = (1.0, 1.0)
@@ -49,9 +47,7 @@ class Gateway:
     def add(self, info: AxisInfo, defaults: tuple[float, float], prefix: str, *, moves: bool) -> None:
         """Show an axis, and begin to follow it."""
         record = (
-            MovedRecord(info, defaults, self._start_motion, self._rig.watch, self.connected)
-            if moves
-            else MotorRecord(info, defaults)
+            MovedRecord(info, defaults, self._start_motion, self.connected) if moves else MotorRecord(info, defaults)
         )
         record["NAME"].begin(f"{prefix}{info.axis}")
         self._records[info.axis] = record
@@ -60,7 +56,15 @@ class Gateway:
         for monitor in info.monitors:
             self._start(self._follow_monitor(record, monitor), f"{monitor} of {info.axis}")
         if isinstance(record, MovedRecord):
-            self._start(self._hold(record), f"control of {info.axis}")
+            record.control = BorrowedControl(
+                self._rig,
+                info.axis,
+                WHO,
+                is_busy=record.is_busy,
+                on_change=record.show_control,
+                on_taken=partial(self._describe, record),
+            )
+            self._start(record.control.run(), f"control of {info.axis}")
             self.variables[f"{prefix}allstop"] = self._all_stop
 
     def end(self) -> None:
@@ -114,19 +118,6 @@ class Gateway:
             for error in filter(None, stopped):
                 raise error
         return Put(0)
-
-    async def _hold(self, record: MovedRecord) -> None:
-        """Control an axis from a put that needs it until it idles; what another program has is never taken by force."""
-        while True:
-            await record.wait_wanted()
-            try:
-                async with self._rig.control(record.info.axis, client=WHO, lease_s=LEASE_S) as axis:
-                    await self._describe(record)  # a lease is of one run of the daemon, and so is what is put under it
-                    await record.controlled(axis, WHO)
-                    await record.wait_idle(IDLE_S)
-                    await record.controlled(None, NO_HOLDER)
-            except LdcndError as error:
-                await record.controlled(None, str(error))
 
     def _start(self, work: Coroutine[object, object, None], name: str) -> asyncio.Task[None]:
         task = self._group.create_task(work, name=name)

@@ -5,7 +5,7 @@ What the gateway cannot do is read-only, such as the offset and retries.
 
 import asyncio
 from collections.abc import Awaitable, Callable, Coroutine
-from contextlib import AbstractAsyncContextManager, suppress
+from contextlib import suppress
 from functools import partial
 
 from ldcnd.client.axis import Axis
@@ -14,7 +14,6 @@ from ldcnd.contract.commands import BufferMode, Verb
 from ldcnd.contract.errors import (
     CommandAborted,
     LdcndError,
-    LeaseRequired,
     PositionLimit,
     RequestRefused,
     ValueOutOfRange,
@@ -22,8 +21,9 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import Moving, Sample, StateSample
+from ldcnd.lab.borrowed_control import BorrowedControl
 from ldcnd.lab.epics.fields import Action, Number, Put, RecordField, Value
-from ldcnd.lab.epics.record import NO_HOLDER, NO_LIMIT, MotorRecord
+from ldcnd.lab.epics.record import NO_LIMIT, MotorRecord
 
 REST_S = 10.0
 """Longest wait for the standstill after a motion that was ended early, in seconds."""
@@ -36,7 +36,6 @@ class MovedRecord(MotorRecord):
         info: what the axis is.
         defaults: its velocity and acceleration, in units a second and a second squared, when a client names no others.
         start: keeps a task until its end.
-        watch: gives the axis without control of it, for what takes energy out.
         clients: returns who is connected: a jog ends when one of them is gone.
     """
 
@@ -45,17 +44,11 @@ class MovedRecord(MotorRecord):
         info: AxisInfo,
         defaults: tuple[float, float],
         start: Callable[[Coroutine[object, object, None], str], asyncio.Future[None]],
-        watch: Callable[[str], AbstractAsyncContextManager[Axis]],
         clients: Callable[[], frozenset[object]],
     ) -> None:
         super().__init__(info, defaults)
-        self._axis: Axis | None = None
-        self._is_refused = False  # another program had control when this one asked for it, or took it
-        self._control_wanted = asyncio.Event()
-        self._control_changed = asyncio.Event()
-        self._used_s = 0.0  # when a put needed control last, in loop time
+        self.control: BorrowedControl  # set before the first put
         self._start = start
-        self._watch = watch
         self._clients = clients
         self._pending = 0
         self._jog_puts = 0
@@ -143,29 +136,13 @@ class MovedRecord(MotorRecord):
         """Tell whether the axis has done what was put."""
         return super().stands() and not self._pending
 
-    async def controlled(self, axis: Axis | None, holder: str) -> None:
-        """Take, give back or lose control of the axis."""
-        self._axis = axis
-        self._is_refused = axis is None and holder != NO_HOLDER
-        self._control_wanted.clear()
-        self._control_changed.set()
+    def is_busy(self) -> bool:
+        """Tell whether the axis moves, or is to move."""
+        return bool(self._pending) or self._wanted is not None or self.moving is not Moving.NO
+
+    async def show_control(self, holder: str) -> None:
+        """Show who controls the axis."""
         await self.show_beside(":control", holder)
-
-    async def wait_wanted(self) -> None:
-        """Wait until a put needs control of the axis."""
-        await self._control_wanted.wait()
-
-    async def wait_idle(self, for_s: float) -> None:
-        """Wait until the axis has not moved and nothing was put that needs control for some time, in seconds.
-
-        Raises:
-            LeaseExpired: control was lost.
-        """
-        loop = asyncio.get_running_loop()
-        while (left_s := self._used_s + for_s - loop.time()) > 0:
-            await asyncio.sleep(left_s)
-            if self._pending or self._wanted is not None or self.moving is not Moving.NO:
-                self._used_s = loop.time()
 
     # -- puts --------------------------------------------------------------------------------------------------------
 
@@ -345,15 +322,14 @@ class MovedRecord(MotorRecord):
 
     async def _put_cnen(self, asked: Value) -> Put:
         if asked == "Enable":
-            await (await self._controlled()).power(on=True)
+            await (await self.control.taken()).power(on=True)
             return Put()
-        async with self._watch(self.info.axis) as axis:  # to switch off needs no control
-            await axis.power(on=False)
+        await self.control.power_off()
         return Put()
 
     async def _put_reset(self, asked: Value) -> Put:
         if asked:
-            await (await self._controlled()).reset()
+            await (await self.control.taken()).reset()
         return Put(0)
 
     async def _put_velo(self, asked: Value) -> Put:
@@ -385,7 +361,7 @@ class MovedRecord(MotorRecord):
         return Put(asked)
 
     async def _absolute(self, target: float) -> Motion:
-        axis = await self._controlled()
+        axis = await self.control.taken()
         velocity = float(self["VELO"].value)
         return await axis.move_absolute(
             target,
@@ -426,7 +402,7 @@ class MovedRecord(MotorRecord):
     async def _until_end(self, motion: Motion, halts: int) -> None:
         try:
             if self._halts != halts:  # put while the motion was on its way to the daemon
-                await (await self._controlled()).halt()
+                await (await self.control.taken()).halt()
             ended = await motion.done()
             await self["MISS"].show(int(ended.settled is False))
         except CommandAborted as error:
@@ -461,31 +437,10 @@ class MovedRecord(MotorRecord):
         self._halts += 1
         self._wanted = None
         self._released.set()
-        if self._axis is None:
-            if self._is_refused or self.moving is not Moving.NO:
-                async with self._watch(self.info.axis) as axis:
-                    await axis.stop()
-            return
-        if self.moving is not Moving.NO or self._pending:
-            await self._axis.halt()
-
-    async def _controlled(self) -> Axis:
-        self._used_s = asyncio.get_running_loop().time()
-        if self._axis is None:
-            self._control_changed.clear()
-            self._control_wanted.set()
-            await self._control_changed.wait()
-            self._used_s = asyncio.get_running_loop().time()
-        if self._axis is None:
-            held = self.beside(":control")
-            raise LeaseRequired(
-                f"axis {self.info.axis} is not controlled by this gateway: {held.value if held is not None else ''}",
-                axis=self.info.axis,
-            )
-        return self._axis
+        await self.control.halt()
 
     async def _movable(self) -> Axis:
-        axis = await self._controlled()  # which may change the unit, and so SPMG
+        axis = await self.control.taken()  # which may change the unit, and so SPMG
         if self["SPMG"].value not in ("Go", "Move"):
             raise WrongState(
                 f"axis {self.info.axis}: SPMG is {self['SPMG'].value}", axis=self.info.axis, remedy="put Go there"

@@ -25,6 +25,7 @@ from ldcnd.contract.samples import (
     TelemetryItem,
     VelocitySample,
 )
+from ldcnd.lab.borrowed_control import NO_HOLDER
 from ldcnd.lab.epics.fields import (
     NO_ALARM,
     Number,
@@ -40,8 +41,6 @@ from ldcnd.lab.epics.fields import (
     text,
 )
 
-NO_HOLDER = "none"
-"""Shown as who controls an axis while this gateway does not and was not refused."""
 NO_LIMIT = 1e30
 """Stands for a missing limit when the other one is set; both 0 stand for none, as in the motor record."""
 SILENT = RecordAlarm(AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM)

@@ -1,0 +1,117 @@
+"""Control of an axis for a gateway whose own clients have no leases: from the first command until the axis idles.
+
+What another program controls is never taken by force, and a gateway that idles keeps no other program out.
+"""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+from ldcnd.client.axis import Axis
+from ldcnd.client.rig import Rig
+from ldcnd.contract.errors import LdcndError, LeaseRequired
+
+NO_HOLDER = "none"
+"""Shown as who controls an axis while a gateway does not and was not refused."""
+LEASE_S = 1.0
+"""The axes do what their `loss.client` says so soon after the gateway is gone, in seconds."""
+IDLE_S = 30.0
+"""Control is given back when an axis has not moved and nothing was sent to it for so long, seconds."""
+
+
+class BorrowedControl:
+    """Control of one axis; `run` takes it when `taken` needs it.
+
+    Args:
+        rig: the rig.
+        axis: the name of the axis.
+        client: who the gateway is, a name for people.
+        is_busy: tells whether the axis moves or is to move.
+        on_change: called with who controls the axis now, or why it could not be had.
+        on_taken: called before anything is sent under new control, which is of one run of the daemon.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        axis: str,
+        client: str,
+        *,
+        is_busy: Callable[[], bool],
+        on_change: Callable[[str], Awaitable[None]],
+        on_taken: Callable[[], Awaitable[None]],
+    ) -> None:
+        self._rig = rig
+        self._name = axis
+        self._client = client
+        self._is_busy = is_busy
+        self._on_change = on_change
+        self._on_taken = on_taken
+        self._axis: Axis | None = None
+        self._holder = NO_HOLDER
+        self._wanted = asyncio.Event()
+        self._changed = asyncio.Event()
+        self._used_s = 0.0  # when control was needed last, in loop time
+
+    async def run(self) -> None:
+        """Control the axis whenever that is needed, until cancelled; what it does then halts."""
+        while True:
+            await self._wanted.wait()
+            try:
+                async with self._rig.control(self._name, client=self._client, lease_s=LEASE_S) as axis:
+                    await self._on_taken()
+                    await self._set(axis, self._client)
+                    await self._wait_idle()
+                    await self._set(None, NO_HOLDER)
+            except LdcndError as error:
+                await self._set(None, str(error))
+                task = asyncio.current_task()
+                if task and task.cancelling():  # control could not be given back: the daemon is gone
+                    raise asyncio.CancelledError from error
+
+    async def taken(self) -> Axis:
+        """Return the axis, under control.
+
+        Raises:
+            LeaseRequired: another program controls it, or the daemon does not answer.
+        """
+        self._used_s = asyncio.get_running_loop().time()
+        if self._axis is None:
+            self._changed.clear()
+            self._wanted.set()
+            await self._changed.wait()
+            self._used_s = asyncio.get_running_loop().time()
+        if self._axis is None:
+            raise LeaseRequired(f"axis {self._name} is not controlled by this gateway: {self._holder}", axis=self._name)
+        return self._axis
+
+    async def halt(self) -> None:
+        """Halt; without control a stop is the only thing that is not refused, and it latches."""
+        if self._axis is not None:
+            if self._is_busy():
+                await self._axis.halt()
+        elif self._holder != NO_HOLDER or self._is_busy():
+            async with self._rig.watch(self._name) as axis:
+                await axis.stop()
+
+    async def power_off(self) -> None:
+        """Open the position loop, which needs no control."""
+        async with self._rig.watch(self._name) as axis:
+            await axis.power(on=False)
+
+    async def _set(self, axis: Axis | None, holder: str) -> None:
+        self._axis, self._holder = axis, holder
+        self._wanted.clear()
+        self._changed.set()
+        await self._on_change(holder)
+
+    async def _wait_idle(self) -> None:
+        """Wait until the axis has not moved and nothing needed control for a while.
+
+        Raises:
+            LeaseExpired: control was lost.
+        """
+        loop = asyncio.get_running_loop()
+        while (left_s := self._used_s + IDLE_S - loop.time()) > 0:
+            await asyncio.sleep(left_s)
+            if self._is_busy():
+                self._used_s = loop.time()

@@ -1,0 +1,272 @@
+"""An axis for a module of a SECoP node: what the module shows, and what is done to it."""
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from enum import IntEnum
+
+from ldcnd.client.axis import Axis
+from ldcnd.client.motion import Motion
+from ldcnd.client.rig import Rig
+from ldcnd.contract.commands import BufferMode
+from ldcnd.contract.condition import Alarm, Condition, assess
+from ldcnd.contract.errors import LdcndError, WrongState
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import (
+    AdcSample,
+    AxisState,
+    FaultSample,
+    MonitorSample,
+    Moving,
+    PositionSample,
+    Quality,
+    Sample,
+    StateSample,
+    VelocitySample,
+)
+from ldcnd.lab.borrowed_control import BorrowedControl
+
+WHO = "secop node"
+SILENT_S = 5.0
+"""Time without samples after which an axis is shown as unknown, seconds."""
+
+
+class StatusCode(IntEnum):
+    """Codes of the status of a module, as the SECoP specification has them."""
+
+    DISABLED = 0
+    IDLE = 100
+    WARN = 200
+    BUSY = 300
+    ERROR = 400
+
+
+@dataclass(frozen=True, slots=True)
+class Update:
+    """A new value of a parameter.
+
+    Attributes:
+        module: the name of the module.
+        parameter: of it.
+        value: the value; None when it is not known.
+        at_s: when it was true, in seconds since 1970; now when missing.
+        error: by how much it may be wrong, in its unit; None when that is not known.
+        problem: why it is not known.
+    """
+
+    module: str
+    parameter: str
+    value: object = None
+    at_s: float | None = None
+    error: float | None = None
+    problem: str | None = None
+
+
+Announce = Callable[[Update], None]
+
+
+class AxisLink:
+    """One axis; made by `linked`.
+
+    Attributes:
+        info: what it is, as the module is described.
+        moves: whether clients may move it.
+        speed: of its moves, in units a second; None for the default of the axis.
+    """
+
+    def __init__(self, rig: Rig, info: AxisInfo, announce: Announce, *, moves: bool) -> None:
+        self.info = info
+        self.moves = moves
+        self.speed: float | None = None
+        self._rig = rig
+        self._announce = announce
+        self._condition: Condition = assess(None)
+        self._state: StateSample | None = None
+        self._faults: FaultSample | None = None
+        self._pending = 0
+        self._velocity = 0.0
+        self._motions: set[asyncio.Task[None]] = set()
+        self.control = BorrowedControl(
+            rig, info.axis, WHO, is_busy=self.is_busy, on_change=self._show_control, on_taken=self._check_description
+        )
+
+    def values(self) -> Mapping[str, str]:
+        """Return the units of what the axis publishes besides its position, by the names of their modules."""
+        name, unit = self.info.axis, self.info.unit
+        found = {f"{name}_velocity": f"{unit}/s"}
+        if self.info.adc_full_scale:
+            found[f"{name}_adc"] = "V"
+        return found | {f"{name}_{monitor}": "" for monitor in self.info.monitors}
+
+    def is_busy(self) -> bool:
+        """Tell whether the axis moves, or is to move."""
+        return bool(self._pending) or (self._state is not None and self._state.moving is not Moving.NO)
+
+    # -- what it says ------------------------------------------------------------------------------------------------
+
+    async def follow(self) -> None:
+        """Show what the axis publishes, until cancelled."""
+        axis = self.info.axis
+        async with self._rig.samples(axis) as samples:
+            for item in self.info.items:
+                last = await self._rig.latest(axis, item)
+                if last:
+                    self.take(last)
+            while True:
+                try:
+                    async with asyncio.timeout(SILENT_S):
+                        _, sample = await anext(samples)
+                except TimeoutError:
+                    self._state = None
+                    self._condition = assess(None, silence="nothing is published any more")
+                    self._update("value", problem="nothing is published any more")
+                    self._show_status()
+                else:
+                    self.take(sample)
+
+    async def follow_monitor(self, monitor: str) -> None:
+        """Show what a monitor publishes, until cancelled."""
+        async with self._rig.samples(self.info.axis, f"monitor/{monitor}") as samples:
+            async for _, sample in samples:
+                if isinstance(sample, MonitorSample):
+                    self._show(f"{self.info.axis}_{monitor}", sample, sample.value)
+
+    def take(self, sample: Sample) -> None:
+        """Show a sample."""
+        match sample:
+            case PositionSample() if sample.unit != self.info.unit:
+                self._update("value", problem=f"it is in {sample.unit} now and is described in {self.info.unit}")
+            case PositionSample():
+                step = 1.0 / self.info.counts_per_unit if self.info.counts_per_unit else 1.0
+                self._show(self.info.axis, sample, sample.value, step + abs(self._velocity) * sample.t_error_ns * 1e-9)
+            case VelocitySample():
+                self._velocity = sample.value
+                self._show(f"{self.info.axis}_velocity", sample, sample.value)
+            case AdcSample():
+                self._show(f"{self.info.axis}_adc", sample, sample.volts)
+            case FaultSample():
+                self._faults = sample
+            case StateSample():
+                self._state, self._condition = sample, assess(sample, self._faults)
+                if self.moves:
+                    self._update("enabled", sample.enabled)
+                    if not self.is_busy() and sample.target is not None:
+                        self._update("target", sample.target)
+                self._show_status()
+
+    def _show(self, module: str, sample: Sample, value: float, error: float | None = None) -> None:
+        if sample.quality is Quality.BAD:
+            self._announce(Update(module, "value", at_s=sample.t * 1e-9, problem="it was not measured"))
+        else:
+            self._announce(Update(module, "value", value, sample.t * 1e-9, error))
+
+    def _update(self, parameter: str, value: object = None, *, problem: str | None = None) -> None:
+        self._announce(Update(self.info.axis, parameter, value, problem=problem))
+
+    def _show_status(self) -> None:
+        self._update("status", self.status())
+
+    def status(self) -> tuple[int, str]:
+        """Return the status of the module: its code, and all that is to be said."""
+        said, state = ", ".join(self._condition.notes), self._state
+        if state is None or state.moving is Moving.UNKNOWN or self._condition.alarm is Alarm.INVALID:
+            return StatusCode.ERROR, said or "its state is not known"
+        if state.state is AxisState.ERROR_STOP or self._condition.alarm is Alarm.MAJOR or state.stop_latched:
+            return StatusCode.ERROR, said
+        if self.moves and self.is_busy():
+            return StatusCode.BUSY, said or state.state.value
+        if self.moves and not state.enabled:
+            return StatusCode.DISABLED, said or "its position loop is open"
+        return (StatusCode.WARN, said) if self._condition.alarm is not Alarm.NONE else (StatusCode.IDLE, said)
+
+    async def _show_control(self, _holder: str) -> None:
+        self._show_status()
+
+    # -- what is done to it ------------------------------------------------------------------------------------------
+
+    async def go(self, target: float) -> float:
+        """Send the axis to a target; returns once the drive has acknowledged it."""
+        return await self._begin(
+            lambda axis: axis.move_absolute(target, buffer_mode=BufferMode.ABORTING, velocity=self.speed), target
+        )
+
+    async def home(self) -> None:
+        """Begin to find the reference position, as the axis's configuration says."""
+        await self._begin(lambda axis: axis.home(), 0.0)
+
+    async def stop(self) -> None:
+        """Halt; without control a stop is the only thing that is not refused, and it latches."""
+        await self.control.halt()
+
+    async def clear_errors(self) -> None:
+        """Clear the latch and faults; nothing moves."""
+        await (await self.control.taken()).reset()
+
+    async def enable(self, *, on: bool) -> bool:
+        """Close or open the position loop."""
+        if on:
+            await (await self.control.taken()).power(on=True)
+        else:
+            await self.control.power_off()
+        return on
+
+    async def _begin(self, starting: Callable[[Axis], Awaitable[Motion]], target: float) -> float:
+        axis = await self.control.taken()
+        self._pending += 1
+        try:
+            motion = await starting(axis)
+        except BaseException:
+            self._pending -= 1
+            raise
+        task = asyncio.create_task(self._until_end(motion), name=f"motion of {self.info.axis}")
+        self._motions.add(task)
+        task.add_done_callback(self._motions.discard)
+        self._show_status()  # busy before the reply, as the specification wants it
+        return target
+
+    async def _until_end(self, motion: Motion) -> None:
+        try:
+            await motion.done()
+        except LdcndError:
+            pass  # the status of the axis says why
+        finally:
+            self._pending -= 1
+            self._show_status()
+
+    async def _check_description(self) -> None:
+        """Refuse control of an axis that is not what its module says.
+
+        Raises:
+            WrongState: it has another unit or other limits.
+        """
+        for info in await self._rig.describe():
+            if info.axis == self.info.axis and described_by(info) != described_by(self.info):
+                raise WrongState(
+                    f"axis {info.axis}: it is not any more what its module says", axis=info.axis, remedy="describe anew"
+                )
+
+
+def described_by(info: AxisInfo) -> tuple[object, ...]:
+    """Return all of an axis that the description of its modules is made of."""
+    return info.unit, info.counts_per_unit, info.limits, info.capabilities, info.monitors, info.adc_full_scale
+
+
+@asynccontextmanager
+async def linked(
+    rig: Rig, infos: Mapping[str, AxisInfo], announce: Announce, moves: tuple[str, ...]
+) -> AsyncIterator[dict[str, AxisLink]]:
+    """Follow axes, and control those that are moved, until the context ends."""
+    links = {name: AxisLink(rig, info, announce, moves=name in moves) for name, info in infos.items()}
+    tasks: list[asyncio.Task[None]] = []
+    async with asyncio.TaskGroup() as group:
+        for name, link in links.items():
+            tasks.append(group.create_task(link.follow(), name=f"values of {name}"))
+            tasks.extend(group.create_task(link.follow_monitor(monitor)) for monitor in link.info.monitors)
+            if link.moves:
+                tasks.append(group.create_task(link.control.run(), name=f"control of {name}"))
+        try:
+            yield links
+        finally:
+            for task in tasks:
+                task.cancel()

@@ -1,0 +1,300 @@
+"""The SECoP node: modules of frappy-core for axes and their values, and the server that they are on.
+
+frappy-core has threads and no asyncio: what clients ask for runs on their threads and waits for the rig's loop. What
+the rig publishes is announced on a thread of its own, as a client that does not read may hold that up for a second.
+"""
+
+import asyncio
+import logging
+import threading
+from collections.abc import Coroutine
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from frappy.datatypes import BoolType, FloatRange, StatusType
+from frappy.errors import CommunicationFailedError, HardwareError, ImpossibleError, RangeError, SECoPError
+from frappy.lib import generalConfig
+from frappy.logging import init_remote_logging
+from frappy.modules import Command, Drivable, Parameter, Readable
+from frappy.protocol.dispatcher import Dispatcher, make_update
+from frappy.protocol.interface.tcp import TCPServer
+from frappy.server import Server
+
+from ldcnd.client.loop_thread import LoopThread
+from ldcnd.client.rig import Rig
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.errors import (
+    AxisUnreachable,
+    DriveFault,
+    LdcndError,
+    OutcomeUnknown,
+    PositionLimit,
+    SessionError,
+    UnknownAxis,
+    ValueOutOfRange,
+)
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.lab.secop.link import AxisLink, Update, described_by, linked
+from ldcnd.listen_address import ListenAddress
+
+ResultT = TypeVar("ResultT")
+LONGEST_START_S = 12.0
+"""Longest wait for the port, in seconds."""
+
+
+class ValueModule(Readable):  # type: ignore[misc] # frappy has no types
+    """What an axis publishes besides its position."""
+
+    enablePoll = False  # noqa: N815 - frappy's name; values come by themselves
+    status = Parameter(datatype=StatusType(Readable))
+
+
+class WatchedAxis(Readable):  # type: ignore[misc]
+    """An axis that clients do not move."""
+
+    enablePoll = False  # noqa: N815
+
+
+class MovedAxis(Drivable):  # type: ignore[misc]
+    """An axis that clients move."""
+
+    enablePoll = False  # noqa: N815
+    status = Parameter(datatype=StatusType(Drivable, "DISABLED"))
+    target = Parameter(datatype=FloatRange(unit="$"), readonly=False, default=0.0)
+    speed = Parameter("velocity of the moves that follow", FloatRange(0, unit="$/s"), readonly=False, default=0.0)
+    enabled = Parameter("the position loop is closed", BoolType(), readonly=False, default=False)
+
+    def __init__(self, name: str, logger: object, cfgdict: dict[str, Any], srv: "Node") -> None:
+        super().__init__(name, logger, cfgdict, srv)
+        self._node = srv
+
+    @property
+    def _link(self) -> AxisLink:
+        return self._node.links[self.name]
+
+    def write_target(self, value: float) -> float:
+        """Send the axis there."""
+        return self._node.wait(self._link.go(value))
+
+    def write_speed(self, value: float) -> float:
+        """Have the moves that follow be so fast; 0 is the default of the axis."""
+        self._link.speed = value or None
+        return value
+
+    def write_enabled(self, value: bool) -> bool:  # noqa: FBT001 - frappy's signature
+        """Close or open the position loop."""
+        return self._node.wait(self._link.enable(on=bool(value)))
+
+    @Command()  # type: ignore[untyped-decorator]
+    def stop(self) -> None:
+        """Halt the axis."""
+        self._node.wait(self._link.stop())
+
+    @Command(export="clear_errors")  # type: ignore[untyped-decorator]
+    def clear_errors(self) -> None:
+        """Clear a latched stop and faults; nothing moves."""
+        self._node.wait(self._link.clear_errors())
+
+    @Command()  # type: ignore[untyped-decorator]
+    def reset(self) -> None:
+        """Clear a latched stop and faults; nothing moves."""
+        self.clear_errors()
+
+    @Command()  # type: ignore[untyped-decorator]
+    def home(self) -> None:
+        """Find the reference position, as the configuration of the axis says."""
+        self._node.wait(self._link.home())
+
+
+class WithErrors(Dispatcher):  # type: ignore[misc]
+    """Says of a value how wrong it may be, which frappy leaves out."""
+
+    def announce_update(self, moduleobj: Any, pobj: Any) -> None:  # noqa: ANN401
+        """Send an update to those who listen."""
+        action, name, report = make_update(moduleobj.name, pobj)
+        report[-1].update(self._error_of(moduleobj.name, pobj.export))
+        self.broadcast_event((action, name, report))
+
+    def _getParameterValue(self, modulename: str, exportedname: str) -> tuple[object, dict[str, object]]:  # noqa: N802
+        value, qualifiers = super()._getParameterValue(modulename, exportedname)
+        return value, {**qualifiers, **self._error_of(modulename, exportedname)}
+
+    def _error_of(self, module: str, parameter: str) -> dict[str, float]:
+        error = self.srv.errors.get(module) if parameter == "value" else None
+        return {} if error is None else {"e": error}
+
+
+class LocalServer(TCPServer):  # type: ignore[misc]
+    """A server that listens where it is told to, and not on every interface."""
+
+    def server_bind(self) -> None:
+        """Bind to the address of the node."""
+        self.server_address: tuple[str, int] = (self.dispatcher.srv.host, self.server_address[1])
+        super().server_bind()
+
+
+class Node(Server):  # type: ignore[misc]
+    """The node; it is made anew when what the axes are has changed.
+
+    Args:
+        rig: the name of the rig.
+        address: where it listens.
+        loop: where the rig is.
+    """
+
+    def __init__(self, rig: str, address: ListenAddress, loop: LoopThread) -> None:  # not frappy's: it reads files
+        self.name = rig
+        self.host = address.host
+        self.links: dict[str, AxisLink] = {}
+        self.errors: dict[str, float] = {}
+        self.log = logging.getLogger("ldcnd.secop")
+        self.log.setLevel(logging.CRITICAL)  # it logs every refusal with a traceback
+        init_remote_logging(self.log)
+        self.node_cfg = {
+            "cls": f"{WithErrors.__module__}.{WithErrors.__name__}",
+            "equipment_id": f"ldcnd.{rig}",
+            "description": f"The axes of rig {rig}.",
+        }
+        self.module_cfg: dict[str, dict[str, Any]] = {}
+        self._testonly = False
+        self._port = address.port
+        self._loop = loop
+        self._announcing = ThreadPoolExecutor(1, "secop announcements")
+        self._tcp: LocalServer | None = None
+        self._early: dict[tuple[str, str], Update] | None = {}  # what came before there were modules
+
+    def add(self, link: AxisLink) -> None:
+        """Have modules for an axis and its values."""
+        info = link.info
+        self.links[info.axis] = link
+        config: dict[str, Any] = {"cls": WatchedAxis, "description": f"{info.axis}, {info.model}"}
+        config["value"] = {"unit": info.unit}
+        if link.moves:
+            low, high = info.limits.position_min, info.limits.position_max
+            limits = {"min": low, "max": high}
+            config["cls"] = MovedAxis
+            config["target"] = {name: value for name, value in limits.items() if value is not None}
+            if info.limits.velocity:
+                config["speed"] = {"max": info.limits.velocity}
+        self.module_cfg[info.axis] = config
+        for name, unit in link.values().items():
+            self.module_cfg[name] = {"cls": ValueModule, "description": name, "value": {"unit": unit}}
+
+    def begin(self) -> None:
+        """Make the modules, and listen; returns when clients can connect.
+
+        Raises:
+            OSError: the address cannot be had.
+        """
+        if not generalConfig.initialized:
+            generalConfig.testinit()
+        self._processCfg()
+        self._loop.call(self._announce_early)
+        self._tcp = LocalServer("tcp", self.log, {"uri": f"tcp://{self._port}"}, self)
+        threading.Thread(target=self._tcp.serve_forever, name="secop", daemon=True).start()
+
+    def end(self) -> None:
+        """Close all connections, and stop to listen."""
+        if self._tcp:
+            self._tcp.shutdown()
+            self._tcp.server_close()
+            for connection in list(self.dispatcher._connections):  # noqa: SLF001 - frappy ends with its process
+                connection.running = False
+                connection.request.close()
+        self._announcing.shutdown(wait=False, cancel_futures=True)
+
+    def shutdown(self) -> None:
+        """Do nothing: it is not for clients to end the node."""
+
+    def restart(self) -> None:
+        """Do nothing, likewise."""
+
+    def announce(self, update: Update) -> None:
+        """Tell clients of a new value, soon."""
+        if self._early is None:
+            self._announcing.submit(self._announce, update)
+        else:
+            self._early[update.module, update.parameter] = update
+
+    def _announce_early(self) -> None:
+        early, self._early = self._early or {}, None
+        for update in early.values():
+            self.announce(update)
+
+    def _announce(self, update: Update) -> None:
+        module = self.secnode.modules.get(update.module)
+        if module is None or update.parameter not in module.parameters:
+            return
+        if update.error is not None:
+            self.errors[update.module] = update.error
+        problem = CommunicationFailedError(update.problem) if update.problem else None
+        module.announceUpdate(update.parameter, update.value, problem, update.at_s)
+
+    def wait(self, work: Coroutine[object, object, ResultT]) -> ResultT:
+        """Do something on the rig's loop, and wait for it on the thread of a client.
+
+        Raises:
+            SECoPError: the rig refused it, or did not answer.
+        """
+        try:
+            return self._loop.run(work)
+        except LdcndError as error:
+            raise _as_secop(error) from error
+
+
+def _as_secop(error: LdcndError) -> SECoPError:
+    match error:
+        case PositionLimit() | ValueOutOfRange():
+            return RangeError(str(error))
+        case DriveFault() | AxisUnreachable():
+            return HardwareError(str(error))
+        case SessionError() | OutcomeUnknown():
+            return CommunicationFailedError(str(error))
+        case _:
+            return ImpossibleError(str(error))
+
+
+async def serve(
+    rig: Rig, address: ListenAddress, axes: tuple[str, ...], moves: tuple[str, ...], ready: asyncio.Event
+) -> None:
+    """Serve axes as a SECoP node until cancelled; what they are is described anew when that changes.
+
+    Args:
+        rig: the rig.
+        address: where to listen.
+        axes: which; all of them when none is named.
+        moves: those that clients may move.
+        ready: set when clients can connect.
+
+    Raises:
+        UnknownAxis: the rig has no such axis.
+        OSError: the address cannot be had.
+    """
+    described = rig.follow_descriptions()
+    infos = dict(await anext(described))
+    unknown = [name for name in axes if name not in infos]
+    if unknown:
+        raise UnknownAxis(
+            f"rig {rig.name} has no axis {unknown[0]!r}; it has {', '.join(infos)}", axis=unknown[0], value=unknown[0]
+        )
+    while True:
+        chosen = {name: info for name, info in infos.items() if not axes or name in axes}
+        can_move = tuple(name for name in moves if name in chosen and Verb.MOVE_ABSOLUTE in chosen[name].capabilities)
+        node = Node(rig.name, address, LoopThread(asyncio.get_running_loop()))
+        async with linked(rig, chosen, node.announce, can_move) as links:
+            for link in links.values():
+                node.add(link)
+            try:
+                await asyncio.to_thread(node.begin)
+                ready.set()
+                async for again in described:
+                    infos = dict(again)
+                    if _is_other(chosen, infos, axes):
+                        break
+            finally:
+                await asyncio.to_thread(node.end)
+
+
+def _is_other(before: dict[str, AxisInfo], now: dict[str, AxisInfo], axes: tuple[str, ...]) -> bool:
+    shown = {name: described_by(info) for name, info in now.items() if not axes or name in axes}
+    return shown != {name: described_by(info) for name, info in before.items()}

@@ -1,0 +1,107 @@
+"""frappy's own client, unmodified, with a daemon and a SECoP node in processes of their own."""
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from typing import Self
+
+import pytest
+from frappy.client import SecopClient
+from frappy.errors import ImpossibleError, RangeError
+
+from ldcnd.contract.commands import Power
+from ldcnd.contract.samples import Moving
+from tests.support.process import ROOT, client, daemon, free_port, process
+
+pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(200)]
+
+LONGEST_S = 30.0
+DISABLED, IDLE, BUSY, ERROR = 0, 100, 300, 400
+
+
+@asynccontextmanager
+async def node(*options: str) -> AsyncIterator[tuple[str, str]]:
+    """Run a daemon and a node; yields the daemon's endpoint, and the node's address."""
+    port = free_port()
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        async with process("secop", "x", "y", "-e", endpoint, "--address", f"127.0.0.1:{port}", *options) as running:
+            assert running.stdout
+            assert b"SECoP modules {x,y}" in await running.stdout.readline()
+            yield endpoint, f"tcp://127.0.0.1:{port}"
+
+
+class Client(SecopClient):
+    """A client that is used by a test."""
+
+    def __enter__(self) -> Self:
+        self.connect(10)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.disconnect()
+
+    def until(self, module: str, parameter: str, holds: Callable[[object], bool]) -> object:
+        until_s = time.monotonic() + LONGEST_S
+        while not holds(value := self.cache[module, parameter].value):
+            assert time.monotonic() < until_s, (module, parameter, value)
+            time.sleep(0.02)
+        return value
+
+    def rests(self, module: str) -> None:
+        self.until(module, "status", lambda status: status[0] == IDLE)
+
+
+async def test_an_axis_is_a_drivable_that_is_sent_stopped_and_reset():
+    def use(uri: str, stop: Callable[[], None]) -> None:
+        with Client(uri, log=None) as there:
+            described = there.modules["x"]
+            assert described["properties"]["interface_classes"] == ["Drivable"]
+            assert there.modules["x_velocity"]["properties"]["interface_classes"] == ["Readable"]
+            assert "communicate" not in {each for module in there.modules.values() for each in module["commands"]}
+            there.until("x", "status", lambda status: status[0] == DISABLED)
+            there.setParameter("x", "enabled", value=True)
+            there.rests("x")
+            there.setParameter("x", "target", 3.0)
+            assert there.cache["x", "status"].value[0] == BUSY  # before the reply
+            there.rests("x")
+            assert abs(there.cache["x", "value"].value - 3) < 0.02
+            assert abs(there.cache["x", "value"].timestamp - time.time()) < 5
+            _, _, (_, qualifiers) = there.request("read", "x:value")
+            assert 0.001 <= qualifiers["e"] < 0.1
+            with pytest.raises(RangeError):
+                there.setParameter("x", "target", 1000.0)
+            there.setParameter("x", "speed", 5.0)
+            there.setParameter("x", "target", 60.0)
+            there.until("x", "value", lambda value: value > 5)
+            there.execCommand("x", "stop")
+            there.rests("x")
+            assert there.cache["x", "value"].value < 55
+            assert abs(there.cache["x", "target"].value - there.cache["x", "value"].value) < 0.5
+            stop()
+            there.until("x", "status", lambda status: status[0] == ERROR and "latched" in status[1])
+            with pytest.raises(ImpossibleError, match="latch"):
+                there.setParameter("x", "target", 1.0)
+            there.execCommand("x", "clear_errors")
+            there.until("x", "status", lambda status: status[0] in (IDLE, DISABLED))
+            there.setParameter("x", "enabled", value=True)
+            there.execCommand("x", "home")
+            there.until("x", "status", lambda status: status[0] == BUSY)
+            there.rests("x")
+
+    async with node("--moves") as (endpoint, uri), client(endpoint) as rig:
+        loop = asyncio.get_running_loop()
+        await asyncio.to_thread(use, uri, lambda: asyncio.run_coroutine_threadsafe(rig.stop("x"), loop).result(10))
+        assert (await rig.state("x")).moving is Moving.NO
+
+
+async def test_a_read_only_node_has_readables():
+    def use(uri: str) -> None:
+        with Client(uri, log=None) as there:
+            assert {module["properties"]["interface_classes"][0] for module in there.modules.values()} == {"Readable"}
+            there.until("x", "value", lambda value: value is not None)
+            assert not any(module["commands"] for module in there.modules.values())
+
+    async with node() as (endpoint, uri), client(endpoint) as rig:
+        await rig.command("x", Power(on=True))
+        await asyncio.to_thread(use, uri)

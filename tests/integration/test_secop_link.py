@@ -1,0 +1,106 @@
+"""What stands between an axis and a module of a SECoP node, on a whole daemon; clients try the node itself."""
+
+import asyncio
+from contextlib import asynccontextmanager
+
+import pytest
+
+from ldcnd.client.rig import Rig
+from ldcnd.contract.errors import LdcndError, LeaseRequired, PositionLimit
+from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.samples import LinkState, Moving
+from ldcnd.lab.secop.link import StatusCode, linked
+from tests.support.rig import running_rig, two_axes
+
+
+@asynccontextmanager
+async def linked_x():
+    updates = []
+    async with running_rig(two_axes()) as running:
+        await running.until("x", lambda state: state.link is LinkState.UP)
+        rig = Rig(running.client, await running.client.daemon())
+        infos = {info.axis: info for info in await rig.describe() if info.axis == "x"}
+        async with linked(rig, infos, updates.append, ("x",)) as links:
+            await links["x"].enable(on=True)
+            yield running, links["x"], updates
+
+
+async def becomes(link, code: StatusCode) -> str:
+    async with asyncio.timeout(30):
+        while link.status()[0] != code:
+            await asyncio.sleep(0.05)
+    return link.status()[1]
+
+
+async def test_a_target_is_reached_and_busy_is_shown_before_the_reply():
+    async with linked_x() as (running, link, updates):
+        await becomes(link, StatusCode.IDLE)
+        updates.clear()
+        await link.go(3.0)
+        shown = [update.value for update in updates if update.parameter == "status"]
+        await becomes(link, StatusCode.IDLE)
+        places = [update for update in updates if (update.module, update.parameter) == ("x", "value")]
+
+        assert shown[-1][0] == StatusCode.BUSY
+        assert places[-1].value == pytest.approx(3, abs=0.02)
+        assert all(0.001 <= update.error < 0.2 for update in places)
+        assert (await running.client.state("x")).target == pytest.approx(3)
+
+
+async def test_a_new_target_sends_a_moving_axis_elsewhere_and_a_stop_halts_it():
+    async with linked_x() as (running, link, _):
+        await link.go(50.0)
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await link.go(1.0)
+        await becomes(link, StatusCode.IDLE)
+        reached = (await running.client.position("x")).value
+        await link.go(50.0)
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await link.stop()
+        await becomes(link, StatusCode.IDLE)
+        state = await running.client.state("x")
+
+        assert reached == pytest.approx(1, abs=0.02)
+        assert state.stop_latched is False
+        assert (await running.client.position("x")).value < 30
+
+
+async def test_a_latch_is_an_error_that_is_cleared_and_limits_are_refused():
+    async with linked_x() as (running, link, _):
+        await link.go(50.0)
+        await running.client.stop("x")
+        said = await becomes(link, StatusCode.ERROR)
+        with pytest.raises(LdcndError, match="latch"):
+            await link.go(1.0)
+        await running.until("x", lambda state: state.moving is Moving.NO)
+        await link.clear_errors()
+        await becomes(link, StatusCode.IDLE)
+        with pytest.raises(PositionLimit):
+            await link.go(1000.0)
+
+        assert "latched" in said
+        assert link.status()[0] == StatusCode.IDLE
+
+
+async def test_control_is_given_back_when_the_axis_idles_and_never_taken_by_force():
+    async with linked_x() as (running, link, _):
+        await link.go(1.0)
+        await becomes(link, StatusCode.IDLE)
+        await asyncio.sleep(31)
+        assert not any(holder.client for holder in (await running.client.ask(ListHolders())).holders)
+        await running.client.ask(Acquire(client="ann", axes=("x",), lease_s=60))
+        with pytest.raises(LeaseRequired, match="ann"):
+            await link.go(2.0)
+        await link.stop()
+
+        assert (await running.client.state("x")).stop_latched
+
+
+async def test_a_daemon_that_says_nothing_is_an_error():
+    async with linked_x() as (running, link, updates):
+        running.daemon.end()
+        async with asyncio.timeout(30):
+            while "nothing is published any more" not in {update.problem for update in updates}:
+                await asyncio.sleep(0.1)
+
+        assert link.status()[0] == StatusCode.ERROR
