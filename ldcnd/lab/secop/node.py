@@ -49,13 +49,13 @@ class ValueModule(Readable):  # type: ignore[misc] # frappy has no types
     status = Parameter(datatype=StatusType(Readable))
 
 
-class WatchedAxis(Readable):  # type: ignore[misc]
+class AxisReadable(Readable):  # type: ignore[misc]
     """An axis that clients do not move."""
 
     enablePoll = False  # noqa: N815
 
 
-class MovedAxis(Drivable):  # type: ignore[misc]
+class AxisDrivable(Drivable):  # type: ignore[misc]
     """An axis that clients move."""
 
     enablePoll = False  # noqa: N815
@@ -64,7 +64,7 @@ class MovedAxis(Drivable):  # type: ignore[misc]
     speed = Parameter("velocity of the moves that follow", FloatRange(0, unit="$/s"), readonly=False, default=0.0)
     enabled = Parameter("the position loop is closed", BoolType(), readonly=False, default=False)
 
-    def __init__(self, name: str, logger: object, cfgdict: dict[str, Any], srv: "Node") -> None:
+    def __init__(self, name: str, logger: object, cfgdict: dict[str, Any], srv: "SecNodeServer") -> None:
         super().__init__(name, logger, cfgdict, srv)
         self._node = srv
 
@@ -133,7 +133,7 @@ class LocalServer(TCPServer):  # type: ignore[misc]
         super().server_bind()
 
 
-class Node(Server):  # type: ignore[misc]
+class SecNodeServer(Server):  # type: ignore[misc]
     """The node; it is made anew when what the axes are has changed.
 
     Args:
@@ -167,12 +167,12 @@ class Node(Server):  # type: ignore[misc]
         """Have modules for an axis and its values."""
         info = link.info
         self.links[info.axis] = link
-        config: dict[str, Any] = {"cls": WatchedAxis, "description": f"{info.axis}, {info.model}"}
+        config: dict[str, Any] = {"cls": AxisReadable, "description": f"{info.axis}, {info.model}"}
         config["value"] = {"unit": info.unit}
         if link.moves:
             low, high = info.limits.position_min, info.limits.position_max
             limits = {"min": low, "max": high}
-            config["cls"] = MovedAxis
+            config["cls"] = AxisDrivable
             config["target"] = {name: value for name, value in limits.items() if value is not None}
             if info.limits.velocity:
                 config["speed"] = {"max": info.limits.velocity}
@@ -280,7 +280,7 @@ async def serve(
     while True:
         chosen = {name: info for name, info in infos.items() if not axes or name in axes}
         can_move = tuple(name for name in moves if name in chosen and Verb.MOVE_ABSOLUTE in chosen[name].capabilities)
-        node = Node(rig.name, address, LoopThread(asyncio.get_running_loop()))
+        node = SecNodeServer(rig.name, address, LoopThread(asyncio.get_running_loop()))
         async with linked(rig, chosen, node.announce, can_move) as links:
             for link in links.values():
                 node.add(link)
