@@ -11,7 +11,7 @@ from ldcnd.client.blocking import (
 )
 from ldcnd.client.blocking import connect as connect_blocking
 from ldcnd.client.blocking import open_rig as open
-from ldcnd.client.motion import Motion, Position, Progress, Sent, State
+from ldcnd.client.motion import Jogging, Motion, Position, Progress, Sent, State
 from ldcnd.client.rig import Rig, Stream, UnfinishedMotion, connect
 from ldcnd.client.traces import Trace
 from ldcnd.contract.commands import (
@@ -257,6 +257,7 @@ __all__ = [
     "IoReply",
     "IoSample",
     "IoTimer",
+    "Jogging",
     "LatchSample",
     "LdcndError",
     "LeaseExpired",

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import ldcnd
 from ldcnd.contract.errors import ERRORS
-from ldcnd.daemon.contract import all_schemas, write_schemas
 from tools.channels import keys_table
+from tools.schemas import all_schemas, write_schemas
 from tools.verb_methods import verb_methods, with_blocking_methods
 
 ROOT = Path(__file__).parents[1]

@@ -8,7 +8,8 @@ import click
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
-from ldcnd.cli.output import end_as_interrupted, show_lines
+from ldcnd.cli.names import whose
+from ldcnd.cli.output import end_as_interrupted, keys, repetitions, show_lines
 from ldcnd.cli.quantities import number, rounded, seconds
 from ldcnd.cli.sending import (
     NAME,
@@ -21,10 +22,9 @@ from ldcnd.cli.sending import (
     halted,
     halting,
 )
-from ldcnd.cli.terminal import keys, repetitions
 from ldcnd.cli.typed import Finite, axis_of
-from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control, control
+from ldcnd.client.motion import Jogging
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import (
     LONGEST_HOLD_S,
@@ -142,18 +142,19 @@ def jog(
             if for_s is None:
                 await _while_pressed(client, info, held, command)
             else:
-                await _for_a_time(info, held, command, for_s)
+                await _for_a_time(client, info, held, command, for_s)
             return await halted(client, info)
 
     end_as_interrupted()
     show_lines(target.run(work))
 
 
-async def _for_a_time(info: AxisInfo, held: Control, command: Jog, for_s: float) -> None:
+async def _for_a_time(client: RigClient, info: AxisInfo, held: Control, command: Jog, for_s: float) -> None:
     """Run the axis for a time, in seconds, or until its software limit."""
     jog = Jogging(partial(held.command, info.axis), command)
     reply = await jog.begin()
-    show_lines(f"{info.axis}: runs at {rounded(reply.velocity or command.velocity)} {info.unit}/s for {for_s:g} s")
+    at = rounded(reply.velocity or command.velocity)
+    show_lines(f"{whose(client.rig)}{info.axis}: runs at {at} {info.unit}/s for {for_s:g} s")
     try:
         async with asyncio.timeout(for_s):
             while True:

@@ -10,9 +10,9 @@ from ldcnd.contract.errors import RemedyCommand
 GROUPS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
     "Run": {
         "run": ("ldcnd.cli.run", "Run the daemon."),
-        "check-config": ("ldcnd.cli.prepare:check_config", "Validate a configuration without opening anything."),
+        "check-config": ("ldcnd.cli.run:check_config", "Validate a configuration without opening anything."),
         "plan": (
-            "ldcnd.cli.prepare:plan",
+            "ldcnd.cli.run:plan",
             "Show what the lines of a configuration promise, before any hardware is there.",
         ),
         "sim": ("ldcnd.cli.sim", "Simulate a line of drives behind a pseudo-terminal."),
@@ -27,7 +27,7 @@ GROUPS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         "reset": ("ldcnd.cli.rig:reset", "Clear stop latches and faults of all axes, or of some."),
         "power": ("ldcnd.cli.rig:power", "Close or open the position loops of all axes, or of some."),
         "speed": ("ldcnd.cli.rig:speed", "Show or set the speed override of the rig."),
-        "group": ("ldcnd.cli.group", "Move several axes together."),
+        "group": ("ldcnd.cli.rig:group", "Move several axes together."),
         "axis": ("ldcnd.cli.axis", "Send any other command to an axis: probe, set its position, read its drive."),
         "lease": ("ldcnd.cli.rig:lease", "See who controls which axis; hold control."),
     },

@@ -15,7 +15,7 @@ from ldcnd.cli.output import on_end
 from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.typed import NewFile, WholeNumber, force_option
 from ldcnd.client.rig_client import RigClient
-from ldcnd.client.trace_file import column_title
+from ldcnd.client.traces import column_title
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.events import FINAL, CommandEvent, CommandStatus
 from ldcnd.parts import require

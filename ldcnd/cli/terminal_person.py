@@ -11,8 +11,7 @@ from contextlib import asynccontextmanager
 from typing_extensions import override
 
 from ldcnd.bench.person import Left, Person
-from ldcnd.cli.output import show_lines
-from ldcnd.cli.terminal import keys, repetitions
+from ldcnd.cli.output import keys, repetitions, show_lines
 from ldcnd.contract.errors import ConfigError
 
 HELD = " "

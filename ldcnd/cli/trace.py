@@ -13,8 +13,16 @@ from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.sending import Shown, derived_question
 from ldcnd.cli.typed import Finite, NewFile, WholeNumber, axis_of, force_option
 from ldcnd.client.rig_client import RigClient
-from ldcnd.client.trace_file import column_title, load_trace, require_suffix, save_trace
-from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
+from ldcnd.client.traces import (
+    Trace,
+    armed_trace,
+    column_title,
+    fetch_trace,
+    load_trace,
+    require_suffix,
+    save_trace,
+    wait_for_trace,
+)
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, read_number
 from ldcnd.contract.traces import (

@@ -9,9 +9,8 @@ from typing import TypeVar
 
 import pydantic
 
-from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control
-from ldcnd.client.motion import Motion, Position, Sent, State
+from ldcnd.client.motion import Jogging, Motion, Position, Sent, State
 from ldcnd.client.notebook import table
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, take_trace
@@ -19,10 +18,10 @@ from ldcnd.client.verbs import AxisVerbs
 from ldcnd.contract.codec import decode_received, explained
 from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
 from ldcnd.contract.condition import assess
-from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError
+from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError, WrongState
 from ldcnd.contract.events import FINAL, CommandOutcome, ReadOutcome
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.samples import Moving, PositionSample, StateSample, TelemetryItem
 from ldcnd.contract.traces import TakeTrace, TraceTrigger
 from ldcnd.net.session import Publication, SampleKind
 
@@ -341,3 +340,44 @@ def _made(make: Callable[[], ReplyT]) -> ReplyT:
         return make()
     except pydantic.ValidationError as error:
         raise explained(error) from None
+
+
+REST_S = 5.0
+"""Longest time that an axis takes to come to rest, or to be heard of, seconds."""
+CHECK_PERIOD_S = 0.05
+
+
+async def seen(axis: Axis) -> Axis:
+    """Wait for the first state and position of an axis; return it.
+
+    Raises:
+        SessionError: nothing is received from it.
+    """
+    deadline_s = asyncio.get_running_loop().time() + REST_S
+    while True:
+        try:
+            _ = axis.state, axis.position
+        except SessionError:
+            if asyncio.get_running_loop().time() > deadline_s:
+                raise
+            await axis.news(CHECK_PERIOD_S)
+        else:
+            return axis
+
+
+async def at_rest(axis: Axis) -> None:
+    """Wait until an axis stands.
+
+    Raises:
+        WrongState: it does not come to rest.
+    """
+    try:
+        async with asyncio.timeout(REST_S):
+            while axis.state.moving is not Moving.NO:
+                await axis.news(CHECK_PERIOD_S)
+    except TimeoutError:
+        raise WrongState(
+            f"axis {axis.name} does not come to rest within {REST_S:g} s",
+            axis=axis.name,
+            remedy="look for a load that moves it, then give the command again",
+        ) from None

@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 
 from ldcnd.client import axis as asynchronous
-from ldcnd.client import jog, motion, rig
+from ldcnd.client import motion, rig
 from ldcnd.client.loop_thread import LoopThread, loop_thread
 from ldcnd.client.notebook import table
 from ldcnd.contract.events import CommandEvent
@@ -71,11 +71,11 @@ class BlockingMotion(Facade[motion.Motion]):
         return self._loop.each(aiter(self._wrapped))
 
 
-class BlockingJogging(Facade[jog.Jogging]):
+class BlockingJogging(Facade[motion.Jogging]):
     """A jog under way; made by `BlockingAxis.jogging`."""
 
-    held = _waiting(jog.Jogging.held)
-    renew = _waiting(jog.Jogging.renew)
+    held = _waiting(motion.Jogging.held)
+    renew = _waiting(motion.Jogging.renew)
 
 
 class BlockingAxis(Facade[asynchronous.Axis]):

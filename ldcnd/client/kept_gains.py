@@ -9,9 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 
 from ldcnd import durable
-from ldcnd.client.axis import Axis
+from ldcnd.client.axis import Axis, at_rest, seen
 from ldcnd.client.rig import Rig
-from ldcnd.client.standstill import at_rest, seen
 from ldcnd.contract.errors import ConfigError, StopLatched, WrongState
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo

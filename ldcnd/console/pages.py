@@ -14,8 +14,8 @@ from functools import partial
 
 from pydantic import Field
 
-from ldcnd.client.jog import Jogging
 from ldcnd.client.lease import Control
+from ldcnd.client.motion import Jogging
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitor

@@ -13,8 +13,7 @@ from starlette.responses import FileResponse, HTMLResponse, PlainTextResponse, R
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from ldcnd.client.trace_file import trace_as_csv, trace_as_json
-from ldcnd.client.traces import Trace, fetch_trace
+from ldcnd.client.traces import Trace, fetch_trace, trace_as_csv, trace_as_json
 from ldcnd.console.errors import Answer, answering_errors, error_response
 from ldcnd.console.feed import Feed, Page, parse_subscription
 from ldcnd.console.replies import RigsReply

@@ -1,6 +1,7 @@
 """All commands, and all models that cross the network."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from types import MappingProxyType
 
 from ldcnd.contract import commands, parameters, rig_commands, traces
@@ -70,3 +71,15 @@ PUBLIC_MODELS: tuple[type[Frozen], ...] = (
 
 MODELS: Mapping[str, type[Frozen]] = MappingProxyType({schema_name(model): model for model in PUBLIC_MODELS})
 """The same by the name of their schema."""
+
+
+def shipped_schemas() -> Mapping[str, bytes]:
+    """Return all schemas, that of the configuration too, from their files, as `meta/schema/<name>` has them.
+
+    A daemon generates none: that takes half as long as all the rest of its start-up, and `make check` holds the files
+    to the models.
+    """
+    package = Path(__file__).parents[1]
+    installed = package / "schemas"  # a wheel has a copy here; in a checkout they are beside the package
+    folder = installed if installed.is_dir() else package.parent / "schemas"
+    return {path.stem: path.read_bytes() for path in sorted(folder.glob("*.json"))}

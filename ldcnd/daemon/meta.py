@@ -6,7 +6,7 @@ from typing import Literal, TypeAlias
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
-from ldcnd.contract.catalogue import COMMANDS
+from ldcnd.contract.catalogue import COMMANDS, shipped_schemas
 from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.commands import About, Verb
 from ldcnd.contract.errors import ErrorCode, MalformedRequest
@@ -16,7 +16,6 @@ from ldcnd.contract.keys import RIG_ITSELF, Keys, matches
 from ldcnd.contract.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.samples import Sample, TelemetryItem
-from ldcnd.daemon.contract import shipped_schemas
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import OwnedRig

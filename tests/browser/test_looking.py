@@ -7,8 +7,7 @@ import re
 import pytest
 
 from ldcnd.cli.params import load_parameters
-from ldcnd.client.trace_file import load_trace
-from ldcnd.client.traces import fetch_trace, trace_header
+from ldcnd.client.traces import fetch_trace, load_trace, trace_header
 from ldcnd.contract.commands import HomeMethod, HomeStop, MoveVelocity, Power, ReportShadow, SetGains
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import ShadowFigure

@@ -6,8 +6,7 @@ from asyncio.subprocess import PIPE
 
 import pytest
 
-from ldcnd.client.trace_file import load_trace
-from ldcnd.client.traces import trace_header
+from ldcnd.client.traces import load_trace, trace_header
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.traces import TracePhase
 from tests.support.process import LDCND, ROOT, client, daemon

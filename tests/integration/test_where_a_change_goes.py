@@ -21,7 +21,7 @@ import asyncio, json
 from ldcnd.cli.quantities import sample_text
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.daemon.contract import all_schemas
+from tools.schemas import all_schemas
 from ldcnd.contract.samples import LinkState
 from tests.support.rig import SIMULATED, running_rig
 from tests.support.verb_table import empty_cells

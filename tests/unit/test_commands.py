@@ -10,8 +10,8 @@ from ldcnd.contract.catalogue import AXIS_COMMANDS, AXIS_QUESTIONS, COMMANDS, RI
 from ldcnd.contract.codec import Encoding, decode, encode
 from ldcnd.contract.commands import About, AxisCommand, Capability, Command, CommandReply, Effect, Ends, Verb
 from ldcnd.contract.frozen import Frozen, schema_name
-from ldcnd.daemon.contract import all_schemas
 from tests.support.process import ROOT
+from tools.schemas import all_schemas
 
 VECTORS = json.loads((ROOT / "tests" / "vectors" / "commands.json").read_text(encoding="utf-8"))["commands"]
 BY_VERB = {**AXIS_COMMANDS, **AXIS_QUESTIONS, **RIG_COMMANDS}

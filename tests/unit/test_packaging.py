@@ -13,8 +13,8 @@ from hatchling.builders.sdist import SdistBuilder
 from hatchling.builders.wheel import WheelBuilder
 
 from ldcnd.contract.fault_pages import codes
-from ldcnd.daemon.contract import all_schemas
 from tests.support.pages import ROOT
+from tools.schemas import all_schemas
 
 NOT_SOURCE = shutil.ignore_patterns(".git", ".venv", "build", "dist", "state", "__pycache__", ".*_cache", ".hypothesis")
 EPOCH = "1700000000"

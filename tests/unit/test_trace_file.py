@@ -2,8 +2,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from ldcnd.client.trace_file import load_trace, require_suffix, save_trace
-from ldcnd.client.traces import Trace
+from ldcnd.client.traces import Trace, load_trace, require_suffix, save_trace
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.samples import Quality
 from ldcnd.contract.traces import TraceChannel, TraceHeader, TracePhase, TraceSource

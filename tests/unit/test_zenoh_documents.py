@@ -11,9 +11,9 @@ from ldcnd.contract.commands import Verb
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.contract.keys import Keys, matches
 from ldcnd.contract.samples import TelemetryItem
-from ldcnd.daemon.contract import all_schemas
 from tools.__main__ import renew_table
 from tools.channels import Kind, channels, keys_table
+from tools.schemas import all_schemas
 
 ROOT = Path(__file__).parents[2]
 REFERENCE = ROOT / "docs" / "reference"

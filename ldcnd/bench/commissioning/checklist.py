@@ -22,10 +22,10 @@ from ldcnd.bench.commissioning.speed import HighestSpeed
 from ldcnd.bench.commissioning.step import Step, StepContext
 from ldcnd.bench.commissioning.travel import Travel
 from ldcnd.bench.person import Person, said
+from ldcnd.client.axis import seen
 from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
-from ldcnd.client.standstill import seen
 from ldcnd.config.edit import edited_for_axis, write_over
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import LdcndError, UnknownAxis, WrongState

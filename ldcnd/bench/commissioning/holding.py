@@ -24,9 +24,8 @@ from ldcnd.bench.commissioning.motor import (
 from ldcnd.bench.commissioning.questions import powered_off
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
 from ldcnd.bench.commissioning.step import Step, StepContext, refuse_latched, refuse_previewed, rest_counts
-from ldcnd.client.axis import Axis
+from ldcnd.client.axis import Axis, seen
 from ldcnd.client.kept_gains import open_loop
-from ldcnd.client.standstill import seen
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import CommandAborted, DriveFault
 from ldcnd.contract.samples import AxisState

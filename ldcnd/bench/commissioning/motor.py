@@ -14,9 +14,8 @@ from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
 from ldcnd.bench.commissioning.step import Step, StepContext, refuse_latched, refuse_previewed, rest_counts
-from ldcnd.client.axis import Axis
+from ldcnd.client.axis import Axis, seen
 from ldcnd.client.kept_gains import KeptGains, gains_in, keep, open_loop, restore
-from ldcnd.client.standstill import seen
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import CommandAborted, DriveFault, LdcndError, WrongState
 from ldcnd.contract.samples import AxisState

@@ -8,10 +8,9 @@ from typing import ClassVar
 
 from ldcnd.bench.commissioning.record import CommissioningRecord, Result, StepState
 from ldcnd.bench.person import Person
-from ldcnd.client.axis import Axis
+from ldcnd.client.axis import REST_S, Axis, at_rest
 from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
-from ldcnd.client.standstill import REST_S, at_rest
 from ldcnd.contract.codec import rebuild_error
 from ldcnd.contract.commands import PreviewReply, Verb
 from ldcnd.contract.errors import LdcndError, Remedy, StopLatched, WrongState, step

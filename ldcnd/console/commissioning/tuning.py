@@ -6,10 +6,10 @@ from ldcnd.bench.commissioning.checklist import CLIENT, STEPS
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, PlotSeries, Result, StepState
 from ldcnd.bench.known import BENCHES
 from ldcnd.bench.person import Person
+from ldcnd.client.axis import seen
 from ldcnd.client.kept_gains import LEASE_S, open_loop
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.client.standstill import seen
 from ldcnd.config.rig import RigConfig
 from ldcnd.console.commissioning.messages import CurveView
 from ldcnd.parts import require
