@@ -4,9 +4,8 @@ import { inPageTerms } from "../parts/remedies.js";
 import { controls } from "./control.js";
 
 const MOVING = new Set(["homing", "discrete_motion", "continuous_motion", "stopping"]);
-/** What buttons are called that send a command in one of its forms. */
-const VERBS = { enable: "power", disable: null, parameters: "read_parameter" };
-const WITHOUT_CONTROL = new Set(["halt", "parameters", "trace", "none"]);
+/** What buttons send, where that is not what they are called. */
+const VERBS = { enable: "power", disable: "power", parameters: "read_parameter", none: null };
 /** Presses that the daemon would carry out, without a use. */
 const USELESS = {
   enable: (axis) => axis.state?.enabled && "The axis is enabled already.",
@@ -21,7 +20,6 @@ const USELESS = {
 };
 
 function notControlled(axis) {
-  if (controls(axis)) return null;
   return axis.holder ? `Control is held by ${axis.holder}: take it first.` : "Take control first.";
 }
 
@@ -31,9 +29,12 @@ function notControlled(axis) {
  */
 export function obstacle(axis, act, joins = false) {
   if (act !== "halt" && axis.rig.worth) return "No data from this rig: the state of the axis is unknown.";
-  const here = (!WITHOUT_CONTROL.has(act) && notControlled(axis)) || USELESS[act]?.(axis);
+  const verb = VERBS[act] === undefined ? act : VERBS[act];
+  // a trace moves nothing: who only looks may take one where the daemon asks for no lease
+  const isControlled = act === "trace" || !axis.rig.commands.get(verb)?.needs_lease || controls(axis);
+  const here = (!isControlled && notControlled(axis)) || USELESS[act]?.(axis);
   if (here) return here;
-  const causes = axis.samples.obstacles?.[VERBS[act] === undefined ? act : VERBS[act]] ?? [];
+  const causes = act === "disable" ? [] : (axis.samples.obstacles?.[verb] ?? []); // nothing refuses what takes energy out
   const cause = causes.find(({ passes }) => !(joins && passes));
   return cause ? inWords(cause) : null;
 }

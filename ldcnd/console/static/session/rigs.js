@@ -203,6 +203,8 @@ export class Rig {
   axes = new Map();
   buses = new Map();
   events = [];
+  /** What the daemon says of each command, by its verb. */
+  commands = new Map();
   heardAtMs = performance.now();
 
   constructor(name) {
@@ -241,6 +243,7 @@ export class Rig {
     for (const bus of this.buses.keys()) if (described && !told.buses.some((each) => each.bus === bus)) this.buses.delete(bus);
     for (const info of told.buses) this.bus(info.bus).info = info;
     for (const info of told.axes) this.axis(info.axis).info = info;
+    for (const info of told.commands?.commands ?? []) this.commands.set(info.verb, info);
     const place = ({ info }) => (info ? [info.bus, info.address] : ["", 0]);
     this.axes = new Map(
       [...this.axes].sort(([, one], [, other]) => {
