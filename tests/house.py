@@ -45,8 +45,8 @@ from tests.support.rig import SIMULATED, RunningRig, running_rig
 from tests.support.trace_rig import trace_config
 
 PACKAGE = Path(ldcnd.__file__).parent
-SESSION = "net/memory_session.py"
-OUTSIDE = ("sim/", "testing/", SESSION, "log.py")
+SESSION = "testing/memory_session.py"
+OUTSIDE = ("sim/", "testing/", "log.py")
 DOORS = ("data_received", "admit", "offer", "reply")
 """What the world outside calls: bytes of the line, and a query with its answer."""
 AXIS = "x"

@@ -1,5 +1,5 @@
 """Sessions between the daemon and its clients.
 
-Start with `session`, the contract; `zenoh_session` and `memory_session` fulfil it, `hand_over` brings
+Start with `session`, the contract; `zenoh_session` fulfils it, `hand_over` brings
 what Zenoh gives to the loop.
 """

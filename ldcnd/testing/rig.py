@@ -18,13 +18,13 @@ from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.line.transport import Opener, Receiver, Transport
 from ldcnd.net.hand_over import Answer
-from ldcnd.net.memory_session import MemoryBroker, MemorySession
 from ldcnd.net.session import NO_PARAMETERS, QUERY_TIMEOUT_S, Publication
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.known import SIMULATED, opener_of
 from ldcnd.testing.faults import Processes, RigFaults
 from ldcnd.testing.jumping_loop import JumpingLoop
 from ldcnd.testing.lines import simulated_config
+from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 from ldcnd.testing.timeline import Timeline
 from ldcnd.testing.truth import Machine, Truth
 

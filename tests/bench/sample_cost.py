@@ -18,10 +18,10 @@ from pathlib import Path
 from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import Quality, TelemetryItem
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.publisher import Publisher, Topic
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.bench.report import Row, table
 from tests.support.process import free_port
 from tests.support.router import PROGRAM as ROUTER

@@ -15,8 +15,8 @@ from ldcnd.contract.events import CommandEvent, CommandStatus
 from ldcnd.contract.keys import EVENT, Keys
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.session import Publication
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 

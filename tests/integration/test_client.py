@@ -36,7 +36,7 @@ from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
-from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.process import ROOT, answering, daemon, process
 from tests.support.rig import EPOCH_NS, RunningRig, running_rig, two_axes
 from tests.support.session_pair import free_endpoint

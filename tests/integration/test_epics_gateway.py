@@ -28,7 +28,7 @@ from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.samples import Moving
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.lab.epics.gateway import gateway
-from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.dialect_rig import LS_182AP, dialect_rig
 from tests.support.epics_records import VALUES, put, records, shows
 from tests.support.rig import EPOCH_NS, two_axes

@@ -19,10 +19,10 @@ from ldcnd.daemon.assembly import build_daemon
 from ldcnd.drives.axis_config import LossConfig, LossPolicy
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, PacketReader
 from ldcnd.drives.network import AdoptFallback, StartPolicy
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.axis_bench import put
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, openers_of, running_rig
 

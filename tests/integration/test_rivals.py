@@ -20,8 +20,8 @@ from ldcnd.contract.health import DaemonHealth
 from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
 from ldcnd.lab.epics.gateway import gateway
 from ldcnd.lab.recording.recorder import Recorder
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.session import Qos
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.command_line import virtual_rig
 from tests.support.console_rig import page, running_console
 from tests.support.epics_records import shows

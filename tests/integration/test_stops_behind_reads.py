@@ -13,8 +13,8 @@ from ldcnd.daemon.dispatch import EarlyStops
 from ldcnd.daemon.meta import WORK_PER_STEP
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.net.hand_over import Query
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.reads import READS_OF_A_CLIENT
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, running_rig
 
 STOP_MOTOR = 0x7

@@ -14,7 +14,7 @@ from ldcnd.cli.connection import TargetOption
 from ldcnd.cli.main import cli, main
 from ldcnd.cli.names import COMMANDS
 from ldcnd.cli.output import EXIT_CODES
-from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.testing.memory_session import MemoryBroker
 
 VALUES = ("nan", "inf", "0", "-1", "", "9" * 30, "\x1b[2J", "no/such")
 DOCUMENTED = set(EXIT_CODES)

@@ -17,12 +17,12 @@ from ldcnd.contract.errors import LdcndError, RequestRefused
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import PlainCommand
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.testing.jumping_loop import JumpingLoop
+from ldcnd.testing.memory_session import MemoryBroker
 
 SCHEDULES = 120
 """Of a batch; `make test` lives through the first third of the first one."""

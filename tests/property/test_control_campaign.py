@@ -21,9 +21,9 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import Power
 from ldcnd.contract.leases import Acquire, Release
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.faults import FaultInjector, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.interruptions import CopiedLoop, Interruptions, in_new_loop, own_folder, run_with_copies
 from tests.support.schedules import LINE, RIG, Act, Drawing, Play, Rig, all_up, faults_of
 from tests.support.shaft_judge import ShaftJudge, now_ns

@@ -59,10 +59,10 @@ from ldcnd.contract.samples import LinkState, StateSample
 from ldcnd.contract.traces import TakeTrace
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.interruptions import (
     Chosen,
     CopiedLoop,

@@ -42,8 +42,8 @@ from ldcnd.drives.driver import (
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, ReplyVerdict, Timing
 from ldcnd.line.proof import Proofs
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.publisher import Publisher
+from ldcnd.testing.memory_session import MemoryBroker
 
 KEYS = Keys("bench")
 COUNTS_PER_MM = 1000

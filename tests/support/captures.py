@@ -15,9 +15,9 @@ from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.capture import config_of, lines_of
 from ldcnd.line.capture import Capture
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.session import Publication
 from ldcnd.testing.jumping_loop import JumpingLoop
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.replay import play, published_line, virtual_time
 
 FOLDER = Path(__file__).parents[1] / "captures"

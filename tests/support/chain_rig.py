@@ -15,10 +15,10 @@ from ldcnd.drives.ldcn.packet import Packet, PacketReader
 from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.line.transport import Opener
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.line import open_simulated_line
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig
 
 UP_WITHIN_S = 60.0

@@ -12,7 +12,7 @@ from typing_extensions import override
 from ldcnd.console.commissioning.messages import ToCommissioningPage, View
 from ldcnd.console.commissioning.routes import Commissioning
 from ldcnd.net.hand_over import Answer
-from ldcnd.net.memory_session import MemorySession
+from ldcnd.testing.memory_session import MemorySession
 from tests.support.browser import Browser
 from tests.support.commissioning import AXIS, CommissioningRig
 from tests.support.console_rig import PageSocket, RunningConsole, console_of, page

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.rig import EPOCH_NS
 
 

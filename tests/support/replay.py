@@ -21,9 +21,9 @@ from ldcnd.daemon.leases import random_token
 from ldcnd.line.capture import Capture
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from ldcnd.line.port_url import SOCKET
-from ldcnd.net.memory_session import MemoryBroker, MemorySession
 from ldcnd.net.session import Publication
 from ldcnd.testing.jumping_loop import JumpingLoop
+from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 from tests.support.recorded_line import Replay, ReplayDeviation
 
 Take = Callable[[Publication], None]

@@ -15,9 +15,9 @@ from ldcnd.contract.samples import StateSample
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.line.transport import Opener
-from ldcnd.net.memory_session import MemoryBroker, MemorySession
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.known import opener_of
+from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 
 EPOCH_NS = 1_700_000_000_000_000_000
 SIMULATED = Path(__file__).parents[2] / "config" / "simulated.toml"

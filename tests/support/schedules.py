@@ -38,10 +38,10 @@ from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.drives.ldcn.registers import RESET_BAUD
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.line import SimulatedLine, open_simulated_line
 from ldcnd.testing.jumping_loop import JumpingLoop
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.shaft_judge import Held, ShaftJudge, now_ns
 
 RIG, LINE = "sim", "a"

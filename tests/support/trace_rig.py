@@ -16,12 +16,12 @@ from ldcnd.drives.smartstep.config import SmartStepAxisConfig, SmartStepUnitConf
 from ldcnd.drives.smartstep.parameters import PN000
 from ldcnd.drives.smartstep.trace_data import DataObject, IoObject, TracePoint
 from ldcnd.line.flight_recorder import WireEvent
-from ldcnd.net.memory_session import MemoryBroker, MemorySession
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.sim.smartstep.cable import smartstep_chain
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import SimulatedVariant
+from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 from tests.support.process import free_port
 from tests.support.rig import RunningRig, openers_of, running_rig
 

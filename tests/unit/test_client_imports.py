@@ -62,7 +62,7 @@ from ldcnd.cli import main, run
 from ldcnd.config.rig import load_config
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.contract.frozen import Frozen
-from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.testing.memory_session import MemoryBroker
 from ldcnd.config.plan import require_plan
 
 async def build(config):

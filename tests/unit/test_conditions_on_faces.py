@@ -42,8 +42,8 @@ from ldcnd.lab.metrics import HealthCollector
 from ldcnd.lab.ros2.bridge import ERROR, STALE, WARN, Bridge
 from ldcnd.lab.top.columns import as_text
 from ldcnd.lab.top.rig_view import Description, RigView
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.session import Publication, SampleKind
+from ldcnd.testing.memory_session import MemoryBroker
 
 NOW_NS = 1_000_000_000_000
 NUMBER = 60.0

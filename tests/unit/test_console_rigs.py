@@ -11,8 +11,8 @@ from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.errors import UnknownAxis
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import DaemonInfo
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.testing.memory_session import MemoryBroker
 
 HERE, THERE = Endpoint("here", ZenohSettings()), Endpoint("there", ZenohSettings())
 

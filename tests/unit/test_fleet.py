@@ -16,9 +16,9 @@ from ldcnd.contract.errors import MalformedRequest
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.assembly import build_daemon
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.process import LDCND
 from tests.support.rig import EPOCH_NS, SIMULATED
 from tests.support.session_pair import free_endpoint

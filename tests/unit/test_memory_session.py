@@ -7,8 +7,8 @@ import pytest
 
 from ldcnd.contract.errors import OutcomeUnknown
 from ldcnd.net.hand_over import Query
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.session import Publication, Qos
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.query_facts import QueryFacts
 from tests.support.session_facts import SampleFacts, TokenFacts
 from tests.support.session_pair import JSON, KEYS, Pair, echo

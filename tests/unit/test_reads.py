@@ -8,7 +8,6 @@ import pytest
 
 from ldcnd.contract.errors import ErrorCode
 from ldcnd.net.hand_over import Answer, Query
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.reads import (
     BLOCKED_S,
     LEAVING_AT_ONCE,
@@ -18,6 +17,7 @@ from ldcnd.net.reads import (
     ReadIntake,
     Reads,
 )
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.session_pair import JSON, KEYS, echo, error_of
 
 STEPS = 10

@@ -12,8 +12,8 @@ from ldcnd.contract.commands import Power
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError
 from ldcnd.contract.samples import PositionSample
 from ldcnd.net.hand_over import Query
-from ldcnd.net.memory_session import MemoryBroker, MemorySession
 from ldcnd.net.session import Declaration, Publication, Qos, SampleKind
+from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 from tests.support.session_pair import JSON, KEYS, POSITION
 
 POWER = Power(on=True)

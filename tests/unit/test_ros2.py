@@ -10,7 +10,7 @@ from ldcnd.contract.samples import LinkState
 from ldcnd.lab.ros2.bridge import Bridge
 from ldcnd.lab.ros2.cdr import JOINT_STATE
 from ldcnd.lab.ros2.graph import RosNode, advertise, attachment_of
-from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.rig import running_rig, two_axes
 from tests.support.ros2_messages import DIAGNOSTICS, JOINTS
 

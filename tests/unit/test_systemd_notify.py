@@ -20,7 +20,7 @@ from ldcnd.daemon.service import Service, describe
 from ldcnd.daemon.systemd import Notifier, reloading, status
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.line.line import Phase
-from ldcnd.net.memory_session import MemoryBroker
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.rig import EPOCH_NS, SIMULATED
 
 WATCHDOG_S = 5.0

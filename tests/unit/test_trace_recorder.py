@@ -21,8 +21,8 @@ from ldcnd.contract.traces import (
     TraceSource,
 )
 from ldcnd.drives.tracer import ArmedTrace, Granted, Recorded, Tracer
-from ldcnd.net.memory_session import MemoryBroker
 from ldcnd.net.publisher import Publisher
+from ldcnd.testing.memory_session import MemoryBroker
 
 LONG = -1.2345678901234567e-300
 REQUEST = TakeTrace(channels=("c0",))
