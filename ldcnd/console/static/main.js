@@ -10,14 +10,15 @@ import { RigPage } from "./pages/rig.js";
 import { ScopePage } from "./pages/scope.js";
 import { TracePage } from "./pages/trace.js";
 import { TuningPage } from "./pages/tuning.js";
-import { decimalsOf, number } from "./parts/format.js";
+import { number } from "./parts/format.js";
 import { problems } from "./parts/problems.js";
-import { Mark, placeText } from "./parts/state.js";
+import { Mark } from "./parts/state.js";
+import { AxisStrip, PlaceAndTarget } from "./parts/strip.js";
 import { overrideOf, slowed } from "./pages/rig_speed.js";
 import { StopAll, Stops } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
 import { feed } from "./session/feed.js";
-import { axisNamed, commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
+import { axesOf, axisNamed, commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
 
 const PAGES = [
   ["rig", "Rig", RigPage],
@@ -58,11 +59,20 @@ function Summary() {
   </p>`;
 }
 
-/** Where the axis of the page is, in sight wherever the page is scrolled to. */
+const MOST_MOVING = 6;
+
+/** What moves, where, and what is wrong, in sight wherever a page is scrolled to; the axis of its page with its ends. */
 function Strip({ at }) {
   const axis = at.page === "axis" && axisNamed(at);
-  if (!axis) return null;
-  return html`<p class="strip number">${axis.name} <b>${placeText(axis, decimalsOf(axis.info))}</b> ${axis.info.unit}, ${axis.condition.state}</p>`;
+  if (axis) return html`<${AxisStrip} axis=${axis} />`;
+  const moving = axesOf().filter((each) => each.info && each.condition.live && each.state?.moving === "yes");
+  const [worst] = problems(rigs.values());
+  return html`<div class="strip">
+    <span class="moving">${moving.length
+      ? moving.slice(0, MOST_MOVING).map((each) => html`<a href=${`#/axis/${each.rig.name}/${each.name}`}>${each.name}</a> <${PlaceAndTarget} axis=${each} /> `)
+      : html`<span class="quiet">Nothing moves</span>`}${moving.length > MOST_MOVING && ` and ${moving.length - MOST_MOVING} more move`}</span>
+    ${worst && html`<span class="worst mark" data-level=${worst.level}>${worst.places[0].where}${worst.places.length > 1 ? ` and ${worst.places.length - 1} more` : ""}: ${worst.text}</span>`}
+  </div>`;
 }
 
 function Notices() {

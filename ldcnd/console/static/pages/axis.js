@@ -30,14 +30,7 @@ export function AxisPage({ at }) {
     </header>
     ${axis.rig.worth && html`<p class="notice mark" data-level="bad">${axis.rig.worth.why} The values below are the last known ones.</p>`}
     <${FaultPanel} axis=${axis} />
-    <div class="columns">
-      <div class="column">
-        <${NowPanel} axis=${axis} />
-        <${ShadowPanel} axis=${axis} />
-        ${axis.can("power") && html`<${WhyPanel} axis=${axis} />`}
-        <${LimitsPanel} axis=${axis} />
-        ${axis.can("set_gains") && html`<${GainsPanel} axis=${axis} />`}
-      </div>
+    <div class="columns work">
       <div class="column">
         <${AuthorityPanel} axis=${axis} />
         ${axis.can("jog") && html`<${JogPanel} key=${axis.name} axis=${axis} />`}
@@ -46,5 +39,25 @@ export function AxisPage({ at }) {
         ${axis.can("set_outputs") && html`<${OutputsPanel} key=${axis.name} axis=${axis} />`}
         ${info.registers.length > 0 && html`<${RegistersPanel} axis=${axis} />`}
       </div>
-    </div>`;
+      <div class="column">
+        <${NowPanel} axis=${axis} />
+        <${ShadowPanel} axis=${axis} />
+        ${axis.can("power") && html`<${WhyPanel} axis=${axis} />`}
+        <${LimitsPanel} axis=${axis} />
+        ${axis.can("set_gains") && html`<${GainsPanel} axis=${axis} />`}
+      </div>
+    </div>
+    <${Jumps} />`;
+}
+
+const JUMPS = ["Control", "Jog", "Move", "Home", "Now"];
+
+/** On a phone: to each part of the page from under the thumb. */
+function Jumps() {
+  const to = (title) => {
+    const heading = [...document.querySelectorAll("main h2")].find((each) => each.textContent === title);
+    heading?.scrollIntoView({ block: "start" });
+  };
+  return html`<div class="jumps" role="group" aria-label="Parts of this page">${JUMPS.map(
+    (title) => html`<button type="button" onClick=${() => to(title)}>${title}</button>`)}</div>`;
 }

@@ -50,7 +50,10 @@ export function WhyPanel({ axis }) {
   const [refusal, setRefusal] = useState(null);
   const { state } = axis;
   const mine = controls(axis);
+  const [asked, setAsked] = useState(false);
+  const isWanted = mine || asked;
   const situation = JSON.stringify([
+    isWanted,
     state?.state,
     state?.link,
     state?.stop_latched,
@@ -64,6 +67,7 @@ export function WhyPanel({ axis }) {
   ]);
   useEffect(() => {
     let wanted = true;
+    if (!isWanted) return undefined;
     question(axis, "why").then(
       (reply) => wanted && (setWhy(reply), setRefusal(null)),
       (error) => wanted && setRefusal(error),
@@ -73,6 +77,9 @@ export function WhyPanel({ axis }) {
     };
   }, [axis, situation]);
 
+  if (!isWanted) {
+    return html`<${Panel} title="Can it move?"><p class="row"><button type="button" onClick=${() => setAsked(true)}>Ask what is in its way</button></p><//>`;
+  }
   return html`<${Panel} title="Can it move?">
     <div aria-live="polite">
       ${

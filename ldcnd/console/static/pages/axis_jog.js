@@ -20,16 +20,15 @@ export function JogPanel({ axis }) {
   const way = obstacle(axis, "jog", true) ?? missing;
   const stepWay = obstacle(axis, "move_relative") ?? missing;
 
-  return html`<${Panel} title="Jog" note="Runs while you hold a button or, with a button focused, an arrow key; letting go halts.">
-    <div class="fields">
+  return html`<${Panel} title="Jog" note="Runs while a button or, with it focused, an arrow key is held.">
+    <div class="jog-line">
       <${NumberField} label="Speed" unit=${`${unit}/s`} value=${speed} onChange=${setSpeed} min=${0} />
-    </div>
     <p class="row jog" role="group" aria-label=${`Jog ${axis.name}`}>
       <${HoldButton} begin=${() => beginJog(axis, -speed)} end=${endJog} keys=${["ArrowLeft"]} obstacle=${way}
         reason=${reason}>◀ Hold to run −<//>
       <${HoldButton} begin=${() => beginJog(axis, speed)} end=${endJog} keys=${["ArrowRight"]} obstacle=${way}
         reason=${reason}>Hold to run + ▶<//>
-    </p>
+    </p></div>
     ${axis.can("move_relative") && html`<p class="row steps" role="group" aria-label=${`Steps of ${axis.name}`}>
       ${STEPS.map((step) => html`<${Action} key=${step} obstacle=${stepWay} reason=${reason}
         act=${() => command(axis, "move_relative", { distance: step, velocity: speed })}

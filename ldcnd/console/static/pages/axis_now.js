@@ -36,7 +36,7 @@ export function NowPanel({ axis }) {
     ]} />
     <h3>Status</h3>
     <${StatusLamps} state=${state} live=${live} />
-    <${Inputs} sample=${samples.inputs} live=${live} />
+    <${Inputs} axis=${axis} live=${live} />
     <${Monitors} axis=${axis} />
     <${Signals} axis=${axis} />
   <//>`;
@@ -61,15 +61,18 @@ function StatusLamps({ state, live }) {
   </ul>`;
 }
 
-/** What every poll carries; a level that the drive does not show is unknown. */
-function Inputs({ sample, live }) {
+/** What every poll carries. A drive shows some inputs only while its motor is on, others only while it is off. */
+function Inputs({ axis, live }) {
+  const sample = axis.samples.inputs;
   if (!sample) return null;
-  const lamp = (name, yes = "high", no = "low") =>
-    html`<${Lamp} label=${words(name)} on=${live ? sample[name] : null} yes=${yes} no=${no} />`;
+  const tripped = axis.info.limit_stop; // the level at which the drive stops, where it does
+  const limits = tripped === "high" ? ["tripped", "clear"] : tripped === "low" ? ["clear", "tripped"] : ["high", "low"];
+  const lamp = (name, yes, no, off) => html`<${Lamp} label=${words(name)} on=${live ? sample[name] : null} yes=${yes} no=${no}
+    unknown=${live ? `not shown while ${off}` : "unknown"} />`;
   return html`<h3>Inputs</h3>
     <ul class="lamps" aria-label="Inputs">
-      ${lamp("reverse_limit")}${lamp("forward_limit")}${lamp("index")}
-      ${lamp("stop_input", "open", "closed")}${lamp("amplifier_enable", "on", "off")}
+      ${lamp("reverse_limit", ...limits, "disabled")}${lamp("forward_limit", ...limits, "disabled")}${lamp("index", "high", "low", "disabled")}
+      ${lamp("stop_input", "open", "closed", "enabled")}${lamp("amplifier_enable", "on", "off", "not known to the daemon")}
     </ul>`;
 }
 
@@ -90,7 +93,7 @@ function Monitors({ axis }) {
 /** A trace of two samples reads the drive's status bits as well. */
 function Signals({ axis }) {
   const [snapshot, setSnapshot] = useState(null);
-  const names = signalsOf(axis);
+  const names = signalsOf(axis).filter((name) => !(name in (axis.samples.inputs ?? {}))); // those are live above
   if (axis.info.family === "smartstep" || !names.length) return null;
   return html`<h3>Drive signals</h3>
     ${snapshot && html`<ul class="lamps" aria-label="Drive signals">

@@ -21,8 +21,8 @@ export function slowed(rig) {
 export function SpeedOverride({ rig }) {
   const shown = overrideOf(rig);
   if (shown === undefined) return null;
-  return html`<div class="row" role="group" aria-label=${`Speed override of ${rig.name}`}>
-    <span role="status">Speed ${number(shown, 0)} %</span>
+  return html`<div class="speed" role="group" aria-label=${`Speed override of ${rig.name}`}>
+    <span role="status">Speed <b>${number(shown, 0)} %</b></span>
     ${SHARES.map((share) => html`<${Action} key=${share} act=${() => setSpeedOverride(rig, share)}>${share} %<//>`)}
   </div>`;
 }

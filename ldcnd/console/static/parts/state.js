@@ -26,14 +26,19 @@ export function placeText(axis, decimals) {
   return known ? value : `(${value}) ${mark}`;
 }
 
-/** The same, the mark below the number. */
-export function Place({ axis, decimals, tag = "b" }) {
-  const { known, mark, live } = axis.condition;
+/** The same without the mark, which `Homed` has. */
+export function Place({ axis, decimals, label = null }) {
+  const { known } = axis.condition;
   const value = number(axis.samples.position?.value, decimals);
-  return html`<span class="place" data-known=${known ? "yes" : "no"}><${tag} aria-label="Position"
-    >${known ? value : `(${value})`}</${tag}> <span class="unit">${axis.info.unit}</span>${
-      !known && html` <${Mark} level=${live ? "warn" : "bad"}>${mark}<//>`
-    }</span>`;
+  return html`<span class="place" data-known=${known ? "yes" : "no"}><b aria-label=${label}
+    >${known ? value : `(${value})`}</b> <span class="unit">${axis.info.unit}</span></span>`;
+}
+
+/** Whether the position says where the axis is: the mark where it does not. */
+export function Homed({ axis }) {
+  const { known, mark, live } = axis.condition;
+  if (!known) return html`<span class="mark unhomed" data-level=${live ? "warn" : "bad"}>${mark}</span>`;
+  return html`<span class="quiet">${axis.state?.has_reference === false ? "cannot be homed" : "homed"}</span>`;
 }
 
 /** How much the values are worth and how old they are. */
@@ -49,10 +54,10 @@ export function Mark({ level = "", children }) {
 }
 
 /** A yes or no of the axis, as a lamp with its word. */
-export function Lamp({ label, on, level = "", yes = "yes", no = "no" }) {
+export function Lamp({ label, on, level = "", yes = "yes", no = "no", unknown = "unknown" }) {
   const known = on !== null && on !== undefined;
   return html`<li class="lamp" data-on=${known && on ? "yes" : "no"} data-level=${known && on ? level : ""}>
-    <span>${label}</span> <b>${known ? (on ? yes : no) : "unknown"}</b>
+    <span>${label}</span> <b>${known ? (on ? yes : no) : unknown}</b>
   </li>`;
 }
 

@@ -1,0 +1,32 @@
+/** An axis in one line that never leaves the screen: where it is and goes, its state, and what ends its motion. */
+
+import { html } from "../html.js";
+import { command } from "../session/control.js";
+import { obstacle } from "../session/obstacles.js";
+import { Action } from "./controls.js";
+import { decimalsOf, number } from "./format.js";
+import { Homed, Place, StateWord } from "./state.js";
+import { stopAxis } from "./stop_all.js";
+
+/** Where an axis is, and where it goes. */
+export function PlaceAndTarget({ axis }) {
+  const decimals = decimalsOf(axis.info);
+  const target = axis.condition.live ? axis.state?.command?.target : null;
+  return html`<span class="number"><${Place} axis=${axis} decimals=${decimals} />${target != null && html` <span class="quiet">→ ${number(target, decimals)}</span>`}</span>`;
+}
+
+/** The strip of the page of an axis. Anyone may end a motion, with or without control. */
+export function AxisStrip({ axis }) {
+  const toHalt = obstacle(axis, "halt");
+  return html`<div class="strip of-axis">
+    <span class="where"><b>${axis.name}</b> <${PlaceAndTarget} axis=${axis} /></span>
+    <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /></span>
+    ${axis.can("stop") && html`<span class="endings" role="group" aria-label=${`End a motion of ${axis.name}`}>
+      <${Action} act=${() => command(axis, "halt")} obstacle=${toHalt} reason="halt-way"
+        title=${toHalt ?? "Decelerate and hold; no latch"}>Halt<//><span class="unseen" id="halt-way">${toHalt ?? ""}</span>
+      <${Action} act=${() => stopAxis(axis)} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
+      <${Action} act=${() => command(axis, "quick_stop")} kind="warn"
+        title="Hold at once, without a ramp, and latch until reset">Quick stop<//>
+    </span>`}
+  </div>`;
+}
