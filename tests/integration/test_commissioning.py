@@ -4,7 +4,7 @@ import asyncio
 import functools
 import re
 import shutil
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import fields, replace
 from xml.etree import ElementTree as ET
 
@@ -24,7 +24,14 @@ from ldcnd.client.kept_gains import KeptGains, file_of, keep
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config
-from ldcnd.contract.errors import CommandAborted, ConfigError, LeaseExpired, LeaseHeld, StopLatched, WrongState
+from ldcnd.contract.errors import (
+    CommandAborted,
+    ConfigError,
+    LeaseExpired,
+    LeaseHeld,
+    StopLatched,
+    WrongState,
+)
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.servo import FULL_PWM
 from tests.support.commissioning import AXIS, GAINS, PLANT, ScriptedPerson, commissioning_rig, rig_text
@@ -249,6 +256,85 @@ async def test_gains_that_could_not_be_put_back_are_said(tmp_path):
         assert "ldcnd tune x --put-back" in rig.person.told[-1]
 
 
+MOVING = [name for name, step in STEPS.items() if step.moves]
+ALL_ANSWERS = {
+    "how far shall": "4",
+    "how far did": "4",
+    "how many": "2",
+    "reverse end": "jog -1",
+    "how far may": "4",
+    "did the axis move": "n",
+}
+
+
+async def what_the_drive_has(rig):
+    state = await rig.running.client.state(AXIS)
+    return rig.drive.loop.gains, rig.drive.loop.servo_on, rig.drive.shaft.position_counts, state.enabled, state.state
+
+
+@contextmanager
+def recorded_requests(chain):
+    """Yield the gains that come, and the changes of the loop of a simulated drive."""
+    loop = chain.modules[0].loop
+    seen = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(loop, "set_gains", lambda gains, real=loop.set_gains: (seen.append(gains), real(gains)))
+        yield seen
+
+
+@pytest.mark.parametrize("powered", [False, True], ids=["open", "closed"])
+@pytest.mark.parametrize("step", MOVING)
+async def test_a_step_that_is_refused_control_sends_nothing_and_leaves_the_record_as_it_was(step, powered, tmp_path):
+    async with commissioning_rig(tmp_path, ALL_ANSWERS) as rig:
+        checklist = await rig.checklist()
+        other = Rig(rig.running.client, await rig.running.client.daemon())
+        await rig.running.until(AXIS, lambda state: state.link == "up")
+        async with other.control(AXIS, client="ann", lease_s=60.0) as held:
+            await held.power(on=True)
+            await held.power(on=powered)
+            await rig.running.until(AXIS, lambda state: state.enabled is powered)
+            await checklist.settle(step, Result(state=StepState.DONE, text="as it was"))
+            before = await what_the_drive_has(rig)
+            with recorded_requests(rig.chain) as gains, pytest.raises(LeaseHeld, match="ann") as refused:
+                await checklist.run(step)
+
+            assert await what_the_drive_has(rig) == before
+        assert gains == []
+        assert refused.value.remedy
+        assert checklist.record.of(step).result.text == "as it was"
+        assert checklist.gains_to_put_back is None
+
+
+@pytest.mark.parametrize("step", [name for name in MOVING if name not in {"motor", "hold"}])
+async def test_a_step_that_a_person_leaves_at_the_key_powers_nothing(step, tmp_path):
+    def leave(what):
+        powered.append(rig.drive.loop.servo_on)
+        raise Left("another key was pressed")
+
+    text = rig_text().replace("home =", 'reference = "at_reset"\nhome =')
+    async with commissioning_rig(tmp_path, ALL_ANSWERS, text=text) as rig:
+        checklist, powered = await rig.checklist(), []
+        rig.person.holding = leave
+        with pytest.raises(Left):
+            await checklist.run(step)
+
+        assert powered == [False]
+        assert not (await rig.running.client.state(AXIS)).enabled
+
+
+@pytest.mark.parametrize("step", ["scale", "home", "speed"])
+async def test_a_step_that_ends_before_the_axis_moves_opens_the_loop_that_it_has_closed(step, tmp_path):
+    text = rig_text().replace("home =", 'reference = "at_reset"\nhome =')
+    async with commissioning_rig(tmp_path, ALL_ANSWERS, text=text) as rig:
+        rig.person.holds_s = 0.0  # let go at once
+        checklist = await rig.checklist()
+        with pytest.raises(CommandAborted, match="the key was let go"):
+            await checklist.run(step)
+
+        assert not (await rig.running.client.state(AXIS)).enabled
+        assert abs(rig.drive.shaft.position_counts) <= 2
+
+
 async def test_another_process_of_the_same_program_takes_no_axis_away(tmp_path, monkeypatch):
     async with commissioning_rig(tmp_path, STANDS) as rig:
         other = Rig(rig.running.client, await rig.running.client.daemon())
@@ -422,7 +508,7 @@ async def test_a_right_scale_proposes_nothing(tmp_path):
 async def test_a_motion_ends_when_the_key_is_released(tmp_path):
     script = {"how far shall": "10", "how far did": "5"}
     async with commissioning_rig(tmp_path, script) as rig:
-        rig.person.holds_s = 1.0
+        rig.person.holds_s = 1.2  # the loop is closed in the first 0.2 s
         kept = await (await rig.checklist()).run("scale")
 
         assert 4000 < figures(kept)["counted"] < 6000
@@ -575,7 +661,7 @@ async def test_travel_is_jogged_and_typed(tmp_path):
     async with commissioning_rig(
         tmp_path, script, text=rig_text().replace("home =", 'reference = "at_reset"\nhome =')
     ) as rig:
-        rig.person.holds_s = 1.2
+        rig.person.holds_s = 1.5  # likewise
         checklist = await rig.checklist()
         kept = await checklist.run("travel")
         change = checklist.change("travel")

@@ -12,7 +12,7 @@ import pytest
 from ldcnd.bench.tuning.ldcn.plan import plan
 from ldcnd.bench.tuning.ldcn.plant import Plant
 from ldcnd.bench.tuning.ldcn.report import plan_reported, reported
-from ldcnd.bench.tuning.ldcn.session import measure, verify
+from ldcnd.bench.tuning.ldcn.session import Findings, measure, verify
 from ldcnd.cli.commission import tune
 from ldcnd.cli.connection import Target
 from ldcnd.client.kept_gains import file_of, kept_for, put_back
@@ -23,6 +23,7 @@ from ldcnd.contract.commands import MoveAbsolute, Power, SetGains
 from ldcnd.contract.errors import (
     DriveFault,
     LeaseExpired,
+    LeaseHeld,
     NotReferenced,
     PositionLimit,
     StopLatched,
@@ -256,6 +257,27 @@ async def test_gains_wait_on_the_disk_while_another_client_has_control():
 
         assert await is_off_with_its_old_gains(rig)
     assert "ldcnd tune x --put-back" in str(refused.value.remedy)
+
+
+@pytest.mark.parametrize("powered", [False, True], ids=["open", "closed"])
+async def test_an_axis_that_another_client_controls_is_not_tuned(powered):
+    async with tuned_rig() as (rig, shaft):
+        planned = await plan(rig.client, "x", None)
+        found = Findings(planned, CONFIGURED, None, None, None, (), 0)  # it is refused before the rest matters
+        async with control(rig.client, "ann", "x") as held:
+            await held.command("x", Power(on=True))
+            await held.command("x", Power(on=powered))
+            await rig.until("x", lambda state: state.enabled is powered)
+            place = shaft.position_counts
+            for work in (measure(rig.client, planned, 20.0, print), verify(rig.client, found, print)):
+                with pytest.raises(LeaseHeld, match="ann") as refused:
+                    await work
+
+                assert refused.value.remedy
+                assert shaft.position_counts == place
+                assert await registers(rig) == CONFIGURED
+                assert (await rig.client.state("x")).enabled is powered
+                assert not file_of("sim", "x").exists()
 
 
 async def test_an_axis_that_was_moved_since_it_was_agreed_to_is_not_tuned():

@@ -190,14 +190,19 @@ class Checklist:
         if obstacle := step.obstacle(site):
             return self._settle(step, site, Result(state=StepState.NOT_POSSIBLE, text=obstacle))
         control = self._rig.control(self._axis, client=CLIENT, lease_s=LEASE_S)
+        has_begun = False
         try:
             async with control if step.moves else self._rig.watch(self._axis) as axis:
-                result = await step.run(site, await seen(axis))
+                await seen(axis)
+                has_begun = True
+                result = await step.run(site, axis)
         except LdcndError as error:
-            self._settle(step, site, Result(state=StepState.FAILED, text=said(error)))
+            if has_begun:  # otherwise nothing was tried, and what is known of the step stays true
+                self._settle(step, site, Result(state=StepState.FAILED, text=said(error)))
             raise
         finally:
-            await self._put_back_or_say()
+            if has_begun:  # otherwise gains that are kept are those of a program which has control
+                await self._put_back_or_say()
         return self._settle(step, site, result)
 
     async def settle(self, name: str, result: Result) -> StepRecord:

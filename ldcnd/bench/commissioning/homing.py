@@ -5,10 +5,9 @@ from functools import partial
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
-from ldcnd.bench.commissioning.step import Step, StepContext, moved_while_held, rest_counts
+from ldcnd.bench.commissioning.step import Step, StepContext, closed_loop, key_released, moved_while_held, rest_counts
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Home, Verb
-from ldcnd.contract.errors import CommandAborted
 from ldcnd.drives.axis_config import HomeConfig
 
 SEARCHES = 5
@@ -62,16 +61,16 @@ class HomeRepeatability(Step):
             return Result(state=StepState.NOT_POSSIBLE, text=self.obstacle(site))
         while not 1 < (searches := round(await person.number("how many searches", SEARCHES))) <= MOST_SEARCHES:
             person.tell(f"2 to {MOST_SEARCHES}")
-        await axis.power(on=True)
         sign = -1 if site.info.direction == "reverse" else 1
-        began = sign * await rest_counts(axis) / site.counts_per_unit
         # with what was said before: the daemon may run with another `home` than the file
         search = partial(axis.home, **home.model_dump(include=REQUESTED, exclude_none=True))
         marks: list[float] = []
-        async with person.holding(f"{axis.name} searches its reference {searches} times") as released:
+        what = f"{axis.name} searches its reference {searches} times"
+        async with person.holding(what) as released, closed_loop(site, axis) as before:
+            began = sign * before / site.counts_per_unit
             for number in range(1, searches + 1):
                 if await moved_while_held(axis, search, released) is None:
-                    raise _halted(axis)
+                    raise key_released(axis)
                 marks.append(await _mark(site, axis))
                 person.tell(f"search {number}: {site.length(marks[-1] - marks[0])} from the first")
                 if number < searches:
@@ -81,7 +80,7 @@ class HomeRepeatability(Step):
                     goal = marks[0] + home.position - (back if home.velocity > 0 else -back)
                     go_back = partial(axis.move_relative, goal - here, velocity=abs(home.velocity))
                     if await moved_while_held(axis, go_back, released) is None:
-                        raise _halted(axis)
+                        raise key_released(axis)
         return _judged(site, marks)
 
 
@@ -91,10 +90,6 @@ async def _mark(site: StepContext, axis: Axis) -> float:
     sample = axis.position.sample
     sign = -1 if site.info.direction == "reverse" else 1
     return sign * sample.counts / site.counts_per_unit - sample.value
-
-
-def _halted(axis: Axis) -> CommandAborted:
-    return CommandAborted(f"axis {axis.name}: the key was let go", axis=axis.name, remedy="run the step again")
 
 
 def _judged(site: StepContext, marks: list[float]) -> Result:

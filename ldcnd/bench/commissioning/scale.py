@@ -5,7 +5,16 @@ from functools import partial
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, Result, StepState
-from ldcnd.bench.commissioning.step import Step, StepContext, done, moved_while_held, refuse_previewed, rest_counts
+from ldcnd.bench.commissioning.step import (
+    Step,
+    StepContext,
+    closed_loop,
+    done,
+    key_released,
+    moved_while_held,
+    refuse_previewed,
+    rest_counts,
+)
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import ValueOutOfRange
@@ -56,11 +65,12 @@ class Scale(Step):
         while not (distance := await person.number(f"how far shall it move, signed, in {unit}", velocity * DEFAULT_S)):
             person.tell("that would not move it")
         refuse_previewed(await axis.preview(distance=distance, velocity=velocity))
-        await axis.power(on=True)
-        before = await rest_counts(axis)
-        async with person.holding(f"{site.info.axis} moves by {site.length(distance)}") as released:
+        moves = f"{site.info.axis} moves by {site.length(distance)}"
+        async with person.holding(moves) as released, closed_loop(site, axis) as before:
             ended = await moved_while_held(axis, partial(axis.move_relative, distance, velocity=velocity), released)
-        counts = await rest_counts(axis) - before
+            counts = await rest_counts(axis) - before
+            if ended is None and not counts:
+                raise key_released(axis)
         if ended is None:
             person.tell("halted; what it went until then can be measured as well")
         measured = await person.number(f"how far did it go, signed, in {unit}")

@@ -10,11 +10,18 @@ from functools import partial
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, PlotSeries, Result, StepState
-from ldcnd.bench.commissioning.step import Step, StepContext, moved_while_held, refuse_previewed
+from ldcnd.bench.commissioning.step import (
+    Step,
+    StepContext,
+    closed_loop,
+    key_released,
+    moved_while_held,
+    refuse_previewed,
+)
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import open_loop
 from ldcnd.contract.commands import Verb
-from ldcnd.contract.errors import CommandAborted, DriveFault, LdcndError
+from ldcnd.contract.errors import DriveFault, LdcndError
 
 GROWTH = 1.25
 """From one step to the next."""
@@ -91,8 +98,8 @@ class HighestSpeed(Step):
         while abs(distance := await person.number(f"how far may it move, signed, in {site.info.unit}", enough)) < least:
             person.tell(f"in less than {site.length(least)} it does not reach its velocity")
         refuse_previewed(await axis.preview(distance=distance, velocity=config.velocity))
-        await axis.power(on=True)
-        async with person.holding(f"{axis.name} moves by {site.length(distance)} and back, again and again") as held:
+        moves = f"{axis.name} moves by {site.length(distance)} and back, again and again"
+        async with person.holding(moves) as held, closed_loop(site, axis):
             fast = await _tried(site, axis, distance, _velocities(site, distance), held)
             hard = [] if fast[-1].objection else await _tried(site, axis, distance, _accelerations(site), held)
         return _judged(site, distance, fast, hard)
@@ -129,7 +136,7 @@ async def _try(
             await open_loop(axis)
             break
         if moved is None:
-            raise CommandAborted(f"axis {axis.name}: the key was let go", axis=axis.name, remedy="run the step again")
+            raise key_released(axis)
         motion, ended = moved
         duration_s = motion.reply.duration_s or 0.0
         late_s = max(late_s, loop.time() - began_s - duration_s)

@@ -2,18 +2,20 @@
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from typing import ClassVar
 
 from ldcnd.bench.commissioning.record import CommissioningRecord, Result, StepState
 from ldcnd.bench.person import Person
 from ldcnd.client.axis import REST_S, Axis, at_rest
+from ldcnd.client.kept_gains import open_loop
 from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
 from ldcnd.contract.codec import rebuild_error
 from ldcnd.contract.commands import PreviewReply, Verb
-from ldcnd.contract.errors import LdcndError, Remedy, StopLatched, WrongState, step
+from ldcnd.contract.errors import CommandAborted, LdcndError, Remedy, StopLatched, WrongState, step
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.drives.axis_config import AxisConfig
 
@@ -134,6 +136,35 @@ async def rest_counts(axis: Axis) -> int:
     return counts
 
 
+@asynccontextmanager
+async def closed_loop(site: StepContext, axis: Axis) -> AsyncIterator[int]:
+    """Close the loop of an axis for the motions of a step; yield where it stood before, in counts.
+
+    It stays closed, because a load could fall without it. A step that ends before the axis has moved leaves it as it
+    found it: an open loop is opened again.
+
+    Raises:
+        WrongState: the axis does not come to rest before.
+        LdcndError: as the daemon refused it.
+    """
+    was_closed, before = axis.state.enabled, await rest_counts(axis)
+    try:
+        await axis.power(on=True)
+        yield before
+    except BaseException:
+        if not (axis.control and axis.control.lost):  # then the daemon sees to it
+            with suppress(LdcndError):
+                await axis.halt()  # also a motion whose reply was not waited for
+                stands = abs(await rest_counts(axis) - before) <= STILL_COUNTS
+                if stands and not was_closed:
+                    await open_loop(axis)
+                elif not stands:
+                    site.person.tell(
+                        f"{axis.name} holds its position: `ldcnd axis power {axis.name} off` opens its loop"
+                    )
+        raise
+
+
 def refuse_previewed(reply: PreviewReply) -> None:
     """Raise what the daemon says against the values of a motion; obstacles that a step clears itself are none.
 
@@ -190,6 +221,11 @@ async def moved_while_held(
     if isinstance(outcome, LdcndError):
         raise outcome
     return motion, outcome
+
+
+def key_released(axis: Axis) -> CommandAborted:
+    """Return the error of a step whose key was released before it had what it needs."""
+    return CommandAborted(f"axis {axis.name}: the key was let go", axis=axis.name, remedy="run the step again")
 
 
 async def _ended(motion: Motion) -> State | LdcndError:

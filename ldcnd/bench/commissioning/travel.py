@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, Result, StepState
-from ldcnd.bench.commissioning.step import Step, StepContext, rest_counts
+from ldcnd.bench.commissioning.step import Step, StepContext, closed_loop, rest_counts
 from ldcnd.bench.person import typed_number
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Verb
@@ -103,9 +103,9 @@ class Travel(Step):
     async def _jog(site: StepContext, axis: Axis, velocity: float) -> None:
         """Run while the key is held, no faster than configured."""
         bounded = max(-site.config.velocity, min(velocity, site.config.velocity))
-        await axis.power(on=True)
         async with (
             site.person.holding(f"{axis.name} runs at {site.length(bounded)}/s") as released,
+            closed_loop(site, axis),
             axis.jogging(bounded) as jog,
         ):
             with suppress(LeaseExpired):  # it is over at the software limit
