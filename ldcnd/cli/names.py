@@ -15,6 +15,7 @@ GROUPS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
             "ldcnd.cli.run:plan",
             "Show what the lines of a configuration promise, before any hardware is there.",
         ),
+        "reload": ("ldcnd.cli.rig:reload", "Have a daemon read its configuration again."),
         "sim": ("ldcnd.cli.sim", "Simulate a line of drives behind a pseudo-terminal."),
     },
     "Operate": {
@@ -83,6 +84,7 @@ COMMANDS: Final[Mapping[str, tuple[str, str]]] = {
 
 EXAMPLES: Final[Mapping[str, str]] = {
     "run": "--config config/simulated.toml --console",
+    "reload": "--dry-run",
     "check-config": "rig.toml",
     "plan": "rig.toml",
     "sim": "--pty ./port --chain pic-servo-sc,pic-io",

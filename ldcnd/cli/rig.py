@@ -31,6 +31,8 @@ from ldcnd.contract.rig_commands import (
     MoveTogetherReply,
     PreviewTogether,
     Rehearse,
+    Reload,
+    ReloadReply,
     SetSpeedOverride,
     WalkPath,
 )
@@ -109,6 +111,47 @@ def speed(sender: Sender, percent: float | None) -> None:
         sender.target.show(reply, *(f"{whose(client.rig)}{line}" for line in told))
 
     sender.target.run(work)
+
+
+@click.command()
+@click.option("--dry-run", is_flag=True, help="Show what would change, and change nothing.")
+@click.option("--yes", is_flag=True, help="Do not ask for confirmation.")
+@commanding
+def reload(sender: Sender, *, dry_run: bool, yes: bool) -> None:
+    """Have the daemon read its configuration again: limits, default speeds, settling, rates and priorities.
+
+    What would change is shown first. A key that needs a restart of the daemon is named, and stays as it is. An axis
+    that another client controls keeps its settings.
+    """
+    target = sender.target
+    leases = (sender.lease,) if sender.lease else ()
+    shown = target.run(lambda client: client.ask(Reload(dry_run=True, leases=leases)))
+    if dry_run or all(each.restart for each in shown.changes):
+        target.show(shown, *change_lines(shown))
+        return
+    if not yes:
+        show_lines(*change_lines(shown), err=True)
+        if not click.confirm("Reload", err=True):
+            raise click.Abort
+    request = Reload(revision=shown.revision, leases=leases)
+    reply = target.run(lambda client: client.ask(request))
+    target.show(reply, *change_lines(reply))
+
+
+def change_lines(reply: ReloadReply) -> list[str]:
+    """Return the changes of a configuration, one in a line."""
+    lines = [
+        f"{each.key}: {each.before or 'not set'} -> {each.after or 'not set'}"
+        + (" (needs a restart of the daemon)" if each.restart else "")
+        for each in reply.changes
+    ]
+    if reply.more:
+        lines.append(f"and {reply.more} more")
+    if not lines:
+        return ["the daemon runs with what is in the file"]
+    if reply.applied:
+        lines.append("reloaded")
+    return lines
 
 
 @click.group(cls=CommandGroup)

@@ -195,6 +195,7 @@ class BlockingRig(Facade[rig.Rig]):
 
     preview_together = _waiting(rig.Rig.preview_together)
     set_speed_override = _waiting(rig.Rig.set_speed_override)
+    reload = _waiting(rig.Rig.reload)
 
     def move_together(
         self,

@@ -29,6 +29,8 @@ from ldcnd.contract.rig_commands import (
     MoveTogether,
     PreviewTogether,
     PreviewTogetherReply,
+    Reload,
+    ReloadReply,
     SetIo,
     SetIoTimer,
     SetSpeedOverride,
@@ -266,6 +268,20 @@ class Rig:
             LeaseHeld, LeaseRequired: it would be raised, and another program controls one of the axes.
         """
         return await self._client.ask(SetSpeedOverride(percent=percent, leases=self._leases()))
+
+    async def reload(self, *, dry_run: bool = False, revision: str | None = None) -> ReloadReply:
+        """Have the daemon read its configuration again; what needs a restart is named and stays as it is.
+
+        Args:
+            dry_run: only name the changes.
+            revision: of an earlier reply; refused when the file has changed since.
+
+        Raises:
+            ConfigError: the file makes no configuration; the daemon goes on with the one that it has.
+            WrongState: it has another revision.
+            LeaseHeld: another client controls an axis whose settings would change.
+        """
+        return await self._client.ask(Reload(dry_run=dry_run, revision=revision, leases=self._leases()))
 
     async def preview_together(
         self,

@@ -338,6 +338,47 @@ class Rehearse(Command[RehearsalReply]):
     """The sender's lease: it must cover the axis, or all axes on the line, where a motion of them would need one."""
 
 
+class ConfigChange(Frozen):
+    """A key at which the configuration file differs from what the daemon runs with."""
+
+    key: str
+    """Path of the key, such as `bus.line0.axis.x.limits.velocity`."""
+    before: str | None
+    """Value that the daemon runs with; null where there is none."""
+    after: str | None
+    """Value in the file; null where there is none."""
+    restart: bool
+    """Only a restart of the daemon takes it."""
+
+
+class ReloadReply(Frozen):
+    """Changes of the configuration file: the reply to `@cmd/_/reload`."""
+
+    changes: tuple[ConfigChange, ...]
+    """Every key that differs, at most 100."""
+    more: int = Field(default=0, ge=0)
+    """Number of further keys that differ."""
+    applied: bool
+    """The changes that need no restart are in use."""
+    revision: str
+    """Revision of the file as it was read, for a request that applies what was shown."""
+
+
+class Reload(Command[ReloadReply]):
+    """Read the configuration file again, and take what needs no restart; a motion under way keeps its values."""
+
+    verb = "reload"
+    about = About.RIG
+    answer_s = 15.0
+
+    dry_run: bool = False
+    """Only name the changes."""
+    revision: str | None = Field(default=None, max_length=64)
+    """Revision whose changes were shown; with another one in the file the request is refused."""
+    leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
+    """Leases of the sender. An axis that another client controls keeps its settings, and the request is refused."""
+
+
 class WireLogReply(Frozen):
     """Some consecutive records of a line, oldest first: the reply to `@cmd/_/wire_log`."""
 
@@ -389,5 +430,6 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     Snapshot,
     SetIo,
     SetIoTimer,
+    Reload,
 )
 """The commands about the rig, those about control and events included."""

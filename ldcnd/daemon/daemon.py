@@ -22,6 +22,7 @@ from ldcnd.daemon.heartbeat import Heartbeat
 from ldcnd.daemon.leases import apply_policy
 from ldcnd.daemon.meta import Describing
 from ldcnd.daemon.rig import OwnedRig
+from ldcnd.daemon.rig_commands import AnswerReload
 from ldcnd.line.capture import Capture
 from ldcnd.log import get_logger
 from ldcnd.net.hand_over import Load
@@ -116,6 +117,10 @@ class Daemon:
         axes = {axis.name: axis for bus in config.bus for axis in bus.axis}
         for bus in self.rig.buses:
             bus.reconfigure(axes)
+
+    def serve_reloads(self, answer: AnswerReload) -> None:
+        """Let clients have the configuration read again."""
+        self._dispatcher.serve_reloads(answer)
 
     async def wait_serving(self) -> None:
         """Return as soon as questions and commands are answered, whether or not any line is up."""

@@ -49,7 +49,7 @@ from ldcnd.contract.leases import Acquire
 from ldcnd.daemon.leases import Authority, LeaseWatch
 from ldcnd.daemon.ledger import EventLog, Ledger, LedgerEntry
 from ldcnd.daemon.rig import OwnedRig
-from ldcnd.daemon.rig_commands import RigCommands
+from ldcnd.daemon.rig_commands import AnswerReload, RigCommands
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.log import LogLimit, get_logger
 from ldcnd.net.hand_over import OnQuery, Query
@@ -351,6 +351,10 @@ class Dispatcher:
         self._rig_commands = RigCommands(
             rig, authority, self.leases, ledger, events, clock, self.carry_out, self._admit_lease
         )
+
+    def serve_reloads(self, answer: AnswerReload) -> None:
+        """Let clients have the configuration read again."""
+        self._rig_commands.answer_reload = answer
 
     async def answer(
         self, axis: str, command: Command[Frozen], login: str | None = None, accept: Accept = lambda _: None

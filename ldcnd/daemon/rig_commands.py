@@ -28,6 +28,7 @@ from ldcnd.contract.commands import (
 from ldcnd.contract.errors import (
     InternalError,
     LdcndError,
+    LeaseHeld,
     MalformedRequest,
     NotSupported,
 )
@@ -47,6 +48,8 @@ from ldcnd.contract.rig_commands import (
     Rehearsal,
     RehearsalReply,
     Rehearse,
+    Reload,
+    ReloadReply,
     SetIo,
     SetIoTimer,
     SetSpeedOverride,
@@ -82,8 +85,21 @@ Admit = Callable[[str, str | None], None]
 """Raises when nothing may be moved on an axis under a lease, or without one."""
 
 
+AnswerReload = Callable[[Reload, Callable[[str], None]], Awaitable[ReloadReply]]
+"""Has the configuration read again; the second argument raises when another client controls an axis."""
+
+
+async def refuse_reload(command: Reload, _admit: Callable[[str], None]) -> ReloadReply:
+    """Refuse a reload of a daemon that was not started from a file."""
+    raise NotSupported(f"{command.verb}: this daemon has no file that it could read again", remedy="restart it")
+
+
 class RigCommands:
-    """Carries out what concerns several axes, a module or the rig, and answers questions."""
+    """Carries out what concerns several axes, a module or the rig, and answers questions.
+
+    Attributes:
+        answer_reload: has the configuration read again.
+    """
 
     def __init__(
         self,
@@ -116,6 +132,7 @@ class RigCommands:
         self._clock = clock
         self._execute = execute
         self._admit = admit
+        self.answer_reload: AnswerReload = refuse_reload
 
     async def answer(self, axis: str, command: Command[Frozen], login: str | None) -> Frozen:
         """Carry out a command that is not for one axis, or answer a question; see `Dispatcher.answer`.
@@ -136,6 +153,8 @@ class RigCommands:
             case SetIoTimer():
                 module = self._rig.modules[command.module]
                 return await module.set_timer(command, lambda: self._admit_module(module, command))
+            case Reload():
+                return await self.answer_reload(command, lambda name: self._refuse_held(name, command.leases))
             case Rehearse():
                 for name in concerned(self._rig, command):
                     self._admit(name, command.lease)
@@ -173,6 +192,21 @@ class RigCommands:
     def _why(self, axis: AxisService, request: Why) -> WhyReply:
         """Tell why a motion of this axis would be refused now, and what would clear that."""
         return explain(axis, request, lambda: self._admit(axis.config.name, request.lease))
+
+    def _refuse_held(self, axis: str, leases: tuple[str, ...]) -> None:
+        """Refuse what changes an axis that another client controls; without control of it, it is open to all.
+
+        Raises:
+            LeaseHeld: names the holder.
+        """
+        holder = self._authority.holder(axis)
+        if holder and holder.token not in leases:
+            raise LeaseHeld(
+                f"axis {axis} is controlled by {holder.client}",
+                axis=axis,
+                value=holder.client,
+                remedy="wait until it is released, or reload with that lease",
+            )
 
     def _own(self, axis: str, leases: tuple[str, ...]) -> str | None:
         """Return which of these leases is the one on an axis; None when another one is, or none."""

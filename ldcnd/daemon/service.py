@@ -3,9 +3,7 @@
 The watchdog is fed only while every bus keeps to its own plan. So it ends a daemon whose loop hangs and one whose loop
 runs while a line does not; a line without adapter or without drives is no reason, and appears in the status instead.
 
-A reload takes changes that affect only later commands and polls: limits, velocities and accelerations that requests
-omit, polling rates and priorities. A motion under way keeps the values that it was started with. All the rest says
-where drives are, what they are, or how the daemon was built, and needs a restart.
+What a reload takes is in reload.py; a signal asks for it here, a client by the command `reload`.
 """
 
 import asyncio
@@ -15,25 +13,20 @@ import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
-from pydantic import BaseModel, ValidationError
-
-from ldcnd.config.plan import require_plan
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.condition import TroubleKind, assess, line_troubles
 from ldcnd.contract.errors import ConfigError
-from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.rig_commands import Reload, ReloadReply
 from ldcnd.contract.samples import FaultEntry, LinkState
 from ldcnd.daemon import systemd
 from ldcnd.daemon.daemon import Daemon
+from ldcnd.daemon.reload import Reloader
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.systemd import Notifier
-from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.line_config import BusConfig
 from ldcnd.log import get_logger
 
 log = get_logger("service")
@@ -153,8 +146,6 @@ STATUS_PERIOD_S = 1.0
 FEEDINGS = 3
 """Number of watchdog notifications within its time-out."""
 TRIES, TRY_PERIOD_S = 50, 0.1
-RELOAD_TIME_S = 10.0
-"""A configuration that takes longer to be read is given up: TimeoutStartSec= bounds a reload, too."""
 
 
 class Service:
@@ -176,7 +167,8 @@ class Service:
     ) -> None:
         self._daemon = daemon
         self._notifier = notifier
-        self._load = load
+        self._reloader = Reloader(daemon, load)
+        daemon.serve_reloads(self._answer_reload)
         self._monotonic_ns = monotonic_ns
         self._asked = asyncio.Event()
         self._ending = False
@@ -254,25 +246,21 @@ class Service:
     async def _reload(self) -> str:
         """Take what can be taken; return what the status must say about the rest."""
         try:
-            async with asyncio.timeout(RELOAD_TIME_S):
-                reload, plan = await asyncio.to_thread(self._prepare, self._daemon.config)
-        except TimeoutError:
-            log.error("configuration not reloaded", reason=f"not read within {RELOAD_TIME_S:g} s")
-            return "configuration not reloaded: it cannot be read"
+            reload = await self._reloader.reload()
         except ConfigError as error:
             log.error("configuration not reloaded", reason=error.message, code=error.code.value)
             return f"configuration not reloaded: {error.message.splitlines()[0]}"
-        self._daemon.reconfigure(reload.config, plan)
-        log.info("configuration reloaded", changed=reload.changed)
-        if not reload.refused:
-            return ""
-        log.warning("changes need a restart", keys=reload.refused)
-        return f"restart needed for {', '.join(reload.refused)}"
+        return _remark(reload.refused)
 
-    def _prepare(self, running: RigConfig) -> "tuple[Reload, RigBudget]":
-        """Read and judge the file, beside the loop: lines go on meanwhile."""
-        reload = plan_reload(running, self._load())
-        return reload, require_plan(reload.config)
+    async def _answer_reload(self, command: Reload, admit: Callable[[str], None]) -> ReloadReply:
+        reply = await self._reloader.answer(command, admit)
+        if reply.applied:
+            self._remark = _remark([each.key for each in reply.changes if each.restart])
+        return reply
+
+
+def _remark(refused: Sequence[str]) -> str:
+    return f"restart needed for {', '.join(refused)}" if refused else ""
 
 
 def describe(rig: OwnedRig) -> str:
@@ -300,88 +288,3 @@ def describe(rig: OwnedRig) -> str:
 class _Faults(NamedTuple):
     active: tuple[FaultEntry, ...]
     first: FaultEntry | None
-
-
-@dataclass(frozen=True, slots=True)
-class Reload:
-    """The effect of a changed configuration.
-
-    Attributes:
-        config: to run with from now on.
-        changed: keys that have another value in it.
-        refused: keys that differ in the file and keep their value until the daemon is started again.
-    """
-
-    config: RigConfig
-    changed: tuple[str, ...]
-    refused: tuple[str, ...]
-
-
-def plan_reload(running: RigConfig, wanted: RigConfig) -> Reload:
-    """Decide which changes apply.
-
-    Keys name buses and axes: `bus.line0.axis.x.limits.velocity`; a bus or axis that was added or removed is one key.
-
-    Raises:
-        ConfigError: what can be changed contradicts what cannot, such as a velocity limit that the bounds of `track`
-            no longer keep.
-    """
-    wanted_buses = {bus.name: bus for bus in wanted.bus}
-    buses = tuple(_bus(bus, wanted_buses.get(bus.name, bus)) for bus in running.bus)
-    config = running.model_copy(update={"bus": buses})
-    return Reload(config, tuple(_differences(running, config, "")), tuple(_differences(config, wanted, "")))
-
-
-def _bus(running: BusConfig, wanted: BusConfig) -> BusConfig:
-    if running.family != wanted.family:
-        return running
-    wanted_axes = {axis.name: axis for axis in wanted.axis}
-    axes = tuple(_axis(axis, wanted_axes.get(axis.name, axis)) for axis in running.axis)
-    return running.model_copy(update={"axis": axes})
-
-
-def _axis(running: AxisConfig, wanted: AxisConfig) -> AxisConfig:
-    """Take the keys over, unless a unit means something else than before: then every number does."""
-    if not running.reloadable or (running.unit, running.counts_per_unit, running.direction) != (
-        wanted.unit,
-        wanted.counts_per_unit,
-        wanted.direction,
-    ):
-        return running
-    merged = running.model_copy(update={key: getattr(wanted, key) for key in running.reloadable})
-    try:
-        return type(running).model_validate(merged.model_dump())
-    except ValidationError as error:
-        reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors())
-        raise ConfigError(
-            f"axis {running.name}: what needs no restart cannot work without what does: {reasons}", axis=running.name
-        ) from error
-
-
-def _differences(one: object, other: object, key: str) -> Iterator[str]:
-    """Yield the keys at which two parts of a configuration differ, as deep down as they can be named."""
-    if one == other:
-        return
-    if isinstance(one, BaseModel) and isinstance(other, BaseModel):
-        for name in type(one).model_fields:
-            yield from _differences(getattr(one, name), getattr(other, name), f"{key}.{name}" if key else name)
-        return
-    ours, theirs = _by_name(one), _by_name(other)
-    if ours is None or theirs is None or list(ours) == list(theirs) == []:
-        yield key
-        return
-    for name in ours | theirs:
-        if name in ours and name in theirs:
-            yield from _differences(ours[name], theirs[name], f"{key}.{name}")
-        else:
-            yield f"{key}.{name}"
-    if list(ours) != list(theirs) and ours.keys() == theirs.keys():
-        yield key  # only their order has changed
-
-
-def _by_name(items: object) -> dict[str, BaseModel] | None:
-    """Return the parts of a list that are known by name, or None for anything else."""
-    if not isinstance(items, Sequence) or isinstance(items, str):
-        return None
-    named = {str(getattr(item, "name", "")): item for item in items if isinstance(item, BaseModel)}
-    return named if len(named) == len(items) and "" not in named else None

@@ -14,6 +14,7 @@ import math
 import random
 from collections import deque
 from dataclasses import dataclass
+from typing import Literal
 
 LIVE_SIXTH = 2
 """Of each half of an electrical turn: the pair without the phase that may be lost."""
@@ -46,6 +47,8 @@ class MotorPlant:
         phase_lost: the motor is a brushless one, and one of its phases is open.
         pole_pairs: electrical turns in a revolution.
         encoder_disconnected: the counter stands still while the shaft turns, and the drive does not notice.
+        coupling_grip: share of the motor's way that reaches encoder and load: below 1 the coupling slips.
+        limits_swapped: each limit switch is wired to the input of the other one.
     """
 
     counts_per_rev: int = 2000
@@ -71,6 +74,8 @@ class MotorPlant:
     phase_lost: bool = False
     pole_pairs: int = 4
     encoder_disconnected: bool = False
+    coupling_grip: float = 1.0
+    limits_swapped: bool = False
 
 
 class Shaft:
@@ -112,6 +117,7 @@ class Shaft:
         self._late_share = plant.delay_s / step_s - whole
         self._on_the_way: deque[float | None] = deque([0.0] * (whole + 1))
         self._backlash = plant.backlash_counts
+        self._grip = plant.coupling_grip
         self._sixths_per_count = 6 * plant.pole_pairs / plant.counts_per_rev if plant.phase_lost else 0.0
         self._supply_v = -plant.supply_v if plant.motor_reversed else plant.supply_v
         radians_per_count = math.tau / plant.counts_per_rev
@@ -164,7 +170,7 @@ class Shaft:
         if velocity == 0.0 == before:
             self.velocity_counts = 0.0
             return
-        way = 0.5 * (before + velocity)
+        way = 0.5 * (before + velocity) * self._grip
         position = self.position_counts + (self._transmitted(way) if self._backlash else way)
         if not self._lowest < position < self._highest:
             position = min(max(position, self._lowest), self._highest)
@@ -203,17 +209,23 @@ class Shaft:
 
     @property
     def on_reverse_limit(self) -> bool:
-        """Whether the reverse limit switch is actuated."""
+        """Whether the input of the reverse limit switch shows it actuated."""
         if self.reverse_stuck is not None:
             return self.reverse_stuck
-        return self.limits_actuated or self.position_counts <= self.plant.reverse_limit_counts
+        return self.limits_actuated or self._is_on("forward" if self.plant.limits_swapped else "reverse")
 
     @property
     def on_forward_limit(self) -> bool:
-        """Whether the forward limit switch is actuated."""
+        """Whether the input of the forward limit switch shows it actuated."""
         if self.forward_stuck is not None:
             return self.forward_stuck
-        return self.limits_actuated or self.position_counts >= self.plant.forward_limit_counts
+        return self.limits_actuated or self._is_on("reverse" if self.plant.limits_swapped else "forward")
+
+    def _is_on(self, switch: Literal["reverse", "forward"]) -> bool:
+        """Tell whether the shaft is on a limit switch."""
+        if switch == "reverse":
+            return self.position_counts <= self.plant.reverse_limit_counts
+        return self.position_counts >= self.plant.forward_limit_counts
 
     @property
     def on_index(self) -> bool:

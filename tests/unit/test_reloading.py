@@ -6,7 +6,7 @@ import pytest
 
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError
-from ldcnd.daemon.service import plan_reload
+from ldcnd.daemon.reload import plan_reload
 
 SIMULATED = Path(__file__).parents[2] / "config" / "simulated.toml"
 RUNNING = load_config(SIMULATED)

@@ -4,16 +4,22 @@ The loop has a position and a derivative gain only, so its output at rest is `kp
 motion forward ends where output and load exceed friction no more, one back where they do so the other way: half of the
 difference of the two outputs is friction, their mean is what holds the load. Outputs are whole PWM steps, so both are
 known to half a step or so.
+
+An axis with a hanging load stands on its stop when the step begins, so each trial first goes away from there, with the
+loop closed, and ends where it can still fall: that it falls when the loop opens is seen, and not concluded.
 """
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.motor import (
-    CAUGHT,
+    COUNTING,
     DAMPING,
+    FELL_SHARE,
     HOW_IT_ENDS,
     OUTPUTS,
     PWM_PER_GAIN,
@@ -24,6 +30,7 @@ from ldcnd.bench.commissioning.motor import (
 from ldcnd.bench.commissioning.questions import powered_off
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
 from ldcnd.bench.commissioning.step import Step, StepContext, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.bench.machine_faults import STANDS, MachineFault, named
 from ldcnd.client.axis import Axis, seen
 from ldcnd.client.kept_gains import open_loop
 from ldcnd.contract.commands import Verb
@@ -33,6 +40,10 @@ from ldcnd.contract.samples import AxisState
 WAY = 2.5
 """Each motion goes this many times the position error limit: it counts from the goal before, which the axis may be one
 limit behind, so an axis that does not follow both ways exceeds the limit."""
+LIFT = 1.25
+"""It first goes this many times the position error limit away from where it stands, and does not come back to there."""
+REACH = 5.0
+"""It stays within this many times the position error limit: lift, one motion, and what it may be beyond its goal."""
 SATURATED_SHARE = 0.8
 """The output is at its limit from this share of the position error limit on."""
 DURATION_S = 3.0
@@ -82,6 +93,10 @@ class HoldingOutput(Step):
                 f"{site.info.axis} moves {APPROACHES} times forward and back by {WAY * el:.0f} counts"
                 f" ({site.length(way)}), at {site.length(velocity)}/s, with {OUTPUTS[0]} to {OUTPUTS[-1]} {UNIT}"
             ),
+            (
+                f"it begins {LIFT * el:.0f} counts beside where it stands, on the side to which it can go, and stays"
+                f" within {REACH * el:.0f} counts; a load that hangs falls back when the loop opens"
+            ),
             f"beyond a position error of {el} counts the drive opens its loop; then more output is tried",
             "run the step motor first: this one takes for granted that motor and encoder agree",
             *HOW_IT_ENDS,
@@ -90,44 +105,65 @@ class HoldingOutput(Step):
     @override
     async def run(self, site: StepContext, axis: Axis) -> Result:
         el = error_limit(site)
+        sign = -1 if site.info.direction == "reverse" else 1
         async with lent_gains(site, axis) as old:
             origin, output = await rest_counts(axis), OUTPUTS[0]
             while output <= min(OUTPUTS[-1], old["ol"]):
                 before = await rest_counts(axis)
-                if abs(before - origin) > CAUGHT * el:
-                    return _failed(f"a load carries it away: it went {abs(before - origin)} counts")
-                outputs = await self._approach(site, axis, output, el, origin)
-                if len(outputs) == 2 * APPROACHES:
-                    return _judged(site, outputs, old.get("cl"))
-                carried = abs(await rest_counts(axis) - before) > el / 2
+                gone = abs(before - origin)
+                if gone > REACH * el:
+                    return _failed(site, f"it went {gone} counts by itself", MachineFault.CARRIED)
+                first = -1 if sign * (before - origin) > 0 else 1
+                for lift in (
+                    (first, -first) if gone < el / 2 else (first,)
+                ):  # where it was left, only towards the origin
+                    trial = await self._approach(site, axis, output, el, lift)
+                    if trial:
+                        return _judged(site, trial, old.get("cl"))
+                    carried = abs(await rest_counts(axis) - before) > el / 2
+                    if carried:
+                        break
                 output = math.ceil(output * (CARRIED_GROWTH if carried else GROWTH))
-        return _failed(
-            f"it does not follow with {min(OUTPUTS[-1], old['ol'])} {UNIT}: look for a closed brake, a jam, or a load"
-            " that is too heavy for it"
-        )
+        return _failed(site, f"it does not follow with {min(OUTPUTS[-1], old['ol'])} {UNIT}", *STANDS)
 
     @staticmethod
-    async def _approach(site: StepContext, axis: Axis, output: int, el: int, origin: int) -> list[tuple[int, float]]:
-        """Move to and fro with an output limit; return direction and output at rest of each motion until it trips."""
+    async def _approach(site: StepContext, axis: Axis, output: int, el: int, lift: int) -> "HoldingTrial | None":
+        """Go away from where it stands, then to and fro, with an output limit; None where the drive gives up."""
         kp = min(math.ceil(PWM_PER_GAIN * output / (SATURATED_SHARE * el)), REGISTER_MOST)
         await axis.set_gains(kp=kp, kd=min(DAMPING * kp, REGISTER_MOST), ki=0, il=0, ol=output, el=el, lent=True)
         velocity, acceleration = _profile(site)
-        sign = -1 if site.info.direction == "reverse" else 1
-        first = -1 if sign * (await rest_counts(axis) - origin) > 0 else 1
+        lifted, way = lift * LIFT * el / site.counts_per_unit, lift * _way(site)
         outputs: list[tuple[int, float]] = []
         await axis.power(on=True)
-        for direction in (first, -first) * APPROACHES:
-            motion = await axis.move_relative(direction * _way(site), velocity=velocity, acceleration=acceleration)
+        for distance in (lifted, *(way, -way) * APPROACHES):
+            motion = await axis.move_relative(distance, velocity=velocity, acceleration=acceleration)
             with suppress(DriveFault, CommandAborted):  # its state tells more
                 await motion.done()
             refuse_latched(axis)
             if axis.state.state is AxisState.ERROR_STOP:
-                break
-            await rest_counts(axis)
+                await open_loop(axis)
+                return None
+            held = await rest_counts(axis)
             error = ((motion.reply.position or 0.0) - axis.position.value) * site.counts_per_unit
-            outputs.append((direction, kp * error / PWM_PER_GAIN))
+            outputs.append((1 if distance > 0 else -1, kp * error / PWM_PER_GAIN))
         await open_loop(axis)
-        return outputs
+        sign = -1 if site.info.direction == "reverse" else 1
+        return HoldingTrial(tuple(outputs[1:]), sign * (await rest_counts(axis) - held), max(COUNTING, FELL_SHARE * el))
+
+
+@dataclass(frozen=True, slots=True)
+class HoldingTrial:
+    """What an axis did that followed to and fro.
+
+    Attributes:
+        outputs: direction of each motion, and the output at rest behind it, PWM steps.
+        fell: how far it went by itself when the loop was opened, counts forward.
+        falls_from: from so many counts on, it has fallen.
+    """
+
+    outputs: tuple[tuple[int, float], ...]
+    fell: int
+    falls_from: float
 
 
 def _way(site: StepContext) -> float:
@@ -142,30 +178,39 @@ def _profile(site: StepContext) -> tuple[float, float]:
     return velocity, min(velocity / (RAMP_SHARE * DURATION_S), limits.acceleration or math.inf)
 
 
-def _held(outputs: list[tuple[int, float]], direction: int) -> float:
+def _held(outputs: Sequence[tuple[int, float]], direction: int) -> float:
     """Return the output that holds the axis behind motions in a direction, PWM steps; the drive gives whole ones."""
     held = [math.trunc(output) for way, output in outputs if way == direction]
     return sum(held) / len(held)
 
 
-def _judged(site: StepContext, outputs: list[tuple[int, float]], limit: int | None) -> Result:
+def _judged(site: StepContext, trial: HoldingTrial, limit: int | None) -> Result:
+    outputs = trial.outputs
     forward, back = _held(outputs, 1), _held(outputs, -1)
     # the next whole step would have moved it on
     friction, load = max((forward - back) / 2 + HALF_A_STEP, 0.0), (forward + back) / 2
-    falls = forward * back > 0
     pulls = f"a load pulls it {'back' if load > 0 else 'forward'} with {abs(load):.1f} {UNIT}"
-    if falls:
+    has_fallen = abs(trial.fell) >= trial.falls_from
+    faults: tuple[MachineFault, ...] = ()
+    if has_fallen:
+        side = "forward" if trial.fell > 0 else "back"
+        text = f"it fell {side} by {abs(trial.fell)} counts when the loop opened; {pulls}"
+        faults = (MachineFault.LOAD_HANGS,)
+    elif forward * back > 0:
         text = (
-            f"{pulls}, more than the {friction:.1f} of its friction: it falls without power, unless a brake holds it;"
-            f" it stood before, so a brake did, or the end of its travel{powered_off(site.config)}"
+            f"{pulls}, more than the {friction:.1f} of its friction, and it stayed where it was when the loop opened: a"
+            " brake holds it; without that it falls"
         )
-        if _said(site) == "none":
-            text += "; you have said that nothing falls: run the step load again"
+        faults = (MachineFault.LOAD_HANGS,)
     elif abs(load) < 1.0:
         text = f"no load to speak of; friction takes {friction:.1f} {UNIT}"
     else:
         holds = "holds it without power" if min(abs(forward), abs(back)) >= 1.0 else "hardly holds it without power"
-        text = f"{pulls}; its friction of {friction:.1f} {holds}"
+        text = f"{pulls}; its friction of {friction:.1f} {holds}: it stayed where it was when the loop opened"
+    if faults:
+        text += f": {named(faults)}{powered_off(site.config)}"
+        if _said(site) == "none":
+            text += "; you have said that nothing falls: run the step load again"
     figures = (
         Figure(what="output at rest behind a motion forward", value=forward, unit=UNIT),
         Figure(what="output at rest behind a motion back", value=back, unit=UNIT),
@@ -175,7 +220,7 @@ def _judged(site: StepContext, outputs: list[tuple[int, float]], limit: int | No
     )
     points = tuple((float(number), output) for number, (_, output) in enumerate(outputs, 1))
     series = (PlotSeries(title="Output at rest", x="motion", y="PWM steps of 255", points=points),)
-    return Result(state=StepState.DONE, text=text, figures=figures, series=series)
+    return Result(state=StepState.DONE, text=text, figures=figures, series=series, faults=faults)
 
 
 def _said(site: StepContext) -> object:
@@ -198,5 +243,8 @@ def _current_limit(limit: int | None) -> tuple[Figure, ...]:
     )
 
 
-def _failed(text: str) -> Result:
-    return Result(state=StepState.FAILED, text=text)
+def _failed(site: StepContext, seen: str, *faults: MachineFault) -> Result:
+    """Return that it did not follow; a reversed motor may be why, unless the step `motor` has excluded it."""
+    agrees = site.record.of("motor").result.state is StepState.DONE
+    possible = faults if agrees else (*faults, MachineFault.REVERSED)
+    return Result(state=StepState.FAILED, text=f"{seen}: {named(possible)}", faults=possible)

@@ -9,6 +9,7 @@ from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, Result, StepState
 from ldcnd.bench.commissioning.step import Step, StepContext, done
+from ldcnd.bench.machine_faults import MachineFault, fault_found, named
 from ldcnd.client.axis import Axis
 from ldcnd.contract.errors import WrongState
 from ldcnd.contract.samples import InputsSample, TelemetryItem
@@ -43,7 +44,12 @@ class LimitSwitches(Step):
         person = site.person
         if not await person.confirm("has the axis limit switches?"):
             return Result(state=StepState.SKIPPED, text="it has no limit switches")
-        idle = _levels(await site.rig.latest(axis.name, TelemetryItem.INPUTS))
+        sample = await site.rig.latest(axis.name, TelemetryItem.INPUTS)
+        if sample is None:
+            raise WrongState(
+                f"axis {axis.name}: its inputs are not published", axis=axis.name, remedy="set `rates.inputs` above 0"
+            )
+        idle = _levels(sample)
         if None in idle:
             raise WrongState(
                 f"axis {axis.name}: this drive shows its limit switches only while its power driver is on",
@@ -54,7 +60,9 @@ class LimitSwitches(Step):
         for side in SIDES:
             person.tell(f"press the {side} limit switch, and let it go")
             pressed.append(await self._pressed(site, idle, side))
-            await self._until(site, lambda levels: levels == idle, "did not come back to its level at rest")
+            await self._until(
+                site, lambda levels: levels == idle, f"came back to its level at rest after the {side} switch"
+            )
         return _judged(site, idle, pressed)
 
     async def _pressed(self, site: StepContext, idle: Levels, side: str) -> int:
@@ -62,7 +70,7 @@ class LimitSwitches(Step):
         changed = await self._until(
             site,
             lambda levels: levels != idle and None not in levels,
-            f"did not change: the {side} switch is not wired to it, or was not pressed",
+            f"changed with the {side} switch",
         )
         which = [number for number in (0, 1) if changed[number] != idle[number]]
         if len(which) > 1:
@@ -74,8 +82,12 @@ class LimitSwitches(Step):
         return which[0]
 
     @staticmethod
-    async def _until(site: StepContext, wanted: Callable[[Levels], bool], otherwise: str) -> Levels:
-        """Watch the inputs until their levels are as wanted; return them."""
+    async def _until(site: StepContext, wanted: Callable[[Levels], bool], what: str) -> Levels:
+        """Watch the inputs until their levels are as wanted; return them.
+
+        Raises:
+            DriveFault: they do not become so in time.
+        """
         axis = site.info.axis
         try:
             async with asyncio.timeout(PRESS_S), site.rig.samples(axis, TelemetryItem.INPUTS) as samples:
@@ -83,7 +95,8 @@ class LimitSwitches(Step):
                 while not wanted(levels):
                     levels = _levels((await anext(samples))[1])
         except TimeoutError:
-            raise WrongState(f"axis {axis}: no input {otherwise}, within {PRESS_S:g} s", axis=axis) from None
+            seen = f"axis {axis}: within {PRESS_S:g} s no input {what}"
+            raise fault_found(seen, MachineFault.SWITCH_DEAD, MachineFault.SWITCH_HELD) from None
         return levels
 
 
@@ -97,14 +110,11 @@ def _judged(site: StepContext, idle: Levels, pressed: list[int]) -> Result:
         for side, number in zip(SIDES, pressed, strict=True)
     )
     if pressed[0] == pressed[1]:
-        text = f"both switches act on the {SIDES[pressed[0]]} input: one of them is not wired to its own"
-        return Result(state=StepState.FAILED, text=text, figures=figures)
+        return _wrong(figures, MachineFault.SWITCHES_JOINED, MachineFault.SWITCH_DEAD)
     if pressed != [0, 1]:
-        text = "the switches are swapped: exchange their wires, or correct `direction` first (step scale)"
-        return Result(state=StepState.FAILED, text=text, figures=figures)
+        return _wrong(figures, MachineFault.SWITCHES_SWAPPED)
     if idle[0] != idle[1]:
-        text = "one switch opens and the other closes when pressed: wire both alike"
-        return Result(state=StepState.FAILED, text=text, figures=figures)
+        return _wrong(figures, MachineFault.SWITCHES_UNLIKE, MachineFault.SWITCH_HELD)
     active: Literal["high", "low"] = LEVELS[not idle[0]]
     result = done(f"both inputs are {active} when their switch is pressed").model_copy(update={"figures": figures})
     proposals: list[ConfigProposal] = []
@@ -118,6 +128,10 @@ def _judged(site: StepContext, idle: Levels, pressed: list[int]) -> Result:
             text += "; the drive can stop on them by itself"
             proposals.append(STOPS)
     return result.model_copy(update={"text": text, "proposals": tuple(proposals)})
+
+
+def _wrong(figures: tuple[Figure, ...], *faults: MachineFault) -> Result:
+    return Result(state=StepState.FAILED, text=named(faults), figures=figures, faults=faults)
 
 
 def _can_stop(site: StepContext, active: str) -> bool:

@@ -5,8 +5,9 @@ error limit. The set-point leads away beyond that limit: a motor that turns the 
 encoder that does not count all end in the drive, which opens its loop.
 """
 
+import asyncio
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 
@@ -14,6 +15,7 @@ from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
 from ldcnd.bench.commissioning.step import Step, StepContext, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.bench.machine_faults import STANDS, MachineFault, named
 from ldcnd.client.axis import Axis, seen
 from ldcnd.client.kept_gains import KeptGains, gains_in, keep, open_loop, restore
 from ldcnd.contract.commands import Verb
@@ -36,6 +38,12 @@ REVERSE_SHARE = 0.125
 """Shares of the position error limit from which a motion counts as one."""
 COUNTING = 4
 """An encoder that counts less, counts nothing: the person is asked whether the axis moved."""
+FELL_SHARE = 0.1
+"""An axis that goes by itself this share of the position error limit when the loop opens has a load that hangs."""
+TRACE_S = 0.02
+AFTER_S = 0.2
+"""The trace of a motion has a sample each `TRACE_S`, and lasts this much longer than its profile, seconds."""
+SHAFT = {"yes": "it turned", "no": "it stood", "unseen": "it cannot be seen"}
 DAMPING = 8
 """kd over kp while the step runs."""
 PWM_PER_GAIN = 256
@@ -77,11 +85,13 @@ class MotorDirection(Step):
         return (
             (
                 f"{site.info.axis} moves forward by about {LEAD * el:.0f} counts ({site.length(lead.distance)}), at"
-                f" {site.length(lead.velocity)}/s, with {OUTPUTS[0]} to {OUTPUTS[-1]} of 255 PWM steps"
+                f" {site.length(lead.velocity)}/s, with {OUTPUTS[0]} to {OUTPUTS[-1]} of 255 PWM steps; back by as much"
+                " where it does not"
             ),
             (
                 f"it stays within {caught:.0f} counts ({site.length(caught / site.counts_per_unit)}): a motor that"
-                f" turns the wrong way is caught after {el} counts, where the loop opens, and its friction stops it"
+                f" turns the wrong way is caught after {el} counts, where the loop opens, and its friction stops it; a"
+                " load that carries it off then may take it twice as far"
             ),
             (
                 "an encoder that does not count: the loop opens, too, within"
@@ -94,24 +104,56 @@ class MotorDirection(Step):
     @override
     async def run(self, site: StepContext, axis: Axis) -> Result:
         el = error_limit(site)
-        points: list[tuple[float, float]] = []
+        tries: list[MotorTry] = []
+        lead = _lead(site, el)
+        back = await axis.preview(distance=-lead.distance, velocity=lead.velocity, acceleration=lead.acceleration)
+        ways = [1] if back.refusal else [1, -1]
+        went_against = False
         async with lent_gains(site, axis) as old:
             for output in (each for each in OUTPUTS if each <= old["ol"]):
-                moved = await self._try(site, axis, output, el)
-                points.append((output, moved))
-                if moved >= FORWARD_SHARE * el or moved <= -REVERSE_SHARE * el:
-                    break
-                nothing = f"the encoder counted nothing with {output} of 255 PWM steps"
-                if abs(moved) < COUNTING and await site.person.confirm(f"{nothing}: did the axis move"):
-                    return _blind(nothing, el, points)
-        if abs(moved) >= COUNTING and len(await site.rig.describe()) > 1:
-            name = site.info.axis
-            if not await site.person.confirm(f"the encoder counted {moved}: was it axis {name} that moved"):
-                return _mistaken(name, el, points)
-        return _judged(el, points)
+                for way in tuple(ways):
+                    tries.append(await self._try(site, axis, output, el, way))
+                    if way > 0 and await self._is_blind(site, tries):  # before it is asked back, without counts
+                        return _result(el, tries, MachineFault.NO_COUNTS)
+                    if tries[-1].follows(el):
+                        return await self._confirmed(site, el, tries)
+                    if tries[-1].goes_against(el):
+                        if way < 0:  # asked forward it stood, or went back: no load does both
+                            return _result(el, tries, MachineFault.REVERSED)
+                        went_against = True
+                        ways.remove(1)  # a load may carry it: asked back, only a reversed motor goes forward
+                    elif went_against and tries[-1].goes(el):
+                        return _result(el, tries, MachineFault.CARRIED)
+        if any(each.goes(el) or each.goes_against(el) for each in tries):
+            return _result(el, tries, MachineFault.REVERSED, MachineFault.CARRIED, MachineFault.COUPLING)
+        if await site.person.choose("did the shaft of the motor turn", SHAFT) == "yes":
+            return _result(el, tries, MachineFault.COUPLING)
+        return _result(el, tries, *STANDS, *(() if -1 in ways else (MachineFault.AT_END,)))
 
-    async def _try(self, site: StepContext, axis: Axis, output: int, el: int) -> int:
-        """Ask for a motion with an output limit; return how far the axis is then from where it was, in counts."""
+    @staticmethod
+    async def _is_blind(site: StepContext, tries: "Sequence[MotorTry]") -> bool:
+        """Ask whether the axis moved where nothing was counted so far."""
+        if any(abs(each.farthest) >= COUNTING for each in tries):
+            return False
+        nothing = f"the encoder counted nothing with {tries[-1].output} of 255 PWM steps"
+        return await site.person.confirm(f"{nothing}: did the axis move")
+
+    async def _confirmed(self, site: StepContext, el: int, tries: "list[MotorTry]") -> Result:
+        """Ask whether it was this axis; return that motor and encoder agree."""
+        name, moved = site.info.axis, tries[-1].farthest
+        if len(await site.rig.describe()) > 1 and not await site.person.confirm(
+            f"the encoder counted {moved}: was it axis {name} that moved"
+        ):
+            text = (
+                f"what moved is not axis {name}: exchange the addresses of the two axes in the configuration (`ldcnd"
+                " scan PORT` says from which end the chain is numbered), start the daemon again, and run this step"
+                " again"
+            )
+            return _result(el, tries, text=text, state=StepState.FAILED)
+        return _agreement(el, tries)
+
+    async def _try(self, site: StepContext, axis: Axis, output: int, el: int, way: int) -> "MotorTry":
+        """Ask for a motion with an output limit, with its trace; its place is taken before the loop is opened."""
         # from half the position error limit on the output is at its limit
         kp = min(math.ceil(2 * PWM_PER_GAIN * output / el), REGISTER_MOST)
         lowered = {"kp": kp, "kd": min(DAMPING * kp, REGISTER_MOST), "ki": 0, "il": 0, "ol": output, "el": el}
@@ -120,18 +162,63 @@ class MotorDirection(Step):
         before = await rest_counts(axis)
         lead = _lead(site, el)
         await axis.power(on=True)
-        motion = await axis.move_relative(lead.distance, velocity=lead.velocity, acceleration=lead.acceleration)
-        with suppress(DriveFault, CommandAborted):  # where the axis is tells more
-            await motion.done()
-        refuse_latched(axis)
+        samples = math.ceil((lead.distance / lead.velocity * (1 + RAMP_SHARE) + AFTER_S) / TRACE_S)
+        tracing = asyncio.create_task(
+            axis.take_trace("position", samples=samples, interval_s=TRACE_S), name=f"trace {axis.name}"
+        )
+        try:
+            motion = await axis.move_relative(
+                way * lead.distance, velocity=lead.velocity, acceleration=lead.acceleration
+            )
+            with suppress(DriveFault, CommandAborted):  # where the axis is tells more
+                await motion.done()
+            refuse_latched(axis)
+            trace = await tracing
+        finally:
+            tracing.cancel()
         tripped = axis.state.state is AxisState.ERROR_STOP
+        held = await rest_counts(axis)
         await open_loop(axis)
-        moved = sign * (await rest_counts(axis) - before)
-        if not tripped and abs(moved) < REVERSE_SHARE * el:
+        rest = await rest_counts(axis)
+        places = [*(int(each) for each in trace.raw[0] if each is not None), held, rest]
+        farthest = max((sign * (each - before) for each in places), key=abs)
+        if not tripped and abs(held - before) < REVERSE_SHARE * el:
             raise WrongState(
                 f"axis {axis.name} was halted before it could be seen to move", axis=axis.name, remedy="run it again"
             )
-        return moved
+        fell = 0 if tripped else sign * (rest - held)
+        return MotorTry(output, way, farthest, tripped, fell)
+
+
+@dataclass(frozen=True, slots=True)
+class MotorTry:
+    """One motion that was tried.
+
+    Attributes:
+        output: its limit, PWM steps.
+        way: 1 where it was asked forward, -1 back.
+        farthest: from where it stood, counts forward, while the loop was closed or behind that.
+        tripped: the drive has opened the loop.
+        fell: how far it went by itself when the loop was opened, counts forward.
+    """
+
+    output: int
+    way: int
+    farthest: int
+    tripped: bool
+    fell: int
+
+    def follows(self, el: int) -> bool:
+        """Tell whether it went to its goal and stayed there: neither a load nor a reversed motor does that."""
+        return not self.tripped and self.goes(el)
+
+    def goes(self, el: int) -> bool:
+        """Tell whether it went the way that was asked."""
+        return self.way * self.farthest >= FORWARD_SHARE * el
+
+    def goes_against(self, el: int) -> bool:
+        """Tell whether it went the other way."""
+        return self.way * self.farthest <= -REVERSE_SHARE * el
 
 
 @asynccontextmanager
@@ -185,44 +272,48 @@ async def _refuse_what_cannot_be(site: StepContext, lead: _Lead) -> None:
     refuse_previewed(reply)
 
 
-def _blind(nothing: str, el: int, points: list[tuple[float, float]]) -> Result:
-    text = f"{nothing}, and the axis moved: switch the drive off and check the wires of the encoder"
-    return _result(StepState.FAILED, text, el, points)
+def _agreement(el: int, tries: Sequence[MotorTry]) -> Result:
+    last = tries[-1]
+    text = f"motor and encoder agree: it moved {'forward' if last.way > 0 else 'back'} by {abs(last.farthest)} counts"
+    found: list[MachineFault] = []
+    if abs(last.fell) >= max(COUNTING, FELL_SHARE * el):
+        side = "back" if last.fell * last.way < 0 else "on"
+        text += f"; it fell {side} by {abs(last.fell)} counts when the loop opened"
+        found.append(MachineFault.LOAD_HANGS)
+    elif any(each.goes_against(el) for each in tries):
+        text += "; before that it went against its output"
+        found.append(MachineFault.CARRIED)
+    if last.way < 0 and not found:
+        text += f"; forward it did not move with {last.output} of 255 PWM steps: {MachineFault.AT_END}"
+    return _result(el, tries, *found, text=text, state=StepState.DONE)
 
 
-def _mistaken(name: str, el: int, points: list[tuple[float, float]]) -> Result:
-    text = (
-        f"what moved is not axis {name}: exchange the addresses of the two axes in the configuration (`ldcnd scan PORT`"
-        " says from which end the chain is numbered), start the daemon again, and run this step again"
-    )
-    return _result(StepState.FAILED, text, el, points)
-
-
-def _judged(el: int, points: list[tuple[float, float]]) -> Result:
-    output, moved = points[-1]
-    if moved >= FORWARD_SHARE * el:
-        text, state = f"motor and encoder agree: it moved forward by {moved:.0f} counts", StepState.DONE
-    elif moved <= -REVERSE_SHARE * el:
-        text = (
-            f"motor and encoder disagree: asked forward, it moved back by {-moved:.0f} counts until the loop opened,"
-            " unless a load pulled it. Switch the drive off, swap the two wires of the motor, and run this step again"
+def _result(
+    el: int, tries: Sequence[MotorTry], *faults: MachineFault, text: str = "", state: StepState = StepState.FAILED
+) -> Result:
+    last = max(tries, key=lambda each: abs(each.farthest))
+    if not text:
+        asked = {1: "asked forward", -1: "asked back"}
+        went = {each.way: each for each in tries if abs(each.farthest) >= COUNTING}
+        text = "; ".join(
+            f"{asked[way]}, it moved {'forward' if each.farthest > 0 else 'back'} by {abs(each.farthest)} counts"
+            for way, each in went.items()
         )
-        state = StepState.FAILED
-    else:
-        text = f"it stood with up to {output:.0f} of 255 PWM steps: check supply, wires of the motor, and brake"
-        state = StepState.FAILED
-    return _result(state, text, el, points)
-
-
-def _result(state: StepState, text: str, el: int, points: list[tuple[float, float]]) -> Result:
-    output, moved = points[-1]
+        text = text or f"it stood with up to {last.output if went else tries[-1].output} of 255 PWM steps"
     figures = (
-        Figure(what="moved", value=moved, unit="counts"),
-        Figure(what="output limit", value=output, unit="of 255 PWM steps"),
+        Figure(what="moved", value=last.farthest, unit="counts"),
+        Figure(what="output limit", value=tries[-1].output, unit="of 255 PWM steps"),
         Figure(what="position error limit", value=el, unit="counts"),
         Figure(what="stated distance", value=CAUGHT * el, unit="counts"),
     )
-    series = (
-        PlotSeries(title="Motion by output limit", x="PWM steps of 255", y="counts forward", points=tuple(points)),
+    series = tuple(
+        PlotSeries(
+            title=f"Motion by output limit, asked {side}",
+            x="PWM steps of 255",
+            y="counts forward",
+            points=tuple((float(each.output), float(each.farthest)) for each in tries if each.way == way),
+        )
+        for way, side in ((1, "forward"), (-1, "back"))
     )
-    return Result(state=state, text=text, figures=figures, series=series)
+    said = f"{text}: {named(faults)}" if faults else text
+    return Result(state=state, text=said, figures=figures, series=series, faults=tuple(faults))

@@ -7,6 +7,7 @@ from pathlib import Path
 from pydantic import Field, JsonValue
 
 from ldcnd import durable
+from ldcnd.bench.machine_faults import MachineFault
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
 
@@ -80,6 +81,8 @@ class Result(Frozen):
     """The same over something, for plots."""
     proposals: tuple[ConfigProposal, ...] = ()
     """What it proposes for the configuration."""
+    faults: tuple[MachineFault, ...] = ()
+    """What may be wrong with the machine; of several it cannot be told which."""
 
 
 class StepRecord(Frozen):

@@ -5,7 +5,7 @@ is left out here is left to them.
 """
 
 from dataclasses import replace
-from typing import Annotated, Literal, Self
+from typing import Annotated, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -87,6 +87,10 @@ class PlantConfig(Frozen):
     """Electrical turns in a revolution of such a motor; 4."""
     encoder_disconnected: bool | None = None
     """Whether the counter stands still while the shaft turns, and the drive does not notice."""
+    coupling_grip: float | None = Field(default=None, ge=0, le=1)
+    """Share of the motor's way that reaches the encoder and the load; below 1 the coupling slips; 1."""
+    limits_swapped: bool | None = None
+    """Whether each limit switch is wired to the input of the other one."""
 
 
 class IoConfig(Frozen):

@@ -16,6 +16,7 @@ from collections.abc import Generator
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
+from ldcnd.bench.machine_faults import STANDS, MachineFault, fault_found
 from ldcnd.bench.tuning.ldcn.plant import FULL_PWM
 from ldcnd.bench.tuning.ldcn.response import Start, TrapezoidMove
 from ldcnd.contract.errors import DriveFault, ValueOutOfRange
@@ -62,6 +63,17 @@ SOFT_DERIVATIVE_TICKS = 8
 STIFF_S = 0.3
 BOTH_WAYS = 2
 """Records of a move: one there, one back."""
+FELL_COUNTS = 10
+FELL_SHARE = 0.1
+"""An axis that goes farther than both by itself when the loop opens, falls: counts, and share of its move."""
+NOT_FOLLOWING = (
+    MachineFault.BRAKE,
+    MachineFault.AT_END,
+    MachineFault.HEAVY,
+    MachineFault.COUPLING,
+    MachineFault.NO_SUPPLY,
+    MachineFault.LOAD_HANGS,
+)
 MOST_ERROR_LIMIT = 0x3FFF
 """Largest EL that `set_gains` takes, counts; some drives would take more."""
 
@@ -240,6 +252,7 @@ class Excitation:
         counts, cycle_s = self.pulse_counts, self._profile.servo_cycle_s
         limit = min(PULSE_TICKS * counts + margin, MOST_ERROR_LIMIT)
         silent = [1, -1]
+        fell_counts = 0
         for halvings in reversed(range(most.bit_length())):
             self.level = most >> halvings
             for direction in tuple(silent):  # a load may make one of them easier
@@ -249,22 +262,25 @@ class Excitation:
                 shown = yield self._trial(Purpose.PULSE, gains, move, PULSE_S)
                 gone = self._account(shown) * direction
                 if gone <= -SEEN_COUNTS:
-                    raise DriveFault(
-                        f"the axis moved by {gone:+d} counts against an output of {self.level} of {FULL_PWM} PWM steps",
-                        value=gone,
-                        remedy="swap the motor's leads or the encoder's tracks; or a load pulled it away: hold that by"
-                        " other means",
+                    seen = (
+                        f"the axis moved by {gone:+d} counts against an output of {self.level} of {FULL_PWM} PWM steps"
                     )
+                    raise fault_found(seen, MachineFault.REVERSED, MachineFault.CARRIED, value=gone)
                 if gone >= SEEN_COUNTS:
                     silent.remove(direction)
+                    fell_counts = gone - direction * shown.rest_counts
             if not silent:
                 return ()
-        raise DriveFault(
-            f"the encoder counted nothing at {most} of {FULL_PWM} PWM steps, {PULSE_TICKS} servo ticks long",
-            value=most,
-            remedy="check the encoder, the motor's leads, its supply and the brake; more output would take a motor"
-            " without an encoder farther than this tuning may go, so allow more distance if all of that is right",
-        )
+        output = f"{most} of {FULL_PWM} PWM steps, {PULSE_TICKS} servo ticks long"
+        if len(silent) == 1:
+            way = "back" if silent == [-1] else "forward"
+            if fell_counts >= SEEN_COUNTS:
+                seen = f"the axis moved, fell back by {fell_counts} counts, and did not move {way} with {output}"
+                raise fault_found(seen, MachineFault.LOAD_HANGS, value=fell_counts)
+            raise fault_found(f"the axis did not move {way} with {output}", MachineFault.AT_END, value=most)
+        # more would take a motor without an encoder farther than this tuning may go
+        seen = f"the encoder counted nothing at {output}; a larger distance allows more"
+        raise fault_found(seen, *STANDS, MachineFault.AT_END, MachineFault.LOAD_HANGS, value=most)
 
     def soft(self) -> Trials:
         """Move there and back by a fourth of the distance, with more output each time until the axis follows.
@@ -307,11 +323,8 @@ class Excitation:
                 lasts_s *= 2
             else:
                 level *= SOFT_STEP
-        raise DriveFault(
-            f"the axis does not follow with {MOST_SOFT_LEVEL} of {FULL_PWM} PWM steps",
-            value=MOST_SOFT_LEVEL,
-            remedy="look for a brake, a jam or a missing supply",
-        )
+        seen = f"the axis does not follow with {MOST_SOFT_LEVEL} of {FULL_PWM} PWM steps"
+        raise fault_found(seen, *NOT_FOLLOWING, value=MOST_SOFT_LEVEL)
 
     def stiff(self, gains: Gains) -> Trials:
         """Move there and back by an eighth of the distance with stiff gains, without their integral.
@@ -378,13 +391,15 @@ class Excitation:
         gone = max(positions, key=abs)
         self.farthest_counts = max(self.farthest_counts, *(abs(self.offset_counts + each) for each in positions))
         self.offset_counts += shown.rest_counts
+        fell = shown.rest_counts - shown.record.positions[-1]
+        if shown.record.ends_at_rest and not shown.tripped and abs(fell) > max(FELL_COUNTS, abs(gone) * FELL_SHARE):
+            raise fault_found(
+                f"the axis fell by {fell:+d} counts when the loop opened", MachineFault.LOAD_HANGS, value=fell
+            )
         if abs(shown.rest_counts) >= SEEN_COUNTS:
             self._slack = 1.0 if shown.rest_counts > 0 else 0.0
         return gone
 
 
 def _gave_up(what: str) -> DriveFault:
-    return DriveFault(
-        f"the drive opened its loop in {what}: the axis did not follow",
-        remedy="look for an obstacle, a load that pulls, or a loose encoder; then reset and tune again",
-    )
+    return fault_found(f"the drive opened its loop in {what}: the axis did not follow", *NOT_FOLLOWING)

@@ -1,0 +1,225 @@
+"""Reading the configuration of a running daemon again: what would change, what is taken, what needs a restart.
+
+A reload takes changes that affect only later commands and polls: limits, velocities and accelerations that requests
+omit, polling rates and priorities. A motion under way keeps the values that it was started with. All the rest says
+where drives are, what they are, or how the daemon was built, and needs a restart.
+"""
+
+import asyncio
+import hashlib
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from pydantic import BaseModel, ValidationError
+
+from ldcnd.config.plan import require_plan
+from ldcnd.config.rig import RigConfig
+from ldcnd.contract.errors import ConfigError, WrongState
+from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.rig_commands import ConfigChange, Reload, ReloadReply
+from ldcnd.daemon.daemon import Daemon
+from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.line_config import BusConfig
+from ldcnd.log import get_logger
+
+log = get_logger("reload")
+
+RELOAD_TIME_S = 10.0
+"""A configuration that takes longer to be read is given up: TimeoutStartSec= bounds a reload, too."""
+LONGEST_VALUE = 120
+MOST_CHANGES = 100
+"""What a reply names; of more changes the rest is in the log."""
+
+
+class Reloader:
+    """Reads the configuration again, for a signal or a client; one at a time.
+
+    Args:
+        daemon: which runs with it.
+        load: reads the configuration, as it was read at the start.
+    """
+
+    def __init__(self, daemon: Daemon, load: Callable[[], RigConfig]) -> None:
+        self._daemon = daemon
+        self._load = load
+        self._one_at_a_time = asyncio.Lock()
+
+    async def reload(self) -> "ReloadPlan":
+        """Take what can be taken.
+
+        Raises:
+            ConfigError: the file cannot be read, or makes no configuration; the running one stays.
+        """
+        async with self._one_at_a_time:
+            reload, budget = await self._read()
+            self._take(reload, budget)
+            return reload
+
+    async def answer(self, command: Reload, admit: Callable[[str], None]) -> ReloadReply:
+        """Answer a client: what a reload would change, or has changed.
+
+        Args:
+            command: the request.
+            admit: raises when another client controls an axis.
+
+        Raises:
+            ConfigError: as `reload`.
+            WrongState: the file is another one than the client has seen.
+            LeaseHeld: another client controls an axis whose settings would change.
+        """
+        async with self._one_at_a_time:
+            reload, budget = await self._read()
+            if not command.dry_run:
+                if command.revision not in (None, reload.revision):
+                    raise WrongState(
+                        "the configuration was changed again since its changes were shown",
+                        value=command.revision,
+                        limit=reload.revision,
+                        remedy="look at the changes again, then reload",
+                    )
+                for axis in reload.axes:
+                    admit(axis)
+                self._take(reload, budget)
+            return ReloadReply(
+                changes=reload.changes[:MOST_CHANGES],
+                more=max(0, len(reload.changes) - MOST_CHANGES),
+                applied=not command.dry_run,
+                revision=reload.revision,
+            )
+
+    async def _read(self) -> "tuple[ReloadPlan, RigBudget]":
+        """Read and judge the file, beside the loop: lines go on meanwhile."""
+        try:
+            async with asyncio.timeout(RELOAD_TIME_S):
+                return await asyncio.to_thread(self._prepare, self._daemon.config)
+        except TimeoutError:
+            raise ConfigError(f"the configuration cannot be read within {RELOAD_TIME_S:g} s") from None
+
+    def _prepare(self, running: RigConfig) -> "tuple[ReloadPlan, RigBudget]":
+        reload = plan_reload(running, self._load())
+        return reload, require_plan(reload.config)
+
+    def _take(self, reload: "ReloadPlan", budget: RigBudget) -> None:
+        self._daemon.reconfigure(reload.config, budget)
+        log.info("configuration reloaded", changed=reload.changed)
+        if reload.refused:
+            log.warning("changes need a restart", keys=reload.refused)
+
+
+@dataclass(frozen=True, slots=True)
+class ReloadPlan:
+    """The effect of a changed configuration.
+
+    Attributes:
+        config: to run with from now on.
+        changes: every key that differs in the file; those that need a restart keep their value until then.
+        revision: of the file, as it was read.
+    """
+
+    config: RigConfig
+    changes: tuple[ConfigChange, ...]
+    revision: str
+
+    @property
+    def changed(self) -> tuple[str, ...]:
+        """Keys that have another value from now on."""
+        return tuple(each.key for each in self.changes if not each.restart)
+
+    @property
+    def refused(self) -> tuple[str, ...]:
+        """Keys that differ in the file and keep their value until the daemon is started again."""
+        return tuple(each.key for each in self.changes if each.restart)
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Axes that get another value."""
+        names = [axis.name for bus in self.config.bus for axis in bus.axis]
+        return tuple(name for name in names if any(f".axis.{name}." in key for key in self.changed))
+
+
+def plan_reload(running: RigConfig, wanted: RigConfig) -> ReloadPlan:
+    """Decide which changes apply.
+
+    Keys name buses and axes: `bus.line0.axis.x.limits.velocity`; a bus or axis that was added or removed is one key.
+
+    Raises:
+        ConfigError: what can be changed contradicts what cannot, such as a velocity limit that the bounds of `track`
+            no longer keep.
+    """
+    wanted_buses = {bus.name: bus for bus in wanted.bus}
+    buses = tuple(_bus(bus, wanted_buses.get(bus.name, bus)) for bus in running.bus)
+    config = running.model_copy(update={"bus": buses})
+    changes = (
+        *_differences(running, config, "", restart=False),
+        *_differences(config, wanted, "", restart=True),
+    )
+    revision = hashlib.sha256(wanted.model_dump_json().encode()).hexdigest()[:16]
+    return ReloadPlan(config, changes, revision)
+
+
+def _bus(running: BusConfig, wanted: BusConfig) -> BusConfig:
+    if running.family != wanted.family:
+        return running
+    wanted_axes = {axis.name: axis for axis in wanted.axis}
+    axes = tuple(_axis(axis, wanted_axes.get(axis.name, axis)) for axis in running.axis)
+    return running.model_copy(update={"axis": axes})
+
+
+def _axis(running: AxisConfig, wanted: AxisConfig) -> AxisConfig:
+    """Take the keys over, unless a unit means something else than before: then every number does."""
+    if not running.reloadable or (running.unit, running.counts_per_unit, running.direction) != (
+        wanted.unit,
+        wanted.counts_per_unit,
+        wanted.direction,
+    ):
+        return running
+    merged = running.model_copy(update={key: getattr(wanted, key) for key in running.reloadable})
+    try:
+        return type(running).model_validate(merged.model_dump())
+    except ValidationError as error:
+        reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors())
+        raise ConfigError(
+            f"axis {running.name}: what needs no restart cannot work without what does: {reasons}", axis=running.name
+        ) from error
+
+
+def _differences(one: object, other: object, key: str, *, restart: bool) -> Iterator[ConfigChange]:
+    """Yield where two parts of a configuration differ, as deep down as it can be named."""
+    if one == other:
+        return
+    if isinstance(one, BaseModel) and isinstance(other, BaseModel):
+        for name in type(one).model_fields:
+            below = f"{key}.{name}" if key else name
+            yield from _differences(getattr(one, name), getattr(other, name), below, restart=restart)
+        return
+    ours, theirs = _by_name(one), _by_name(other)
+    if ours is None or theirs is None or list(ours) == list(theirs) == []:
+        yield _change(key, one, other, restart=restart)
+        return
+    for name in ours | theirs:
+        yield from _differences(ours.get(name), theirs.get(name), f"{key}.{name}", restart=restart)
+    if list(ours) != list(theirs) and ours.keys() == theirs.keys():
+        yield _change(key, list(ours), list(theirs), restart=restart)  # only their order has changed
+
+
+def _change(key: str, before: object, after: object, *, restart: bool) -> ConfigChange:
+    return ConfigChange(key=key, before=_shown(before), after=_shown(after), restart=restart)
+
+
+def _shown(value: object) -> str | None:
+    """Return a value as text; a part with a name is known by that."""
+    if value is None:
+        return None
+    if isinstance(value, BaseModel):
+        value = getattr(value, "name", None) or value.model_dump(mode="json", exclude_none=True)
+    text = json.dumps(value, default=str, ensure_ascii=False)
+    return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]} ..."
+
+
+def _by_name(items: object) -> dict[str, BaseModel] | None:
+    """Return the parts of a list that are known by name, or None for anything else."""
+    if not isinstance(items, Sequence) or isinstance(items, str):
+        return None
+    named = {str(getattr(item, "name", "")): item for item in items if isinstance(item, BaseModel)}
+    return named if len(named) == len(items) and "" not in named else None
