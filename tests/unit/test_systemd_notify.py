@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import MoveAbsolute, Power
-from ldcnd.contract.errors import ConfigError, VelocityLimit
+from ldcnd.contract.errors import ConfigError, LeaseHeld, VelocityLimit, WrongState
+from ldcnd.contract.rig_commands import Reload
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
@@ -245,6 +247,51 @@ async def test_reload_is_framed_and_changes_limits_at_once(manager: Manager):
     assert messages[0] == "RELOADING=1\nMONOTONIC_USEC=1234567"
     assert messages[1].startswith("READY=1\nSTATUS=rig sim: 1/1 buses")
     assert reply.velocity == pytest.approx(4.0, rel=0.01)
+
+
+async def test_a_client_is_shown_what_a_reload_changes_and_gets_that(manager: Manager):
+    config = load_config(SIMULATED)
+    gains = config.bus[0].axis[0].gains.model_copy(update={"kp": 351})
+    files = [with_axis(config, "x", velocity=4.0, gains=gains)]
+    async with service_of(manager, lambda: files[-1]) as (_, daemon, client):
+        await daemon.wait_up()
+        rig = Rig(client, await client.daemon())
+        shown = await rig.reload(dry_run=True)
+        info = next(each for each in await rig.describe() if each.axis == "x")
+        files.append(with_axis(files[-1], "x", velocity=3.0))
+        with pytest.raises(WrongState, match="changed again"):
+            await rig.reload(revision=shown.revision)
+        files.pop()
+        async with rig.control("x", client="ann"):
+            with pytest.raises(LeaseHeld, match="axis x is controlled by ann"):
+                await client.ask(Reload())
+            await client.command("x", Power(on=False))  # open to all, as ever
+        done = await rig.reload(revision=shown.revision)
+        taken = daemon.config.bus[0].axis[0]
+        again = await rig.reload(dry_run=True)
+
+    assert not shown.applied
+    assert info.axis == "x"
+    assert [(each.key, each.before, each.after, each.restart) for each in shown.changes] == [
+        ("bus.line0.axis.x.velocity", "20.0", "4.0", False),
+        ("bus.line0.axis.x.gains.kp", "350", "351", True),
+    ]
+    assert done.applied
+    assert done.changes == shown.changes
+    assert (taken.velocity, taken.gains.kp) == (4.0, 350)
+    assert [each.key for each in again.changes] == ["bus.line0.axis.x.gains.kp"]
+
+
+async def test_a_file_that_makes_no_configuration_is_refused_and_the_daemon_goes_on(manager: Manager):
+    def load() -> RigConfig:
+        raise ConfigError("bus[0].axis[0].velocity: must be above 0")
+
+    async with service_of(manager, load) as (_, daemon, client):
+        await daemon.wait_up()
+        with pytest.raises(ConfigError, match="must be above 0"):
+            await Rig(client, await client.daemon()).reload()
+
+        assert daemon.config == load_config(SIMULATED)
 
 
 async def test_reload_does_not_touch_a_motion(manager: Manager):
