@@ -348,7 +348,7 @@ class ConfigChange(Frozen):
     after: str | None
     """Value in the file; null where there is none."""
     restart: bool
-    """Only a restart of the daemon takes it."""
+    """Whether only a restart of the daemon takes it."""
 
 
 class ReloadReply(Frozen):
@@ -359,7 +359,7 @@ class ReloadReply(Frozen):
     more: int = Field(default=0, ge=0)
     """Number of further keys that differ."""
     applied: bool
-    """The changes that need no restart are in use."""
+    """Whether the changes that need no restart are in use."""
     revision: str
     """Revision of the file as it was read, for a request that applies what was shown."""
 
@@ -372,7 +372,7 @@ class Reload(Command[ReloadReply]):
     answer_s = 15.0
 
     dry_run: bool = False
-    """Only name the changes."""
+    """Whether the changes are only named."""
     revision: str | None = Field(default=None, max_length=64)
     """Revision whose changes were shown; with another one in the file the request is refused."""
     leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
