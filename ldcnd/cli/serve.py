@@ -1,6 +1,7 @@
 """Programs that show a rig to others until they are ended: browsers, Prometheus, EPICS, ROS 2, Foxglove."""
 
 import asyncio
+import re
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -256,13 +257,18 @@ HIGHEST_DOMAIN = 232
 @click.argument("axes", nargs=-1)
 @click.option("--router", required=True, help="Zenoh endpoint of the ROS graph's router, such as tcp/127.0.0.1:7447.")
 @click.option("--domain", type=WholeNumber(0, HIGHEST_DOMAIN), default=0, show_default=True, envvar="ROS_DOMAIN_ID")
+@click.option("--namespace", default="/", show_default=True, help="Of the node and of joint_states, such as /lab.")
 @with_target
-def ros2(target: Target, axes: tuple[str, ...], router: str, domain: int) -> None:
-    """Publish AXES (all of them by default) on /joint_states and /diagnostics until SIGTERM or SIGINT; read-only."""
-    target.run(lambda client: _serve_ros2(client, axes, router, domain))
+def ros2(target: Target, axes: tuple[str, ...], router: str, domain: int, namespace: str) -> None:
+    """Publish AXES (all of them by default) on joint_states and /diagnostics until SIGTERM or SIGINT; read-only."""
+    if not re.fullmatch(r"/|(/[A-Za-z_][A-Za-z0-9_]*)+", namespace):
+        raise click.BadParameter(
+            "a namespace is / or names behind slashes, such as /lab/stage", param_hint="--namespace"
+        )
+    target.run(lambda client: _serve_ros2(client, axes, router, domain, namespace))
 
 
-async def _serve_ros2(client: RigClient, axes: tuple[str, ...], router: str, domain: int) -> None:
+async def _serve_ros2(client: RigClient, axes: tuple[str, ...], router: str, domain: int, namespace: str) -> None:
     from ldcnd.lab.ros2.bridge import run_bridge  # noqa: PLC0415
     from ldcnd.net.zenoh_session import open_zenoh_session  # noqa: PLC0415 - loads Zenoh
     from ldcnd.net.zenoh_settings import ZenohSettings  # noqa: PLC0415
@@ -275,7 +281,7 @@ async def _serve_ros2(client: RigClient, axes: tuple[str, ...], router: str, dom
             )
     endpoint = endpoint_of(router)
     async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
-        running = asyncio.create_task(run_bridge(rig, session, axes, domain), name="bridge")
+        running = asyncio.create_task(run_bridge(rig, session, axes, domain, namespace), name="bridge")
         on_end(lambda: _cancel(running))
         click.echo(f"rig {rig.name} in ROS domain {domain} through {endpoint}")
         try:

@@ -17,6 +17,7 @@ from ldcnd.contract.samples import (
     Quality,
     Sample,
     StateSample,
+    TelemetryItem,
     VelocitySample,
 )
 from ldcnd.lab.ros2.cdr import DIAGNOSTIC_ARRAY, JOINT_STATE, DiagnosticArray, DiagnosticStatus, JointState
@@ -46,11 +47,15 @@ class Bridge:
         self._rig = rig
         self.axes = axes
         self._velocities: dict[str, VelocitySample] = {}
+        self._round: dict[str, PositionSample] = {}  # since the last message
         self._states: dict[str, StateSample] = {}
         self._faults: dict[str, FaultSample] = {}
 
     def take(self, axis: str, sample: Sample) -> JointState | None:
-        """Take a sample; return the joint state that it makes, if it is a position that was measured."""
+        """Take a sample; return the state of all joints that it completes, if it is a position that was measured.
+
+        Joints of which nothing is known, and axes that have none, are not waited for.
+        """
         match sample:
             case VelocitySample():
                 self._velocities[axis] = sample
@@ -59,16 +64,42 @@ class Bridge:
             case FaultSample():
                 self._faults[axis] = sample
             case PositionSample() if sample.unit in SI and self._is_known(axis, sample):
-                scale = SI[sample.unit]  # of the daemon that has measured it, which may have another unit than before
-                velocity = self._velocities.get(axis)
-                is_fresh = (
-                    velocity is not None
-                    and velocity.unit == f"{sample.unit}/s"
-                    and abs(sample.t - velocity.t) <= FRESH_NS
-                )
-                velocities = (velocity.value * scale,) if velocity and is_fresh else ()
-                return JointState(sample.t, (axis,), (sample.value * scale,), velocities)
+                made = self._joints() if axis in self._round else None  # of a joint that is late: it is in the next one
+                self._round[axis] = sample
+                if made is None and self._round.keys() >= self._awaited():
+                    made = self._joints()
+                return made
         return None
+
+    def _awaited(self) -> set[str]:
+        """Return the axes whose places are known, and which have therefore a position in each round."""
+        return {
+            name
+            for name, info in self.axes.items()
+            if info.unit in SI
+            and name in self._states
+            and assess(self._states[name], self._faults.get(name)).place is Place.KNOWN
+        }
+
+    def _joints(self) -> JointState:
+        """Return the positions of a round, and the velocities if there is one of each joint."""
+        positions, self._round = self._round, {}
+        names = tuple(name for name in self.axes if name in positions)
+        scales = [SI[positions[name].unit] for name in names]  # of the daemon that has measured it, not as described
+        velocities = [self._velocity(name, positions[name]) for name in names]
+        known = tuple(each * scale for each, scale in zip(velocities, scales, strict=True) if each is not None)
+        return JointState(
+            max(sample.t for sample in positions.values()),
+            names,
+            tuple(positions[name].value * scale for name, scale in zip(names, scales, strict=True)),
+            known if len(known) == len(names) else (),
+        )
+
+    def _velocity(self, axis: str, position: PositionSample) -> float | None:
+        velocity = self._velocities.get(axis)
+        if velocity is None or velocity.unit != f"{position.unit}/s" or abs(position.t - velocity.t) > FRESH_NS:
+            return None
+        return velocity.value
 
     def diagnostics(self, now_ns: int) -> DiagnosticArray:
         """Return a report on every axis."""
@@ -97,7 +128,7 @@ class Bridge:
         return DiagnosticStatus(level, f"{self._rig}: {axis}", message, f"{info.bus}/{info.address}", values)
 
 
-async def run_bridge(rig: Rig, session: Session, axes: tuple[str, ...], domain: int) -> None:
+async def run_bridge(rig: Rig, session: Session, axes: tuple[str, ...], domain: int, namespace: str = "/") -> None:
     """Publish until cancelled.
 
     Args:
@@ -105,15 +136,16 @@ async def run_bridge(rig: Rig, session: Session, axes: tuple[str, ...], domain: 
         session: with the router of the ROS graph.
         axes: which axes; all of them when none is named.
         domain: the ROS domain.
+        namespace: of the node and its topics.
     """
     infos = {info.axis: info for info in await rig.describe() if not axes or info.axis in axes}
     bridge = Bridge(rig.name, infos)
-    node = RosNode(domain, f"ldcnd_{rig.name}", secrets.token_hex(16))
+    node = RosNode(domain, f"ldcnd_{rig.name}", secrets.token_hex(16), namespace)
     async with AsyncExitStack() as declared:
         declared.push_async_callback((await session.declare_token(node.token)).close)
         publishers: list[RosPublisher] = []
         for entity, (topic, message) in enumerate(
-            (("/joint_states", JOINT_STATE), ("/diagnostics", DIAGNOSTIC_ARRAY)), 1
+            ((node.topic("joint_states"), JOINT_STATE), ("/diagnostics", DIAGNOSTIC_ARRAY)), 1
         ):
             publisher, token = await advertise(session, node, entity, topic, message)
             declared.push_async_callback(token.close)
@@ -131,6 +163,11 @@ async def _descriptions(rig: Rig, bridge: Bridge, axes: tuple[str, ...]) -> None
 
 async def _joints(rig: Rig, bridge: Bridge, publisher: RosPublisher) -> None:
     async with rig.samples() as samples:
+        for axis in bridge.axes:
+            for item in (TelemetryItem.STATE, TelemetryItem.FAULT, TelemetryItem.VELOCITY):
+                last = await rig.latest(axis, item)
+                if last:
+                    bridge.take(axis, last)  # a first message waits for no change, and has velocities
         async for axis, sample in samples:
             if axis in bridge.axes and (message := bridge.take(axis, sample)):
                 publisher.publish(message.payload, message.t)

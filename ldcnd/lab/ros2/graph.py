@@ -19,29 +19,34 @@ GID_BYTES = 16
 
 @dataclass(frozen=True, slots=True)
 class RosNode:
-    """A node in the root namespace.
+    """A node.
 
     Attributes:
         domain: the ROS domain, 0 to 232.
         name: of the node.
         session_id: names its session, in hexadecimal.
+        namespace: of the node and its topics, such as `/lab`; the root otherwise.
     """
 
     domain: int
     name: str
     session_id: str
+    namespace: str = "/"
 
     @property
     def token(self) -> str:
         """The key of its liveliness token."""
-        return f"@ros2_lv/{self.domain}/{self.session_id}/0/0/NN/%/%/{self.name}"
+        return f"@ros2_lv/{self.domain}/{self.session_id}/0/0/NN/%/{_mangled(self.namespace)}/{self.name}"
+
+    def topic(self, name: str) -> str:
+        """Return the whole name of a topic in the node's namespace."""
+        return f"{self.namespace.rstrip('/')}/{name}"
 
     def publisher_token(self, entity: int, topic: str, message: MessageType) -> str:
         """Return the key of the liveliness token of one of its publishers, such as of `/joint_states`."""
-        mangled = topic.replace("/", "%")
         return (
-            f"@ros2_lv/{self.domain}/{self.session_id}/0/{entity}/MP/%/%/{self.name}/{mangled}"
-            f"/{message.name}/{message.type_hash}/{QOS}"
+            f"@ros2_lv/{self.domain}/{self.session_id}/0/{entity}/MP/%/{_mangled(self.namespace)}/{self.name}"
+            f"/{_mangled(topic)}/{message.name}/{message.type_hash}/{QOS}"
         )
 
     def topic_key(self, topic: str, message: MessageType) -> str:
@@ -99,6 +104,10 @@ def attachment_of(number: int, t: int, gid: bytes) -> bytes:
             gid,
         )
     )
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")
 
 
 def _text(text: str) -> bytes:
