@@ -23,6 +23,7 @@ CALLS: Mapping[str, tuple[str, str]] = MappingProxyType(
         "connect": ("ldcnd.client.rig", "connect"),
         "connect_blocking": ("ldcnd.client.blocking", "connect"),
         "open": ("ldcnd.client.blocking", "open_rig"),
+        "recording": ("ldcnd.lab.recording.tables", "recording"),
     }
 )
 """The functions: where each is."""

@@ -14,6 +14,7 @@ EXTRAS = {
     "mcap": ("mcap", "lab"),
     "numpy": ("numpy", "bench"),
     "prometheus_client": ("prometheus-client", "lab"),
+    "pyarrow": ("pyarrow", "parquet"),
     "starlette": ("starlette", "console"),
     "textual": ("textual", "tui"),
     "uvicorn": ("uvicorn", "console"),

@@ -83,12 +83,13 @@ def recover_file(damaged: Path, whole: Path) -> None:
 @record.command("export")
 @click.argument("recording", type=RECORDING)
 @click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
-def export(recording: Path, folder: Path) -> None:
+@click.option("--parquet", is_flag=True, help="Parquet files instead of CSV.")
+def export(recording: Path, folder: Path, parquet: bool) -> None:  # noqa: FBT001 - click's
     """Write RECORDING into FOLDER as CSV: a table for each topic, a row for each message, a column for each value."""
-    require("mcap")
+    require("mcap", *(["pyarrow"] if parquet else []))
     from ldcnd.lab.recording.tables import export_tables  # noqa: PLC0415 - needs an optional package
 
-    done = export_tables(recording, folder)
+    done = export_tables(recording, folder, parquet=parquet)
     click.echo(f"{done.rows} messages in {len(done.tables)} tables in {folder}")
     if done.damages:
         tell_damages(recording, done.damages)

@@ -5,6 +5,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+from ldcnd.client.notebook import table
 from ldcnd.client.rig_client import CHECK_PERIOD_S
 from ldcnd.contract.commands import CommandReply, Jog
 from ldcnd.contract.condition import Condition, assess
@@ -245,6 +246,21 @@ class Motion:
         if state.link is LinkState.DOWN:
             raise OutcomeUnknown(f"axis {self._axis.name}: the drive does not answer any more", axis=self._axis.name)
         return state.command is not None and state.command.command_id == self.command_id
+
+    def _repr_html_(self) -> str:
+        """Return what it is and how it has ended as a table, for notebooks."""
+        reply, ended = self.reply, self.ended
+        unit = self._axis.position.unit
+        values = {
+            "target": (reply.position, unit),
+            "velocity": (reply.velocity, f"{unit}/s"),
+            "acceleration": (reply.acceleration, f"{unit}/s2"),
+            "duration": (reply.duration_s, "s"),
+            "ended at": (ended.position if ended else None, unit),
+            "following error": (ended.following_error if ended else None, unit),
+        }
+        rows = [(name, f"{value:g} {per}") for name, (value, per) in values.items() if value is not None]
+        return table(f"{reply.verb} of {reply.axis}: {'ended' if ended else 'accepted'}", rows)
 
     def __repr__(self) -> str:
         target = "" if self.reply.position is None else f" to {self.reply.position:g}"

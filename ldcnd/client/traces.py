@@ -5,7 +5,7 @@ import csv
 import io
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from ldcnd.client.notebook import panes
@@ -40,9 +40,18 @@ class Trace:
     """
 
     header: TraceHeader
-    offsets_ns: tuple[int, ...]
-    values: tuple[tuple[float | None, ...], ...]
-    raw: tuple[tuple[int | float | None, ...], ...]
+    offsets_ns: tuple[int, ...] = field(repr=False)
+    values: tuple[tuple[float | None, ...], ...] = field(repr=False)
+    raw: tuple[tuple[int | float | None, ...], ...] = field(repr=False)
+
+    def table(self) -> dict[str, tuple[int | float | None, ...]]:
+        """Return the columns by their titles, `offset_ns` the first one, for `pandas.DataFrame` and `pyarrow.table`.
+
+        None stands where the drive did not say.
+        """
+        titles = [column_title(each.name, each.unit) for each in self.header.channels]
+        columns = (self.offsets_ns, *self.values, *self.raw)
+        return dict(zip(("offset_ns", *titles, *self.header.raw_columns), columns, strict=True))
 
     def _repr_html_(self) -> str:
         """Return its channels as curves, for notebooks."""
@@ -256,14 +265,12 @@ def trace_as_json(trace: Trace) -> str:
 
 def trace_as_csv(trace: Trace) -> str:
     """Return a trace as a table."""
-    header = trace.header
-    titles = ["offset_ns", *(column_title(each.name, each.unit) for each in header.channels), *header.raw_columns]
-    columns = (trace.offsets_ns, *trace.values, *trace.raw)
+    columns = trace.table()
     text = io.StringIO()
-    text.write(f"{MARK}{header.model_dump_json()}\n")
+    text.write(f"{MARK}{trace.header.model_dump_json()}\n")
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(titles)
-    writer.writerows(zip(*columns, strict=True))
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
     return text.getvalue()
 
 

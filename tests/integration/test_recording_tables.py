@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+import ldcnd
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.events import CommandStatus
@@ -51,6 +52,22 @@ async def test_each_topic_becomes_a_table_whose_columns_are_its_values(tmp_path)
     assert float(rows(folder, "meta.health.line0")[-1]["axes.0.rate_hz"]) > 10
     assert json.loads(rows(folder, "tele.x.fault")[0]["active"]) == []
     assert rows(folder, "tele.x.event")[-1]["event.status"] == CommandStatus.DONE
+
+
+async def test_a_topic_is_columns_of_the_same_length(tmp_path):
+    await record_a_move(tmp_path / "run.mcap")
+    tables = ldcnd.recording(tmp_path / "run.mcap")
+    positions, states = tables.table("tele/x/position"), tables.table("/ldcn/sim/tele/x/state")
+
+    assert tables.topics["/ldcn/sim/tele/x/position"] == len(positions["value"]) > 50
+    assert list(positions)[:2] == ["t_ns", "received_ns"]
+    assert positions["value"][-1] == pytest.approx(5.0, abs=0.01)
+    assert {len(column) for column in states.values()} == {len(states["t_ns"])}
+    assert None in states["command.command_id"]
+    with pytest.raises(ConfigError, match="several topics"):
+        tables.table("position")
+    with pytest.raises(ConfigError, match="no topic"):
+        tables.table("tele/q/position")
 
 
 async def test_of_a_damaged_recording_the_rest_is_exported_and_it_says_so(tmp_path):

@@ -36,6 +36,7 @@ OTHERS = {
     "logging_journald",
     "mcap",
     "prometheus_client",
+    "pyarrow",
     "serial",
     "serial_asyncio",
     "uvloop",

@@ -1,9 +1,11 @@
-"""Recordings as CSV: one table for each topic, one row for each message, one column for each value."""
+"""Recordings as tables, in memory, CSV or Parquet: one for each topic, with rows of messages and columns of values."""
 
 import csv
 import json
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 from mcap.records import Channel, Message
@@ -38,56 +40,170 @@ class Exported:
     damages: tuple[Damage, ...]
 
 
-def export_tables(path: Path, folder: Path) -> Exported:
+class RecordedTables:
+    """The topics of a recording as tables; made by `recording`.
+
+    Attributes:
+        path: the recording.
+        damages: what could not be read of it when it was read last.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._recording = Recording(path)
+
+    @property
+    def damages(self) -> tuple[Damage, ...]:
+        """What could not be read, in order."""
+        return tuple(self._recording.damages)
+
+    @cached_property
+    def topics(self) -> dict[str, int]:
+        """The topics, and how many messages each has.
+
+        Raises:
+            ConfigError: the file is no recording.
+        """
+        return dict(Counter(topic for topic, _, _ in _rows(self._recording)))
+
+    def table(self, topic: str) -> dict[str, list[Cell]]:
+        """Return the messages of a topic as columns of the same length, for `pandas.DataFrame` and `pyarrow.table`.
+
+        The first ones are `t_ns`, when the value was true, and `received_ns`, when it was recorded, both UTC in ns
+        since 1970; None stands where a message has nothing.
+
+        Args:
+            topic: such as `/ldcn/sim/tele/x/position`; its end is enough when no other topic ends so.
+
+        Raises:
+            ConfigError: there is no such topic, or several.
+        """
+        found = [name for name in self.topics if name == topic] or [
+            name for name in self.topics if name.endswith(f"/{topic.strip('/')}")
+        ]
+        if len(found) != 1:
+            raise ConfigError(
+                f"{self.path}: {'several topics end' if found else 'no topic ends'} in {topic}: "
+                f"{', '.join(found or self.topics)}",
+                value=topic,
+            )
+        rows = [_row(message, cells) for name, message, cells in _rows(self._recording) if name == found[0]]
+        names = dict.fromkeys(name for row in rows for name in row)
+        return {name: [row.get(name) for row in rows] for name in names}
+
+
+def recording(path: Path | str) -> RecordedTables:
+    """Return the tables of a recording, which is read when one of them is."""
+    return RecordedTables(Path(path))
+
+
+def export_tables(path: Path, folder: Path, *, parquet: bool = False) -> Exported:
     """Write a recording into a folder, a table for each topic.
 
     Objects become columns with dotted names, lists of objects likewise with numbers; a list of plain values is one
     cell, in JSON. The recording is read twice, because a column may first be needed in its last message.
+
+    Args:
+        path: the recording.
+        folder: where to.
+        parquet: Parquet files instead of CSV.
 
     Raises:
         ConfigError: the file is no recording; a table exists already.
         OSError: a file cannot be read or written.
     """
     recording = Recording(path)
-    columns: dict[str, dict[str, None]] = {}
-    for topic, _, cells in _rows(recording):
-        columns.setdefault(topic, {}).update(dict.fromkeys(cells))
+    columns: dict[str, dict[str, set[type]]] = {}
+    for topic, message, cells in _rows(recording):
+        kinds = columns.setdefault(topic, {})
+        for name, cell in _row(message, cells).items():
+            kinds.setdefault(name, set()).add(type(cell))
     folder.mkdir(parents=True, exist_ok=True)
-    tables = {topic: _Table(_file_of(topic, folder), tuple(columns[topic])) for topic in columns}
+    kind, suffix = (_ParquetTable, "parquet") if parquet else (_CsvTable, "csv")
+    tables = {topic: kind(_file_of(topic, folder, suffix), columns[topic]) for topic in columns}
     rows = 0
     for topic, message, cells in _rows(recording):
-        tables[topic].add({T_NS: message.publish_time, RECEIVED_NS: message.log_time, **cells})
+        tables[topic].add(_row(message, cells))
         rows += 1
     for table in tables.values():
-        table.write()
+        table.end()
     return Exported(tuple(table.path for table in tables.values()), rows, tuple(recording.damages))
 
 
 class _Table:
     """One file, and the rows that are not in it yet."""
 
-    def __init__(self, path: Path, columns: tuple[str, ...]) -> None:
+    def __init__(self, path: Path, columns: Mapping[str, set[type]]) -> None:
         self.path = path
-        self._columns = (T_NS, RECEIVED_NS, *columns)
+        self._columns = columns
         self._rows: list[dict[str, Cell]] = []
-        with path.open("x", encoding="utf-8") as stream:
-            csv.writer(stream, lineterminator="\n").writerow(self._columns)
 
     def add(self, row: dict[str, Cell]) -> None:
         """Take a row."""
         self._rows.append(row)
         if len(self._rows) == BLOCK_ROWS:
-            self.write()
+            self._write(self._rows)
+            self._rows.clear()
 
-    def write(self) -> None:
+    def end(self) -> None:
         """Write the rows there are."""
+        self._write(self._rows)
+
+    def _write(self, rows: list[dict[str, Cell]]) -> None:
+        raise NotImplementedError
+
+
+class _CsvTable(_Table):
+    def __init__(self, path: Path, columns: Mapping[str, set[type]]) -> None:
+        super().__init__(path, columns)
+        with path.open("x", encoding="utf-8") as stream:
+            csv.writer(stream, lineterminator="\n").writerow(columns)
+
+    def _write(self, rows: list[dict[str, Cell]]) -> None:
         with self.path.open("a", encoding="utf-8", newline="") as stream:
-            csv.DictWriter(stream, self._columns, lineterminator="\n").writerows(self._rows)
-        self._rows.clear()
+            csv.DictWriter(stream, tuple(self._columns), lineterminator="\n").writerows(rows)
 
 
-def _file_of(topic: str, folder: Path) -> Path:
-    path = folder / f"{topic.strip('/').replace('/', '.')}.csv"
+class _ParquetTable(_Table):
+    """A file whose columns are numbers where all of their cells are, and texts otherwise."""
+
+    def __init__(self, path: Path, columns: Mapping[str, set[type]]) -> None:
+        import pyarrow as pa  # noqa: PLC0415 - an optional package, and large
+        from pyarrow.parquet import ParquetWriter  # noqa: PLC0415
+
+        super().__init__(path, columns)
+        kinds = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
+        self._table = pa.table
+        self._types = {name: _one_kind(found) for name, found in columns.items()}
+        self._schema = pa.schema([(name, kinds.get(kind, pa.string())) for name, kind in self._types.items()])
+        self._writer = ParquetWriter(path, self._schema)
+
+    def _write(self, rows: list[dict[str, Cell]]) -> None:
+        cells = {
+            name: [None if (cell := row.get(name)) is None else kind(cell) for row in rows]
+            for name, kind in self._types.items()
+        }
+        self._writer.write_table(self._table(cells, schema=self._schema))
+
+    def end(self) -> None:
+        """Write the rows there are, and what a reader needs."""
+        super().end()
+        self._writer.close()
+
+
+def _one_kind(found: set[type]) -> type:
+    kinds = found - {type(None)}
+    if kinds == {int, float}:
+        return float
+    return kinds.pop() if len(kinds) == 1 else str
+
+
+def _row(message: Message, cells: dict[str, Cell]) -> dict[str, Cell]:
+    return {T_NS: message.publish_time, RECEIVED_NS: message.log_time, **cells}
+
+
+def _file_of(topic: str, folder: Path, suffix: str) -> Path:
+    path = folder / f"{topic.strip('/').replace('/', '.')}.{suffix}"
     if path.exists():
         raise ConfigError(f"{path} exists already", value=str(path), remedy="choose another folder")
     return path

@@ -1,0 +1,44 @@
+"""Recordings and traces in Arrow's own library: Parquet files with types, and columns that it takes as they are."""
+
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+
+import ldcnd
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.samples import AxisState
+from ldcnd.lab.recording.tables import export_tables
+from tests.support.bluesky_engine import laboratory
+from tests.support.recordings import recorded_rig
+
+pytestmark = [pytest.mark.edges, pytest.mark.timeout(300)]
+
+
+async def test_tables_are_parquet_files_with_types(tmp_path):
+    path = tmp_path / "run.mcap"
+    async with recorded_rig(path) as recorded:
+        client = recorded.rig.client
+        await recorded.rig.until("x", lambda state: state.state is AxisState.DISABLED)
+        await client.command("x", Power(on=True))
+        reply = await client.command("x", MoveAbsolute(position=5.0))
+        await client.wait_for_end("x", reply.command_id)
+    done = export_tables(path, tmp_path / "tables", parquet=True)
+    expected = ldcnd.recording(path).table("tele/x/state")
+    table = parquet.read_table(tmp_path / "tables" / "ldcn.sim.tele.x.state.parquet")
+    positions = parquet.read_table(tmp_path / "tables" / "ldcn.sim.tele.x.position.parquet")
+
+    assert done.rows == sum(parquet.read_metadata(path).num_rows for path in done.tables)
+    assert table.to_pydict() == expected
+    assert [str(table.schema.field(name).type) for name in ("t_ns", "enabled", "state")] == ["int64", "bool", "string"]
+    assert [str(positions.schema.field(name).type) for name in ("value", "counts")] == ["double", "int64"]
+    assert pa.table(expected).num_rows == table.num_rows
+
+
+def test_a_trace_is_a_table_of_columns_with_titles():
+    with laboratory() as lab, lab.powered("x") as (x,):
+        trace = lab.loop.run(x._axis.take_trace("position", samples=50))
+    table = pa.table(trace.table())
+
+    assert table.column_names[:2] == ["offset_ns", "position [mm]"]
+    assert table.num_rows == 50
+    assert len(repr(trace)) < 2000
