@@ -13,6 +13,7 @@ EXTRAS = {
     "matplotlib": ("matplotlib", "plot"),
     "mcap": ("mcap", "lab"),
     "numpy": ("numpy", "bench"),
+    "p4p": ("p4p", "epics-pva"),
     "prometheus_client": ("prometheus-client", "lab"),
     "pyarrow": ("pyarrow", "parquet"),
     "starlette": ("starlette", "console"),

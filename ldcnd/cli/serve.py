@@ -4,6 +4,7 @@ import asyncio
 import re
 import shlex
 from collections.abc import Sequence
+from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,7 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.output import on_end
-from ldcnd.cli.typed import CONSOLE_ADDRESS, WholeNumber, address_option
+from ldcnd.cli.typed import CONSOLE_ADDRESS, WholeNumber, address_option, parsed_address
 from ldcnd.client.health import health_reports
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient, Samples
@@ -173,24 +174,49 @@ EPICS_ADDRESS = "127.0.0.1:5064"
     "--moves", is_flag=True, help="Let puts move the axes, under a lease of this program; it is read-only otherwise."
 )
 @address_option("--address", EPICS_ADDRESS)
+@click.option(
+    "--pva",
+    callback=parsed_address,
+    metavar="HOST:PORT",
+    help="Serve them over PV Access, too, such as on 127.0.0.1:5075.",
+)
 @with_target
-def epics(target: Target, address: ListenAddress, axes: tuple[str, ...], prefix: str | None, moves: bool) -> None:  # noqa: FBT001 - click's
+def epics(
+    target: Target,
+    address: ListenAddress,
+    axes: tuple[str, ...],
+    prefix: str | None,
+    moves: bool,  # noqa: FBT001 - click's
+    pva: ListenAddress | None,
+) -> None:
     """Serve AXES (all of them by default) as motor records until SIGTERM or SIGINT.
 
-    Channel Access does not authenticate clients: with --moves, any client that reaches the address moves axes.
+    Clients are not authenticated: with --moves, any client that reaches an address moves axes.
     """
-    target.run(lambda client: _serve_epics(client, address, axes, prefix, moves=moves))
+    target.run(lambda client: _serve_epics(client, address, axes, prefix, pva, moves=moves))
 
 
 async def _serve_epics(
-    client: RigClient, address: ListenAddress, axes: tuple[str, ...], prefix: str | None, *, moves: bool
+    client: RigClient,
+    address: ListenAddress,
+    axes: tuple[str, ...],
+    prefix: str | None,
+    pva: ListenAddress | None,
+    *,
+    moves: bool,
 ) -> None:
-    require("caproto")
+    require("caproto", *(["p4p"] if pva else []))
     from ldcnd.lab.epics.gateway import gateway, serve  # noqa: PLC0415 - needs an optional package
 
     rig = Rig(client, await client.daemon())
     named = f"{rig.name}:" if prefix is None else prefix
-    async with gateway(rig, prefix=named, axes=axes, moves=(axes or rig.axes) if moves else ()) as records:
+    async with AsyncExitStack() as faces:
+        moved = (axes or rig.axes) if moves else ()
+        records = await faces.enter_async_context(gateway(rig, prefix=named, axes=axes, moves=moved))
+        if pva:
+            from ldcnd.lab.epics.pva import serve_pva  # noqa: PLC0415 - likewise
+
+            await faces.enter_async_context(serve_pva(records, pva))
         serving = asyncio.create_task(serve(records, address), name="channel access")
         on_end(lambda: _cancel(serving))
         click.echo(

@@ -176,9 +176,35 @@ def caproto_tools(record: str) -> None:
     assert "2.5" in run("caproto-get", "--no-repeater", f"{record}.VAL")
 
 
+def p4p_calls(record: str) -> None:
+    """get, put and monitor over PV Access, with what belongs to a value."""
+    from p4p.client.thread import Context, RemoteError
+
+    with Context("pva") as there:
+        seen = []
+        subscription = there.monitor(f"{record}.RBV", seen.append)
+        began = there.get(f"{record}.RBV", timeout=LONGEST_S)
+        assert (began.raw.display.units, began.raw.display.precision, began.severity) == ("mm", 3, 0)
+        assert abs(began.timestamp - time.time()) < 60
+        there.put(record, float(began) + 2.0, wait=True, timeout=LONGEST_S)
+        assert there.get(f"{record}.DMOV", timeout=LONGEST_S) == 1
+        assert abs(there.get(f"{record}.RBV", timeout=LONGEST_S) - began - 2.0) < 0.02
+        with pytest.raises(RemoteError, match="limit"):
+            there.put(record, 1000.0, wait=True, timeout=LONGEST_S)
+        there.put(f"{record}.VELO", 2.0, timeout=LONGEST_S)
+        there.put(record, float(began) + 40.0, wait=False, timeout=LONGEST_S)
+        assert there.get(f"{record}.DMOV", timeout=LONGEST_S) == 0  # a put that does not wait returns at once
+        there.put(f"{record}.SPMG", "Stop", wait=True, timeout=LONGEST_S)
+        until(lambda: there.get(f"{record}.DMOV", timeout=LONGEST_S) == 1)
+        assert there.get(f"{record}.SPMG", timeout=LONGEST_S).choice == "Stop"
+        assert "SPMG" not in there.get(f"{record}:message", timeout=LONGEST_S)
+        assert len(seen) > 3
+        subscription.close()
+
+
 CLIENTS = {
     client.__name__: client
-    for client in (caget, aioca_calls, pyepics_motor, ophyd_motor, ophyd_async_motor, caproto_tools)
+    for client in (caget, aioca_calls, pyepics_motor, ophyd_motor, ophyd_async_motor, caproto_tools, p4p_calls)
 }
 
 if __name__ == "__main__":

@@ -19,7 +19,8 @@ pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(400)
 @asynccontextmanager
 async def gateway(*options: str) -> AsyncIterator[tuple[str, dict[str, str]]]:
     """Run a daemon and a gateway; yields the daemon's endpoint, and the environment of clients."""
-    port = free_port()
+    port, pva_port = free_port(), free_port()
+    options = (*options, "--pva", f"127.0.0.1:{pva_port}")
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
         async with client(endpoint) as rig:
             await rig.command("x", Power(on=True))
@@ -35,6 +36,8 @@ async def gateway(*options: str) -> AsyncIterator[tuple[str, dict[str, str]]]:
                     "EPICS_CA_AUTO_ADDR_LIST": "NO",
                     "EPICS_CA_SERVER_PORT": str(port),
                     "EPICS_CA_REPEATER_PORT": str(free_port()),
+                    "EPICS_PVA_NAME_SERVERS": f"127.0.0.1:{pva_port}",
+                    "EPICS_PVA_AUTO_ADDR_LIST": "NO",
                 },
             )
 

@@ -35,6 +35,7 @@ OTHERS = {
     "frappy",
     "logging_journald",
     "mcap",
+    "p4p",
     "prometheus_client",
     "pyarrow",
     "serial",

@@ -67,9 +67,18 @@ NO_ALARM = RecordAlarm()
 
 
 class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
-    """A caproto channel whose puts go to an action; clients put with `write`, the gateway shows values with `show`."""
+    """A caproto channel whose puts go to an action; clients put with `write`, the gateway shows values with `show`.
+
+    Attributes:
+        action: what a put does; None when it is refused.
+        followers: called after each change, for those who serve the channel by another protocol.
+    """
 
     action: Action | None = None
+
+    def __init__(self, **given: Any) -> None:  # noqa: ANN401
+        super().__init__(**given)
+        self.followers: list[Callable[[], None]] = []
 
     def get_field(self, name: str) -> "RecordField":
         """Return the channel for what a client names behind a dot: a variable beside a record has only its value."""
@@ -82,15 +91,21 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
         """Say who may do what: puts need an action."""
         return AccessRights.READ | AccessRights.WRITE if self.action else AccessRights.READ
 
-    async def write(self, value: Any, **_metadata: Any) -> None:  # noqa: ANN401
-        """Take a put, and return when it has had its effect."""
+    async def write(self, value: Any, *, wait: bool = True, **_metadata: Any) -> None:  # noqa: ANN401
+        """Take a put, and return when it has had its effect, or has begun to have it."""
         if self.action is None:
             raise PermissionError("this field is read-only")
         put = await self.action(self.native(self.preprocess_value(value)))
         if put.value is not None:
             await self.show(put.value)
-        if put.end is not None:
+        if put.end is not None and wait:
             await put.end
+
+    async def publish(self, flags: Any) -> None:  # noqa: ANN401
+        """Send the value to those who monitor it."""
+        await super().publish(flags)
+        for follower in self.followers:
+            follower()
 
     async def show(self, value: Value, alarm: RecordAlarm = NO_ALARM, at_s: float | None = None) -> None:
         """Publish a value.

@@ -1,0 +1,107 @@
+"""PV Access beside Channel Access: the same variables, with the same puts, by p4p (extra `epics-pva`)."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Any
+
+from caproto import AlarmStatus
+from p4p.nt import NTEnum, NTScalar
+from p4p.server import Server, StaticProvider
+from p4p.server.asyncio import SharedPV
+
+from ldcnd.contract.errors import LdcndError
+from ldcnd.lab.epics.fields import ChoiceField, Integer, Number, RecordField, Short
+from ldcnd.lab.epics.gateway import Gateway
+from ldcnd.listen_address import ListenAddress
+
+
+class _Puts:
+    """Takes the puts of a variable, as `SharedPV` has it."""
+
+    def __init__(self, field: RecordField) -> None:
+        self._field = field
+
+    async def put(self, _pv: SharedPV, operation: Any) -> None:  # noqa: ANN401 - p4p has no types
+        """Carry a put out; one that asks for it (`record[block=true]`) is answered at the end of its effect."""
+        try:
+            given = operation.value()
+            value = int(given) if isinstance(self._field, ChoiceField) else given
+            await self._field.write(value, wait=_is_blocking(operation))
+        except (LdcndError, ValueError, PermissionError) as error:
+            operation.done(error=str(error))
+        else:
+            operation.done()
+
+
+def _is_blocking(operation: Any) -> bool:  # noqa: ANN401
+    options = operation.pvRequest().todict().get("record", {}).get("_options", {})
+    return str(options.get("block", "")).lower() == "true"
+
+
+def _shown(field: RecordField) -> dict[str, Any]:
+    """Return the value of a variable with what belongs to it, as the normative types of PV Access have it."""
+    seconds, nanoseconds = divmod(round(field.timestamp * 1e9), 10**9)
+    shown: dict[str, Any] = {
+        "value": field.value,
+        "alarm": {
+            "severity": int(field.severity),
+            "status": int(bool(field.status)),
+            "message": AlarmStatus(field.status).name,
+        },
+        "timeStamp": {"secondsPastEpoch": seconds, "nanoseconds": nanoseconds},
+    }
+    if isinstance(field, ChoiceField):
+        words = list(field.enum_strings)
+        return {**shown, "value": {"index": words.index(field.value), "choices": words}}
+    if isinstance(field, Number):
+        low, high = field.lower_ctrl_limit, field.upper_ctrl_limit
+        limits = {"limitLow": low, "limitHigh": high}
+        return {
+            **shown,
+            "display": {**limits, "units": field.units, "precision": field.precision},
+            "control": limits,
+        }
+    return shown
+
+
+def _variable(field: RecordField) -> SharedPV:
+    match field:
+        case ChoiceField():
+            kind: Any = NTEnum()
+        case Number():
+            kind = NTScalar("d", display=True, control=True, form=True)
+        case Integer() | Short():
+            kind = NTScalar("i")
+        case _:
+            kind = NTScalar("s")
+    shared = SharedPV(handler=_Puts(field), nt=kind, initial=_shown(field))
+    field.followers.append(partial(_post, shared, field))
+    return shared
+
+
+def _post(shared: SharedPV, field: RecordField) -> None:
+    shared.post(_shown(field))
+
+
+@asynccontextmanager
+async def serve_pva(records: Gateway, address: ListenAddress) -> AsyncIterator[None]:
+    """Serve the variables of a gateway until the context ends; beacons go as those of Channel Access do."""
+    provider = StaticProvider("ldcnd")
+    shared: dict[int, SharedPV] = {}
+    for name, field in records.variables.items():
+        if id(field) not in shared:
+            shared[id(field)] = _variable(field)
+        provider.add(name, shared[id(field)])
+        if "." not in name and f"{name}.VAL" not in records.variables:
+            provider.add(f"{name}.VAL", shared[id(field)])
+    conf = {"EPICS_PVAS_INTF_ADDR_LIST": address.host, "EPICS_PVAS_SERVER_PORT": str(address.port)}
+    if address.host.startswith("127."):
+        conf |= {"EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO", "EPICS_PVAS_BEACON_ADDR_LIST": address.host}
+    server = Server(providers=[provider], conf=conf, useenv=True)
+    try:
+        yield
+    finally:
+        for field in records.variables.values():
+            field.followers.clear()
+        server.stop()
