@@ -130,7 +130,7 @@ class Rig:
 
     Attributes:
         name: of the rig.
-        axes: the names of its axes.
+        axes: the names of its axes, as they were described last.
     """
 
     def __init__(self, client: RigClient, daemon: DaemonInfo) -> None:
@@ -306,7 +306,11 @@ class Rig:
 
     async def describe(self) -> list[AxisInfo]:
         """Return what every axis is: unit, limits, capabilities, in the order of lines and addresses."""
-        return await self._client.axes()
+        described = await self._client.axes()
+        names = tuple(info.axis for info in described)
+        if described and {*names} != {*self.axes}:
+            self.axes = names  # the daemon was restarted with others
+        return described
 
     async def follow_descriptions(self) -> AsyncIterator[Mapping[str, AxisInfo]]:
         """Yield what every axis is by its name: at once, and soon after each reload and restart of the daemon."""

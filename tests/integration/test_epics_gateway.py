@@ -554,6 +554,45 @@ async def test_a_daemon_with_another_unit_is_not_moved_by_numbers_of_the_former_
             assert (await client.position("x")).value == pytest.approx(stands + 2, abs=0.02)
 
 
+async def test_an_axis_that_a_restart_brings_is_shown_and_one_that_it_takes_away_is_invalid():
+    broker, loop = MemoryBroker(), asyncio.get_running_loop()
+
+    @asynccontextmanager
+    async def life(instance: str, *names: str):
+        config = two_axes()
+        (bus,) = config.bus
+        axes = tuple(each.model_copy(update={"name": name}) for each, name in zip(bus.axis, names, strict=True))
+        config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
+        async with broker.session() as session, asyncio.TaskGroup() as group:
+            daemon = build_daemon(config, session, lambda: EPOCH_NS + round(loop.time() * 1e9), instance)
+            running = group.create_task(daemon.run(), name=instance)
+            await daemon.wait_up()
+            yield
+            daemon.end()
+            await running
+
+    async with broker.session() as session, AsyncExitStack() as faces:
+        client = RigClient(session, "sim")
+        async with life("first", "x", "y"):
+            rig = Rig(client, await client.daemon())
+            made = await faces.enter_async_context(gateway(rig, prefix="T:", moves=("x", "y")))
+            await shows(made, "T:y.SEVR", "NO_ALARM")
+            await put(made, "T:y.VELO", 3.0)
+        async with life("second", "x", "new"):
+            async with asyncio.timeout(30):
+                while "T:new.VAL" not in made.variables:
+                    await asyncio.sleep(0.1)
+            await shows(made, "T:new.SEVR", "NO_ALARM")
+            await shows(made, "T:y.SEVR", "INVALID")
+            with pytest.raises(LdcndError):
+                await put(made, "T:y", 1.0)
+            await put(made, "T:new.CNEN", "Enable")
+            await put(made, "T:new", 2.0)
+
+            assert (await client.position("new")).value == pytest.approx(2, abs=0.02)
+            assert made.variables["T:y.VELO"].value == 3.0
+
+
 @pytest.mark.parametrize("seed", range(1))
 async def test_no_puts_move_an_axis_of_a_read_only_gateway(seed: int):
     rng = random.Random(seed)

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import os
-from collections.abc import AsyncIterator, Coroutine
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 
@@ -31,27 +31,39 @@ class Gateway:
     Attributes:
         variables: the process variables by name.
         circuits: the connections of clients at present.
+        on_added: called with the variables of each axis that comes later.
     """
 
-    def __init__(self, rig: Rig, group: asyncio.TaskGroup) -> None:
+    def __init__(self, rig: Rig, group: asyncio.TaskGroup, prefix: str, *, shows_all: bool, moves_all: bool) -> None:
         self.variables: dict[str, RecordField] = {}
         self.circuits: set[object] = set()
+        self.on_added: list[Callable[[Mapping[str, RecordField]], None]] = []
+        self._prefix = prefix
+        self._shows_all = shows_all
+        self._moves_all = moves_all
         self._rig = rig
         self._group = group
         self._tasks: set[asyncio.Task[None]] = set()
         self._records: dict[str, MotorRecord] = {}
         self._all_stop = Short(value=0)
         self._all_stop.action = self._stop_all
+
+    def begin(self) -> None:
+        """Begin to follow what the axes are."""
         self._start(self._follow_descriptions(), "descriptions")
 
-    def add(self, info: AxisInfo, defaults: tuple[float, float], prefix: str, *, moves: bool) -> None:
+    def add(self, info: AxisInfo, defaults: tuple[float, float], *, moves: bool) -> None:
         """Show an axis, and begin to follow it."""
+        prefix = self._prefix
         record = (
             MovedRecord(info, defaults, self._start_motion, self.connected) if moves else MotorRecord(info, defaults)
         )
         record["NAME"].begin(f"{prefix}{info.axis}")
         self._records[info.axis] = record
-        self.variables |= {f"{prefix}{name}": field for name, field in record.fields.items()}
+        added = {f"{prefix}{name}": field for name, field in record.fields.items()}
+        self.variables |= added
+        for take in self.on_added:
+            take(added)
         self._start(self._follow(record), f"values of {info.axis}")
         for monitor in info.monitors:
             self._start(self._follow_monitor(record, monitor), f"{monitor} of {info.axis}")
@@ -78,16 +90,20 @@ class Gateway:
 
     async def _follow_descriptions(self) -> None:
         async for described in self._rig.follow_descriptions():
-            for name, record in self._records.items():
-                if name in described:
-                    await record.describe(described[name], await _defaults(self._rig, name))
+            for name, info in described.items():
+                if name in self._records:
+                    await self._take(self._records[name], info)
+                elif self._shows_all:  # the daemon was restarted with another axis
+                    self.add(info, await _defaults(self._rig, name) or MOTIONLESS, moves=self._moves_all)
 
     async def _describe(self, record: MotorRecord) -> None:
         """Have a record say what its axis is by the daemon that is there now."""
-        name = record.info.axis
         for info in await self._rig.describe():
-            if info.axis == name:
-                await record.describe(info, await _defaults(self._rig, name))
+            if info.axis == record.info.axis:
+                await self._take(record, info)
+
+    async def _take(self, record: MotorRecord, info: AxisInfo) -> None:
+        await record.describe(info, await _defaults(self._rig, info.axis) or record.defaults)
 
     async def _follow(self, record: MotorRecord) -> None:
         axis = record.info.axis
@@ -167,9 +183,10 @@ async def gateway(
         )
     try:
         async with asyncio.TaskGroup() as group:
-            made = Gateway(rig, group)
+            made = Gateway(rig, group, prefix, shows_all=not axes, moves_all={*known} <= {*moves})
             for name in axes or known:
-                made.add(known[name], await _defaults(rig, name), prefix, moves=name in moves)
+                made.add(known[name], await _defaults(rig, name) or MOTIONLESS, moves=name in moves)
+            made.begin()
             try:
                 yield made
             finally:
@@ -195,11 +212,11 @@ async def serve(records: Gateway, address: ListenAddress) -> None:
     await context.run()
 
 
-async def _defaults(rig: Rig, name: str) -> tuple[float, float]:
-    """Return the velocity and acceleration of a move that names none."""
-    async with rig.watch(name) as axis:
-        try:
+async def _defaults(rig: Rig, name: str) -> tuple[float, float] | None:
+    """Return the velocity and acceleration of a move that names none; None when the daemon does not say now."""
+    try:
+        async with rig.watch(name) as axis:
             preview = await axis.preview(distance=0)
-        except LdcndError:
-            return MOTIONLESS
+    except LdcndError:
+        return None
     return preview.velocity or MOTIONLESS[0], preview.acceleration or MOTIONLESS[1]

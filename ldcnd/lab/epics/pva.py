@@ -1,6 +1,6 @@
 """PV Access beside Channel Access: the same variables, with the same puts, by p4p (extra `epics-pva`)."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from functools import partial
 from typing import Any
@@ -89,12 +89,17 @@ async def serve_pva(records: Gateway, address: ListenAddress) -> AsyncIterator[N
     """Serve the variables of a gateway until the context ends; beacons go as those of Channel Access do."""
     provider = StaticProvider("ldcnd")
     shared: dict[int, SharedPV] = {}
-    for name, field in records.variables.items():
-        if id(field) not in shared:
-            shared[id(field)] = _variable(field)
-        provider.add(name, shared[id(field)])
-        if "." not in name and f"{name}.VAL" not in records.variables:
-            provider.add(f"{name}.VAL", shared[id(field)])
+
+    def add(variables: Mapping[str, RecordField]) -> None:
+        for name, field in variables.items():
+            if id(field) not in shared:
+                shared[id(field)] = _variable(field)
+            provider.add(name, shared[id(field)])
+            if "." not in name and f"{name}.VAL" not in variables:
+                provider.add(f"{name}.VAL", shared[id(field)])
+
+    add(records.variables)
+    records.on_added.append(add)
     conf = {"EPICS_PVAS_INTF_ADDR_LIST": address.host, "EPICS_PVAS_SERVER_PORT": str(address.port)}
     if address.host.startswith("127."):
         conf |= {"EPICS_PVAS_AUTO_BEACON_ADDR_LIST": "NO", "EPICS_PVAS_BEACON_ADDR_LIST": address.host}
@@ -102,6 +107,7 @@ async def serve_pva(records: Gateway, address: ListenAddress) -> AsyncIterator[N
     try:
         yield
     finally:
+        records.on_added.remove(add)
         for field in records.variables.values():
             field.followers.clear()
         server.stop()

@@ -87,9 +87,12 @@ MIP_MOVE = 0x20
 class MotorRecord:
     """One axis; its variables are in `fields`, by their names behind the prefix.
 
-    Args:
+    Attributes:
         info: what the axis is.
         defaults: its velocity and acceleration, in units a second and a second squared, when a client names no others.
+        condition: how it is.
+        moving: whether it moves.
+        state: as it was published last; None when that was of a daemon that described it differently.
     """
 
     def __init__(self, info: AxisInfo, defaults: tuple[float, float]) -> None:
@@ -97,7 +100,7 @@ class MotorRecord:
         self.condition = assess(None)
         self.moving = Moving.UNKNOWN
         self.state: StateSample | None = None
-        self._defaults = defaults
+        self.defaults = defaults
         self._alarm = SILENT
         self._faults: FaultSample | None = None
         self._switches = 0  # bits of MSTA
@@ -184,7 +187,7 @@ class MotorRecord:
 
     def _speeds(self) -> dict[str, Value]:
         """Return the values of fields that say how an axis moves for which a client has put nothing else."""
-        velocity, acceleration = self._defaults
+        velocity, acceleration = self.defaults
         return {
             **dict.fromkeys(("VELO", "BVEL", "JVEL"), velocity),
             **dict.fromkeys(("S", "SBAK"), velocity / self._step),
@@ -216,8 +219,8 @@ class MotorRecord:
 
         What a client has put into a field stays, unless it cannot be: after a change of unit, or above a limit.
         """
-        before, is_new = self.info, defaults != self._defaults
-        self.info, self._defaults = info, defaults
+        before, is_new = self.info, defaults != self.defaults
+        self.info, self.defaults = info, defaults
         is_other_unit = info.unit != before.unit
         if is_other_unit:
             self.state = None
