@@ -184,6 +184,7 @@ from ldcnd.contract.traces import (
     TraceTrigger,
     TriggerKind,
 )
+from ldcnd.lab.recording.tables import recording
 
 __all__ = [
     "About",
@@ -370,4 +371,5 @@ __all__ = [
     "connect",
     "connect_blocking",
     "open",
+    "recording",
 ]
