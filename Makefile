@@ -59,7 +59,7 @@ soak: .venv/ready
 	$(PY) -m pytest tests/property tests/fuzz -n 2 --timeout 3600 --hypothesis-profile new
 	$(PY) -m pytest -m soak -n 2 --timeout 3600
 
-# other people's clients, unmodified, in an environment of their own: Bluesky, EPICS, ROS 2; minutes
+# other people's clients, unmodified, in an environment of their own: Bluesky, EPICS, SECoP, ROS 2; minutes
 test-edges: .venv-edges/ready
 	.venv-edges/bin/python -m pytest tests/edges -m edges --timeout 600
 
