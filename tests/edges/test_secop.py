@@ -3,7 +3,7 @@
 import asyncio
 import time
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from typing import Self
 
 import pytest
@@ -12,7 +12,7 @@ from frappy.errors import ImpossibleError, RangeError
 
 from ldcnd.contract.commands import Power
 from ldcnd.contract.samples import Moving
-from tests.support.process import ROOT, client, daemon, free_port, process
+from tests.support.process import ROOT, answering, client, daemon, free_port, process
 
 pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(200)]
 
@@ -105,3 +105,43 @@ async def test_a_read_only_node_has_readables():
     async with node() as (endpoint, uri), client(endpoint) as rig:
         await rig.command("x", Power(on=True))
         await asyncio.to_thread(use, uri)
+
+
+async def test_a_daemon_with_another_unit_is_described_anew_and_not_moved_by_numbers_of_the_former_one(tmp_path):
+    def connected(uri: str) -> Client:
+        there = Client(uri, log=None)
+        there.connect(10)
+        return there
+
+    def follow(there: Client) -> None:
+        until_s = time.monotonic() + LONGEST_S
+        while there.modules["x"]["parameters"]["value"]["datatype"].unit != "um":
+            assert time.monotonic() < until_s
+            with suppress(Exception):  # while the node is away, and until it is described anew
+                there.setParameter("x", "target", 50.0)
+            time.sleep(0.2)
+        there.until("x", "status", lambda status: status[0] == DISABLED)
+
+    config, port = tmp_path / "rig.toml", free_port()
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    text = (ROOT / "config" / "simulated.toml").read_text()
+    config.write_text(text)
+    run = ("run", "--config", str(config), "--listen", endpoint)
+    async with process(*run) as first:
+        await answering(first, endpoint)
+        async with process("secop", "x", "-e", endpoint, "--address", f"127.0.0.1:{port}", "--moves") as node:
+            assert node.stdout
+            assert b"SECoP modules {x}" in await node.stdout.readline()
+            there = await asyncio.to_thread(connected, f"tcp://127.0.0.1:{port}")
+            first.terminate()
+            await first.wait()
+            config.write_text(text.replace('unit = "mm"', 'unit = "um"'))
+            async with process(*run) as second:
+                await answering(second, endpoint)
+                await asyncio.to_thread(follow, there)
+                async with client(endpoint) as rig:
+                    position = await rig.position("x")
+            await asyncio.to_thread(there.disconnect)
+
+    assert position.unit == "um"
+    assert abs(position.value) < 1
