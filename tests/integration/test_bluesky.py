@@ -2,7 +2,7 @@
 
 import asyncio
 import threading
-from contextlib import contextmanager, suppress
+from contextlib import AsyncExitStack, contextmanager, suppress
 
 import bluesky.plan_stubs as bps
 import bluesky.plans as bp
@@ -13,6 +13,9 @@ from bluesky.suspenders import SuspendBoolHigh
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
 import ldcnd.lab.bluesky.flight
+from ldcnd.client.loop_thread import LoopThread
+from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.errors import (
@@ -28,11 +31,12 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire
-from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.lab.bluesky import Fly, PlanAxis, ReadableAxis, Signal, Status, TraceDetector
 from ldcnd.sim.ldcn.power import FaultCondition
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.bluesky_engine import Laboratory, laboratory
-from tests.support.rig import two_axes
+from tests.support.rig import running_rig, two_axes
 
 IN_POSITION = 0.02
 """Millimetres between where a motor stands and where it was sent."""
@@ -581,3 +585,31 @@ def test_each_device_has_a_lease_of_its_own(lab: Laboratory):
         y.set(1).wait(20)
         with pytest.raises(LeaseHeld), lab.devices.control("y", client="bob"):
             pass
+
+
+async def test_values_of_a_daemon_with_another_unit_are_in_no_document_that_describes_the_former_one():
+    broker, loop = MemoryBroker(), LoopThread(asyncio.get_running_loop())
+    document = two_axes().model_dump(mode="json", exclude_unset=True)
+    document["bus"][0]["axis"][0] |= {"unit": "um"}
+    async with broker.session() as session, AsyncExitStack() as held:
+        client = RigClient(session, "sim")
+        async with running_rig(two_axes(), broker=broker) as first:
+            await first.until("x", lambda state: state.link is LinkState.UP)
+            rig = Rig(client, await client.daemon())
+            (info,) = [each for each in await rig.describe() if each.axis == "x"]
+            watched = await held.enter_async_context(rig.watch("x"))
+            axis = ReadableAxis("x", watched, info, rig, loop)
+            signal = Signal("x_position", rig, info, "position", loop)
+            units = [(await device.describe())[device.name]["units"] for device in (axis, signal)]
+            read = await axis.read()
+        async with running_rig(RigConfig.model_validate(document), broker=broker) as second:
+            await second.until("x", lambda state: state.link is LinkState.UP)
+            await asyncio.sleep(1)
+            for device in (axis, signal):
+                with pytest.raises(WrongState, match="in um now"):
+                    await device.read()
+            again = [(await device.describe())[device.name]["units"] for device in (axis, signal)]
+            read_again = await axis.read()
+
+    assert (units, again) == (["mm", "mm"], ["um", "um"])
+    assert (read["x"]["value"], read_again["x"]["value"]) == (pytest.approx(0, abs=1), pytest.approx(0, abs=1))
