@@ -195,7 +195,7 @@ async def test_errors_are_shown_and_cleared_as_nicos_does():
     async with records() as (running, made):
         moving = asyncio.create_task(put(made, "T:x", 50.0))
         await running.until("x", lambda state: state.moving is Moving.YES)
-        assert made.variables["T:x-Err"].value == 0
+        assert (made.variables["T:x-Err"].value, made.variables["T:x-MsgTxt"].value) == (0, "")
         await running.client.stop()
         with suppress(CommandAborted, StopLatched):
             await moving

@@ -42,6 +42,7 @@ async def test_a_target_is_reached_and_busy_is_shown_before_the_reply():
         places = [update for update in updates if (update.module, update.parameter) == ("x", "value")]
 
         assert shown[-1][0] == StatusCode.BUSY
+        assert link.status() == (StatusCode.IDLE, "")
         assert places[-1].value == pytest.approx(3, abs=0.02)
         assert all(0.001 <= update.error < 0.2 for update in places)
         assert (await running.client.state("x")).target == pytest.approx(3)

@@ -117,14 +117,13 @@ class MotorRecord:
 
     def _variables_beside(self, target: RecordField) -> dict[str, RecordField]:
         info, reset = self.info, Short(value=0)
-        condition = text()
         beside: dict[str, RecordField] = {
             "": target,
             "_able": choice("Enable", "Enable", "Disable"),  # as `asyn_motor.db` has it
-            "-MsgTxt": condition,  # these three as NICOS and the devices of ESS have them
+            "-MsgTxt": text(),  # these three as NICOS and the devices of ESS have them
             "-Err": Short(value=0),
             "-ErrRst": reset,
-            ":condition": condition,
+            ":condition": text(),
             ":reset": reset,
             ":state": string(),
             ":velocity": number(),
@@ -294,7 +293,7 @@ class MotorRecord:
         if self._alarm != before:  # no position may come that would carry it
             for field in ("RBV", "RRBV"):
                 await self[field].show(self[field].value, self._alarm)
-        await self.show_beside(":condition", ", ".join(self.condition.notes))
+        await self._show_condition()
         await self.show_beside("-Err", int(sample.stop_latched or sample.state is AxisState.ERROR_STOP))
         await self.show_beside(":state", sample.state.value + (", stop latched" if sample.stop_latched else ""))
         await self["CNEN"].show("Enable" if sample.enabled else "Disable")
@@ -321,9 +320,14 @@ class MotorRecord:
         """Show that nothing is known of the axis: the daemon does not publish."""
         self.moving, self._alarm = Moving.UNKNOWN, SILENT
         self.condition = assess(None, silence="nothing is published any more")
-        await self.show_beside(":condition", ", ".join(self.condition.notes))
+        await self._show_condition()
         await self["RBV"].show(self["RBV"].value, SILENT)
         await self.show_motion()
+
+    async def _show_condition(self) -> None:
+        """Show all that is to be said of the axis; a message is what is wrong with it, not who controls it."""
+        await self.show_beside(":condition", ", ".join(self.condition.notes))
+        await self.show_beside("-MsgTxt", ", ".join(trouble.short for trouble in self.condition.troubles))
 
     def stands(self) -> bool:
         """Tell whether the axis has done what was put: one of which that is not known has not arrived."""

@@ -169,7 +169,7 @@ class AxisLink:
 
     def status(self) -> tuple[int, str]:
         """Return the status of the module: its code, and all that is to be said."""
-        said, state = ", ".join(self._condition.notes), self._state
+        said, state = ", ".join(trouble.short for trouble in self._condition.troubles), self._state
         if state is None or state.moving is Moving.UNKNOWN or self._condition.alarm is Alarm.INVALID:
             return StatusCode.ERROR, said or "its state is not known"
         if state.state is AxisState.ERROR_STOP or self._condition.alarm is Alarm.MAJOR or state.stop_latched:
