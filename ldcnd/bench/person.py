@@ -8,9 +8,13 @@ import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
+from typing import TYPE_CHECKING
 
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.number_text import NotANumber, read_number
+
+if TYPE_CHECKING:
+    from ldcnd.bench.tuning.ldcn.report import MoveCurve
 
 YES = ("y", "yes")
 NO = ("n", "no")
@@ -47,6 +51,9 @@ class Person(ABC):
         Raises:
             Left: the key will not be held.
         """
+
+    def show_moves(self, unit: str, curves: "Sequence[MoveCurve]") -> None:  # noqa: B027 - a terminal draws nothing
+        """Draw test moves, where there is a place for that."""
 
     async def choose(self, question: str, choices: Mapping[str, str]) -> str:
         """Ask until the answer is one of some words, or begins one of them only; return that word.

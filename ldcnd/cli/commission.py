@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING
 import click
 
 from ldcnd import durable
-from ldcnd.bench.commissioning.checklist import STEPS, Checklist
+from ldcnd.bench.commissioning.checklist import STEPS, Checklist, change_of
 from ldcnd.bench.commissioning.checklist import axis_of as configured_axis
+from ldcnd.bench.commissioning.gains import gain_proposals
 from ldcnd.bench.commissioning.record import StepRecord
 from ldcnd.bench.commissioning.report import html_of
 from ldcnd.bench.commissioning.walk import ChecklistWalk
@@ -27,6 +28,7 @@ from ldcnd.client.kept_gains import put_back as put_back_gains
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
+from ldcnd.config.edit import write_over
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError, NotSupported, WrongState
 from ldcnd.parts import require
@@ -188,6 +190,12 @@ STYLES = {"new gains, predicted": "--", "command": ":k"}
     type=click.Path(path_type=Path, dir_okay=False),
     help="Draw the test moves, measured beside predicted, to a picture such as a PNG; needs the extra `plot`.",
 )
+@click.option(
+    "--write",
+    "file",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    help="Write the gains into this configuration, after showing the change.",
+)
 @click.option("--put-back", is_flag=True, help="Put back the gains that a tuning has left behind that was cut short.")
 @with_target
 def tune(
@@ -196,6 +204,7 @@ def tune(
     bandwidth_hz: float | None,
     within: float | None,
     plot: Path | None,
+    file: Path | None,
     *,
     dry_run: bool,
     yes: bool,
@@ -214,6 +223,8 @@ def tune(
         gains = ", ".join(f"{name} = {value}" for name, value in kept.gains.items())
         target.show(kept, f"{axis}: off, with its old gains: {gains}")
         return
+    if file:
+        configured_axis(load_config(file), axis)
     family = BENCHES.get(info.family)
     if family is None or not family.is_tuned_by_host:
         raise NotSupported(f"axis {axis}: the gains of a {info.model} are not found by the host", axis=axis)
@@ -227,6 +238,26 @@ def tune(
         _draw(figure, tuned)
         save_figure(figure, plot)
     _show(target, tuned)
+    if file:
+        _write_gains(file, axis, tuned, asks=not yes)
+
+
+def _write_gains(file: Path, axis: str, tuned: "Tuned", *, asks: bool) -> None:
+    """Write the gains of an axis into a configuration, as the step `gains` of `ldcnd commission` does.
+
+    Raises:
+        click.Abort: the person did not agree; the drive has the gains all the same.
+        ConfigError: it cannot be written; likewise.
+    """
+    change = change_of(file, axis, gain_proposals(tuned.report.gains))
+    if change is None:
+        show_lines(f"{file} has these gains", err=True)
+        return
+    show_lines(*change.lines, err=True)
+    if asks and not click.confirm(f"write this into {file}", err=True):
+        raise click.Abort
+    write_over(file, change.before, change.text)
+    show_lines(f"{file} is written: the daemon loads these gains from its next start on", err=True)
 
 
 async def _put_back(client: RigClient, axis: str) -> KeptGains:

@@ -383,7 +383,9 @@ def _stored(source: ParameterFile | ParameterDump) -> dict[str, int]:
 
 
 def _line(value: ParameterValue) -> str:
-    writes = "" if value.eeprom_writes is None else f", {value.eeprom_writes} of {value.eeprom_total} EEPROM writes"
+    writes = (
+        "" if value.eeprom_writes is None else f", {value.eeprom_writes} EEPROM writes ({value.eeprom_total} in all)"
+    )
     return (
         f"{value.parameter}  {value.active} ({value.active:04X}H) in use, {value.stored} ({value.stored:04X}H) stored"
         f"{writes}  {value.name}"

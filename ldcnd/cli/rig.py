@@ -32,7 +32,6 @@ from ldcnd.contract.rig_commands import (
     PreviewTogether,
     Rehearse,
     Reload,
-    ReloadReply,
     SetSpeedOverride,
     WalkPath,
 )
@@ -127,31 +126,15 @@ def reload(sender: Sender, *, dry_run: bool, yes: bool) -> None:
     leases = (sender.lease,) if sender.lease else ()
     shown = target.run(lambda client: client.ask(Reload(dry_run=True, leases=leases)))
     if dry_run or all(each.restart for each in shown.changes):
-        target.show(shown, *change_lines(shown))
+        target.show(shown, *shown.lines())
         return
     if not yes:
-        show_lines(*change_lines(shown), err=True)
+        show_lines(*shown.lines(), err=True)
         if not click.confirm("Reload", err=True):
             raise click.Abort
     request = Reload(revision=shown.revision, leases=leases)
     reply = target.run(lambda client: client.ask(request))
-    target.show(reply, *change_lines(reply))
-
-
-def change_lines(reply: ReloadReply) -> list[str]:
-    """Return the changes of a configuration, one in a line."""
-    lines = [
-        f"{each.key}: {each.before or 'not set'} -> {each.after or 'not set'}"
-        + (" (needs a restart of the daemon)" if each.restart else "")
-        for each in reply.changes
-    ]
-    if reply.more:
-        lines.append(f"and {reply.more} more")
-    if not lines:
-        return ["the daemon runs with what is in the file"]
-    if reply.applied:
-        lines.append("reloaded")
-    return lines
+    target.show(reply, *reply.lines())
 
 
 @click.group(cls=CommandGroup)

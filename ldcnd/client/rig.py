@@ -300,6 +300,11 @@ class Rig:
 
     # -- what it says ------------------------------------------------------------------------------------------------
 
+    @property
+    def client(self) -> RigClient:
+        """Client that this rig stands on."""
+        return self._client
+
     async def daemon(self) -> DaemonInfo:
         """Return what the daemon says about itself."""
         return await self._client.daemon()

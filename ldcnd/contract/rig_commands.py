@@ -363,6 +363,21 @@ class ReloadReply(Frozen):
     revision: str
     """Revision of the file as it was read, for a request that applies what was shown."""
 
+    def lines(self) -> list[str]:
+        """Return the changes for people, one in a line."""
+        lines = [
+            f"{each.key}: {each.before or 'not set'} -> {each.after or 'not set'}"
+            + (" (needs a restart of the daemon)" if each.restart else "")
+            for each in self.changes
+        ]
+        if self.more:
+            lines.append(f"and {self.more} more")
+        if not lines:
+            lines.append("the daemon runs with what is in the file")
+        elif self.applied:
+            lines.append("reloaded; what needs a restart stays as it is until then")
+        return lines
+
 
 class Reload(Command[ReloadReply]):
     """Read the configuration file again, and take what needs no restart; a motion under way keeps its values."""

@@ -211,7 +211,7 @@ class Walk:
 
     async def tune(self) -> None:
         async def tuning() -> None:
-            await self.until_asked("Gains", "within which distance")
+            await self.begin("Gains")
             await self.answer("within which distance", "4")
             await self.answer("bandwidth of the loop", "20")
             await self.choose(f"move {self.axis} now", "Yes")

@@ -10,8 +10,9 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from ldcnd.bench.commissioning.checklist import STEPS, Checklist
+from ldcnd.bench.commissioning.checklist import STEPS, Checklist, change_of
 from ldcnd.bench.commissioning.first_settings import SOFT_GAINS
+from ldcnd.bench.commissioning.gains import gain_proposals
 from ldcnd.bench.commissioning.holding import REACH
 from ldcnd.bench.commissioning.limit_switches import _judged
 from ldcnd.bench.commissioning.motor import CAUGHT, MOST_EL_COUNTS, OUTPUTS
@@ -496,7 +497,7 @@ async def test_a_wrong_scale_and_a_reversed_encoder_are_found_and_written(tmp_pa
         assert "# as ordered" in rig.config.read_text()
         axis = load_config(rig.config).bus[0].axis[0]
         assert (axis.direction, axis.counts_per_unit) == ("reverse", proposed(kept)["counts_per_unit"])
-        with pytest.raises(WrongState, match="another counts_per_unit and direction"):
+        with pytest.raises(WrongState, match="other counts_per_unit and direction"):
             await checklist.preview("home")
 
 
@@ -855,6 +856,36 @@ async def test_a_configuration_that_a_scan_has_begun_gets_unit_scale_and_soft_ga
     assert (axis.home.method.value, axis.home.velocity) == ("index", 0.5)
     assert told == []
     assert checklist.record.of("motor").result.state is StepState.OPEN
+
+
+@pytest.mark.parametrize(
+    "form",
+    [
+        "gains = { kp = 350, kd = 3000, ki = 400, el = 4000 } # soft",
+        "",
+        "[bus.axis.gains]\nkp = 100\nel = 900",
+    ],
+    ids=["inline", "none", "table"],
+)
+def test_tuned_gains_are_written_as_the_one_table_of_the_axis(form, tmp_path):
+    text = re.sub("gains = .*\n", "", rig_text())
+    place = "home =" if form.startswith("gains") else "[[sim]]"
+    text = text.replace(place, f"{form}\n{place}")
+    config = tmp_path / "rig.toml"
+    config.write_text(text)
+    gains = {"kp": 721, "kd": 6000, "ki": 90, "il": 300, "ol": 250, "el": 3000, "sr": 1, "deadband": 0}
+    change = change_of(config, AXIS, gain_proposals(gains))
+    config.write_text(change.text)
+
+    assert load_config(config).bus[0].axis[0].gains.model_dump(include=set(gains)) == gains
+    assert change_of(config, AXIS, gain_proposals(gains)) is None
+    assert change.restarts == tuple(f"gains.{name}" for name in gains)
+
+
+def test_gains_come_before_what_needs_them():
+    order = list(STEPS)
+
+    assert order.index("motor") < order.index("gains") < order.index("speed")
 
 
 async def test_settings_that_are_there_are_not_asked_for(tmp_path):

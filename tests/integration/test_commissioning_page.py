@@ -12,14 +12,22 @@ import serial
 from ldcnd import parts
 from ldcnd.bench.commissioning.record import CommissioningRecord, StepState
 from ldcnd.config.rig import load_config
-from ldcnd.console.commissioning.messages import FromCommissioningPage, PersonAnswer
+from ldcnd.console.commissioning.messages import FromCommissioningPage, PersonAnswer, View
 from ldcnd.console.commissioning.page_person import HELD_S
 from ldcnd.console.commissioning.scan_conversation import ScanConversation
 from ldcnd.contract.errors import ErrorCode
 from ldcnd.contract.leases import ListHolders
 from ldcnd.contract.samples import Moving
+from ldcnd.daemon.reload import Reloader
 from tests.support.commissioning import AXIS, GAINS, commissioning_rig, rig_text
-from tests.support.commissioning_page import COMMAND, ViewerSession, commissioning_console, commissioning_page, told_to
+from tests.support.commissioning_page import (
+    COMMAND,
+    OpenCommissioning,
+    ViewerSession,
+    commissioning_console,
+    commissioning_page,
+    told_to,
+)
 from tests.support.console_rig import page, running_console
 
 
@@ -174,6 +182,29 @@ async def test_what_is_under_way_can_be_left(rig, console):
         await opened.begin("load")  # and something else begun
 
 
+async def test_a_reload_shows_what_it_changes_and_names_what_needs_a_restart(rig, console):
+    daemon = rig.running.daemon
+    daemon.serve_reloads(Reloader(daemon, lambda: load_config(rig.config)).answer)
+    text = rig.config.read_text().replace("velocity = 10", "velocity = 9").replace("kp = 350", "kp = 351")
+    rig.config.write_text(text)
+    async with page(console.app, console.browser, path="/api/commissioning/scan") as socket:
+        opened = OpenCommissioning(socket, View())
+        opened.say(begin="reload")
+        await opened.asked("reload")
+        shown = opened.view.lines
+        before = daemon.config.bus[0].axis[0].velocity
+        await opened.answer("reload", "yes")
+        await opened.ended()
+
+    assert shown == (
+        "bus.line.axis.x.velocity: 10.0 -> 9.0",
+        "bus.line.axis.x.gains.kp: 350 -> 351 (needs a restart of the daemon)",
+    )
+    assert before == 10
+    assert (daemon.config.bus[0].axis[0].velocity, daemon.config.bus[0].axis[0].gains.kp) == (9, 350)
+    assert not (await rig.running.client.state(AXIS)).enabled
+
+
 async def test_gains_come_back_when_a_page_goes_while_motor_and_encoder_are_compared(rig, console):
     async with commissioning_page(console) as opened:
         await opened.begin("motor")
@@ -201,6 +232,7 @@ async def test_gains_come_back_when_a_page_goes_while_the_axis_is_tuned(tmp_path
         async with commissioning_page(console) as opened:
             await opened.until(lambda view: not view.running and view.steps)
             opened.say(begin="gains")
+            await opened.answer("run it", "yes")
             await opened.answer("within which distance", "2")
             await opened.answer("bandwidth", "25")
             await opened.asked("move x now")
@@ -309,7 +341,7 @@ async def test_a_daemon_that_runs_with_another_file_is_to_be_restarted(rig, cons
         opened.say(begin="motor")
         view = await opened.until(lambda view: view.problem)
 
-    assert "another counts_per_unit than the file" in view.problem.message
+    assert "other counts_per_unit than the file" in view.problem.message
 
 
 async def test_before_there_is_a_file_the_overview_offers_the_search_alone(tmp_path):
@@ -331,7 +363,7 @@ async def test_a_port_that_another_program_has_is_not_scanned(tmp_path):
     port = os.ttyname(slave)
     said = []
     with serial.Serial(port, exclusive=True):
-        search = ScanConversation(tmp_path / "rig.toml")
+        search = ScanConversation(None, tmp_path / "rig.toml")
         async with asyncio.TaskGroup() as group:
             running = group.create_task(search.run())
             search.heard(FromCommissioningPage(begin="scan"))

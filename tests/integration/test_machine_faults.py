@@ -23,7 +23,7 @@ from tests.support.commissioning import AXIS, commissioning_rig, rig_text
 
 SEED = 11
 COUNTS = 2000
-PER_KIND = 2
+PER_KIND = 6
 SYSTEM = (pytest.mark.system, pytest.mark.timeout(1800))
 STEPS = ("motor", "hold", "tune")
 
@@ -210,6 +210,40 @@ async def test_tuning_names_what_is_wrong_or_cannot_tell(kind, tmp_path, monkeyp
 
     assert found & TRUTH[kind]
     assert not is_well
+
+
+@pytest.mark.parametrize(
+    ("wrong", "stuck", "pressed", "named"),
+    [
+        ({"limits_swapped": True}, None, ("reverse", "forward"), {MachineFault.SWITCHES_SWAPPED}),
+        ({}, "reverse", ("reverse", "forward"), {MachineFault.SWITCH_DEAD, MachineFault.SWITCH_HELD}),
+        ({}, "forward", ("reverse", "forward"), {MachineFault.SWITCH_DEAD, MachineFault.SWITCH_HELD}),
+        ({}, None, (), {MachineFault.SWITCH_DEAD, MachineFault.SWITCH_HELD}),
+    ],
+    ids=["swapped", "reverse stuck", "forward stuck", "not pressed"],
+)
+async def test_limit_switches_that_are_wrong_are_named_or_cannot_be_told(wrong, stuck, pressed, named, tmp_path):
+    async with commissioning_rig(tmp_path, {"has the axis": "y"}, **wrong) as rig:
+        if stuck:
+            setattr(rig.drive.shaft, f"{stuck}_stuck", False)
+        checklist = await rig.checklist()
+        pressing = asyncio.create_task(press(rig, *pressed))
+        text, is_well = await verdict(rig, "limits")
+        pressing.cancel()
+
+        assert not is_well
+        assert named_in(text) == named
+        assert checklist.change("limits") is None
+        assert abs(rig.drive.shaft.position_counts) in {0, 20_100}  # where the hand has put it
+
+
+async def press(rig, *sides):
+    """Press limit switches one after the other, by turning the shaft onto them."""
+    for side in sides:
+        for place in ({"reverse": -20_100.0, "forward": 20_100.0}[side], 0.0):
+            await asyncio.sleep(1.0)
+            rig.drive.catch_up(asyncio.get_running_loop().time())
+            rig.drive.shaft.position_counts = place
 
 
 @pytest.mark.parametrize("step", [pytest.param(each, marks=SYSTEM) for each in STEPS])

@@ -2,7 +2,7 @@
 
 import asyncio
 import difflib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -11,11 +11,12 @@ from pydantic import JsonValue
 
 from ldcnd.bench.commissioning import record as records
 from ldcnd.bench.commissioning.first_settings import FirstSettings
+from ldcnd.bench.commissioning.gains import CLIENT, GainsStep
 from ldcnd.bench.commissioning.holding import HoldingOutput
 from ldcnd.bench.commissioning.homing import HomeRepeatability
 from ldcnd.bench.commissioning.limit_switches import LimitSwitches
 from ldcnd.bench.commissioning.motor import MotorDirection
-from ldcnd.bench.commissioning.questions import GainsStep, LoadStep
+from ldcnd.bench.commissioning.questions import LoadStep
 from ldcnd.bench.commissioning.record import CommissioningRecord, ConfigProposal, Result, StepRecord, StepState
 from ldcnd.bench.commissioning.scale import Scale
 from ldcnd.bench.commissioning.speed import HighestSpeed
@@ -24,12 +25,12 @@ from ldcnd.bench.commissioning.travel import Travel
 from ldcnd.bench.person import Person, said
 from ldcnd.client.axis import seen
 from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
-from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.config.edit import edited_for_axis, write_over
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import LdcndError, UnknownAxis, WrongState
 from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.rig_commands import ReloadReply
 from ldcnd.drives.axis_config import AxisConfig, MovedAxisConfig
 
 STEPS: dict[str, Step] = {
@@ -42,13 +43,12 @@ STEPS: dict[str, Step] = {
         Scale(),
         LimitSwitches(),
         HomeRepeatability(),
+        GainsStep(),
         Travel(),
         HighestSpeed(),
-        GainsStep(),
     )
 }
 """All of them, in the order in which they build on each other."""
-CLIENT = program_name("ldcnd commission")
 LEASE_S = 2.0
 """So soon the daemon applies `loss.client` of the axis when this program disappears, seconds."""
 WITHOUT_RUN = (StepState.NOT_POSSIBLE, StepState.NOT_NEEDED)
@@ -66,13 +66,13 @@ class Change:
         before: the file as it was.
         text: as it would be.
         lines: the difference, as `diff -u` shows it.
-        restarts: whether the daemon must be restarted for it; otherwise SIGHUP has it read the file again.
+        restarts: keys for which the daemon must be restarted; for the others it reads the file again.
     """
 
     before: str
     text: str
     lines: tuple[str, ...]
-    restarts: bool
+    restarts: tuple[str, ...]
 
 
 class Checklist:
@@ -215,18 +215,7 @@ class Checklist:
         Raises:
             ConfigError: it has to be put in by hand, or would make no configuration.
         """
-        tables: dict[str, dict[str, str]] = {}
-        proposals = self.record.of(name).result.proposals
-        for each in proposals:
-            tables.setdefault(each.table, {})[each.key] = each.literal
-        if not tables:
-            return None
-        before, after = self._config.read_text(encoding="utf-8"), edited_for_axis(self._config, self._axis, tables)
-        if before == after:
-            return None
-        named = str(self._config)
-        lines = difflib.unified_diff(before.splitlines(), after.splitlines(), named, named, lineterm="", n=2)
-        return Change(before, after, tuple(lines), restarts=any(not _is_reloaded(each) for each in proposals))
+        return change_of(self._config, self._axis, self.record.of(name).result.proposals)
 
     def write(self, change: Change) -> None:
         """Replace the configuration; it was checked whole when the change was made.
@@ -235,6 +224,14 @@ class Checklist:
             ConfigError: it cannot be written, or was changed since; it is as it is.
         """
         write_over(self._config, change.before, change.text)
+
+    async def reload(self) -> ReloadReply:
+        """Have the daemon read its configuration again.
+
+        Raises:
+            LdcndError: as the daemon refused it.
+        """
+        return await self._rig.reload()
 
     # -- what it stands on -------------------------------------------------------------------------------------------
 
@@ -259,6 +256,23 @@ class Checklist:
     def _keep(self, record: CommissioningRecord) -> None:
         records.write(self.path, record)
         self.record = record
+
+
+def change_of(config: Path, axis: str, proposals: Sequence[ConfigProposal]) -> Change | None:
+    """Return how values for an axis would change a configuration; None where they are there.
+
+    Raises:
+        ConfigError: it has to be put in by hand, or would make no configuration.
+    """
+    tables: dict[str, dict[str, str]] = {}
+    for each in proposals:
+        tables.setdefault(each.table, {})[each.key] = each.literal
+    before, after = config.read_text(encoding="utf-8"), edited_for_axis(config, axis, tables) if tables else ""
+    if not tables or before == after:
+        return None
+    lines = difflib.unified_diff(before.splitlines(), after.splitlines(), str(config), str(config), lineterm="", n=2)
+    restarts = tuple(each.name for each in proposals if not _is_reloaded(each.name))
+    return Change(before, after, tuple(lines), restarts)
 
 
 def axis_of(rig: RigConfig, name: str) -> AxisConfig:
@@ -304,10 +318,13 @@ def _require_same(site: StepContext) -> None:
     """
     differ = list(_differing(site.info, site.config))
     if differ:
+        restarts = [name for name in differ if not _is_reloaded(name)]
         raise WrongState(
-            f"axis {site.info.axis}: the daemon runs with another {' and '.join(differ)} than the file",
+            f"axis {site.info.axis}: the daemon runs with other {' and '.join(differ)} than the file",
             axis=site.info.axis,
-            remedy="restart the daemon with this file",
+            remedy=f"restart the daemon with this file: it takes {' and '.join(restarts)} only then"
+            if restarts
+            else "type: ldcnd reload",
         )
 
 
@@ -317,5 +334,5 @@ def _differing(info: AxisInfo, config: AxisConfig) -> Iterator[str]:
             yield name
 
 
-def _is_reloaded(proposal: ConfigProposal) -> bool:
-    return (proposal.table or proposal.key).partition(".")[0] in RELOADED
+def _is_reloaded(name: str) -> bool:
+    return name.partition(".")[0] in RELOADED

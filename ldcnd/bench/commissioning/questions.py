@@ -1,11 +1,10 @@
-"""Steps that ask and move nothing: a brake or a hanging load, and whether the loop is tuned."""
+"""A step that asks and moves nothing: a brake or a hanging load."""
 
 from typing_extensions import override
 
-from ldcnd.bench.commissioning.record import Figure, Result, StepState
+from ldcnd.bench.commissioning.record import Figure, Result
 from ldcnd.bench.commissioning.step import Step, StepContext, done
 from ldcnd.client.axis import Axis
-from ldcnd.contract.commands import Verb
 from ldcnd.drives.axis_config import AxisConfig, LossPolicy
 
 LOADS = {
@@ -14,7 +13,6 @@ LOADS = {
     "brake": "nothing: a brake holds the axis",
     "both": "the load, unless its brake holds it",
 }
-SHOWN = ("kp", "kd", "ki", "il", "ol", "el")
 POWERING_OFF = ("bus", "client", "daemon")
 
 
@@ -51,31 +49,3 @@ class LoadStep(Step):
         if answer in ("hangs", "both"):
             text += powered_off(site.config)
         return done(text).model_copy(update={"figures": tuple(figures)})
-
-
-class GainsStep(Step):
-    """Points to tuning."""
-
-    name = "gains"
-    title = "Gains"
-    about = (
-        "`ldcnd tune AXIS` measures the axis and proposes gains; of a drive that tunes itself it tries gains that you"
-        " name. This step only asks whether that was done."
-    )
-    moves = False
-    needs = (Verb.SET_GAINS,)
-
-    @override
-    def obstacle(self, site: StepContext) -> str:
-        gains_are_parameters = Verb.WRITE_PARAMETER in site.info.capabilities
-        return "" if gains_are_parameters else super().obstacle(site)
-
-    @override
-    async def run(self, site: StepContext, axis: Axis) -> Result:
-        registers = {each.name: each.value for each in site.info.registers if each.value is not None}
-        figures = tuple(Figure(what=name, value=registers[name]) for name in SHOWN if name in registers)
-        if await site.person.confirm(
-            f"are the gains of {axis.name} tuned, and in the configuration or stored in the drive"
-        ):
-            return Result(state=StepState.DONE, text="tuned, as the person says", figures=figures)
-        return Result(state=StepState.OPEN, text=f"type: ldcnd tune {axis.name}")

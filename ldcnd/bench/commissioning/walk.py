@@ -4,7 +4,8 @@ from collections.abc import Callable
 
 from ldcnd.bench.commissioning.checklist import STEPS, Checklist
 from ldcnd.bench.commissioning.record import Result, StepRecord, StepState
-from ldcnd.bench.person import Left, Person
+from ldcnd.bench.person import Left, Person, said
+from ldcnd.contract.errors import LdcndError
 
 RUN = {"yes": "Run it", "skip": "Skip it, for a reason", "no": "Not now"}
 
@@ -72,7 +73,7 @@ class ChecklistWalk:
         """Show what a step proposes as a change of the configuration, and write it if the person agrees.
 
         Returns:
-            True when it was written: the daemon has to read it before the next step. None otherwise.
+            True when it was written, and the daemon has to read it before the next step. None otherwise.
         """
         while change := self._checklist.change(name):
             if not await self._person.approve(self._file, change.lines):
@@ -83,6 +84,14 @@ class ChecklistWalk:
         if change is None:
             return None
         self._checklist.write(change)
-        how = "restart the daemon" if change.restarts else "SIGHUP lets the daemon read it"
-        self._person.tell(f"{self._file} is changed: {how}; then go on with the next step")
-        return True
+        if change.restarts:
+            keys = ", ".join(change.restarts)
+            self._person.tell(f"{self._file} is changed: restart the daemon, which takes {keys} only then, and go on")
+            return True
+        try:
+            await self._checklist.reload()
+        except LdcndError as error:
+            self._person.tell(f"{self._file} is changed, and the daemon has not read it: {said(error)}")
+            return True
+        self._person.tell(f"{self._file} is changed, and the daemon has read it")
+        return None

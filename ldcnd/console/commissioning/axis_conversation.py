@@ -1,4 +1,4 @@
-"""The checklist of one axis on a page: its steps, and tuning in the place of the step that only points to it."""
+"""The checklist of one axis on a page."""
 
 from pathlib import Path
 
@@ -11,13 +11,9 @@ from ldcnd.bench.commissioning.walk import ChecklistWalk
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config
 from ldcnd.console.commissioning.conversation import Conversation
-from ldcnd.console.commissioning.messages import CurveView, FromCommissioningPage, StepView, View
-from ldcnd.console.commissioning.tuning import ABOUT, is_offered, tune
+from ldcnd.console.commissioning.messages import FromCommissioningPage, StepView, View
 from ldcnd.console.rigs import Rigs
 from ldcnd.contract.errors import UnknownVerb
-
-TUNING = "gains"
-"""The step that a page carries out by tuning."""
 
 
 class AxisConversation(Conversation):
@@ -37,24 +33,20 @@ class AxisConversation(Conversation):
         self._axis = axis
         self._visitor = visitor
         self._record = CommissioningRecord(rig="", axis=axis)
-        self._curves: tuple[CurveView, ...] = ()
-        self._unit = ""
         self._seen: object = None
-        self._is_tuned_here = False
 
     @override
     def shown(self) -> View:
         return View(
             steps=tuple(self._step_view(self._record.of(name)) for name in STEPS),
-            unit=self._unit,
-            curves=self._curves,
+            unit=self.person.unit,
+            curves=self.person.curves,
         )
 
     @override
     async def refresh(self) -> None:
         self._seen = self._outside()
         config = load_config(self._config)
-        self._is_tuned_here = is_offered(config, self._axis)
         self._record = records.read(records.file_of(self._config, config.rig, self._axis), config.rig, self._axis)
         if config.rig in self._rigs.names:
             await self._opened(self._visitor)
@@ -70,11 +62,7 @@ class AxisConversation(Conversation):
         checklist = await self._opened(begun.by.strip() or self._visitor)
         walk = ChecklistWalk(checklist, self.person, str(self._config), lambda kept: self._keep(checklist, kept))
         await walk.put_back_gains()
-        possible = checklist.record.of(begun.begin).result.state is not StepState.NOT_POSSIBLE
-        if begun.begin == TUNING and self._is_tuned_here and possible:
-            await self._tune(checklist, walk)
-        else:
-            await walk.one(begun.begin)
+        await walk.one(begun.begin)
 
     async def _opened(self, by: str) -> Checklist:
         """Return the checklist as it is now, compared with drive and file."""
@@ -89,16 +77,6 @@ class AxisConversation(Conversation):
         self._record = checklist.record
         self.person.tell(kept.result.text)
 
-    async def _tune(self, checklist: Checklist, walk: ChecklistWalk) -> None:
-        """Tune the axis, keep the result as that of the step, and offer its gains for the configuration."""
-        tuning = await tune(self._rigs.client(self._record.rig), self.person, self._axis)
-        if tuning is None:
-            return
-        self._curves, self._unit = tuning.curves, tuning.unit
-        if tuning.result:
-            self._keep(checklist, await checklist.settle(TUNING, tuning.result))
-            await walk.offer(TUNING)
-
     def _outside(self) -> object:
         """Return what tells when file or daemon have changed."""
         changed_ns = self._config.stat().st_mtime_ns if self._config.exists() else 0
@@ -110,7 +88,7 @@ class AxisConversation(Conversation):
         return StepView(
             name=kept.step,
             title=step.title,
-            about=ABOUT if self._is_tuned_here and kept.step == TUNING and not impossible else step.about,
+            about=step.about,
             state=result.state.value.replace("_", " "),
             text=kept.reopened or result.text,
             at=kept.at,

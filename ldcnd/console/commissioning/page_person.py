@@ -8,12 +8,16 @@ import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
 
 from typing_extensions import override
 
 from ldcnd.bench.person import Left, Person
-from ldcnd.console.commissioning.messages import Choice, HoldButton, PersonAnswer, Question
+from ldcnd.console.commissioning.messages import Choice, CurveView, HoldButton, PersonAnswer, Question
 from ldcnd.printable import printable
+
+if TYPE_CHECKING:
+    from ldcnd.bench.tuning.ldcn.report import MoveCurve
 
 HELD_S = 1.0
 """The button is released after this time without a message that it is held; pages send one each tenth of a second."""
@@ -30,10 +34,14 @@ class PagePerson(Person):
 
     Attributes:
         question: what is asked now.
+        curves: test moves that were shown last.
+        unit: of these.
     """
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self.question: Question | None = None
+        self.curves: tuple[CurveView, ...] = ()
+        self.unit = ""
         self._changed = changed
         self._lines: deque[str] = deque(maxlen=MOST_LINES)
         self._count = 0
@@ -58,6 +66,12 @@ class PagePerson(Person):
     @override
     def tell(self, *lines: str) -> None:
         self._lines += [printable(line) for line in lines]
+        self._changed()
+
+    @override
+    def show_moves(self, unit: str, curves: "Sequence[MoveCurve]") -> None:
+        self.unit = unit
+        self.curves = tuple(CurveView.model_validate(each.model_dump()) for each in curves)
         self._changed()
 
     @override

@@ -19,9 +19,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ldcnd.bench.commissioning import record as records
 from ldcnd.bench.commissioning.checklist import SETTLED, STEPS, axis_of
+from ldcnd.bench.commissioning.gains import GainsStep
 from ldcnd.bench.commissioning.report import html_of
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.console.commissioning.axis_conversation import TUNING, AxisConversation
+from ldcnd.console.commissioning.axis_conversation import AxisConversation
 from ldcnd.console.commissioning.conversation import Conversation
 from ldcnd.console.commissioning.messages import FromCommissioningPage, ToCommissioningPage
 from ldcnd.console.commissioning.scan_conversation import ScanConversation
@@ -106,7 +107,7 @@ class Commissioning:
             await self._serve(socket, f"axis {name}", partial(self._checked, name, new))
 
         async def scan(socket: WebSocket) -> None:
-            await self._serve(socket, SCANNING, partial(ScanConversation, self._config))
+            await self._serve(socket, SCANNING, partial(ScanConversation, self._rigs, self._config))
 
         return [
             Route("/api/commissioning", answering_errors(overview)),
@@ -170,7 +171,7 @@ class Commissioning:
                     axis=each.name,
                     model=each.model,
                     open=tuple(STEPS[name].title for name in still),
-                    tuned=TUNING not in still,
+                    tuned=GainsStep.name not in still,
                     page=self._pages.get(f"axis {each.name}"),
                 )
             )

@@ -1,4 +1,4 @@
-"""The search for drives on a page: what `ldcnd scan` finds on a port, and a configuration begun with it."""
+"""The configuration on a page: begun with what `ldcnd scan` finds on a port, and read again by the daemon."""
 
 import difflib
 from pathlib import Path
@@ -9,12 +9,17 @@ from ldcnd.bench.begun import begun_with, scan_port, write
 from ldcnd.bench.family import ScannedDrive
 from ldcnd.bench.known import BENCHES
 from ldcnd.bench.opened import ports
+from ldcnd.client.rig import Rig
+from ldcnd.config.rig import load_config
 from ldcnd.console.commissioning.conversation import Conversation
 from ldcnd.console.commissioning.messages import FromCommissioningPage, View
+from ldcnd.console.rigs import Rigs
 from ldcnd.contract.errors import UnknownVerb
 from ldcnd.contract.health import Finding
 
 SCAN = "scan"
+RELOAD = "reload"
+TAKE = {"yes": "Reload", "no": "Leave"}
 ANY = "any"
 CONSENT = (
     "no drive has an address: reset the line and give addresses? That is done only where nothing can be moving; the"
@@ -23,14 +28,16 @@ CONSENT = (
 
 
 class ScanConversation(Conversation):
-    """One page that looks for drives; only a port that no daemon has is opened.
+    """One page that looks for drives, on a port that no daemon has, or has the daemon read the configuration again.
 
     Args:
+        rigs: of the console.
         config: the configuration that is begun, or added to.
     """
 
-    def __init__(self, config: Path) -> None:
+    def __init__(self, rigs: Rigs, config: Path) -> None:
         super().__init__()
+        self._rigs = rigs
         self._config = config
 
     @override
@@ -47,6 +54,9 @@ class ScanConversation(Conversation):
 
     @override
     async def carry_out(self, begun: FromCommissioningPage) -> None:
+        if begun.begin == RELOAD:
+            await self._reload()
+            return
         if begun.begin != SCAN:
             raise UnknownVerb(f"there is no {begun.begin!r} here", value=begun.begin)
         person = self.person
@@ -64,6 +74,15 @@ class ScanConversation(Conversation):
                     await self._offer(name, port, drives)
                     return
         person.tell("no drive was found: the lines above say what to check")
+
+    async def _reload(self) -> None:
+        """Show what a reload would change, and do it when the person agrees to that."""
+        client = self._rigs.client(load_config(self._config).rig)
+        rig = Rig(client, await client.daemon())
+        shown = await rig.reload(dry_run=True)
+        self.person.tell(*shown.lines())
+        if any(not each.restart for each in shown.changes) and await self.person.choose("reload", TAKE) == "yes":
+            self.person.tell(*(await rig.reload(revision=shown.revision)).lines()[-1:])
 
     async def _found(self, name: str, port: str, *, give_addresses: bool) -> list[ScannedDrive]:
         self.person.tell(f"searching for {name} drives on {port}: 10 to 20 seconds")

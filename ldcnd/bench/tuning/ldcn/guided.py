@@ -86,7 +86,8 @@ def ending(report: TuningReport) -> list[str]:
     if not report.applied:
         return [f"{report.axis}: not better: {report.objection}; it is off, with its old gains"]
     return [
-        f"{report.axis}: off, with the new gains until the next start of the daemon; to keep them, configure:",
+        f"{report.axis}: off, with the new gains until the next start of the daemon",
+        "to keep them, configure, in the place of the gains that it has there:",
         f"gains = {{ {listed(report.gains)} }}",
     ]
 

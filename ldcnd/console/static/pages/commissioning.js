@@ -51,31 +51,34 @@ function Search({ overview }) {
   const step = overview.rig ? "Search for more drives" : "1. Search for drives";
   return html`<${Panel} title=${step} note="Listens and reads on a port that no daemon has: nothing moves, nothing is reset. Only when you agree are addresses given.">
     ${overview.problem && html`<p class="mark" data-level="bad">${overview.problem}</p>`}
-    ${open ? html`<${SearchTalk} />` : html`<p class="row"><button type="button" class=${overview.rig ? "" : "main"} onClick=${() => setOpen(true)}>Search a port</button></p>`}
+    ${open ? html`<${FileTalk} begin="scan" title="Search" again="Search again" />` : html`<p class="row"><button type="button" class=${overview.rig ? "" : "main"} onClick=${() => setOpen(true)}>Search a port</button></p>`}
   <//>`;
 }
 
-function SearchTalk() {
+/** What concerns the configuration as a whole: the search for drives, and a reload by the daemon. */
+function FileTalk({ begin, title, again }) {
   const talk = useConversation("scan");
   useEffect(() => {
     if (talk?.view && !talk.begun) {
       talk.begun = true;
-      talk.begin("scan", "");
+      talk.begin(begin, "");
     }
   }, [talk?.view]);
   if (!talk?.view) return html`<${Away} talk=${talk} />`;
   const { view } = talk;
-  return html`<${Activity} talk=${talk} title="Search" />
-    ${!view.running && html`<p class="row"><button type="button" onClick=${() => talk.begin("scan", "")}>Search again</button></p>`}`;
+  return html`<${Activity} talk=${talk} title=${title} />
+    ${!view.running && html`<p class="row"><button type="button" onClick=${() => talk.begin(begin, "")}>${again}</button></p>`}`;
 }
 
 function Daemon({ overview }) {
+  const [open, setOpen] = useState(false);
   const text = overview.connected
     ? `The daemon of rig ${overview.rig} runs.`
     : `No daemon serves rig ${overview.rig} yet. Start it in a terminal of the machine that has the port; this page notices by itself.`;
-  return html`<${Panel} title="2. The daemon" note="Nothing moves when it starts. After a change of the file that it does not read while it runs, end it and start it again with the same command.">
+  return html`<${Panel} title="2. The daemon" note="Nothing moves when it starts. A reload shows first what it would change; what needs a restart is named: end the daemon then, and start it again with the same command.">
     <p role="status" class="mark" data-level=${overview.connected ? null : "warn"}>${text}</p>
     <${CopiedCommand} command=${overview.command} />
+    ${overview.connected && (open ? html`<${FileTalk} begin="reload" title="Reload" again="Reload again" />` : html`<p class="row"><button type="button" onClick=${() => setOpen(true)}>Reload the configuration</button></p>`)}
   <//>`;
 }
 
