@@ -8,13 +8,10 @@ import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
-from typing import TYPE_CHECKING
 
 from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.number_text import NotANumber, read_number
-
-if TYPE_CHECKING:
-    from ldcnd.bench.tuning.ldcn.report import MoveCurve
 
 YES = ("y", "yes")
 NO = ("n", "no")
@@ -24,6 +21,19 @@ LEAST, MOST = 1e-12, 1e12
 
 class Left(Exception):
     """The person has left: no answer will come."""
+
+
+class MoveCurve(Frozen):
+    """One way of a test move, drawn forward."""
+
+    label: str
+    """What it shows."""
+    times_s: tuple[float, ...]
+    """From the begin of the move, seconds."""
+    positions: tuple[float, ...]
+    """Positions, in axis units."""
+    following_errors: tuple[float, ...]
+    """What they are behind the command, in axis units."""
 
 
 class Person(ABC):
@@ -52,7 +62,7 @@ class Person(ABC):
             Left: the key will not be held.
         """
 
-    def show_moves(self, unit: str, curves: "Sequence[MoveCurve]") -> None:  # noqa: B027 - a terminal draws nothing
+    def show_moves(self, unit: str, curves: Sequence[MoveCurve]) -> None:  # noqa: B027 - a terminal draws nothing
         """Draw test moves, where there is a place for that."""
 
     async def choose(self, question: str, choices: Mapping[str, str]) -> str:

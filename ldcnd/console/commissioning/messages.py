@@ -4,6 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from ldcnd.bench.person import MoveCurve
 from ldcnd.contract.commands import ErrorReply
 from ldcnd.contract.frozen import Frozen
 
@@ -57,19 +58,6 @@ class StepView(Frozen):
     """Why it cannot begin now; empty when it can."""
 
 
-class CurveView(Frozen):
-    """One way of a test move."""
-
-    label: str
-    """What it shows."""
-    times_s: tuple[float, ...]
-    """Seconds."""
-    positions: tuple[float, ...]
-    """Position, in axis units."""
-    following_errors: tuple[float, ...]
-    """Likewise."""
-
-
 class View(Frozen):
     """Everything that a page shows of one axis, or of the search for drives."""
 
@@ -87,7 +75,7 @@ class View(Frozen):
     """Why the last thing that was begun has failed."""
     unit: str = ""
     """Of the curves."""
-    curves: tuple[CurveView, ...] = ()
+    curves: tuple[MoveCurve, ...] = ()
     """Test moves of the last tuning."""
 
 

@@ -8,16 +8,12 @@ import asyncio
 from collections import deque
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING
 
 from typing_extensions import override
 
-from ldcnd.bench.person import Left, Person
-from ldcnd.console.commissioning.messages import Choice, CurveView, HoldButton, PersonAnswer, Question
+from ldcnd.bench.person import Left, MoveCurve, Person
+from ldcnd.console.commissioning.messages import Choice, HoldButton, PersonAnswer, Question
 from ldcnd.printable import printable
-
-if TYPE_CHECKING:
-    from ldcnd.bench.tuning.ldcn.report import MoveCurve
 
 HELD_S = 1.0
 """The button is released after this time without a message that it is held; pages send one each tenth of a second."""
@@ -40,7 +36,7 @@ class PagePerson(Person):
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self.question: Question | None = None
-        self.curves: tuple[CurveView, ...] = ()
+        self.curves: tuple[...] = ()
         self.unit = ""
         self._changed = changed
         self._lines: deque[str] = deque(maxlen=MOST_LINES)
@@ -69,9 +65,9 @@ class PagePerson(Person):
         self._changed()
 
     @override
-    def show_moves(self, unit: str, curves: "Sequence[MoveCurve]") -> None:
+    def show_moves(self, unit: str, curves: Sequence[MoveCurve]) -> None:
         self.unit = unit
-        self.curves = tuple(CurveView.model_validate(each.model_dump()) for each in curves)
+        self.curves = tuple(curves)
         self._changed()
 
     @override

@@ -5,9 +5,9 @@ The lines that show a report are here, too, for whoever prints one.
 
 from dataclasses import dataclass
 
-from ldcnd.bench.person import Person
+from ldcnd.bench.person import MoveCurve, Person
 from ldcnd.bench.tuning.ldcn.plan import plan
-from ldcnd.bench.tuning.ldcn.report import MoveCurve, MoveFigures, TuningReport, curves_of, reported
+from ldcnd.bench.tuning.ldcn.report import MoveFigures, TuningReport, curves_of, reported
 from ldcnd.bench.tuning.ldcn.session import measure, verify
 from ldcnd.client.rig_client import RigClient
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 
+from ldcnd.bench.person import MoveCurve
 from ldcnd.bench.tuning.ldcn.plan import Plan
 from ldcnd.bench.tuning.ldcn.response import Figures, Floats
 from ldcnd.bench.tuning.ldcn.session import Findings, VerifiedMove, registers_of
@@ -60,19 +61,6 @@ class LoopMargins(Frozen):
     """Phase margin."""
     gain_db: float | None
     """Gain margin; null where the phase never reaches -180 degrees."""
-
-
-class MoveCurve(Frozen):
-    """One way of a test move, drawn forward."""
-
-    label: str
-    """What it shows."""
-    times_s: tuple[float, ...]
-    """From the begin of the move, seconds."""
-    positions: tuple[float, ...]
-    """Positions, in axis units."""
-    following_errors: tuple[float, ...]
-    """What they are behind the command, in axis units."""
 
 
 class TuningReport(Frozen):
