@@ -36,7 +36,7 @@ class PagePerson(Person):
 
     def __init__(self, changed: Callable[[], None]) -> None:
         self.question: Question | None = None
-        self.curves: tuple[...] = ()
+        self.curves: tuple[MoveCurve, ...] = ()
         self.unit = ""
         self._changed = changed
         self._lines: deque[str] = deque(maxlen=MOST_LINES)
