@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ldcnd.bench.family import BenchFamily, ScannedDrive
-from ldcnd.bench.known import BENCHES
-from ldcnd.bench.opened import show_findings
+from ldcnd.bench.known import BENCHES, show_findings
 from ldcnd.config.edit import draft_of, write_over
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 import click
 
 from ldcnd import durable
-from ldcnd.bench.commissioning.checklist import STEPS, Checklist, change_of
+from ldcnd.bench.commissioning.checklist import STEPS, Checklist, ChecklistWalk, change_of
 from ldcnd.bench.commissioning.checklist import axis_of as configured_axis
 from ldcnd.bench.commissioning.gains import gain_proposals
 from ldcnd.bench.commissioning.record import StepRecord
 from ldcnd.bench.commissioning.report import html_of
-from ldcnd.bench.commissioning.walk import ChecklistWalk
 from ldcnd.bench.known import BENCHES
 from ldcnd.bench.person import Left, Person
 from ldcnd.cli.connection import AXIS, AxisName, Target, with_target
@@ -37,8 +36,8 @@ from ldcnd.version import version
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from ldcnd.bench.tuning.ldcn.guided import Tuned
-    from ldcnd.bench.tuning.ldcn.watching import ShadowAlarm
+    from ldcnd.bench.tuning.report import Tuned
+    from ldcnd.bench.tuning.watching import ShadowAlarm
 
 
 @click.command()
@@ -274,8 +273,8 @@ async def _put_back(client: RigClient, axis: str) -> KeptGains:
 
 
 def _plan(target: Target, axis: str, within: float | None) -> None:
-    from ldcnd.bench.tuning.ldcn import plan as plans  # noqa: PLC0415 - needs an optional package
-    from ldcnd.bench.tuning.ldcn import report as reports  # noqa: PLC0415 - likewise
+    from ldcnd.bench.tuning import plan as plans  # noqa: PLC0415 - needs an optional package
+    from ldcnd.bench.tuning import report as reports  # noqa: PLC0415 - likewise
 
     plan = target.run(lambda client: plans.plan(client, axis, within))
     target.show(reports.plan_reported(plan), *plan.lines, "Nothing was sent to the drive.")
@@ -287,12 +286,12 @@ def _tune(target: Target, axis: str, within: float | None, bandwidth_hz: float |
     Raises:
         click.Abort: the person has left, or did not agree to the proposal; the old gains are back.
     """
-    from ldcnd.bench.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
+    from ldcnd.bench.tuning import report as reports  # noqa: PLC0415 - needs an optional package
 
     async def tuned(client: RigClient) -> "Tuned | None":
         person = TerminalPerson(None) if asks else AssentingPerson(None)
         try:
-            return await guided.tune(client, person, axis, within, bandwidth_hz)
+            return await reports.tune(client, person, axis, within, bandwidth_hz)
         except Left:
             return None
 
@@ -307,10 +306,10 @@ def _tune(target: Target, axis: str, within: float | None, bandwidth_hz: float |
 
 
 def _show(target: Target, tuned: "Tuned") -> None:
-    from ldcnd.bench.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
+    from ldcnd.bench.tuning import report as reports  # noqa: PLC0415 - needs an optional package
 
     report = tuned.report
-    target.show(report, *guided.table(report), *guided.ending(report))
+    target.show(report, *reports.table(report), *reports.ending(report))
     if not report.applied:
         sys.exit(FAILED)
 
@@ -344,7 +343,7 @@ def shadow(target: Target, reports: tuple[Path, ...]) -> None:
     Needs the extra `bench`.
     """
     require("numpy")
-    from ldcnd.bench.tuning.ldcn.watching import read_report, watch  # noqa: PLC0415 - needs an optional package
+    from ldcnd.bench.tuning.watching import read_report, watch  # noqa: PLC0415 - needs an optional package
 
     plants = [read_report(path) for path in reports]
     twice = {plant.axis for plant in plants if [each.axis for each in plants].count(plant.axis) > 1}

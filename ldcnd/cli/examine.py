@@ -13,8 +13,7 @@ import click
 
 from ldcnd.bench.begun import begun_with, scan_port, write
 from ldcnd.bench.family import BenchFamily, TrialMove
-from ldcnd.bench.known import BENCHES, line_of
-from ldcnd.bench.opened import show_findings
+from ldcnd.bench.known import BENCHES, line_of, show_findings
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.typed import Finite, WholeNumber
 from ldcnd.config.rig import RigConfig, load_config

@@ -5,8 +5,7 @@ import random
 import pytest
 
 from ldcnd.bench.begun import begun_with, write
-from ldcnd.bench.known import BENCHES
-from ldcnd.bench.opened import with_line
+from ldcnd.bench.known import BENCHES, with_line
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import Verdict

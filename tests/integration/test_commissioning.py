@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 
 import pytest
 
-from ldcnd.bench.commissioning.checklist import STEPS, Checklist, change_of
+from ldcnd.bench.commissioning.checklist import STEPS, Checklist, ChecklistWalk, change_of
 from ldcnd.bench.commissioning.first_settings import SOFT_GAINS
 from ldcnd.bench.commissioning.gains import gain_proposals
 from ldcnd.bench.commissioning.holding import REACH
@@ -18,10 +18,9 @@ from ldcnd.bench.commissioning.limit_switches import _judged
 from ldcnd.bench.commissioning.motor import CAUGHT, MOST_EL_COUNTS, OUTPUTS
 from ldcnd.bench.commissioning.record import Result, StepState
 from ldcnd.bench.commissioning.report import html_of
-from ldcnd.bench.commissioning.walk import ChecklistWalk
 from ldcnd.bench.machine_faults import MachineFault
 from ldcnd.bench.person import Left
-from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.bench.tuning.plant import Plant
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import KeptGains, file_of, keep
 from ldcnd.client.lease import program_name

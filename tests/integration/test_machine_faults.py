@@ -12,8 +12,8 @@ import pytest
 
 from ldcnd.bench.commissioning.record import StepState
 from ldcnd.bench.machine_faults import MachineFault
-from ldcnd.bench.tuning.ldcn.plan import plan
-from ldcnd.bench.tuning.ldcn.session import measure
+from ldcnd.bench.tuning.plan import plan
+from ldcnd.bench.tuning.session import measure
 from ldcnd.client.kept_gains import kept_for
 from ldcnd.contract.errors import LdcndError
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -202,6 +202,22 @@ async def test_a_hanging_load_is_never_said_to_be_held(kind, tmp_path, monkeypat
 
     assert found == {MachineFault.LOAD_HANGS}
     assert "when the loop opened" in text
+
+
+async def test_a_load_is_measured_on_the_side_to_which_the_axis_may_go(tmp_path):
+    text = (
+        rig_text()
+        .replace("position_min = -18", "position_min = -0.1")
+        .replace("home =", 'reference = "at_reset"\nhome =')
+    )
+    async with commissioning_rig(tmp_path, text=text) as rig:
+        checklist = await rig.checklist()
+        await checklist.preview("hold")
+        text, is_well = await verdict(rig, "hold")
+
+        assert is_well, text
+        assert "no load to speak of" in text
+        assert rig.drive.shaft.position_counts > 0
 
 
 @pytest.mark.parametrize("kind", ["hangs", "brake closed", "at its end"])

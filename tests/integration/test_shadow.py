@@ -7,10 +7,10 @@ from dataclasses import asdict, replace
 
 import pytest
 
-from ldcnd.bench.tuning.ldcn import shadow
-from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.report import Estimate
-from ldcnd.bench.tuning.ldcn.watching import LOOK_S, WatchedAxis, memory_file, watch
+from ldcnd.bench.tuning import shadow
+from ldcnd.bench.tuning.plant import Plant
+from ldcnd.bench.tuning.report import Estimate
+from ldcnd.bench.tuning.watching import LOOK_S, WatchedAxis, memory_file, watch
 from ldcnd.client.kept_gains import KeptGains, forget, gains_in, keep
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient

@@ -9,10 +9,10 @@ from dataclasses import replace
 import click
 import pytest
 
-from ldcnd.bench.tuning.ldcn.plan import plan
-from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.report import plan_reported, reported
-from ldcnd.bench.tuning.ldcn.session import Findings, measure, verify
+from ldcnd.bench.tuning.plan import plan
+from ldcnd.bench.tuning.plant import Plant
+from ldcnd.bench.tuning.report import plan_reported, reported
+from ldcnd.bench.tuning.session import Findings, measure, verify
 from ldcnd.cli.commission import tune
 from ldcnd.cli.connection import Target
 from ldcnd.client.kept_gains import file_of, kept_for, put_back
@@ -159,7 +159,8 @@ def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, m
     pytest.importorskip("matplotlib")
     monkeypatch.setattr("ldcnd.cli.commission.end_as_interrupted", lambda: None)
     monkeypatch.setattr("sys.stdin", io.StringIO())
-    picture = tmp_path / "tune.png"
+    picture, file = tmp_path / "tune.png", tmp_path / "rig.toml"
+    file.write_text(SIMULATED.read_text())
 
     with rig_on(loop) as rig:
         monkeypatch.setattr(Target, "run", lambda _, work: loop.run_until_complete(work(rig.client)))
@@ -169,7 +170,8 @@ def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, m
         tune.main(["x", "--json", "--dry-run"], standalone_mode=False)
         dry = capsys.readouterr()
         untouched = loop.run_until_complete(registers(rig))["kp"]
-        tune.main(["x", "--json", "--yes", "--bandwidth", "25", "--plot", str(picture)], standalone_mode=False)
+        options = ["--yes", "--bandwidth", "25", "--plot", str(picture), "--write", str(file)]
+        tune.main(["x", "--json", *options], standalone_mode=False)
         done = capsys.readouterr()
         loaded = loop.run_until_complete(registers(rig))
         with pytest.raises(WrongState, match="no gains of an unfinished tuning"):
@@ -182,6 +184,8 @@ def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, m
     report = json.loads(done.out.splitlines()[-1])
     assert report["applied"]
     assert report["gains"] == loaded
+    written = load_config(file).bus[0].axis[0].gains.model_dump()
+    assert {name: written[name] for name in loaded} == loaded
     assert report["margins"]["bandwidth_hz"] == pytest.approx(25, rel=0.1)
     assert "identifying" in done.err
     assert picture.read_bytes().startswith(b"\x89PNG")

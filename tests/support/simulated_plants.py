@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 
-from ldcnd.bench.tuning.ldcn.design import Proposal, duration_s, propose, stiff_gains, within_authority
-from ldcnd.bench.tuning.ldcn.excitation import Bounds, Excitation, MoveRecord, Trial, TrialOutcome, Trials
-from ldcnd.bench.tuning.ldcn.identify import Identified, identify
-from ldcnd.bench.tuning.ldcn.plant import ENDLESS_COUNTS, Plant
-from ldcnd.bench.tuning.ldcn.response import Figures, Response, Start, TrapezoidMove, simulate
-from ldcnd.bench.tuning.ldcn.verdict import measured, worst
+from ldcnd.bench.tuning.design import Proposal, duration_s, propose, stiff_gains, within_authority
+from ldcnd.bench.tuning.excitation import Bounds, Excitation, MoveRecord, Trial, TrialOutcome, Trials
+from ldcnd.bench.tuning.identify import Identified, identify
+from ldcnd.bench.tuning.plant import ENDLESS_COUNTS, Plant
+from ldcnd.bench.tuning.response import Figures, Response, Start, TrapezoidMove, simulate
+from ldcnd.bench.tuning.verdict import measured, worst
 from ldcnd.contract.errors import DriveFault
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import Profile

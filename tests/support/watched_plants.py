@@ -5,11 +5,11 @@ import random
 from collections.abc import Iterator
 from dataclasses import replace
 
-from ldcnd.bench.tuning.ldcn.design import stiff_gains, within_authority
-from ldcnd.bench.tuning.ldcn.effort import SeenPosition
-from ldcnd.bench.tuning.ldcn.identify import Identified
-from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.response import TrapezoidMove
+from ldcnd.bench.tuning.design import stiff_gains, within_authority
+from ldcnd.bench.tuning.effort import SeenPosition
+from ldcnd.bench.tuning.identify import Identified
+from ldcnd.bench.tuning.plant import Plant
+from ldcnd.bench.tuning.response import TrapezoidMove
 from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.power import PicServoPower

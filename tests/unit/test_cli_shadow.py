@@ -6,11 +6,11 @@ from dataclasses import asdict
 import pytest
 
 from ldcnd import parts
-from ldcnd.bench.tuning.ldcn import watching
-from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.report import Estimate
-from ldcnd.bench.tuning.ldcn.shadow import FigureName
-from ldcnd.bench.tuning.ldcn.watching import ShadowAlarm
+from ldcnd.bench.tuning import watching
+from ldcnd.bench.tuning.plant import Plant
+from ldcnd.bench.tuning.report import Estimate
+from ldcnd.bench.tuning.shadow import FigureName
+from ldcnd.bench.tuning.watching import ShadowAlarm
 from ldcnd.cli import commission
 from ldcnd.cli.commission import shadow
 from ldcnd.cli.connection import Target

@@ -3,8 +3,8 @@
 import pytest
 
 from ldcnd import parts
-from ldcnd.bench.tuning.ldcn import guided
-from ldcnd.bench.tuning.ldcn.report import Estimate, LoopMargins, MoveFigures, TuningReport
+from ldcnd.bench.tuning import report as guided
+from ldcnd.bench.tuning.report import Estimate, LoopMargins, MoveFigures, TuningReport
 from ldcnd.contract.errors import ConfigError
 
 PREDICTED = MoveFigures(settling_s=0.016, settled=True, overshoot=0.022, following_error=0.111, error=0.0)

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from ldcnd.bench.tuning.ldcn.effort import MOST_GAP_S, EffortMeter, SeenPosition
-from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.shadow import LEARNT_MOTIONS, FigureAlarm, FigureName, Shadow
-from ldcnd.bench.tuning.ldcn.watching import meaning
+from ldcnd.bench.tuning.effort import MOST_GAP_S, EffortMeter, SeenPosition
+from ldcnd.bench.tuning.plant import Plant
+from ldcnd.bench.tuning.shadow import LEARNT_MOTIONS, FigureAlarm, FigureName, Shadow
+from ldcnd.bench.tuning.watching import meaning
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC
 from tests.support.simulated_plants import drawn_plants
 from tests.support.watched_plants import AxisAtWork

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import pytest
 
-from ldcnd.bench.tuning.ldcn.excitation import Bounds, Excitation
-from ldcnd.bench.tuning.ldcn.verdict import MOST_MEASURED_OVERSHOOT, objection
+from ldcnd.bench.tuning.excitation import Bounds, Excitation
+from ldcnd.bench.tuning.verdict import MOST_MEASURED_OVERSHOOT, objection
 from ldcnd.contract.errors import DriveFault, LdcndError
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_V4
 from tests.support.simulated_plants import DrawnPlant, SimulatedAxis, Tuned, drawn_plants, tuned

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.bench.opened import show_findings
+from ldcnd.bench.known import show_findings
 from ldcnd.bench.smartstep.family import SMARTSTEP_BENCH, SOFT_PARITY
 from ldcnd.contract.health import Verdict
 from ldcnd.drives.smartstep.network import smartstep_opener

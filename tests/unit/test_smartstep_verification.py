@@ -5,8 +5,7 @@ from itertools import product
 
 import pytest
 
-from ldcnd.bench.smartstep.tools import verified_keys
-from ldcnd.bench.smartstep.verification import verify_traces
+from ldcnd.bench.smartstep.verification import verified_keys, verify_traces
 from ldcnd.config.edit import set_for_axis
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import DriveFault

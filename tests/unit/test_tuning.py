@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.bench.tuning.ldcn.design import (
+from ldcnd.bench.tuning.design import (
     GAIN_MARGIN_DB,
     LEAST_PHASE_DEG,
     MOST_OVERSHOOT,
@@ -15,11 +15,11 @@ from ldcnd.bench.tuning.ldcn.design import (
     stiff_gains,
     within_authority,
 )
-from ldcnd.bench.tuning.ldcn.excitation import PULSE_TICKS, Bounds, Excitation, MoveRecord, TrialOutcome
-from ldcnd.bench.tuning.ldcn.identify import Identified, identify
-from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.response import Figures, Start, TrapezoidMove, figures, simulate
-from ldcnd.bench.tuning.ldcn.verdict import objection
+from ldcnd.bench.tuning.excitation import PULSE_TICKS, Bounds, Excitation, MoveRecord, TrialOutcome
+from ldcnd.bench.tuning.identify import Identified, identify
+from ldcnd.bench.tuning.plant import Plant
+from ldcnd.bench.tuning.response import Figures, Start, TrapezoidMove, figures, simulate
+from ldcnd.bench.tuning.verdict import objection
 from ldcnd.contract.commands import SetGains
 from ldcnd.contract.errors import DriveFault, ValueOutOfRange
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4

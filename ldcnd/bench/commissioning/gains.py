@@ -76,7 +76,7 @@ async def _tuned(site: StepContext, axis: Axis) -> Result:
         Left: the person has left; the old gains are back.
         LdcndError: it cannot be tuned; likewise.
     """
-    from ldcnd.bench.tuning.ldcn import guided  # noqa: PLC0415 - needs an optional package
+    from ldcnd.bench.tuning import report as reports  # noqa: PLC0415 - needs an optional package
 
     person, unit = site.person, site.info.unit
     earlier = site.record.of(GainsStep.name).result
@@ -87,14 +87,14 @@ async def _tuned(site: StepContext, axis: Axis) -> Result:
         return kept
     usual = WITHIN_COUNTS / site.counts_per_unit
     within = await person.number(f"within which distance of where it stands may it move, in {unit}", usual)
-    tuned = await guided.tune(site.rig.client, person, axis.name, within, await _bandwidth(site))
+    tuned = await reports.tune(site.rig.client, person, axis.name, within, await _bandwidth(site))
     if tuned is None:
         return kept
     person.show_moves(unit, tuned.curves)
     report = tuned.report
     if report.after is None and report.objection is None:  # the proposal was not wanted
         return kept
-    person.tell(*guided.table(report), *guided.ending(report))
+    person.tell(*reports.table(report), *reports.ending(report))
     if not report.applied or report.after is None:
         return kept
     figures = (

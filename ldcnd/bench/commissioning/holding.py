@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 from typing_extensions import override
 
+from ldcnd.bench.commissioning.first_settings import powered_off
 from ldcnd.bench.commissioning.motor import (
     COUNTING,
     DAMPING,
@@ -27,7 +28,6 @@ from ldcnd.bench.commissioning.motor import (
     error_limit,
     lent_gains,
 )
-from ldcnd.bench.commissioning.questions import powered_off
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
 from ldcnd.bench.commissioning.step import Step, StepContext, refuse_latched, refuse_previewed, rest_counts
 from ldcnd.bench.machine_faults import STANDS, MachineFault, named
@@ -86,8 +86,10 @@ class HoldingOutput(Step):
         velocity, acceleration = _profile(site)
         async with site.rig.watch(site.info.axis) as axis:
             refuse_latched(await seen(axis))
-            for distance in (way, -way):
-                refuse_previewed(await axis.preview(distance=distance, velocity=velocity, acceleration=acceleration))
+            if not await _sides(site, axis):
+                refuse_previewed(
+                    await axis.preview(distance=_farthest(site), velocity=velocity, acceleration=acceleration)
+                )
         return (
             (
                 f"{site.info.axis} moves {APPROACHES} times forward and back by {WAY * el:.0f} counts"
@@ -114,9 +116,10 @@ class HoldingOutput(Step):
                 if gone > REACH * el:
                     return _failed(site, f"it went {gone} counts by itself", MachineFault.CARRIED)
                 first = -1 if sign * (before - origin) > 0 else 1
-                for lift in (
-                    (first, -first) if gone < el / 2 else (first,)
-                ):  # where it was left, only towards the origin
+                carried = False
+                wanted = (first, -first) if gone < el / 2 else (first,)  # from where it was left towards the origin
+                sides = await _sides(site, axis)
+                for lift in [each for each in wanted if each in sides] or sides:
                     trial = await self._approach(site, axis, output, el, lift)
                     if trial:
                         return _judged(site, trial, old.get("cl"))
@@ -169,6 +172,21 @@ class HoldingTrial:
 def _way(site: StepContext) -> float:
     """Return how far each motion goes, in axis units."""
     return WAY * error_limit(site) / site.counts_per_unit
+
+
+def _farthest(site: StepContext) -> float:
+    """Return how far the goals are from where it stands, in axis units."""
+    return (LIFT + WAY) * error_limit(site) / site.counts_per_unit
+
+
+async def _sides(site: StepContext, axis: Axis) -> list[int]:
+    """Return the sides to which it may go: forward 1, back -1. It may stand at one of its limits."""
+    velocity, acceleration = _profile(site)
+    replies = {
+        side: await axis.preview(distance=side * _farthest(site), velocity=velocity, acceleration=acceleration)
+        for side in (1, -1)
+    }
+    return [side for side, reply in replies.items() if not reply.refusal and reply.approach_from is None]
 
 
 def _profile(site: StepContext) -> tuple[float, float]:

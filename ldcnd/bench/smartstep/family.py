@@ -45,9 +45,9 @@ class SmartStepBench(BenchFamily[SmartStepBusConfig]):
 
     @override
     def commands(self) -> Sequence[click.Command]:
-        from ldcnd.bench.smartstep import tools  # noqa: PLC0415 - only that command needs them
+        from ldcnd.bench.smartstep import verification  # noqa: PLC0415 - only that command needs them
 
-        return tools.commands()
+        return verification.commands()
 
     @override
     def scan(self, port: str, *, give_addresses: bool, opener: Opener | None = None) -> Scan:

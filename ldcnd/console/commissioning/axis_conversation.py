@@ -5,9 +5,8 @@ from pathlib import Path
 from typing_extensions import override
 
 from ldcnd.bench.commissioning import record as records
-from ldcnd.bench.commissioning.checklist import STEPS, Checklist
+from ldcnd.bench.commissioning.checklist import STEPS, Checklist, ChecklistWalk
 from ldcnd.bench.commissioning.record import CommissioningRecord, StepRecord, StepState
-from ldcnd.bench.commissioning.walk import ChecklistWalk
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config
 from ldcnd.console.commissioning.conversation import Conversation

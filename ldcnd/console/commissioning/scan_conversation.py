@@ -7,8 +7,7 @@ from typing_extensions import override
 
 from ldcnd.bench.begun import begun_with, scan_port, write
 from ldcnd.bench.family import ScannedDrive
-from ldcnd.bench.known import BENCHES
-from ldcnd.bench.opened import ports
+from ldcnd.bench.known import BENCHES, ports
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config
 from ldcnd.console.commissioning.conversation import Conversation

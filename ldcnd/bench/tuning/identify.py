@@ -12,9 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ldcnd.bench.tuning.ldcn.excitation import MoveRecord
-from ldcnd.bench.tuning.ldcn.plant import LEAST_DAMPING_PER_S, Plant
-from ldcnd.bench.tuning.ldcn.response import Floats, TrapezoidMove, simulate
+from ldcnd.bench.tuning.excitation import MoveRecord
+from ldcnd.bench.tuning.plant import LEAST_DAMPING_PER_S, Plant
+from ldcnd.bench.tuning.response import Floats, TrapezoidMove, simulate
 from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.drives.ldcn.profiles import Profile
 

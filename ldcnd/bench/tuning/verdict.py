@@ -5,11 +5,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ldcnd.bench.tuning.ldcn.design import WINDOW_COUNTS, WINDOW_SHARE
-from ldcnd.bench.tuning.ldcn.excitation import BOTH_WAYS, MoveRecord
-from ldcnd.bench.tuning.ldcn.identify import begin_s
-from ldcnd.bench.tuning.ldcn.plant import Plant
-from ldcnd.bench.tuning.ldcn.response import Figures, Floats, figures, simulate
+from ldcnd.bench.tuning.design import WINDOW_COUNTS, WINDOW_SHARE
+from ldcnd.bench.tuning.excitation import BOTH_WAYS, MoveRecord
+from ldcnd.bench.tuning.identify import begin_s
+from ldcnd.bench.tuning.plant import Plant
+from ldcnd.bench.tuning.response import Figures, Floats, figures, simulate
 from ldcnd.drives.ldcn.profiles import Profile
 
 MOST_MEASURED_OVERSHOOT = 0.15

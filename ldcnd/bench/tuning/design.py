@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ldcnd.bench.tuning.ldcn.identify import Identified
-from ldcnd.bench.tuning.ldcn.plant import FULL_PWM, Plant
-from ldcnd.bench.tuning.ldcn.response import Figures, Response, TrapezoidMove, figures, simulate
+from ldcnd.bench.tuning.identify import Identified
+from ldcnd.bench.tuning.plant import FULL_PWM, Plant
+from ldcnd.bench.tuning.response import Figures, Response, TrapezoidMove, figures, simulate
 from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import Profile

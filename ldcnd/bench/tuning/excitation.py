@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from ldcnd.bench.machine_faults import STANDS, MachineFault, fault_found
-from ldcnd.bench.tuning.ldcn.plant import FULL_PWM
-from ldcnd.bench.tuning.ldcn.response import Start, TrapezoidMove
+from ldcnd.bench.tuning.plant import FULL_PWM
+from ldcnd.bench.tuning.response import Start, TrapezoidMove
 from ldcnd.contract.errors import DriveFault, ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import Profile

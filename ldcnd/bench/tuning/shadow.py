@@ -18,8 +18,8 @@ from enum import StrEnum
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from ldcnd.bench.tuning.ldcn.effort import LEAST_COUNTS, Effort, EffortMeter, SeenPosition
-from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.bench.tuning.effort import LEAST_COUNTS, Effort, EffortMeter, SeenPosition
+from ldcnd.bench.tuning.plant import Plant
 from ldcnd.contract.samples import FigureRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import Profile

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ldcnd.bench.tuning.ldcn.plant import Plant
+from ldcnd.bench.tuning.plant import Plant
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.drives.ldcn.registers import FRACTION

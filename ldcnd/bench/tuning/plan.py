@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from ldcnd.bench.tuning.ldcn.excitation import Bounds, Excitation
+from ldcnd.bench.tuning.excitation import Bounds, Excitation
 from ldcnd.client.axis import Axis, at_rest
 from ldcnd.client.kept_gains import kept_for, put_back_by_hand
 from ldcnd.client.rig import Rig

@@ -11,8 +11,8 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 
-from ldcnd.bench.tuning.ldcn.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
-from ldcnd.bench.tuning.ldcn.excitation import (
+from ldcnd.bench.tuning.design import Proposal, duration_s, figures_of, propose, stiff_gains, within_authority
+from ldcnd.bench.tuning.excitation import (
     MOST_ERROR_LIMIT,
     Excitation,
     MoveRecord,
@@ -21,10 +21,10 @@ from ldcnd.bench.tuning.ldcn.excitation import (
     TrialOutcome,
     Trials,
 )
-from ldcnd.bench.tuning.ldcn.identify import Identified, identify
-from ldcnd.bench.tuning.ldcn.plan import Plan, check_as_planned, check_off
-from ldcnd.bench.tuning.ldcn.response import TrapezoidMove, simulate
-from ldcnd.bench.tuning.ldcn.verdict import MOST_MEASURED_OVERSHOOT, SAME_S, Measured, measured, objection, worst
+from ldcnd.bench.tuning.identify import Identified, identify
+from ldcnd.bench.tuning.plan import Plan, check_as_planned, check_off
+from ldcnd.bench.tuning.response import TrapezoidMove, simulate
+from ldcnd.bench.tuning.verdict import MOST_MEASURED_OVERSHOOT, SAME_S, Measured, measured, objection, worst
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import (
     LEASE_S,
