@@ -31,7 +31,7 @@ function restOf(axis, event) {
   if (event.position != null) return event.position;
   const after = axis.rig.events.slice(axis.rig.events.indexOf(event) + 1).filter((each) => each.axis === axis.name);
   const ending = after.find((each) => each.position != null);
-  if (ending) return axis.rig.motions.has(ending.verb) ? null : ending.position;
+  if (ending) return axis.rig.mayMove(ending.verb) ? null : ending.position;
   return axis.condition.live && axis.state?.moving === "no" && axis.ended() === event ? (axis.samples.position?.value ?? null) : null;
 }
 

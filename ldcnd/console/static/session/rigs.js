@@ -131,7 +131,7 @@ export class Axis {
   ended(commandId = null) {
     const mine = (event) =>
       event.axis === this.name && FINAL.has(event.status) &&
-      (commandId ? event.command_id === commandId : this.rig.motions.has(event.verb) && event.status !== "refused");
+      (commandId ? event.command_id === commandId : this.rig.mayMove(event.verb) && event.status !== "refused");
     return this.rig.events.findLast(mine) ?? null;
   }
 
@@ -198,8 +198,6 @@ export class Rig {
   daemon = null;
   plan = null;
   health = null;
-  /** The verbs that may move an axis. */
-  motions = new Set();
   axes = new Map();
   buses = new Map();
   events = [];
@@ -221,6 +219,11 @@ export class Rig {
     return null;
   }
 
+  /** Whether a command may make an axis move, as the daemon says. */
+  mayMove(verb) {
+    return this.commands.get(verb)?.effect === "motion";
+  }
+
   axis(name) {
     if (!this.axes.has(name)) this.axes.set(name, new Axis(this, name));
     return this.axes.get(name);
@@ -237,7 +240,6 @@ export class Rig {
     this.problem = told.problem;
     this.daemon = told.daemon ?? this.daemon;
     this.plan = told.plan ?? this.plan;
-    for (const { verb, effect } of told.commands?.commands ?? []) if (effect === "motion") this.motions.add(verb);
     const described = Boolean(told.daemon);
     if (described) for (const axis of this.axes.values()) axis.info = null; // those that it has not any more keep none
     for (const bus of this.buses.keys()) if (described && !told.buses.some((each) => each.bus === bus)) this.buses.delete(bus);
