@@ -179,11 +179,13 @@ class PageControl:
             before.keeping.cancel()  # the daemon has put the new lease in its place
         keeping = self._group.create_task(self._keep(rig, axis, control), name=f"lease of {self.client} on {axis}")
         self._held[rig, axis] = _Hold(client, axis, control, keeping)
+        self._rigs.control_changed(rig, axis)
 
     async def release(self, rig: str, axis: str) -> None:
         """Give up control of an axis; one that may move is halted before."""
         if hold := self._held.pop((rig, axis), None):
             await _give_up(hold, self.client)
+            self._rigs.control_changed(rig, axis)
 
     async def command(self, rig: str, axis: str, command: AxisCommand[CommandReply]) -> CommandReply:
         """Send one command, under the page's lease where it has one.
@@ -288,6 +290,7 @@ class PageControl:
         hold = self._held.get((rig, axis))
         if hold and hold.control is control:
             del self._held[rig, axis]
+            self._rigs.control_changed(rig, axis)
             why = control.lost.message if control.lost else ""
             log.info("control lost", client=self.client, rig=rig, axis=axis, reason=why)
             taker = await self._holder(rig, axis)

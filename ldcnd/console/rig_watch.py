@@ -9,7 +9,7 @@ import msgpack
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
-from ldcnd.console.latest_values import LatestValues
+from ldcnd.console.latest_values import LatestValues, as_msgpack
 from ldcnd.console.replies import RigReply
 from ldcnd.contract.codec import Encoding
 from ldcnd.contract.commands import Why
@@ -27,8 +27,10 @@ OBSTACLES_TOPIC = "obstacles"
 """The last chunk of the key under which a page gets what forbids the commands of an axis; no daemon publishes it."""
 ASK_WHY_EACH_S = 0.2
 """Shortest time between two rounds of questions for what forbids the commands of axes, seconds."""
-ASK_ALL_WHY_S = 2.0
+ASK_ALL_WHY_S = 5.0
 """Longest time between them: what is not in the state of an axis, as another daemon, forbids commands too."""
+STAMPS = frozenset({"t", "t_error_ns", "seq"})
+"""Fields of a sample that differ in each."""
 LINGER_S = 0.016
 """Period in which samples are taken together, seconds; less than a frame at the highest rate."""
 DESCRIPTION_AGE_S = 1.0
@@ -56,6 +58,7 @@ class RigWatch:
         self._values = values
         self._lease_of = lease_of
         self._why_due: set[str] = set()
+        self._said: dict[str, dict[str, object]] = {}
         self._why_wanted = asyncio.Event()
         self._conditions = Conditions(client.rig, values.take, asyncio.get_running_loop().time)
         self._telemetry = client.keys.telemetry_pattern("*", "*").removesuffix("*/*")
@@ -96,8 +99,9 @@ class RigWatch:
             group.create_task(self._follow_obstacles(), name=f"obstacles of {self.client.rig}")
             await self._watch()
 
-    def _want_why(self, *axes: str) -> None:
-        self._why_due.update(axes)
+    def want_why(self, axis: str) -> None:
+        """Ask anew what forbids the commands of an axis: something of it is different, such as the lease of a page."""
+        self._why_due.add(axis)
         self._why_wanted.set()
 
     async def _follow_obstacles(self) -> None:
@@ -128,10 +132,19 @@ class RigWatch:
     def _take(self, sample: Publication) -> None:
         if sample.kind is SampleKind.DELETE and sample.key.startswith(self._telemetry):
             return  # its daemon ends, which is known otherwise: pages show these as the last known values, not as none
-        if sample.key.endswith((f"/{TelemetryItem.STATE}", f"/{TelemetryItem.FAULT}")):
-            self._want_why(sample.key.split("/")[-2])
+        if sample.key.endswith((f"/{TelemetryItem.STATE}", f"/{TelemetryItem.FAULT}")) and self._is_other(sample):
+            self.want_why(sample.key.split("/")[-2])
         self._values.take(sample)
         self._conditions.take(sample)
+
+    def _is_other(self, sample: Publication) -> bool:
+        """Tell whether a state or fault sample says something else than the one before: most are signs of life only."""
+        packed = as_msgpack(sample.payload, sample.encoding)
+        fields = msgpack.unpackb(packed) if packed else {}
+        said = {name: value for name, value in fields.items() if name not in STAMPS}
+        is_other = said != self._said.get(sample.key)
+        self._said[sample.key] = said
+        return is_other
 
     async def _watch(self) -> None:
         while True:

@@ -73,6 +73,10 @@ class Rigs:
         """Return the run of a rig's daemon that the console shows, or None before it was there."""
         return self._watch(rig).instance
 
+    def control_changed(self, rig: str, axis: str) -> None:
+        """Learn that a page has another lease on an axis, or none any more."""
+        self._watch(rig).want_why(axis)
+
     def axes(self, rig: str) -> frozenset[str]:
         """Return the names of a rig's axes, as it described itself last."""
         return self._watch(rig).axes

@@ -10,7 +10,7 @@ import { ask } from "../session/api.js";
 import { command, controls, release, take } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { axesOf, changed, endpoints, useRigs } from "../session/rigs.js";
-import { AxesOf, ShortAction } from "./rig_axes.js";
+import { AxesOf, refused, ShortAction } from "./rig_axes.js";
 import { GroupMoves } from "./rig_groups.js";
 import { SpeedOverride } from "./rig_speed.js";
 
@@ -119,12 +119,6 @@ function RigSection({ rig }) {
     ${filtered && !axes.length && html`<p class="quiet">No axis of this rig is like that.</p>`}
     <${GroupMoves} rig=${rig} />
   </section>`;
-}
-
-/** Why an axis refused a command, with the nearest value that it would take. */
-function refused(axis, verb, { message, nearest }) {
-  const text = message.replace(`axis ${axis.name}: `, "");
-  return `${words(verb)} refused: ${text}${nearest === null ? "" : `; nearest that is taken: ${nearest}`}`;
 }
 
 /** What can be asked of all axes of a rig at once; each one that cannot do it now is passed over. */

@@ -2,7 +2,8 @@
 
 import { html, useId } from "../html.js";
 import { Action } from "../parts/controls.js";
-import { decimalsOf, number, percent } from "../parts/format.js";
+import { decimalsOf, number, percent, words } from "../parts/format.js";
+import { inPageTerms } from "../parts/remedies.js";
 import { Homed, Mark, Meter, Place, StateWord } from "../parts/state.js";
 import { command, controls, take } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
@@ -94,6 +95,13 @@ function AxisRow({ axis }) {
   }`;
 }
 
+/** Why an axis refused a command, what to do, and the nearest value that it would take. */
+export function refused(axis, verb, { message, nearest, remedy, steps }) {
+  const text = message.replace(`axis ${axis.name}: `, "");
+  const way = remedy ? `; ${inPageTerms({ remedy, steps })}` : "";
+  return `${words(verb)} refused: ${text}${nearest === null ? way : `; nearest that is taken: ${nearest}`}`;
+}
+
 /** What can be asked of one axis without leaving the page; why not is in the title and read to screen readers.
 
  * Of the commands that the daemon would carry out now: without control that is to take it.
@@ -108,16 +116,24 @@ function AxisCommands({ axis }) {
   const second = obstacle(axis, "reset") === null || !axis.can("home") ? reset : home;
   const taking = ["Take control", "none", () => take([axis])];
   const held = axis.holder ? `Control is held by ${axis.holder}: take it on the page of ${axis.name}.` : null;
+  const refuse = (title) => (error) => {
+    axis.refusal = refused(axis, title.toLowerCase(), error); // below the row, which is one line
+    changed();
+  };
+  const begin = (run) => () => {
+    axis.refusal = null;
+    return run();
+  };
   return html`<span class="row" role="group" aria-label=${`Commands for ${axis.name}`}>
     ${(controls(axis) ? [power, second, halt] : [taking, halt]).map(([title, act, run]) => html`<${ShortAction} key=${act} title=${title}
-      name=${axis.name} act=${run} obstacle=${obstacle(axis, act) ?? (act === "none" ? held : null)} />`)}
+      name=${axis.name} act=${begin(run)} onRefused=${refuse(title)} obstacle=${obstacle(axis, act) ?? (act === "none" ? held : null)} />`)}
   </span>`;
 }
 
 /** A small button for what `name` says; what is in its way is in the title and read to screen readers. */
-export function ShortAction({ title, name, act, obstacle: way }) {
+export function ShortAction({ title, name, act, onRefused, obstacle: way }) {
   const reason = useId();
-  return html`<${Action} act=${act} obstacle=${way} reason=${reason} title=${way ?? `${title} ${name}`}
+  return html`<${Action} act=${act} onRefused=${onRefused} obstacle=${way} reason=${reason} title=${way ?? `${title} ${name}`}
     >${title}<span class="unseen"> ${name}</span><//>${way && html`<span class="unseen" id=${reason}>${way}</span>`}`;
 }
 
