@@ -29,8 +29,9 @@ ASK_WHY_EACH_S = 0.2
 """Shortest time between two rounds of questions for what forbids the commands of axes, seconds."""
 ASK_ALL_WHY_S = 5.0
 """Longest time between them: what is not in the state of an axis, as another daemon, forbids commands too."""
-STAMPS = frozenset({"t", "t_error_ns", "seq"})
-"""Fields of a sample that differ in each."""
+STAMPS = frozenset({"t", "t_error_ns", "seq", "holder"})
+"""Fields of a sample that differ in each; and who controls the axis: of its own leases the console knows itself, and it
+would ask for a page that is about to learn of its lease."""
 LINGER_S = 0.016
 """Period in which samples are taken together, seconds; less than a frame at the highest rate."""
 DESCRIPTION_AGE_S = 1.0
