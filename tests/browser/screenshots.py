@@ -28,8 +28,8 @@ async def rig(house: House, desk: Desk) -> None:
     await client.command("x", MoveAbsolute(position=60, velocity=5))
     await desk.open("rig")
     await expect(desk.page.get_by_text("position error").first).to_be_visible()
-    await expect(desk.panel("Rig sim").get_by_role("row", name="x ls-182ap").get_by_text("moving")).to_be_visible()
-    await expect(desk.panel("Rig sim").get_by_role("row", name="y ls-182ap").get_by_text("standstill")).to_be_visible()
+    await expect(desk.panel("Rig sim").locator("tr[data-axis=x] .state")).to_contain_text("moving")
+    await expect(desk.panel("Rig sim").locator("tr[data-axis=y] .state")).to_have_text("standstill")
 
 
 async def axis(house: House, desk: Desk) -> None:

@@ -79,7 +79,7 @@ function Notices() {
   return html`<div class="notices" role="alert">
     ${failure && html`<p class="notice mark" data-level="bad">${failure.message} ${failure.remedy ?? ""}</p>`}
     ${[...rigs.values()].filter((rig) => rig.worth).map((rig) => html`<p class="notice mark" key=${rig.name} data-level="bad"
-      >${rig.name}: no values. ${rig.worth.why}</p>`)}
+      >${rig.name}: no new values. ${rig.worth.why}</p>`)}
     ${lost.size > 0 && html`<p class="notice mark" data-level="bad">${lostInWords().join(" ")}
       <button type="button" class="plain" onClick=${dismissLost}>Dismiss</button></p>`}
     <${Stops} />
@@ -106,6 +106,15 @@ function Console() {
     addEventListener("hashchange", moved);
     return () => removeEventListener("hashchange", moved);
   }, []);
+  const frame = useRef();
+  useEffect(() => {
+    // whatever notices the frame holds: what gets the focus comes to lie below it
+    const watching = new ResizeObserver(() => {
+      document.documentElement.style.scrollPaddingTop = `${frame.current.offsetHeight + 8}px`;
+    });
+    watching.observe(frame.current);
+    return () => watching.disconnect();
+  }, []);
   const [, title, Page] = PAGES.find(([page]) => page === at.page) ?? ["axis", at.axis ?? "Axis", AxisPage];
   useEffect(() => {
     const place = at.page === "axis" ? `Axis ${at.axis}` : title;
@@ -116,7 +125,7 @@ function Console() {
     event.preventDefault();
     main.current.focus();
   }}>Skip to the page</a>
-    <header class="frame">
+    <header class="frame" ref=${frame}>
       <div class="top">
         <span class="brand">ldcnd</span>
         <${Navigation} at=${at} />

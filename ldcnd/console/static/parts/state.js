@@ -38,7 +38,7 @@ export function Place({ axis, decimals, label = null }) {
 export function Homed({ axis }) {
   const { known, mark, live } = axis.condition;
   if (!known) return html`<span class="mark unhomed" data-level=${live ? "warn" : "bad"}>${mark}</span>`;
-  return html`<span class="quiet">${axis.state?.has_reference === false ? "cannot be homed" : "homed"}</span>`;
+  return html`<span class="quiet">${axis.state?.has_reference === false ? "–" : "homed"}</span>`;
 }
 
 /** How much the values are worth and how old they are. */
