@@ -46,6 +46,8 @@ LIMIT_COUNTS = 60.0
 """So far a servo overshoots a software limit."""
 PATH_COUNTS = 150.0
 """So far an axis may be beside its polyline: the points of corners, and what the servo lags."""
+SEEN_WITHIN_S = 0.4
+"""Until a daemon knows at the latest that a drive has opened its loop: it is polled six times a second."""
 CAME_S = 1e-6
 """What is sent arrives at once; the turn of the loop in which it does takes no longer."""
 
@@ -114,6 +116,7 @@ class ShaftJudge(Witness):
         daemons: those whose tokens are shown.
         born: when each was made.
         ended: those that were told to end, and when.
+        tripped: of each axis, when its drive last opened its loop by itself.
         frozen: when the process was held up, and until when.
         motions: how many were begun.
         modules: the drives, in the order of the chain.
@@ -132,6 +135,7 @@ class ShaftJudge(Witness):
         self.daemons: set[str] = set()
         self.born: dict[str, float] = {}
         self.ended: dict[str, float] = {}
+        self.tripped: dict[str, float] = {}
         self.frozen: list[tuple[float, float]] = []
         self.begun: dict[str, Begun] = {name: Begun() for name in self.settings}
         self.renewed: dict[str, float] = {}
@@ -226,10 +230,11 @@ class ShaftJudge(Witness):
             self._watch_profile(name, drive)
 
         def executed(command: ReceivedCommand) -> None:
-            before = drive.loop.trajectory.velocity
+            before, tripped = drive.loop.trajectory.velocity, self.tripped.get(name, -math.inf)
             execute(command)
             if isinstance(command, StopMotor):
                 self.heard[name].append(self.now_s)
+                self.tripped[name] = tripped  # what opened the loop now was asked for
             self._check_goal(name, drive, command, moving=bool(before))
 
         drive.restart, drive.execute = restarted, executed  # type: ignore[method-assign]
@@ -241,6 +246,15 @@ class ShaftJudge(Witness):
         counts, cycle_s, step = abs(axis.signed_counts_per_unit), drive.profile.servo_cycle_s, trajectory.step
         most_velocity = (axis.limits.velocity or math.inf) * counts * (1 + ROUNDING)
         most_acceleration = (axis.limits.acceleration or math.inf) * counts * (1 + ROUNDING)
+
+        open_loop = loop.open
+
+        def opened() -> None:
+            if loop.servo_on:
+                self.tripped[name] = self.now_s
+            open_loop()
+
+        loop.open = opened  # type: ignore[method-assign]
 
         def stepped() -> None:
             before = trajectory.velocity
@@ -266,7 +280,9 @@ class ShaftJudge(Witness):
     # -- beginnings --------------------------------------------------------------------------------------------------
 
     @override
-    def _forbidden(self, daemon: Daemon, name: str, now_s: float) -> str | None:
+    def _forbidden(self, daemon: Daemon, name: str, now_s: float, *, begins: bool) -> str | None:
+        if not begins and now_s <= self._settled_s(self.tripped.get(name, -math.inf)) + SEEN_WITHIN_S:
+            return None  # the drive has opened its loop by itself, and no reading could tell
         instance = daemon._run.instance
         if (ended_s := self.ended.get(instance)) is not None and now_s > self._settled_s(ended_s):
             return f"the end of its daemon has begun at {ended_s:.4f}"
@@ -276,7 +292,7 @@ class ShaftJudge(Witness):
         holds = name in self.latched or stopped_s >= self.born[instance]
         if now_s > self._settled_s(stopped_s) and holds:
             return f"it was stopped at {stopped_s:.4f} and not reset"
-        return super()._forbidden(daemon, name, now_s)
+        return super()._forbidden(daemon, name, now_s, begins=begins)
 
     @override
     def _count(self, daemon: Daemon, name: str, now_s: float) -> None:
@@ -338,16 +354,28 @@ class ShaftJudge(Witness):
             self._begin_path(name, begun, request, here)
         elif profile.mode is ProfileMode.TRAPEZOIDAL:
             goal, tick_s = profile._goal / FRACTION + loose, drive.profile.servo_cycle_s * drive.loop._tick_cycles
-            wrong = self._wrong_motion(name, request, here, goal, profile._top_speed / FRACTION / tick_s, moving=moving)
+            speed, shaft = profile._top_speed / FRACTION / tick_s, drive.shaft.position_counts
+            wrong = self._wrong_motion(name, request, (here, shaft), goal, speed, moving=moving)
             if wrong:
                 way = f"{name} goes from {here:.0f} to {goal:.0f} for {request!r}"
                 self.wrong.append(f"{self.now_s:.4f}: {way}: {wrong}")
             self._goals[name] = goal
 
     def _wrong_motion(
-        self, name: str, request: AxisCommand[CommandReply], here: float, goal: float, speed: float, *, moving: bool
+        self,
+        name: str,
+        request: AxisCommand[CommandReply],
+        places: tuple[float, float],
+        goal: float,
+        speed: float,
+        *,
+        moving: bool,
     ) -> str | bool:
-        """Tell what is wrong with a trapezoid: its goal, its way, its speed in counts a second."""
+        """Tell what is wrong with a trapezoid: its goal, its way, its speed in counts a second.
+
+        Its distance is from where the shaft is or from where its drive wants it; the two differ while a servo settles.
+        """
+        here, shaft = places
         axis = self.settings[name]
         counts, tolerance = axis.signed_counts_per_unit, GOAL_COUNTS
         if moving:
@@ -363,7 +391,7 @@ class ShaftJudge(Witness):
                     return wrong
                 return _wrong_way((goal - here) / counts, direction, axis.modulo, GOAL_COUNTS / abs(counts))
             case MoveRelative(distance=distance):
-                froms = here, self._goals.get(name, here)  # one that follows a move in mid-move is from its goal
+                froms = here, shaft, self._goals.get(name, here)  # one that follows a move in mid-move is from its goal
                 off = min(abs(goal - begin - distance * counts) for begin in froms)
                 return off > tolerance and "that is another distance"
             case MoveVelocity(velocity=velocity):

@@ -72,7 +72,7 @@ class Witness:
             if self.daemon is None:
                 self.wrong.append(f"{now_s:.4f}: {name} got {packet} from a daemon that had only started")
                 continue
-            if why := self._forbidden(self.daemon, name, now_s):
+            if why := self._forbidden(self.daemon, name, now_s, begins=begins):
                 self.wrong.append(f"{now_s:.4f}: {name} got {packet} although {why}")
             if begins:
                 self._count(self.daemon, name, now_s)
@@ -101,8 +101,9 @@ class Witness:
         goes_nowhere = loaded.servo and profile.done and here
         return not goes_nowhere, goes_nowhere and not drive.loop.servo_on
 
-    def _forbidden(self, daemon: Daemon, name: str, now_s: float) -> str | None:
-        """Return why an axis must not be moved now."""
+    def _forbidden(self, daemon: Daemon, name: str, now_s: float, *, begins: bool) -> str | None:
+        """Return why an axis must not be moved now; without `begins` its loop is closed, or its path goes on."""
+        del begins
         tracker, dispatcher = daemon.rig.axes[name].tracker, daemon._dispatcher
         lease = dispatcher.authority.holder(name)
         if lease is None or lease.ends_at_s <= now_s:
