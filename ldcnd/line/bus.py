@@ -50,6 +50,7 @@ class Job(Transaction):
     """
 
     __slots__ = ("attempts", "attempts_left", "condition", "future", "timing")
+    proves = False
 
     def __init__(
         self,
@@ -78,7 +79,7 @@ class Job(Transaction):
             except LdcndError as error:
                 self.fail(error)
                 return False
-        self.attempts_left -= 1
+        self.attempts_left -= 1  # what the condition forbids was no attempt
         return True
 
     def fail(self, error: LdcndError) -> None:
@@ -101,6 +102,8 @@ class Job(Transaction):
     @override
     def lost(self, error: BusError) -> bool:
         exchange = self.exchange
+        # a position that is loaded again in mid-move is added to the first one on an LS-182AP, and a lost reply does
+        # not say that the packet was lost (LS-182AP manual, Load Trajectory)
         if not exchange.repeatable:
             self.fail(
                 OutcomeUnknown(
@@ -396,6 +399,7 @@ class Bus:
                 delay_s = min(2 * delay_s, LONGEST_REOPEN_S)
                 continue
             opened_s = self._loop.time()
+            # of a port that did not stay the last time, the log says nothing before it has stayed
             said = self._loop.call_later(STAYS_S if failure else 0.0, self._say_open)
             try:
                 await self._use(transport)
@@ -405,6 +409,7 @@ class Bus:
             if stayed or self._loss_reason != failure:
                 log.warning("line lost", bus=self.settings.name, reason=self._loss_reason)
             failure = "" if stayed else self._loss_reason
+            # a port that opens but does not stay must not be opened at full speed for ever
             delay_s, pause_s = FIRST_REOPEN_S, FIRST_REOPEN_S if stayed else pause_s
             await asyncio.sleep(pause_s)
             pause_s = min(2 * pause_s, LONGEST_REOPEN_S)
@@ -431,7 +436,7 @@ class Bus:
 
     def _note_loss(self, reason: str) -> None:
         """Take note that the line is lost: every exchange that waits has its outcome."""
-        self._line = None
+        self._line = None  # first, so that nothing is queued by what follows
         self._tried_at_s = self._loop.time()
         self._loss_reason = reason
         self._opened.clear()

@@ -31,7 +31,10 @@ class ReplyVerdict(Enum):
     FOREIGN = "foreign"
     """Well formed, but not the answer to this request: skipped, the bus reads on until the deadline."""
     REJECTED = "rejected"
-    """An intact reply by which the node says it did not execute our damaged packet; resending is always safe."""
+    """An intact reply by which the node says it did not execute our damaged packet; resending is always safe.
+
+    Source: PIC-SERVO manual, 4.1, and 5.3, status bit cksum_error.
+    """
 
 
 class PacketEffect(Enum):

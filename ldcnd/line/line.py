@@ -10,7 +10,6 @@ follow a request; after any loss the line is resynchronised (`Resync`) before it
 """
 
 import asyncio
-from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from enum import Enum
@@ -32,8 +31,10 @@ AT_ONCE = tuple(f"{lane}{AT_ONCE_REMARK}" for lane in LANES)
 """The same for packets that waited for the reply before them."""
 
 
-class Transaction(ABC):
+class Transaction:
     """One exchange on its way over the wire; exactly one of the outcomes is reported for each time it is sent.
+
+    This one is of no caller: the line sends it itself, to prove that it is in step.
 
     Attributes:
         exchange: request and expected reply.
@@ -50,7 +51,7 @@ class Transaction(ABC):
     __slots__ = ("at_baud", "exchange", "lane", "slow_to_deliver", "then_baud", "wanted_at_s")
     condition: Condition | None = None
     poller: Poller[Any] | None = None
-    proves = False
+    proves = True
 
     def __init__(self, exchange: Exchange[Any], lane: Lane, wanted_at_s: float) -> None:
         self.exchange = exchange
@@ -69,26 +70,26 @@ class Transaction(ABC):
         """Check the condition directly before sending; if it fails, that is the outcome."""
         return True
 
-    def fail(self, error: LdcndError) -> None:  # noqa: B027 - polls and probes are asked for by no caller
+    def fail(self, error: LdcndError) -> None:
         """Give the caller the error, if there is one who waits."""
 
-    @abstractmethod
     def completed(self, reply: bytes, timing: Timing) -> None:
         """Take the intact reply (empty when none was due); the next request is on the wire already."""
 
-    @abstractmethod
-    def lost(self, error: BusError) -> bool:
+    def lost(self, error: BusError) -> bool:  # noqa: ARG002 - the line repeats its own by itself
         """Note that no reply is valid any more; return whether to send the exchange again."""
+        return False
 
-    @abstractmethod
     def rejected(self) -> bool:
         """Note that the node did not execute the packet; return whether to send it again."""
+        return False
 
 
 class PollTransaction(Transaction):
     """A poll; it is never sent again, because the next poll comes soon enough."""
 
     __slots__ = ("poller",)
+    proves = False
 
     def __init__(self, poller: Poller[Any], exchange: Exchange[Any], wanted_at_s: float) -> None:
         self.exchange, self.lane, self.wanted_at_s = exchange, POLL, wanted_at_s  # one call less for each poll
@@ -114,25 +115,6 @@ class PollTransaction(Transaction):
     def rejected(self) -> bool:
         self.poller.missed(PacketRejected(f"node {self.exchange.node} received a damaged packet"))
         return False
-
-
-class ResyncExchange(Transaction):
-    """The line's own exchange at the end of a resynchronisation; the line repeats it by itself."""
-
-    __slots__ = ()
-    proves = True
-
-    @override
-    def completed(self, reply: bytes, timing: Timing) -> None:
-        pass
-
-    @override
-    def lost(self, error: BusError) -> bool:
-        return False
-
-    @override
-    def rejected(self) -> bool:
-        return False  # an intact refusal proves nothing
 
 
 NEVER_S = float("inf")
@@ -320,7 +302,7 @@ class Line(Receiver):
         self.deliver()
         transaction, self._transaction = self._transaction, None
         if for_good and transaction and transaction.lane is POLL:
-            transaction = None
+            transaction = None  # its drive has not failed to answer
         if transaction and transaction.lost(
             ReplyTimeout(f"node {transaction.exchange.node}: {reason} before the reply came")
         ):
@@ -376,6 +358,8 @@ class Line(Receiver):
 
     def _write_request(self, transaction: Transaction, now_s: float) -> str:
         """Write a request and do nothing else; return why the line was lost over it, if it was."""
+        # One at a time: a second command would overwrite the first in the module's buffer, and every module drops the
+        # reply that it is sending (PIC-SERVO manual, 4.1); a SmartStep is silent about it (SmartStep manual, 2.1).
         self._transaction, self._sent_at_s = transaction, now_s
         self.phase = Phase.REPLY if transaction.exchange.reply_bytes else Phase.QUIET
         try:
@@ -393,6 +377,7 @@ class Line(Receiver):
         request, expected, sent_at_s = exchange.request, exchange.reply_bytes, self._sent_at_s
         request_s = len(request) * byte_s
         self._held, self._early = b"", False
+        # a module answers a complete packet only, so nothing of its reply can be here before the request is over
         self._earliest_s = earliest_s = sent_at_s + CLOCK_TOLERANCE * request_s if settings.paced else -NEVER_S
         self._whole_from_s = earliest_s + CLOCK_TOLERANCE * byte_s * expected
         # a whole intact reply is all that it takes to go on to the next transaction
@@ -401,7 +386,8 @@ class Line(Receiver):
         )
         self._missing = missing = expected if goes_on and self._in_step and not settings.echo else NOT_PLAIN
         self.transport.expect(missing - early if missing > early else ANY)
-        # the drive's own time-out: a servo cycle (PIC-SERVO manual, 4.1), 0.2 s (SmartStep serial manual, 2.1)
+        # a module replies at the end of its servo cycle, within 0.51 ms (PIC-SERVO manual, 4.1), a SmartStep within
+        # 0.2 s (SmartStep manual, 2.1); what draws no reply needs that time of silence, or it would be overwritten
         over_s = sent_at_s + request_s + exchange.response_s
         if expected:
             over_s += expected * byte_s + settings.margin_s + self.transport.lag_s
@@ -489,29 +475,24 @@ class Line(Receiver):
             reply, surplus = reply[:total], reply[total:]
             verdict = exchange.check(reply)
             if verdict is not ReplyVerdict.FOREIGN:
-                self._judge(transaction, reply, surplus, verdict, data, now_s)
+                flaw = "came too early" if self._early else _FLAWS.get(verdict, "")
+                why = "came with surplus bytes" if surplus else flaw
+                self._log.add(now_s, WireEvent.RECEIVED, data, why)
+                if surplus or self._early or verdict is ReplyVerdict.CORRUPT:
+                    self._discard_reply(transaction, reply + surplus, why, now_s)
+                else:
+                    self._judge(transaction, reply, verdict, now_s)
                 return
             self._note_stray(data[: len(data) - len(surplus)], now_s, "foreign reply")
             self._held, self._early, data = b"", False, surplus
 
-    def _judge(
-        self,
-        transaction: Transaction,
-        reply: bytes,
-        surplus: bytes,
-        verdict: ReplyVerdict,
-        arrived: bytes,
-        now_s: float,
-    ) -> None:
-        """Accept a reply, wait for a better one, or reject it."""
-        why = "came with surplus bytes" if surplus else "came too early" if self._early else _FLAWS.get(verdict, "")
-        self._log.add(now_s, WireEvent.RECEIVED, arrived, why)
+    def _judge(self, transaction: Transaction, reply: bytes, verdict: ReplyVerdict, now_s: float) -> None:
+        """Accept a whole reply, or wait whether another one follows."""
         if self._distrusted:
             self._discard_reply(transaction, reply, _OLDER, now_s)
-        elif surplus or self._early or verdict is ReplyVerdict.CORRUPT:
-            self._discard_reply(transaction, reply + surplus, why, now_s)
         elif not transaction.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(transaction)):
-            # not accepted before no other reply can come
+            # What could move a drive twice is not repeated, so its reply has to be its own: a status packet has neither
+            # address nor number (PIC-SERVO manual, 4.1), so none is accepted before no other one can come.
             self.phase, self._kept = Phase.LINGER, (reply, now_s)
             self._watchdog.set(until_s)
         else:
@@ -526,7 +507,7 @@ class Line(Receiver):
     def _accept(self, transaction: Transaction, reply: bytes, verdict: ReplyVerdict, now_s: float) -> None:
         if verdict is ReplyVerdict.REJECTED:
             self._handle_rejection(transaction, reply, now_s)
-        elif isinstance(transaction, ResyncExchange):
+        elif transaction.proves:
             self._judge_probe(transaction, reply, now_s)
         else:
             self._complete(transaction, reply, now_s)
@@ -604,6 +585,7 @@ class Line(Receiver):
 
     def _handle_rejection(self, transaction: Transaction, reply: bytes, now_s: float) -> None:
         """Go on after a node did not execute our packet: the line is in step, and sending again is always safe."""
+        # after a checksum, framing or overrun error a module executes nothing but still replies (PIC-SERVO manual, 4.1)
         self._statistics.rejected_packets += 1
         self.deliver()
         if self._distrusted:
@@ -629,7 +611,7 @@ class Line(Receiver):
             lost_s = transaction.exchange.longest_s(self.byte_s) + self._settings.margin_s
             lost_s += self._resync.longest_s(self.byte_s, self._schedule.mute.failing())
             self._schedule.put_off(poller, now_s, lost_s)
-        if not isinstance(transaction, ResyncExchange):
+        if not transaction.proves:  # a probe that fails has its rounds counted
             self._require_probe()
         # before the resynchronisation, which a stop that is sent again cuts short
         if transaction.lost(error):
@@ -644,6 +626,7 @@ class Line(Receiver):
     def _handle_collision(self, data: bytes, now_s: float) -> None:
         """Handle an echo that differs from what was sent."""
         if self._transaction and self.phase is Phase.REPLY:
+            # two senders at once: neither the request nor what follows it can be trusted
             why = "follows an echo that differs: collision"
             self._log.add(now_s, WireEvent.RECEIVED, data, why)
             self._discard_reply(self._transaction, data, why, now_s)
@@ -678,10 +661,13 @@ class Line(Receiver):
         self._log.add(now_s, WireEvent.RESYNC)
         self.transport.expect(ANY)
         self._echo.clear()
+        # a request makes all modules drop their replies and listen (PIC-SERVO manual, 4.1), so a stop need not wait
         self._watchdog.set(now_s if self._schedule.stop_waits() else now_s + self._resync.quiet_s)
 
     def _flush(self, now_s: float) -> None:
-        """Fill up any half-received packet: with nulls (PIC-SERVO manual, 4.1) or an end of line (SmartStep)."""
+        """Fill up any half-received packet, so that the next request is not taken for the rest of it."""
+        # 16 nulls, a millisecond, and whatever was received is dropped (PIC-SERVO manual, 4.1, network initialization);
+        # a lone end of line is no command of 14 characters, so a SmartStep is silent about it (SmartStep manual, 2.1)
         self.phase = Phase.FLUSH
         flush, echo_s = self._resync.flush, self._settings.margin_s if self._settings.echo else 0.0
         self._watchdog.set(now_s + len(flush) * self.byte_s + self._resync.settle_s + echo_s)
@@ -698,7 +684,7 @@ class Line(Receiver):
 
     def _probe(self, now_s: float) -> None:
         """After the flush: prove with a known reply that the line is in step, unless a stop cannot wait for that."""
-        self.transport.discard_input()
+        self.transport.discard_input()  # what came after the silence is as old as what came before it
         self._echo.clear()
         self.phase = Phase.IDLE
         if self._in_step or self._schedule.stop_waits():
@@ -708,13 +694,14 @@ class Line(Receiver):
         self._probes_left = self._probes_left - 1 if exchange else 0
         self._in_step = self._probes_left == 0  # silence and flush have to do where no node proves it
         if exchange:
-            self._send(ResyncExchange(exchange, Lane.STOP, now_s), now_s, "probe")
+            self._send(Transaction(exchange, Lane.STOP, now_s), now_s, "probe")
         else:
             self._next()
 
-    def _judge_probe(self, probe: ResyncExchange, reply: bytes, now_s: float) -> None:
+    def _judge_probe(self, probe: Transaction, reply: bytes, now_s: float) -> None:
         self._count_reply(probe, reply, self._sent_at_s, self.byte_s, now_s)
         try:
+            # by content and by length, because a late reply to a poll has an intact checksum too
             probe.exchange.decode(reply)
         except BadReply:
             why = "is not the known one"
@@ -758,6 +745,7 @@ class Line(Receiver):
 
     def _end_silence(self, transaction: Transaction, now_s: float) -> None:
         """End an exchange without a reply: it is complete once the line may be used again."""
+        # a group without a leader does not reply; the host leaves it 0.51 ms (PIC-SERVO manual, 4.1, group addresses)
         sent_at_s, request_s = self._sent_at_s, len(transaction.exchange.request) * self.byte_s
         self._statistics.wire_busy_s += request_s
         self._release(transaction, transaction.then_baud)

@@ -188,6 +188,7 @@ class Proofs:
         Raises:
             AxisUnreachable, NotIdentified: see `Proof.refusal`, of the first one that lacks its proof.
         """
+        # of an address that several share the weakest proof counts: all execute the packet (PIC-SERVO manual, 4.1)
         proofs = (self._nodes[node],) if node in self._nodes else self._groups.get(node)
         if not proofs:
             raise NotIdentified(

@@ -21,6 +21,8 @@ MARGIN_S = 0.005
 class RecordingTransaction(Transaction):
     """A transaction that notes its outcomes in a story."""
 
+    proves = False
+
     def __init__(self, exchange: Exchange[int], story: list[str], lane: Lane = Lane.COMMAND):
         super().__init__(exchange, lane, 0.0)
         self.story = story
