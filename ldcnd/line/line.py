@@ -311,18 +311,23 @@ class Line(Receiver):
 
     # -- sending -----------------------------------------------------------------------------------------------------
 
-    def _next(self, remarks: tuple[str, ...] = LANES) -> None:
-        """Put the next exchange on the wire, with its lane's remark in the log, or sleep until one is due."""
+    def _next(self) -> None:
+        """Put the next exchange on the wire, or sleep until one is due."""
         if self.phase is not Phase.IDLE:
             return
         now_s = self._loop.time()
-        if not (self._in_step or self._schedule.stop_waits()):
-            self._begin_quarantine(now_s)  # only a stop may use a line that is not proven to be in step
-        elif transaction := self._take(now_s):
-            self._send(transaction, now_s, remarks[transaction.lane])
+        if transaction := self._take(now_s):
+            self._send(transaction, now_s, LANES[transaction.lane])
         else:
+            self._rest(now_s)
+
+    def _rest(self, now_s: float) -> None:
+        """Sleep until the next exchange is due, on a line that is in step."""
+        if self._in_step:
             self.transport.expect(ANY)
             self._watchdog.set(self._schedule.polls.next_due_s())
+        else:
+            self._begin_quarantine(now_s)
 
     def _take(self, now_s: float) -> Transaction | None:
         """Remove and return what goes on the wire now, or None: this is the only gate between queue and wire.
@@ -331,7 +336,7 @@ class Line(Receiver):
         """
         schedule = self._schedule
         if not (self._in_step or schedule.stop_waits()):
-            return None
+            return None  # only a stop may use a line that is not proven to be in step
         while job := schedule.take_job(now_s):
             if job.condition and self.undelivered:
                 self.deliver()  # permission is asked of all that the drives have said by now
@@ -540,7 +545,8 @@ class Line(Receiver):
         if joins := slow or bool(undelivered):
             undelivered.append((transaction, reply, timing))
         if following is None:
-            self._next(AT_ONCE)
+            if self.phase is Phase.IDLE:
+                self._rest(self._loop.time())
         elif following.at_baud:
             self._send(following, now_s, AT_ONCE[following.lane])
         else:
