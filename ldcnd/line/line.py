@@ -335,9 +335,16 @@ class Line(Receiver):
         A queue may be long, so who is at the address and whether the motion is still permitted is asked here.
         """
         schedule = self._schedule
-        if not (self._in_step or schedule.stop_waits()):
-            return None  # only a stop may use a line that is not proven to be in step
-        while job := schedule.take_job(now_s):
+        while self._in_step or schedule.stop_waits():  # only a stop may use a line that is not proven to be in step
+            job = schedule.take_job(now_s)
+            if job is None:
+                poller = schedule.polls.take(now_s)
+                if poller is None:
+                    return None
+                wanted_at_s, exchange = poller.due_at_s, poller.next_exchange(now_s)
+                if exchange.effect is not READS:
+                    raise AssertionError(f"the poll {exchange.request.hex(' ')} does not say that it only reads")
+                return PollTransaction(poller, exchange, wanted_at_s)
             if job.condition and self.undelivered:
                 self.deliver()  # permission is asked of all that the drives have said by now
                 if self._distrusted:  # and one of them cannot have said that
@@ -345,13 +352,7 @@ class Line(Receiver):
                     return None
             if job.may_go(now_s):
                 return job
-        poller = schedule.polls.take(now_s)
-        if poller is None:
-            return None
-        wanted_at_s, exchange = poller.due_at_s, poller.next_exchange(now_s)
-        if exchange.effect is not READS:
-            raise AssertionError(f"the poll {exchange.request.hex(' ')} does not say that it only reads")
-        return PollTransaction(poller, exchange, wanted_at_s)
+        return None
 
     def _send(self, transaction: Transaction, now_s: float, remark: str) -> None:
         if transaction.at_baud:

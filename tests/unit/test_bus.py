@@ -8,6 +8,7 @@ import pytest
 from ldcnd.contract.errors import (
     BusBusy,
     LdcndError,
+    NotIdentified,
     NotSupported,
     WrongState,
 )
@@ -76,6 +77,21 @@ async def test_what_can_move_is_sent_only_if_its_condition_holds_when_its_turn_c
 
     assert isinstance(refused.result(), WrongState)
     assert rig.sent() == [1, 9, 3]
+
+
+async def test_a_stop_that_is_refused_lets_no_command_pass_before_the_line_is_proven_to_be_in_step():
+    rig = Rig()
+
+    async with running(rig):
+        rig.line.say(b"\xf0")
+        stranger = replace(toy.exchange(2, node=9), effect=PacketEffect.CHANGES)
+        async with asyncio.TaskGroup() as callers:
+            command = callers.create_task(rig.bus.execute(toy.exchange(1)), name="command")
+            stop = callers.create_task(outcome_of(rig.bus.execute(stranger, Lane.STOP)), name="stop")
+
+    assert isinstance(stop.result(), NotIdentified)
+    assert command.result() == 1
+    assert rig.nodes() == [toy.PROBE_NODE, 1]
 
 
 async def test_a_line_that_is_distrusted_proves_that_it_is_in_step_before_it_believes_another_reply():
