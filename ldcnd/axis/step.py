@@ -285,12 +285,10 @@ def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:
 
 
 def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
-    on, state = event.on, status.state
-    if state is not AxisState.ERROR_STOP:
-        state = AxisState.STANDSTILL if on else AxisState.DISABLED
+    on = event.on
     return replace(
         _end(status, CommandStatus.ABORTED, "aborted by power"),
-        state=state,
+        state=_state_at_rest(status, enabled=on),
         enabled=on,
         effective_from_s=event.now_s,
         target_counts=None,
@@ -447,7 +445,14 @@ def _fail(status: AxisStatus, reason: str, *, settled: bool | None = None) -> Ax
 def _finished(status: AxisStatus, error: str | None = None, *, settled: bool | None = None) -> AxisStatus:
     error = error or status.failure
     status = _end(status, CommandStatus.FAILED if error else CommandStatus.DONE, error, settled=settled)
-    return _with(status, state=AxisState.STANDSTILL if status.enabled else AxisState.DISABLED)
+    return _with(status, state=_state_at_rest(status, enabled=status.enabled))
+
+
+def _state_at_rest(status: AxisStatus, *, enabled: bool) -> AxisState:
+    """Return the state without a command. MC_Reset alone leads out of ErrorStop (PLCopen part 1, state diagram)."""
+    if status.state is AxisState.ERROR_STOP:
+        return AxisState.ERROR_STOP
+    return AxisState.STANDSTILL if enabled else AxisState.DISABLED
 
 
 def _end(

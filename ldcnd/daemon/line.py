@@ -6,7 +6,7 @@ from typing import Any
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.events import CommandOver, PowerSwitched
+from ldcnd.axis.events import PowerSwitched
 from ldcnd.axis.polling import AxisPoller
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch, WrongState
@@ -307,14 +307,16 @@ class BusService:
                 each.cancel()
 
     def _restarted(self, name: str) -> None:
-        """A drive has lost power and is about to answer again: it is disabled, whatever its axis was doing."""
+        """A drive has lost power and is about to answer again: its loop is open, nothing that was commanded goes on.
+
+        Its module was initialised again, its axis was not reset: an axis in error_stop stays there.
+        """
         log.warning("drive lost power", axis=name, bus=self.bus.settings.name)
         axis = self._axis(name)
         axis.readings.report_restart()
         axis.disconnected()
         axis.stops.note_power_loss()
         axis.tracker.take(PowerSwitched(on=False, now_s=asyncio.get_running_loop().time()))
-        axis.tracker.take(CommandOver())
 
     def _connect(self, report: BringUpReport) -> None:
         """Start polling. Only the very first reset can be a reference, and only where its place is proven."""

@@ -20,7 +20,7 @@ from ldcnd.contract.commands import (
     Why,
 )
 from ldcnd.contract.errors import DriveFault, NotReferenced, WrongState
-from ldcnd.contract.samples import AxisState, Moving
+from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.ldcn.faults import FaultCode
 from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.dialect_rig import (
@@ -395,6 +395,24 @@ async def test_a_loop_that_opens_without_a_reason_is_a_fault_of_its_own():
 
         state = await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
         assert not state.enabled
+
+
+async def test_a_drive_that_lost_power_leaves_its_axis_in_error_stop_until_reset():
+    async with dialect_rig(LS_182AP) as rig:
+        await rig.power_on()
+        rig.drive.restart()
+        await rig.until(lambda state: state.state is AxisState.ERROR_STOP)
+        rig.drive.power(on=False, at_s=asyncio.get_running_loop().time())
+        await rig.until(lambda state: state.link is LinkState.DOWN)
+        rig.drive.power(on=True, at_s=asyncio.get_running_loop().time())
+        await rig.until(lambda state: state.link is LinkState.UP)
+
+        with pytest.raises(WrongState, match="error stop"):
+            await rig.send(Power(on=True))
+
+        await rig.send(Reset())
+        await rig.send(Power(on=True))
+        await rig.until(lambda state: state.state is AxisState.STANDSTILL)
 
 
 async def test_a_position_error_limit_of_0_says_so_at_power_on():

@@ -7,7 +7,8 @@ import pytest
 
 from ldcnd.client.overview import overview
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import MoveAbsolute, Power, Why
+from ldcnd.contract.commands import MoveAbsolute, Power, Reset, Why
+from ldcnd.contract.errors import WrongState
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
@@ -83,7 +84,7 @@ async def test_a_drive_that_lost_power_is_back_within_3_s_and_the_others_finish_
     assert [(state.link, state.state) for state in seeing] == [(LinkState.UP, AxisState.DISCRETE_MOTION)] * 2
     assert took_s < 3.0
     assert max(later - earlier for earlier, later in pairwise(polled_at_s)) < 0.1 + 8 * margin_ms / 1000
-    assert (back.state, back.referenced) == (AxisState.DISABLED, False)
+    assert (back.state, back.enabled, back.referenced) == (AxisState.ERROR_STOP, False, False)
     assert not heard.referenced  # cut off by its neighbour: it went on unseen
     assert meanwhile == []
     assert bus.baud == 115_200
@@ -130,12 +131,28 @@ async def test_the_axis_works_again_once_it_is_powered():
         await rig.until("y", lambda state: state.link is LinkState.UP)
 
         await rig.until("y", lambda state: state.moving is Moving.NO)  # until then it may coast, and is stopped
+        with pytest.raises(WrongState, match="error stop"):
+            await rig.client.command("y", Power(on=True))  # its module was initialised again, its axis was not reset
+        await rig.client.command("y", Reset())
         await rig.client.command("y", Power(on=True))
         state = await rig.until("y", lambda state: state.state is AxisState.STANDSTILL)
 
     assert not state.referenced
     assert drive(chain, 2).loop.gains.kp == 350
     assert drive(chain, 2).loop.servo_on
+
+
+async def test_a_drive_that_lost_power_with_its_loop_open_needs_no_reset():
+    chain = chain_of()
+    async with rig_on(chain, simulated_config()) as rig:
+        await rig.until("y", lambda state: state.link is LinkState.UP)
+        set_power(chain, 2, on=False)
+        await rig.until("y", lambda state: state.link is LinkState.DOWN)
+        set_power(chain, 2, on=True)
+        back = await rig.until("y", lambda state: state.link is LinkState.UP and state.moving is Moving.NO)
+        await rig.client.command("y", Power(on=True))
+
+    assert back.state is AxisState.DISABLED
 
 
 async def test_several_neighbours_that_lost_power_come_back_in_order():
@@ -165,7 +182,7 @@ async def test_a_whole_chain_that_lost_power_comes_back():
             set_power(chain, address, on=True)
         states = [await rig.until(name, lambda state: state.link is LinkState.UP, 3.0) for name in NAMES]
 
-    assert [state.state for state in states] == [AxisState.DISABLED] * 4
+    assert [(state.state, state.enabled) for state in states] == [(AxisState.ERROR_STOP, False)] * 4
     assert [module.address for module in chain.modules] == [1, 2, 3, 4]
 
 
@@ -217,7 +234,7 @@ async def test_stops_of_a_dark_axis_do_not_disturb_the_search_for_it():
         set_power(chain, 2, on=True)
         back = await rig.until("y", lambda state: state.link is LinkState.UP, 3.0)
 
-    assert (back.state, back.stop_latched) == (AxisState.DISABLED, True)
+    assert (back.state, back.enabled, back.stop_latched) == (AxisState.ERROR_STOP, False, True)
 
 
 async def test_a_foreign_module_in_place_of_the_old_one_gets_no_address():

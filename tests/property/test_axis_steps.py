@@ -271,6 +271,12 @@ def test_an_axis_in_error_takes_no_command_before_its_reset(history):
             assert all(refused(after, verb) for verb in moving)
 
 
+def test_only_a_reset_leads_out_of_error_stop(history):
+    for before, event, after in lives(history):
+        if before.state is AxisState.ERROR_STOP and not isinstance(event, events.CommandBegun):  # none is let through
+            assert after.state is AxisState.ERROR_STOP or isinstance(event, events.ResetDone)
+
+
 def test_a_fault_keeps_its_instant_and_the_first_stays_until_reset(history):
     for before, event, after in lives(history):
         stood = {entry.code: entry for entry in before.faults}
