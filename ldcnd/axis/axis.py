@@ -272,7 +272,7 @@ class AxisService:
         return [(error, guard is guards.check_stands) for error, guard in found]
 
     def obstacles_to_motion(self, *, absolute: bool) -> list[tuple[LdcndError, bool]]:
-        """Return all that keeps the axis from a motion, the faults of its drive one by one."""
+        """Return all that keeps the axis from a motion, each cause once: what has stopped its drive one by one."""
         able = self.driver.capabilities
         moves = any(command.effect is Effect.MOTION and verb in able for verb, command in AXIS_COMMANDS.items())
         absolute = absolute and Verb.MOVE_ABSOLUTE in able
@@ -280,9 +280,14 @@ class AxisService:
         found = list(guards.obstacles(row, self.tracker, self._moves))
         name = self.config.name
         first = [error for error, guard in found if guard in (guards.check_reachable, guards.check_not_latched)]
-        faults = [guards.fault(name, each) for each in self.tracker.status.active_faults if each.source == "drive"]
-        causes = [(error, False) for error in (*first, *faults)]
-        causes += [(error, guard is guards.check_stands) for error, guard in found if error not in first]
+        # a warning keeps nothing from moving
+        faults = [each for each in self.tracker.status.active_faults if each.source == "drive" and each.stops]
+        causes = [(error, False) for error in (*first, *(guards.fault(name, each) for each in faults))]
+        for error, guard in found:
+            if guard is guards.check_not_in_error:
+                causes.append((guards.error_stop(self.tracker, faults), False))
+            elif error not in first:
+                causes.append((error, guard is guards.check_stands))
         if not moves:
             text = f"axis {name}: its drive takes no motion over the line"
             causes.append((NotSupported(text, axis=name, remedy=NO_COMMAND_HELPS), False))

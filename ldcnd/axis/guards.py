@@ -4,7 +4,7 @@ Each refusal says what, which limit, and what to do. The table also answers `why
 command.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 from ldcnd.axis.quiet_drive import QuietDrive
@@ -59,16 +59,18 @@ def check_stop_confirmed(axis: AxisTracker) -> None:
 def check_not_in_error(axis: AxisTracker) -> None:
     """Refuse while a fault, or a command that ended badly, waits to be acknowledged."""
     if axis.status.state is AxisState.ERROR_STOP:
-        raise _faulted(axis)
+        raise error_stop(axis)
 
 
 def check_enabled(axis: AxisTracker) -> None:
     """Refuse a motion while the position loop is open."""
-    if axis.status.state is AxisState.DISABLED:
+    status = axis.status
+    # error_stop hides that it is disabled as well, which its reset does not change
+    if status.state is AxisState.DISABLED or (status.state is AxisState.ERROR_STOP and not status.enabled):
         raise WrongState(
             f"axis {axis.name} is disabled",
             axis=axis.name,
-            value=axis.status.state,
+            value=AxisState.DISABLED,
             remedy=Remedy("{}", step("power", 'send power {"on": true}', on=True)),
         )
 
@@ -211,19 +213,21 @@ def fault(axis: str, entry: FaultEntry) -> DriveFault:
     )
 
 
-def _faulted(axis: AxisTracker) -> WrongState:
-    causes = _said(axis) or "a command ended badly"
+def error_stop(axis: AxisTracker, said: Collection[FaultEntry] = ()) -> WrongState:
+    """Return the refusal of an axis in error_stop, with its causes but for those that were said before."""
+    causes = _said(axis, said) or ("" if said else "a command ended badly")
     return WrongState(
-        f"axis {axis.name} is in error stop: {causes}",
+        f"axis {axis.name} is in error stop: {causes}" if causes else f"axis {axis.name} is in error stop",
         axis=axis.name,
         value=axis.status.state,
         remedy=Remedy("remove the cause, then {}", step("reset")),
     )
 
 
-def _said(axis: AxisTracker) -> str:
+def _said(axis: AxisTracker, before: Collection[FaultEntry] = ()) -> str:
     first = (axis.status.first_fault,) if axis.status.first_fault else ()
-    return "; ".join(fault.text for fault in axis.status.active_faults or first)
+    entries = axis.status.active_faults or first
+    return "; ".join(dict.fromkeys(entry.text for entry in entries if entry not in before))
 
 
 # -- what each command needs -----------------------------------------------------------------------------------------

@@ -483,6 +483,37 @@ async def test_why_names_every_command_of_the_axis_once_and_a_stop_is_never_forb
     assert {"halt", "stop", "quick_stop"} <= {verb for group in groups for verb in group.verbs if not group.causes}
 
 
+async def test_why_says_each_cause_of_an_error_stop_once_and_that_the_loop_is_open_as_well():
+    async with commanded() as rig:
+        await rig.x.settled(faults=(Fault("overheat", "too hot"), Fault("overvoltage", "too high")), enabled=False)
+        causes = (await rig.send(Why(absolute=False))).causes
+
+    assert [(cause.code, cause.text) for cause in causes] == [
+        ("drive_fault", "axis x: too hot"),
+        ("drive_fault", "axis x: too high"),
+        ("wrong_state", "axis x is in error stop"),
+        ("wrong_state", "axis x is disabled"),
+    ]
+
+
+async def test_why_names_what_else_has_led_to_an_error_stop():
+    async with commanded() as rig:
+        await rig.x.settled(enabled=False)  # the drive has opened its loop by itself
+        causes = (await rig.send(Why(absolute=False))).causes
+
+    assert [cause.text.partition(":")[0] for cause in causes] == ["axis x is in error stop", "axis x is disabled"]
+    assert "opened its position loop by itself" in causes[0].text
+
+
+async def test_a_warning_of_a_drive_keeps_no_axis_from_moving():
+    async with commanded() as rig:
+        await rig.x.settled(faults=(Fault("servo_overrun", "late", stops=False),))
+        reply = await rig.send(Why(absolute=False))
+        await rig.send(MoveRelative(distance=1.0))
+
+    assert (reply.can_move, reply.causes) == (True, ())
+
+
 async def test_why_marks_what_a_move_may_wait_for():
     async with commanded() as rig:
         await _moving(rig)
