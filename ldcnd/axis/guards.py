@@ -41,7 +41,8 @@ def check_reachable(axis: AxisTracker) -> None:
 
 def check_not_latched(axis: AxisTracker) -> None:
     """Refuse while a stop is latched, or not confirmed by the drive."""
-    check_stop_confirmed(axis)
+    if axis.status.stop:
+        check_stop_confirmed(axis)
     if axis.status.stop_latched:
         raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy=Remedy("{}", step("reset")))
 

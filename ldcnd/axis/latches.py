@@ -46,7 +46,7 @@ class LatchKeeper:
         if files is None:
             return
         for tracker in trackers.values():
-            tracker.watch(self._watch, "stop_latched", "stop", "state", "first_fault")
+            tracker.watch(self._watch, "stop_latched", "stop", "state")
         try:
             kept = files.latches()
         except DamagedFile as error:
@@ -62,8 +62,9 @@ class LatchKeeper:
             log.warning("latched since an earlier daemon", axis=name, stopped=latch.stopped, in_error=latch.in_error)
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
-        if _latch_of(before) != _latch_of(after):
-            self._changed.set()
+        in_error = AxisState.ERROR_STOP in (before.state, after.state)
+        if in_error or after.stop_latched is not before.stop_latched or after.stop is not before.stop:
+            self._changed.set()  # perhaps in vain: what is kept is compared before it is written
 
     async def run(self) -> None:
         """Keep what comes and goes until cancelled; without a place for it there is nothing to do."""

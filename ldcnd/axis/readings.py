@@ -161,14 +161,14 @@ class AxisReadings:
 
     def judge(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
         """Take a reading if the drive can have got there; true when it has to be read again first."""
-        tracker = self._tracker
-        if tracker.status.stop_pending:
+        tracker, status = self._tracker, self._tracker.status
+        if status.stop and status.stop_pending:
             self._stops.wanted.set()  # it replies again, whatever it says
         if not self._proof.holds:
             self._count_miss()  # from its drive: who answers was not identified
             return False
         # a command that waits has sent nothing yet
-        standing = tracker.status.command is None and tracker.status.at_rest and not self._queue.at_work.locked()
+        standing = status.command is None and status.at_rest and not self._queue.at_work.locked()
         judged = self._plausibility.judge(reading, timing, standing=standing)
         if judged.verdict is ReadingVerdict.BELIEVED:
             if judged.confirmed:

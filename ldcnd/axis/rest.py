@@ -49,7 +49,8 @@ class RestEvidence:
         """Return the evidence with a reading that was requested at an instant, in loop time."""
         position = reading.position_counts
         runs = reading.enabled and not reading.profile_done
-        if runs or shows_velocity(reading):
+        # `shows_velocity`, written out: every poll passes here
+        if runs or abs(reading.velocity_counts_per_s) > reading.velocity_resolution_counts_per_s:
             if self.rests is False and self.turns and self.since_s is None and self.quiet_s == REST_S:
                 return self
             return RestEvidence(rests=False, turns=True, commanded=self.commanded)

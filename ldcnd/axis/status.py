@@ -251,7 +251,7 @@ class AxisStatus:
             "stop_pending": self.stop_pending,
             "command": self.command,
             "last_error": self.last_error,
-            "has_reference": self.has_reference,
+            "has_reference": self.commanded,
             "reference_lost": self.reference_lost,
             "target": self.target,
             "speed_override": self.speed_override,

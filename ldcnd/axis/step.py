@@ -72,7 +72,8 @@ def step(status: AxisStatus, event: AxisEvent) -> AxisStatus:
 # -- the steps -------------------------------------------------------------------------------------------------------
 
 
-def _take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
+def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
+    """Return the status behind a reading; the step that every poll takes."""
     if not status.commanded:
         return _take_of_others(status, event)
     reading, now_ns = event.reading, event.now_ns
@@ -119,7 +120,8 @@ def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
     if command is None:
         if status.state is AxisState.ERROR_STOP or (rests is None and status.state is not AxisState.DISABLED):
             return status
-        return _with(status, state=AxisState.STANDSTILL if rests else AxisState.DISCRETE_MOTION)
+        state = AxisState.STANDSTILL if rests else AxisState.DISCRETE_MOTION
+        return status if status.state is state else replace(status, state=state)
     match command.completion:
         case Completion.PROFILE if reading.profile_done:
             return _take_profile_end(status, command, event, faults)
@@ -310,7 +312,7 @@ def _change_control(status: AxisStatus, event: ControlChanged) -> AxisStatus:
 
 
 def _latch(status: AxisStatus, _event: StopLatch) -> AxisStatus:
-    return _with(status, stop_latched=True)
+    return status if status.stop_latched else replace(status, stop_latched=True)
 
 
 def _send_stop(status: AxisStatus, event: StopSent) -> AxisStatus:
@@ -360,7 +362,7 @@ def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
 
 STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType(
     {
-        ReadingTaken: _take_reading,
+        ReadingTaken: take_reading,
         LookTaken: _take_look,
         LoopSeen: _see_loop,
         PollMissed: _miss,

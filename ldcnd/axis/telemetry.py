@@ -70,7 +70,8 @@ class AxisTelemetry:
             t_error_ns: how far off that can be.
         """
         scale = status.scale
-        quality = self._fields_of(status)["quality"]
+        fields = self._fields if status is self._of else self._fields_of(status)
+        quality = fields["quality"]
         if TelemetryItem.POSITION in asked:
             counts, lag, turns = reading.position_counts, reading.following_error_counts, None
             value = (counts - scale.origin_counts) / scale.counts_per_unit
@@ -147,13 +148,13 @@ class AxisTelemetry:
         if status is self._latest and not due:
             return
         self._latest = status
-        fields = self._fields_of(status)
+        fields = self._fields if status is self._of else self._fields_of(status)
         if due or fields != self._published:
             self._published, command = fields, status.command
             self._state.publish(
                 {"t": t, "t_error_ns": t_error_ns, "seq": 0, **fields, "command": command and _current(command)}
             )
-        faults = (status.active_faults, status.first_fault)
+        faults = (status.active_faults if status.stop else status.faults, status.first_fault)
         if due or faults != self._published_faults:
             self._published_faults = faults
             self._faults.publish(
@@ -205,9 +206,7 @@ class AxisTelemetry:
         self._publisher.item(self._name, TelemetryItem.SHADOW).publish_sample(sample)
 
     def _fields_of(self, status: AxisStatus) -> dict[str, Any]:
-        """Return the fields of the state sample of a status."""
-        if status is self._of:
-            return self._fields
+        """Return the fields of the state sample of another status."""
         self._of = status
         self._fields = status.sample_fields()
         return self._fields

@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 from ldcnd.axis.events import AxisEvent, ReadingTaken
 from ldcnd.axis.status import AxisStatus
-from ldcnd.axis.step import STEPS
+from ldcnd.axis.step import STEPS, take_reading
 from ldcnd.contract.errors import WrongState
 from ldcnd.drives.driver import AxisReading
 from ldcnd.line.exchange import Timing
@@ -18,35 +18,29 @@ class AxisTracker:
     """The status of one axis, changed only by events.
 
     Attributes:
+        name: of the axis.
         status: as of now.
         reading: the latest; None before the first.
         proof: that who answers is its drive.
     """
 
     def __init__(self, status: AxisStatus, proof: Proof) -> None:
+        self.name = status.name
         self.status = status
         self.reading: AxisReading | None = None
         self.proof = proof
-        self._watching: tuple[tuple[tuple[str, ...], OnChange], ...] = ()
-
-    @property
-    def name(self) -> str:
-        """The name of the axis."""
-        return self.status.name
+        self._watching: tuple[tuple[str, OnChange], ...] = ()
 
     def watch(self, on_change: OnChange, *fields: str) -> None:
-        """Have changes of these fields of the status told, to one listener after the other."""
-        self._watching = (*self._watching, (fields, on_change))
+        """Have a function called for each of these fields of the status that has changed."""
+        self._watching = (*self._watching, *((name, on_change) for name in fields))
 
     def take(self, event: AxisEvent) -> AxisStatus:
         """Take an event; return the status after it."""
         before = self.status
         after = STEPS[type(event)](before, event)
         if after is not before:
-            self.status = after
-            for fields, on_change in self._watching:
-                if any(getattr(after, name) is not getattr(before, name) for name in fields):
-                    on_change(before, after)
+            self._change(before, after)
         return after
 
     def observe(self, reading: AxisReading, timing: Timing, now_ns: int) -> AxisStatus:
@@ -57,8 +51,17 @@ class AxisTracker:
             timing: of its exchange.
             now_ns: when it was true, UTC.
         """
-        self.reading = reading
-        return self.take(ReadingTaken(reading, timing.sent_at_s, now_ns))
+        self.reading, before = reading, self.status
+        after = take_reading(before, ReadingTaken(reading, timing.sent_at_s, now_ns))
+        if after is not before:  # most readings change nothing
+            self._change(before, after)
+        return after
+
+    def _change(self, before: AxisStatus, after: AxisStatus) -> None:
+        self.status = after
+        for name, on_change in self._watching:
+            if getattr(after, name) is not getattr(before, name):
+                on_change(before, after)
 
     def latest(self) -> AxisReading:
         """Return the latest reading.
