@@ -138,7 +138,9 @@ async def test_a_drive_that_moves_is_not_reset_by_the_fallback():
     chain.modules[3].power(on=False, at_s=loop.time())
 
     async with rig_on(chain, simulated_config(start="adopt", adopt_fallback="reset"), up=False) as rig:
-        await asyncio.sleep(1)
+        async with asyncio.timeout(5):
+            while rig.line.problem == "not opened yet":
+                await asyncio.sleep(0.1)
         (bus,) = await rig.client.buses()
         still_moving = drive(chain, 1).loop.servo_on
         chain.modules[3].power(on=True, at_s=loop.time())
@@ -341,7 +343,7 @@ async def test_stops_during_a_take_over_delay_it_at_most():
 
 async def test_modules_that_are_no_axes_are_kept_and_published():
     chain = chain_of("ls182ap", "ls182ap", "picservo-v4", "picservo-v4", "picio", "picstep")
-    config = simulated_config(module=[{"address": 5, "model": "pic-io"}])
+    config = simulated_config(module=[{"address": 5, "model": "pic-io"}, {"address": 6, "model": "pic-step"}])
 
     async with rig_on(chain, config) as rig:
         await asyncio.sleep(2)
@@ -356,9 +358,24 @@ async def test_modules_that_are_no_axes_are_kept_and_published():
         (6, "pic-step", None),
     ]
     assert [module.status for module in bus.modules] == [None, None, None, None, 0, 0]
-    assert bus.remarks == (
-        "address 6: PIC-STEP (id 3, version 1) is not configured; it is kept on the line and never moved",
-    )
+
+
+@pytest.mark.parametrize("start", ["reset", "adopt"])
+async def test_a_line_with_a_module_that_is_not_configured_stays_down_and_says_which_lines_describe_it(start):
+    chain = chain_of("ls182ap", "ls182ap", "picservo-v4", "picservo-v4", "picstep")
+    described = simulated_config(module=[{"address": 5, "model": "pic-step"}])
+    async with rig_on(chain, described):
+        pass
+    before = [drive(chain, address).loop.position for address in (1, 2, 3, 4)]
+
+    async with rig_on(chain, simulated_config(start=start), up=False) as rig:
+        await asyncio.sleep(8)
+        (bus,) = await rig.client.buses()
+
+    assert not bus.up
+    assert "address 5: PIC-STEP (id 3, version 1) is not configured" in bus.problem
+    assert start == "adopt" or 'needs [[bus.module]] with address = 5 and model = "pic-step"' in bus.problem
+    assert [drive(chain, address).loop.position for address in (1, 2, 3, 4)] == before
 
 
 async def test_the_simulated_rig_publishes_its_first_position_within_a_second_of_being_started():

@@ -181,10 +181,10 @@ class History:
         return abs(module.loop.position - before) <= 2
 
 
-def play(seed: int) -> str:
+def play(seed: int, kind: type[History] = History) -> str:
     """Play one history; return what was wrong."""
     loop = JumpingLoop()
-    history = History(seed)
+    history = kind(seed)
     try:
         loop.run_until_complete(history.run())
     finally:
@@ -233,6 +233,41 @@ def test_modules_behind_one_without_power_get_no_address_while_the_line_is_broug
         runner.run(bring_up())
     assert history.flaws == []
     assert [module.address for module in history.chain.modules] == [1, 2, 3]
+
+
+class SurplusHistory(History):
+    """A chain that may have more modules than are configured, of which some have no power while it is brought up."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__(seed)
+        self.surplus = self.dice.choice((0, 0, 1, 2, 3))
+        self.configured = len(self.models)
+        self.models += tuple(self.dice.choice(self.models) for _ in range(self.surplus))
+        self.chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in self.models), seed=seed))
+
+    async def judge(self) -> None:
+        """Bring the line up once, and again while modules are without power."""
+        loop = asyncio.get_running_loop()
+        config = config_of(self.models[: self.configured], self.baud)
+        if self.dice.random() < 0.8:
+            async with rig_on(self.chain, config, up=not self.surplus):
+                await asyncio.sleep(4.0 if self.surplus else 0.0)
+        off = [module for module in self.chain.modules if self.dice.random() < 0.4]
+        for module in off:
+            module.power(on=False, at_s=loop.time())
+        async with rig_on(self.chain, config, up=False) as rig:
+            for module in off:
+                await asyncio.sleep(self.dice.choice((0.001, 0.05, 0.5, 3.0)) * self.dice.random())
+                module.power(on=True, at_s=loop.time())
+            await asyncio.sleep(BACK_WITHIN_S)
+            if not self.surplus and rig.line.problem:
+                self.flaws.append(f"not up: {rig.line.problem}")
+
+
+@pytest.mark.promise("address-only-of-its-place")
+def test_no_module_gets_the_address_of_another_place_on_a_chain_with_more_modules_than_are_configured() -> None:
+    print("seeds 0 to 24")
+    assert [flaw for seed in range(25) if (flaw := play(seed, SurplusHistory))] == []
 
 
 @pytest.mark.soak

@@ -16,12 +16,12 @@ from typing import TypeVar
 from ldcnd.contract.errors import BadReply, CommandAborted, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node, spaced, unanswered
-from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket, decode_status
+from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket, check_status, decode_status
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
 from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud, baud_at_reset, baud_divisor
 from ldcnd.drives.network import GroupSpec
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, PacketEffect
+from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
 
 ReplyT = TypeVar("ReplyT")
 
@@ -202,6 +202,17 @@ RESET_S = 2.0
 """Longest time that a module takes to restart, seconds. No manual has it; 2 s are recommended for one model."""
 
 
+@dataclass(frozen=True, slots=True)
+class Heard:
+    """Bytes came back.
+
+    Attributes:
+        identity: what they say; None when they are damaged, as by two replies at once.
+    """
+
+    identity: Identity | None
+
+
 LARGE_DEVIATION = 0.02
 """Share of a rate from which a divisor takes most of what a receiver bears: 57600 with the manual's."""
 
@@ -308,9 +319,13 @@ class LineRate:
     async def who_is_at(self, baud: int, address: int) -> Identity | None:
         """Read the identity once at another rate than the other modules', which receive noise; otherwise `who_is`."""
         exchange = once(read_identity(address))
-        if self._bus.baud == baud:
-            return await self._answer(lambda: self._bus.execute(exchange))
-        return await self._answer(lambda: self._bus.execute_at(baud, exchange))
+        return await self._answer(lambda: self.execute_at(baud, exchange))
+
+    async def execute_at(self, baud: int | None, exchange: Exchange[ReplyT]) -> ReplyT:
+        """Execute at another rate than the other modules', which receive noise; None for theirs."""
+        if baud is None or baud == self._bus.baud:
+            return await self._bus.execute(exchange)
+        return await self._bus.execute_at(baud, exchange)
 
     async def _answer(self, ask: Callable[[], Awaitable[StatusPacket]]) -> Identity | None:
         while True:
@@ -320,6 +335,23 @@ class LineRate:
                 continue  # a stop of this axis took the question off the queue: it says nothing about the module
             except (ReplyTimeout, OutcomeUnknown, BadReply, PacketRejected):
                 return None
+
+    async def listen(self, address: int, baud: int | None = None) -> Heard | None:
+        """Read an identity; None means silence. Replies that collide are no silence: their identity is None."""
+        received = bytearray()
+        exchange = read_identity(address)
+
+        def length(data: bytes) -> int:
+            received[:] = data
+            return exchange.reply_bytes
+
+        def intact(data: bytes) -> ReplyVerdict:
+            received[:] = data
+            return check_status(data)
+
+        asked = replace(once(exchange), check=intact, total_bytes=length)
+        identity = await self._answer(lambda: self.execute_at(baud, asked))
+        return Heard(identity) if identity or received else None
 
 
 MOST_MODULES = 32
@@ -381,27 +413,51 @@ class Addressing:
         held by one module, in the order of the chain: one that has restarted meanwhile left its waiting address.
 
         Args:
-            expected: number of configured modules; they are waited for as long as they may take to restart. Fewer keep
-                their waiting addresses: behind one without power the next one that receives is not the next place.
+            expected: number of configured modules, 0 where that is not known; they are waited for as long as they may
+                take to restart. Fewer keep their waiting addresses: behind one without power the next one that
+                receives is not the next place. Where there is one more, all are reset again, and it is returned with
+                them: only the right number shows that none is without power, and in a chain without any address those
+                that receive are the first ones.
         """
         self.had_address.clear()
         count, until_s = 0, asyncio.get_running_loop().time() + self.rate.reset_s
-        while count < MOST_MODULES and await (
-            self._park_expected(count + 1, until_s) if count < expected else self._park_unexpected(count + 1)
-        ):
+        while count < expected and await self._park_expected(count + 1, until_s):
             count += 1
+        surplus: Identity | None = None
+        if not expected:
+            while count < MOST_MODULES and await self._newcomer() and await self._park_expected(count + 1, 0.0):
+                count += 1
+        elif count == expected:
+            await self._reset_strays(count)
+            surplus = await self._newcomer()
         modules: dict[int, Identity] = {}
         for number in range(1, count + 1):
             identity = await self.rate.who_is(waiting_address(number), patient=True)
             if identity is None:
                 return modules
             modules[number] = identity
+        if surplus:
+            await self._reset_at(self.rate.at_reset, commands.RESET_SETTLE_S)
+            return modules | {count + 1: surplus}
         if count < expected:
             return modules
         for number in modules:
             if not await self.move(waiting_address(number), number):
                 return {address: modules[address] for address in range(1, number)}
         return modules
+
+    async def _reset_strays(self, places: int) -> None:
+        """Reset what has the address of a place before it was given to any module.
+
+        It was deaf to the reset, behind a module without power, and receives now that all others have addresses. So
+        those that did not wait for it are not in the places that they seem to be in. It shows as one module more that
+        waits at address 0, or by making the next one deaf.
+        """
+        nodes = [Node(number, ANY_DIALECT) for number in range(1, places + 1)]
+        burst = self.rate.spaced([commands.hard_reset(node).request for node in nodes])
+        await self._bus.execute(
+            unanswered(EVERYBODY, burst, NULLS_SETTLE_S, repeatable=False, effect=PacketEffect.ARRANGES)
+        )
 
     async def _park_expected(self, number: int, until_s: float) -> bool:
         """Give what waits at address 0 a waiting address; tell whether there was something until that instant.
@@ -420,15 +476,12 @@ class Addressing:
                 await asyncio.sleep(RESTART_PAUSE_S)
         return False
 
-    async def _park_unexpected(self, number: int) -> bool:
-        """Give an unsupported module a waiting address; tell whether there was one.
-
-        Whether one waits for an address is read first: a lost reply to that leaves nothing open.
-        """
+    async def _newcomer(self) -> Identity | None:
+        """Return what waits at address 0 although no module is expected there any more."""
         for _ in range(END_ATTEMPTS):
-            if await self.rate.who_is(UNADDRESSED.address):
-                return await self._park_expected(number, 0.0)
-        return False
+            if identity := await self.rate.who_is(UNADDRESSED.address):
+                return identity
+        return None
 
     async def let_all_hear(self, expected: int) -> None:
         """Assign this many waiting addresses, to any modules, so that the next reset reaches every module.

@@ -76,6 +76,8 @@ class Adoption:
         await self.search()
         identities = {address: found.identity for address, found in self.found.items()}
         problems = list(differences(self._expected, identities))
+        if not problems and (more := await self._rate.who_is(len(self._expected) + 1)):
+            problems.append(f"address {len(self._expected) + 1}: {more} is not configured")
         bauds = sorted({found.baud for found in self.found.values()})
         if len(bauds) > 1:
             problems += [f"address {address} is at {found.baud} baud" for address, found in sorted(self.found.items())]

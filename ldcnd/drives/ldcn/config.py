@@ -115,7 +115,7 @@ a time take less processor time. 0 for one at a time."""
     axis: tuple[LdcnAxisConfig, ...] = Field(min_length=1, max_length=31)
     """The drives that are axes."""
     module: tuple[ModuleConfig, ...] = Field(default=(), max_length=30)
-    """Modules on the line besides the axes."""
+    """All modules on the line besides the axes: a line with one that is not configured stays down."""
 
     @property
     def models(self) -> dict[int, str]:

@@ -28,11 +28,10 @@ Sources: PIC-SERVO manual, 4.1; LS-182AP manual, "Addressing", "Hard Reset".
 
 import asyncio
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import TypeVar
 
-from ldcnd.contract.errors import BadReply, CommandAborted, OutcomeUnknown, PacketRejected, ReplyTimeout, StopLatched
+from ldcnd.contract.errors import BadReply, CommandAborted, OutcomeUnknown, PacketRejected, StopLatched
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import (
     ANY_DIALECT,
@@ -43,17 +42,13 @@ from ldcnd.drives.ldcn.addressing import (
     Expected,
     Identity,
     LineRate,
-    identity_in,
-    read_identity,
 )
 from ldcnd.drives.ldcn.adoption import MOTION_ITEMS, WATCH_S, moves
 from ldcnd.drives.ldcn.commands import Node, unanswered
-from ldcnd.drives.ldcn.packet import StatusPacket, check_status
+from ldcnd.drives.ldcn.packet import StatusPacket
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
+from ldcnd.line.exchange import Exchange, PacketEffect
 from ldcnd.log import get_logger
-
-ReplyT = TypeVar("ReplyT")
 
 log = get_logger("ldcn")
 
@@ -67,17 +62,6 @@ CONFIRMATIONS = 3
 """Further replies that must be intact where two modules may share a waiting address."""
 GOLDEN = 0.618034
 """Instants that are spaced by this share of a servo cycle fall everywhere in it."""
-
-
-@dataclass(frozen=True, slots=True)
-class Heard:
-    """Bytes came back.
-
-    Attributes:
-        identity: what they say; None when they are damaged, as by two replies at once.
-    """
-
-    identity: Identity | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -185,7 +169,7 @@ class Gathering:
                 if any([await self._rate.who_is(address) for address in addresses]):
                     rates.add(baud)
         if not rates and await self._rate.host_to(self._rate.at_reset):
-            first = await self._listen(UNADDRESSED.address)
+            first = await self._rate.listen(UNADDRESSED.address)
             if first is not None and first.identity is None:
                 rates.add(self._rate.at_reset)
         return frozenset(rates)
@@ -198,7 +182,7 @@ class Gathering:
         found = []
         for address in self._pool[numbers.start : numbers.stop]:
             for baud in dict.fromkeys((self._bus.baud, self._rate.at_reset)):
-                if await self._listen(address, baud):
+                if await self._rate.listen(address, baud):
                     found.append(address)
                     again = commands.set_address(Node(address, ANY_DIALECT), address, WAITING_GROUP)
                     await self._acknowledged(baud, again)
@@ -235,21 +219,21 @@ class Gathering:
                 continue
             # one that answers at the line's rate, too, has not restarted: only its replies were lost for a while, or
             # the port does not pass rates on (a pseudo-terminal); a reset would switch off a motor that holds
-            heard = await self._listen(each.address, at_reset)
+            heard = await self._rate.listen(each.address, at_reset)
             if heard and heard.identity and each.accepts(heard.identity) and not await self._answers(each.address):
                 node = Node(each.address, each.profile)
-                before = await self._at(at_reset, commands.read_status(node, MOTION_ITEMS))
+                before = await self._rate.execute_at(at_reset, commands.read_status(node, MOTION_ITEMS))
                 await asyncio.sleep(WATCH_S)
-                after = await self._at(at_reset, commands.read_status(node, MOTION_ITEMS))
+                after = await self._rate.execute_at(at_reset, commands.read_status(node, MOTION_ITEMS))
                 if not moves(before, after):
-                    await self._at(at_reset, commands.hard_reset(node))
+                    await self._rate.execute_at(at_reset, commands.hard_reset(node))
 
     # -- waiting addresses -------------------------------------------------------------------------------------------
 
     async def _park_all(self) -> list[int]:
         """Give all that wait at address 0 and receive waiting addresses, and return these in their order."""
         arrived: list[int] = []
-        while len(arrived) <= len(self.places) and await self._listen(UNADDRESSED.address, self._rate.at_reset):
+        while len(arrived) <= len(self.places) and await self._rate.listen(UNADDRESSED.address, self._rate.at_reset):
             arrived.append(await self._park())
         return arrived
 
@@ -258,7 +242,7 @@ class Gathering:
         address = await self._fresh()
         at_reset = self._rate.at_reset
         if any(each.profile.sc_extensions for each in self.places):
-            await self._at(at_reset, commands.hard_reset(UNADDRESSED))
+            await self._rate.execute_at(at_reset, commands.hard_reset(UNADDRESSED))
         self._waiting.append(address)
         self._empty.discard(address)
         await self._acknowledged(at_reset, commands.set_address(UNADDRESSED, address, WAITING_GROUP))
@@ -267,7 +251,7 @@ class Gathering:
 
     async def _to_line_rate(self) -> None:
         if self._bus.baud != self._rate.at_reset:
-            await self._at(self._rate.at_reset, self._rate.set_baud(WAITING_GROUP, self._bus.baud))
+            await self._rate.execute_at(self._rate.at_reset, self._rate.set_baud(WAITING_GROUP, self._bus.baud))
 
     async def _fresh(self) -> int:
         """Return a waiting address that no module has had since all had their own."""
@@ -284,7 +268,7 @@ class Gathering:
         """
         reset = commands.hard_reset(commands.LeaderlessGroup(WAITING_GROUP))
         for baud in dict.fromkeys((self._bus.baud, self._rate.at_reset)):
-            await self._at(baud, reset)
+            await self._rate.execute_at(baud, reset)
         self._empty.update(self._waiting)
 
     # -- observations ------------------------------------------------------------------------------------------------
@@ -299,10 +283,10 @@ class Gathering:
                 silent.append(at)
         present: dict[int, Identity | None] = {}
         for address in tuple(self._waiting):
-            answer = await self._listen(address)
+            answer = await self._rate.listen(address)
             if answer is None and address not in self._empty:
                 await self._to_line_rate()  # the packet that should have brought it here may have been lost
-                answer = await self._listen(address)
+                answer = await self._rate.listen(address)
             self._empty.discard(address)
             if answer is None:
                 self._empty.add(address)
@@ -313,38 +297,10 @@ class Gathering:
     async def _answers(self, address: int) -> bool:
         return await self._rate.who_is(address) is not None or await self._rate.who_is(address) is not None
 
-    async def _listen(self, address: int, baud: int | None = None) -> Heard | None:
-        """Read an identity; None means silence. Replies that collide are no silence: their identity is None."""
-        received = bytearray()
-        exchange = read_identity(address)
-
-        def length(data: bytes) -> int:
-            received[:] = data
-            return exchange.reply_bytes
-
-        def intact(data: bytes) -> ReplyVerdict:
-            received[:] = data
-            return check_status(data)
-
-        asked = replace(exchange, check=intact, total_bytes=length, repeatable=False)
-        while True:
-            try:
-                status = await self._at(baud, asked)
-            except (StopLatched, CommandAborted):
-                continue  # a stop took the question off the queue: it says nothing about the module
-            except (ReplyTimeout, OutcomeUnknown, BadReply, PacketRejected):
-                return Heard(None) if received else None
-            return Heard(identity_in(status))
-
-    async def _at(self, baud: int | None, exchange: Exchange[ReplyT]) -> ReplyT:
-        if baud is None or baud == self._bus.baud:
-            return await self._bus.execute(exchange)
-        return await self._bus.execute_at(baud, exchange)
-
     async def _acknowledged(self, baud: int | None, exchange: Exchange[StatusPacket]) -> None:
         """Send a packet whose effect is seen otherwise."""
         try:
-            await self._at(baud, exchange)
+            await self._rate.execute_at(baud, exchange)
         except (OutcomeUnknown, BadReply, PacketRejected, StopLatched, CommandAborted) as error:
             log.debug("not acknowledged", bus=self._bus.settings.name, reason=error.message)
 
@@ -395,7 +351,7 @@ class Gathering:
     async def _speaks_alone(self, address: int, identity: Identity) -> bool:
         """Tell whether no other module replies at a waiting address, also if one reply was lost."""
         for _ in range(CONFIRMATIONS):
-            answer = await self._listen(address)
+            answer = await self._rate.listen(address)
             if answer is None or answer.identity != identity:
                 return False
         return True
@@ -407,7 +363,7 @@ class Gathering:
         loop = asyncio.get_running_loop()
         until_s = loop.time() + self._rate.reset_s
         while len(order) < len(stock.silent) and loop.time() < until_s:
-            if await self._listen(UNADDRESSED.address, self._rate.at_reset):
+            if await self._rate.listen(UNADDRESSED.address, self._rate.at_reset):
                 order.append(await self._park())
         return await self._confirm(stock, dict(zip(order, stock.silent, strict=False)))
 
@@ -426,10 +382,10 @@ class Gathering:
             hidden = [
                 other
                 for other in names
-                if other != name and not (await self._listen(now[other]) or await self._listen(now[other]))
+                if other != name and not (await self._rate.listen(now[other]) or await self._rate.listen(now[other]))
             ]
             until_s = loop.time() + self._rate.reset_s
-            while not await self._listen(UNADDRESSED.address, self._rate.at_reset):
+            while not await self._rate.listen(UNADDRESSED.address, self._rate.at_reset):
                 if loop.time() > until_s:
                     return None
             self._waiting.remove(now[name])
@@ -484,8 +440,8 @@ class Gathering:
             self._waiting.append(there)
             for _ in range(SPLITS if identity is None else 1):
                 await self._move_some(here, there)
-                if await self._listen(there):
-                    if await self._listen(here):
+                if await self._rate.listen(there):
+                    if await self._rate.listen(here):
                         return True
                     here, there = there, here
         return False

@@ -256,11 +256,6 @@ class LdcnNetwork(Network):
     def _up(self, modules: Mapping[int, Identity], remarks: tuple[str, ...], *, reset: bool) -> BringUpReport:
         self._identities.clear()
         self._identities.update(modules)
-        self._gathering.places = self._expected + tuple(
-            Expected(address, "module", found.profile or PIC_STEP, found)
-            for address, found in sorted(modules.items())
-            if address > len(self._expected)
-        )
         self._watches = {
             address: self._io.get(address) or ModuleWatch(address) for address in modules if address not in self._drives
         }
@@ -344,26 +339,27 @@ class LdcnNetwork(Network):
 
     async def _reset_and_address(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
         for _ in range(RATE_ATTEMPTS):
-            modules, remarks = await self._address_afresh()
+            modules = await self._address_afresh()
             deaf = await self._change_rate(modules)
             if deaf is None:
                 await self._addressing.with_leaders()
-                return modules, remarks
-        modules, remarks = await self._address_afresh()
+                return modules, ()
+        modules = await self._address_afresh()
         self._rate.working = self._rate.at_reset
         await self._addressing.with_leaders()
         told = f"address {deaf} does not answer at {self._baud} baud; the line stays at {self._rate.at_reset}"
-        return modules, (*remarks, told)
+        return modules, (told,)
 
-    async def _address_afresh(self) -> tuple[dict[int, Identity], tuple[str, ...]]:
-        """Bring everybody to the rate of power-up and give out addresses; return who is where, and remarks.
+    async def _address_afresh(self) -> dict[int, Identity]:
+        """Bring everybody to the rate of power-up and give out addresses; return who is where.
 
         Raises:
             NetworkMismatch: they are not those of the configuration.
         """
         await self._addressing.reset_all()
         modules = await self._addressing.address_all(len(self._expected))
-        return modules, self._compare(modules)
+        self._check(modules)
+        return modules
 
     async def _all_wait(self) -> bool:
         """Tell, before a reset, whether all modules wait for an address, and so stand where they were powered on.
@@ -404,13 +400,17 @@ class LdcnNetwork(Network):
                 return address
         return None
 
-    def _compare(self, modules: Mapping[int, Identity]) -> tuple[str, ...]:
-        """Hold what was found against the configuration; return remarks on what does no harm.
+    def _check(self, modules: Mapping[int, Identity]) -> None:
+        """Hold what was found against the configuration.
+
+        A module that is not configured is refused, although it does no harm itself: where any number of modules is
+        right, one of which the supply has failed and the next one, which is deaf behind it, are not missed, and the
+        modules behind them would get their addresses.
 
         Raises:
-            NetworkMismatch: a configured module is missing or is something else.
+            NetworkMismatch: a configured module is missing or is something else, or one is not configured.
         """
-        different = differences(self._expected, modules)
+        different = differences(self._expected, modules) + self._surplus(modules)
         if different:
             missing = next((each for each in self._expected if each.address not in modules), None)
             first = f": {missing.what}, address {missing.address}, first, those behind it need it" if missing else ""
@@ -419,9 +419,14 @@ class LdcnNetwork(Network):
                 f" {self._rate.reset_s:g} s of the reset, {len(self._expected)} configured; " + "; ".join(different),
                 remedy=f"switch on what has no power{first}; correct the wiring or the configuration",
             )
+
+    def _surplus(self, modules: Mapping[int, Identity]) -> tuple[str, ...]:
+        """Return in words what is there and not configured, with the lines of the configuration that it needs."""
         known = {each.address for each in self._expected}
         return tuple(
-            f"address {address}: {found} is not configured; it is kept on the line and never moved"
+            f"address {address}: {found} is not configured; it needs [[bus.module]] with address = {address} and"
+            f' model = "{found.profile.name if found.profile else PIC_STEP.name}"'
+            + ("" if found.profile else f", identity = [{found.device_id}, {found.version}]")
             for address, found in sorted(modules.items())
             if address not in known
         )
