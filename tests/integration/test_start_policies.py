@@ -10,6 +10,7 @@ from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power
 from ldcnd.contract.condition import Severity
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.samples import AxisState, LinkState, Moving, StateSample, TelemetryItem
+from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
 from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import LoadTrajectory
@@ -442,3 +443,22 @@ async def turn(chain, address):
     while True:
         await asyncio.sleep(0.01)
         drive(chain, address).shaft.position_counts += 5
+
+
+@pytest.mark.parametrize("placed", [1, 2, 3])
+async def test_a_line_that_a_killed_daemon_has_addressed_in_part_is_taken_over(placed):
+    chain = chain_of(*["ls182ap"] * 4)
+    axes = [axis | {"model": "ls-182ap"} for axis in simulated_config().model_dump()["bus"][0]["axis"]]
+    config = simulated_config(start="adopt", adopt_fallback="reset", axis=axes)
+    async with rig_on(chain, config, up=False) as rig:
+        while chain.modules[placed - 1].address != placed:
+            await asyncio.sleep(0.0005)
+        await rig.kill()
+    assert chain.modules[placed].address in WAITING_ADDRESSES
+
+    began_at_s = asyncio.get_running_loop().time()
+    async with rig_on(chain, config):
+        took_s = asyncio.get_running_loop().time() - began_at_s
+
+    assert [module.address for module in chain.modules] == [1, 2, 3, 4]
+    assert took_s < 5.0
