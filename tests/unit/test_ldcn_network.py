@@ -16,6 +16,7 @@ from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drives.ldcn.registers import actual_baud
 from ldcnd.drives.network import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
 from ldcnd.sim.chain import Chain
+from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.quirks import ModuleSettings
@@ -505,3 +506,31 @@ async def test_one_lost_reply_does_not_hide_a_module_behind_the_configured_ones(
     assert isinstance(refused, NetworkMismatch)
     assert "5 module(s) found within 2 s of the reset, 4 configured; address 5: PIC-SERVO version 4" in str(refused)
     assert [module.address for module in chain.modules] == [0] * 5
+
+
+class MuteForAWhile(FaultInjector):
+    """Loses every reply while `mute`."""
+
+    mute = False
+
+    def reply(self, data, at_s):
+        return FaultyReply(b"" if self.mute else data)
+
+
+async def test_an_sc_that_has_kept_its_power_is_not_reset_although_it_answers_at_the_rate_of_power_up_too():
+    """Its replies were lost for a while, and a pseudo-terminal passes no rates on, and its replies on a little late."""
+    late = ModuleSpec("picservo-sc", adjust=lambda known: known.model_copy(update={"reply_latency_s": 0.005}))
+    chain = build_chain(ChainSpec((ModuleSpec("ls182ap"), late), baud_check=False))
+    injector = chain._injector = MuteForAWhile(FaultPlan())
+    async with bare_network(chain, specs("ls-182ap", "pic-servo-sc")) as line:
+        await line.network.bring_up()
+        await line.network.axes["a2"].power(on=True)
+        before, injector.mute = len(line.sent()), True
+        with pytest.raises(ReplyTimeout):
+            await line.bus.execute(line.network.axes["a2"].reading(frozenset()))
+        injector.mute = False
+
+        await line.network.rejoin(lambda _: None)
+
+        assert CommandCode.HARD_RESET not in {packet.command for packet in line.sent(before)}
+        assert chain.modules[1].loop.servo_on
