@@ -34,27 +34,6 @@ class AdoptFallback(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class ModuleEntry:
-    """A module that is expected on the line and is no axis.
-
-    Attributes:
-        address: node address, 1 to 127.
-        model: profile name of the family.
-        identity: see `AxisSpec`.
-        name: of an I/O module that is served; empty for one that is only watched.
-        outputs: its lines that may be driven.
-        rate_hz: polling rate.
-    """
-
-    address: int
-    model: str
-    identity: tuple[int, int] | None = None
-    name: str = ""
-    outputs: tuple[int, ...] = ()
-    rate_hz: float = 5.0
-
-
-@dataclass(frozen=True, slots=True)
 class GroupSpec:
     """Axes that start and stop together.
 
@@ -67,31 +46,6 @@ class GroupSpec:
     name: str
     axes: tuple[str, ...]
     leader: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class LineSpec:
-    """The configuration of a line as a whole.
-
-    Attributes:
-        start: see `StartPolicy`.
-        adopt_fallback: see `AdoptFallback`.
-        alternate_divisors: use the other family of baud rate divisors.
-        clock_hz: of the modules.
-        snapshot: positions may be frozen at one instant, which overwrites the drives' home registers.
-        proves_places: find out at a reset which drives stand where they were powered on, see `BringUpReport.placed`.
-        modules: what is on the line besides the axes.
-        groups: at most one for each axis.
-    """
-
-    start: StartPolicy = StartPolicy.RESET
-    adopt_fallback: AdoptFallback = AdoptFallback.REFUSE
-    alternate_divisors: bool = False
-    clock_hz: int = 20_000_000
-    snapshot: bool = False
-    proves_places: bool = False
-    modules: tuple[ModuleEntry, ...] = ()
-    groups: tuple[GroupSpec, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,69 +13,90 @@ degrees; PIC-SERVO SC data sheet, 3-phase outputs: the Hall inputs choose one ch
 import math
 import random
 from collections import deque
-from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
+
+from pydantic import AfterValidator, Field
+
+from ldcnd.contract.frozen import Frozen
 
 LIVE_SIXTH = 2
 """Of each half of an electrical turn: the pair without the phase that may be lost."""
 
 
-@dataclass(frozen=True, slots=True)
-class MotorPlant:
-    """The constants of one machine; positions are encoder counts from where the shaft is at power-up.
+CountRange = tuple[int, int]
 
-    The defaults are a small servo motor (3000 1/min at 24 V) that position gains of KP=350 KD=3000 KI=400 IL=400 and of
-    KP=100 KD=1000 KI=50 IL=200 hold with a damping ratio of about 0.7.
 
-    Attributes:
-        torque_nm_per_a: also the back EMF constant in V s/rad.
-        friction_nm: Coulomb friction, also at standstill.
-        viscous_nm_s: viscous friction per rad/s.
-        reverse_limit_counts: the reverse limit switch is actuated here and below.
-        forward_limit_counts: the forward limit switch is actuated here and above.
-        stop_margin_counts: the hard stops lie so far behind the switches.
-        index_at_counts: where an index pulse begins.
-        index_spacing_counts: from there to the next one; None for a revolution.
-        index_width_counts: 4 is an ungated Z track. Firmware samples it once per servo cycle and may miss it.
-        pot_span_counts: the potentiometer turns from 0 to full scale over this range of travel.
-        pot_noise: standard deviation of its reading, as a share of full scale.
-        seed: of the potentiometer's noise.
-        load_nm: torque of a hanging load, positive when it pulls forward.
-        delay_s: from a change of the output to the torque: the amplifier and the motor's inductance, as a dead time.
-        backlash_counts: lost motion between motor and encoder, which sits on the load.
-        motor_reversed: the motor's leads are swapped: a positive output turns it in reverse.
-        phase_lost: the motor is a brushless one, and one of its phases is open.
-        pole_pairs: electrical turns in a revolution.
-        encoder_disconnected: the counter stands still while the shaft turns, and the drive does not notice.
-        coupling_grip: share of the motor's way that reaches encoder and load: below 1 the coupling slips.
-        limits_swapped: each limit switch is wired to the input of the other one.
+def _rising(span: CountRange) -> CountRange:
+    if span[0] >= span[1]:
+        raise ValueError(f"the first number must be below the second, not {span[0]} and {span[1]}")
+    return span
+
+
+RisingRange = Annotated[CountRange, AfterValidator(_rising)]
+
+
+class PlantConfig(Frozen):
+    """The machine on a shaft; what is left out is a small servo motor, 3000 1/min at 24 V.
+
+    Position gains of KP=350 KD=3000 KI=400 IL=400 and of KP=100 KD=1000 KI=50 IL=200 hold it with a damping ratio of
+    about 0.7. Positions are encoder counts from where the shaft is at power-up.
     """
 
-    counts_per_rev: int = 2000
-    supply_v: float = 24.0
-    resistance_ohm: float = 1.2
-    torque_nm_per_a: float = 0.0767
-    inertia_kg_m2: float = 5.0e-5
-    viscous_nm_s: float = 1.0e-5
-    friction_nm: float = 0.004
-    reverse_limit_counts: int = -100_000
-    forward_limit_counts: int = 100_000
-    stop_margin_counts: int = 2000
+    counts_per_rev: int = Field(default=2000, gt=0)
+    """Encoder counts of a revolution."""
+    supply_v: float = Field(default=24.0, gt=0, le=100)
+    """Voltage at full duty."""
+    resistance_ohm: float = Field(default=1.2, gt=0)
+    """Resistance of the winding, in ohms."""
+    torque_nm_per_a: float = Field(default=0.0767, gt=0)
+    """Torque constant, and back EMF constant in V s/rad."""
+    inertia_kg_m2: float = Field(default=5.0e-5, gt=0)
+    """Inertia of motor and load, in kg m2."""
+    viscous_nm_s: float = Field(default=1.0e-5, ge=0)
+    """Viscous friction per rad/s."""
+    friction_nm: float = Field(default=0.004, ge=0)
+    """Coulomb friction, also at standstill."""
+    stop_margin_counts: int = Field(default=2000, ge=0)
+    """Distance of the hard stops behind the limit switches."""
     index_at_counts: int = 700
-    index_spacing_counts: int | None = None
-    index_width_counts: int = 4
-    pot_span_counts: tuple[int, int] = (-105_000, 105_000)
-    pot_noise: float = 0.0
-    seed: int = 1
+    """Position at which an index pulse begins, in counts."""
+    index_spacing_counts: int | None = Field(default=None, gt=0)
+    """Distance from one index pulse to the next, in counts; a revolution when left out."""
+    index_width_counts: int = Field(default=4, gt=0)
+    """How long a pulse is; 4 is an ungated Z track. Firmware samples it once per servo cycle and may miss it."""
+    pot_span_counts: RisingRange = (-105_000, 105_000)
+    """The potentiometer turns from 0 to full scale over this range."""
+    pot_noise: float = Field(default=0.0, ge=0, le=1)
+    """Standard deviation of its reading, as a share of full scale."""
     load_nm: float = 0.0
-    delay_s: float = 0.0
-    backlash_counts: float = 0.0
+    """Torque of a hanging load, positive when it pulls forward."""
+    delay_s: float = Field(default=0.0, ge=0, le=0.1)
+    """Dead time from a change of the output to the torque: the amplifier and the motor's inductance."""
+    backlash_counts: float = Field(default=0.0, ge=0)
+    """Lost motion between the motor and the encoder, which sits on the load."""
     motor_reversed: bool = False
+    """Whether the motor's leads are swapped: a positive output turns it in reverse. Then no position loop holds."""
     phase_lost: bool = False
-    pole_pairs: int = 4
+    """Whether it is a brushless motor behind Hall sensors with one phase open: no torque in two thirds of a turn."""
+    pole_pairs: int = Field(default=4, ge=1, le=100)
+    """Electrical turns in a revolution of such a motor."""
     encoder_disconnected: bool = False
-    coupling_grip: float = 1.0
+    """Whether the counter stands still while the shaft turns, and the drive does not notice."""
+    coupling_grip: float = Field(default=1.0, ge=0, le=1)
+    """Share of the motor's way that reaches the encoder and the load; below 1 the coupling slips."""
     limits_swapped: bool = False
+    """Whether each limit switch is wired to the input of the other one."""
+
+
+class MotorPlant(PlantConfig):
+    """A machine with its travel."""
+
+    reverse_limit_counts: int = -100_000
+    """The reverse limit switch is actuated here and below."""
+    forward_limit_counts: int = 100_000
+    """The forward limit switch is actuated here and above."""
+    seed: int = 1
+    """Seed of the potentiometer's noise."""
 
 
 class Shaft:

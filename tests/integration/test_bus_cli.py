@@ -39,7 +39,7 @@ def bench(monkeypatch):
     """A servo whose forward switch is at 5 mm, and a PIC-I/O whose line 1 is low."""
     plant = MotorPlant(reverse_limit_counts=-20_000, forward_limit_counts=5_000, index_spacing_counts=100_000)
     servo = ModuleSpec("pic-servo-v4", plant)
-    chain = build_chain(ChainSpec((servo, ModuleSpec("pic-io", wiring=IoWiring(low=frozenset({1}))))))
+    chain = build_chain(ChainSpec((servo, ModuleSpec("pic-io", wiring=IoWiring(low=(1,))))))
     with virtual_rig(monkeypatch, CONFIG, {"line": chain}) as rig:
         rig.wait(rig.rig.until("x", lambda state: state.link is LinkState.UP))
         yield rig

@@ -5,7 +5,6 @@ import functools
 import re
 import shutil
 from contextlib import asynccontextmanager, contextmanager
-from dataclasses import fields, replace
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -98,7 +97,7 @@ async def test_a_reversed_motor_is_caught_within_the_stated_distance(direction, 
 @pytest.mark.parametrize("wrong", ["", "motor_reversed", "encoder_disconnected"])
 async def test_drawn_machines_stay_near_whatever_is_wrong_with_their_wires(wrong, count, tmp_path):
     for drawn in drawn_plants(SEED, count):
-        machine = {each.name: getattr(drawn.motor, each.name) for each in fields(drawn.motor)}
+        machine = dict(drawn.motor)
         plant = {**machine, "load_nm": 0.0, **({wrong: True} if wrong else {})}
         folder = tmp_path / str(drawn.number)
         folder.mkdir()
@@ -426,7 +425,9 @@ async def test_a_load_that_friction_does_not_hold_contradicts_the_person(tmp_pat
     script = {"what falls": "none", "remark": ""}
     text = rig_text().replace("[[sim]]", '[bus.axis.loss]\nclient = "power_off"\n\n[[sim]]')
     chain = build_chain(
-        ChainSpec((ModuleSpec("picservo-sc", replace(PLANT, friction_nm=2.5 * nm, load_nm=-5.4 * nm)),))
+        ChainSpec(
+            (ModuleSpec("picservo-sc", PLANT.model_copy(update={"friction_nm": 2.5 * nm, "load_nm": -5.4 * nm})),)
+        )
     )
     chain.modules[0].shaft.stalled = True
     async with commissioning_rig(tmp_path, script, text=text, chain=chain) as rig:
@@ -455,7 +456,7 @@ async def test_friction_and_load_of_drawn_machines_are_measured(count, tmp_path)
     hanging = [drawn for drawn in drawn_plants(SEED, 5 * count) if drawn.motor.load_nm][:count]
     off = []
     for drawn in hanging:
-        machine = {each.name: getattr(drawn.motor, each.name) for each in fields(drawn.motor)}
+        machine = dict(drawn.motor)
         folder = tmp_path / str(drawn.number)
         folder.mkdir()
         async with commissioning_rig(folder, **machine) as rig:

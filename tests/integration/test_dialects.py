@@ -1,7 +1,6 @@
 """Each dialect through codec, simulated drive and daemon: enable, move, read back, home, stop, fault, recovery."""
 
 import asyncio
-from dataclasses import replace
 
 import pytest
 
@@ -25,7 +24,7 @@ from tests.support.dialect_rig import (
     dialect_rig,
 )
 
-WIDE_INDEX = replace(PLANT, index_width_counts=40)
+WIDE_INDEX = PLANT.model_copy(update={"index_width_counts": 40})
 
 
 async def next_sample(rig: DialectRig, item: TelemetryItem):

@@ -2,7 +2,6 @@
 
 import asyncio
 from contextlib import asynccontextmanager
-from dataclasses import replace
 
 import pytest
 
@@ -184,7 +183,7 @@ async def test_a_sensor_lost_in_any_other_move_disturbs_nothing(dialect):
 
 @named(LOGOSOL)
 async def test_an_encoder_that_was_lost_takes_the_reference_with_it_until_the_axis_is_homed(dialect):
-    async with dialect_rig(dialect, replace(PLANT, index_width_counts=40)) as rig:
+    async with dialect_rig(dialect, PLANT.model_copy(update={"index_width_counts": 40})) as rig:
         await rig.power_on()
         assert (await rig.rig.client.state(AXIS)).referenced
         await rig.send(FAR)
@@ -244,7 +243,9 @@ async def test_a_counter_that_wrapped_means_nothing_before_a_new_reference(diale
 
 @named((V4, LS_182AP))
 async def test_a_counter_that_wrapped_can_be_homed_with_the_warning_standing(dialect):
-    far_index = replace(PLANT, index_width_counts=40, index_at_counts=8000, index_spacing_counts=100_000)
+    far_index = PLANT.model_copy(
+        update={"index_width_counts": 40, "index_at_counts": 8000, "index_spacing_counts": 100_000}
+    )
     async with near_the_end_of_the_counter(dialect, far_index) as rig:
         await rig.send(SetPwm(duty=0.1, duration_s=0.3))
         await rig.until_fault(lambda faults: faults.active)
@@ -284,7 +285,7 @@ async def test_motor_power_lost_is_named_and_nothing_lurches_when_it_returns(dia
 
 @named((V1, V4, SC))
 async def test_current_limiting_is_a_warning_that_reset_clears_with_the_loop_closed(dialect):
-    hard_stop = replace(PLANT, forward_limit_counts=1000, stop_margin_counts=100)
+    hard_stop = PLANT.model_copy(update={"forward_limit_counts": 1000, "stop_margin_counts": 100})
     async with dialect_rig(dialect, hard_stop, gains=GAINS | {"cl": 101, "el": 16_000}) as rig:
         await rig.power_on()
 

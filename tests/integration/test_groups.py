@@ -20,9 +20,10 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.driver import CountsMotion, HomeCapture, StopMode
 from ldcnd.drives.ldcn.commands import spaced
+from ldcnd.drives.ldcn.config import LineSpec
 from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode
-from ldcnd.drives.network import GroupSpec, LineSpec, StartPolicy
+from ldcnd.drives.network import GroupSpec, StartPolicy
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.bare_network import bare_network, specs

@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-from dataclasses import replace
 
 import pytest
 
@@ -30,8 +29,8 @@ from tests.support.dialect_rig import (
 
 PIC_SERVOS = (V1, V2, V3, V4, SC)
 LIMITS = (*PIC_SERVOS, LS_182AP, LS_182AP_22)
-WIDE_INDEX = replace(PLANT, index_width_counts=40)
-HARD_STOP = replace(PLANT, stop_margin_counts=500)
+WIDE_INDEX = PLANT.model_copy(update={"index_width_counts": 40})
+HARD_STOP = PLANT.model_copy(update={"stop_margin_counts": 500})
 
 
 def named(dialects):
@@ -154,7 +153,7 @@ async def test_an_axis_that_stands_on_its_switch_moves_off_it_first(dialect):
 
 
 async def test_moving_off_a_switch_that_never_releases_is_bounded():
-    stuck = replace(PLANT, reverse_limit_counts=15_000, stop_margin_counts=30_000)
+    stuck = PLANT.model_copy(update={"reverse_limit_counts": 15_000, "stop_margin_counts": 30_000})
     async with dialect_rig(V4, stuck) as rig:
         await rig.power_on()
 
@@ -217,7 +216,7 @@ async def test_a_search_that_the_index_pulse_can_slip_through_is_refused_with_th
 
 @pytest.mark.parametrize("index_at_counts", [700, 701, 702, 703, 704])
 async def test_at_the_nearest_velocity_no_index_pulse_is_missed(index_at_counts):
-    narrow = replace(PLANT, index_width_counts=1, index_at_counts=index_at_counts)
+    narrow = PLANT.model_copy(update={"index_width_counts": 1, "index_at_counts": index_at_counts})
     async with dialect_rig(LS_182AP, narrow) as rig:
         await rig.power_on()
 

@@ -2,7 +2,6 @@
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 
@@ -59,7 +58,7 @@ async def test_the_amplifier_enable_follows_power_and_stops():
 @dialects
 @pytest.mark.parametrize("on_index", [True, False])
 async def test_the_index_is_shown_as_a_level_whatever_bit_the_drive_sends(dialect, on_index):
-    plant = replace(PLANT, index_at_counts=0 if on_index else 500, index_width_counts=8)
+    plant = PLANT.model_copy(update={"index_at_counts": 0 if on_index else 500, "index_width_counts": 8})
     async with dialect_rig(dialect, plant, start_counts=4.0) as rig:
         await rig.power_on()
 

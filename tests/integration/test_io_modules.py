@@ -36,7 +36,7 @@ def config(start: str = "reset", line: dict[str, object] | None = None, **module
 
 
 def chain_of():
-    wiring = IoWiring(low=frozenset({1}), wires={5: 4}, adc=(0, 51, 255))
+    wiring = IoWiring(low=(1,), wires=((4, 5),), adc=(0, 51, 255))
     return build_chain(ChainSpec((ModuleSpec("picservo-v4"), ModuleSpec("picio", wiring=wiring))))
 
 

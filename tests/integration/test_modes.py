@@ -2,7 +2,6 @@
 
 import asyncio
 import contextlib
-from dataclasses import replace
 
 import pytest
 
@@ -117,7 +116,7 @@ async def test_an_analog_move_stops_before_a_software_limit():
         assert 2.0 < rig.position_mm < 4.0
 
 
-DEAD_SENSOR = replace(PLANT, pot_span_counts=(-(1 << 40), 1 << 40), forward_limit_counts=1 << 30)
+DEAD_SENSOR = PLANT.model_copy(update={"pot_span_counts": (-(1 << 40), 1 << 40), "forward_limit_counts": 1 << 30})
 """A coupling that slips: the sensor stays where it is."""
 
 

@@ -1,7 +1,6 @@
 """`probe`: a move that ends at an input, with the position that the drive has latched and its bound."""
 
 import asyncio
-from dataclasses import replace
 
 import pytest
 
@@ -37,7 +36,7 @@ async def test_a_switch_is_latched_within_its_bound_and_the_reference_stays(dial
 
 
 async def test_of_several_sources_the_first_that_comes_counts():
-    plant = replace(PLANT, index_at_counts=3000, index_spacing_counts=100_000)
+    plant = PLANT.model_copy(update={"index_at_counts": 3000, "index_spacing_counts": 100_000})
     async with dialect_rig(V4, plant) as rig:
         await rig.power_on()
 
@@ -60,7 +59,9 @@ async def test_a_probe_that_finds_nothing_has_failed_and_stands_at_its_end():
 
 async def test_the_limit_switch_ahead_ends_a_probe_for_something_else():
     async with dialect_rig(
-        LS_182AP, replace(PLANT, index_at_counts=-15_000, index_spacing_counts=100_000), limit_switches="stop"
+        LS_182AP,
+        PLANT.model_copy(update={"index_at_counts": -15_000, "index_spacing_counts": 100_000}),
+        limit_switches="stop",
     ) as rig:
         await rig.power_on()
 

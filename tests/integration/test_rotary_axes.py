@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import replace
 
 import pytest
 from pydantic import ValidationError
@@ -124,7 +123,7 @@ async def test_a_jog_that_is_changed_on_its_way_does_not_run_through_the_counter
 
 
 async def test_homing_near_the_end_of_the_counter_takes_the_reference_over():
-    plant = replace(ENDLESS, index_at_counts=6_000, index_spacing_counts=2**31)
+    plant = ENDLESS.model_copy(update={"index_at_counts": 6_000, "index_spacing_counts": 2**31})
     async with dialect_rig(LS_182AP, plant) as before:
         before.drive.loop.renumber(NEAR_END)
     async with adopting_rig(LS_182AP, before) as rig:

@@ -3,7 +3,7 @@
 import asyncio
 import json
 from contextlib import asynccontextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 
 import pytest
 
@@ -92,7 +92,9 @@ async def test_a_load_that_doubles_is_said_and_what_was_learnt_outlives_the_obse
             async with watched(rig, alarms, said):
                 await move(axis, 10)
             learnt = kept()["learnt"]
-            heavy = Shaft(replace(MACHINE, inertia_kg_m2=2 * MACHINE.inertia_kg_m2), module.profile.servo_cycle_s)
+            heavy = Shaft(
+                MACHINE.model_copy(update={"inertia_kg_m2": 2 * MACHINE.inertia_kg_m2}), module.profile.servo_cycle_s
+            )
             heavy.position_counts = module.shaft.position_counts
             module.loop.shaft = heavy
             async with watched(rig, alarms, said):

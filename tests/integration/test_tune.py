@@ -204,7 +204,7 @@ async def test_wrong_wires_end_it_within_the_stated_distance_and_the_gains_come_
             places.append(shaft.position_counts)
             await asyncio.sleep(0.002)
 
-    async with tuned_rig(replace(MotorPlant(), **wrong)) as (rig, shaft):
+    async with tuned_rig(MotorPlant(**wrong)) as (rig, shaft):
         planned = await plan(rig.client, "x", WRONG_WITHIN)
         watching = asyncio.create_task(watch(shaft), name="watch")
         with pytest.raises(DriveFault, match=f"axis x: .*{said}") as refused:

@@ -6,10 +6,10 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
 from ldcnd.drives.driver import AxisSpec, Gains
+from ldcnd.drives.ldcn.config import LineSpec
 from ldcnd.drives.ldcn.network import LdcnNetwork, ldcn_line
 from ldcnd.drives.ldcn.packet import Packet, PacketReader
 from ldcnd.drives.ldcn.registers import RESET_BAUD
-from ldcnd.drives.network import LineSpec
 from ldcnd.line.bus import Bus
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.line.settings import BusSettings

@@ -5,6 +5,7 @@ import contextlib
 
 from ldcnd.contract.errors import NetworkMismatch
 from ldcnd.drives.driver import AxisSpec
+from ldcnd.drives.ldcn.config import LineSpec, ModuleConfig
 from ldcnd.drives.ldcn.network import ldcn_line
 from ldcnd.drives.ldcn.profiles import Support
 from ldcnd.drives.network import BringUpReport, LineSpec, ModuleEntry
@@ -27,7 +28,7 @@ async def bring_up(chain: Chain, baud: int = 115_200, attempts: int = 1) -> Brin
         if module.profile.support is Support.FULL:
             drives.append(AxisSpec(f"a{address}", address, name, None, identity))
         else:
-            others.append(ModuleEntry(address, name, identity))
+            others.append(ModuleConfig(address=address, model=name, identity=identity))
     line = LineSpec(modules=tuple(others))
     settings = BusSettings("clean", 19_200)
     bus, network = ldcn_line(settings, lambda: open_simulated_line(chain), tuple(drives), baud, line)

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -145,7 +145,7 @@ async def commissioning_rig(
     config = folder / "rig.toml"
     if text is not None or not config.exists():
         config.write_text(text or rig_text(), encoding="utf-8")
-    machine = replace(PLANT, **plant)  # type: ignore[arg-type]  # names and types are those of the class
+    machine = PLANT.model_copy(update=plant)
     chain = chain or build_chain(ChainSpec((ModuleSpec(module, machine),)))
     drive = chain.modules[0]
     assert isinstance(drive, SimulatedDrive)

@@ -36,7 +36,7 @@ class SlippingShaft(Shaft):
     """
 
     def __init__(self, plant: MotorPlant, step_s: float, torque_nm: float) -> None:
-        super().__init__(replace(plant, inertia_kg_m2=plant.inertia_kg_m2 * MOTOR_SHARE), step_s)
+        super().__init__(plant.model_copy(update={"inertia_kg_m2": plant.inertia_kg_m2 * MOTOR_SHARE}), step_s)
         counts_per_step = step_s / (math.tau / plant.counts_per_rev)
         # the change of the relative speed by full torque in one step, counts a step
         self._most = torque_nm * step_s * counts_per_step / plant.inertia_kg_m2
@@ -97,7 +97,7 @@ class AxisAtWork:
     def gets(self, **changes: float) -> None:
         """Let values of the machine be multiplied by these."""
         values = {name: getattr(self._motor, name) * factor for name, factor in changes.items()}
-        self._motor = replace(self._motor, **values)
+        self._motor = self._motor.model_copy(update=values)
         self.becomes(Shaft(self._motor, self.profile.servo_cycle_s))
 
     def slips(self, share: float) -> None:
@@ -108,7 +108,7 @@ class AxisAtWork:
 
     def loses_phase(self) -> None:
         """Let one phase of its motor be open."""
-        self._motor = replace(self._motor, phase_lost=True)
+        self._motor = self._motor.model_copy(update={"phase_lost": True})
         self.becomes(Shaft(self._motor, self.profile.servo_cycle_s))
 
     @property

@@ -11,10 +11,11 @@ from ldcnd.drives.driver import CountsMotion, HomeCapture, StopMode
 from ldcnd.drives.ldcn.addressing import Expected, Identity, differences
 from ldcnd.drives.ldcn.adoption import Found
 from ldcnd.drives.ldcn.commands import Node, read_status
+from ldcnd.drives.ldcn.config import LineSpec, ModuleConfig
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drives.ldcn.registers import actual_baud
-from ldcnd.drives.network import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
+from ldcnd.drives.network import AdoptFallback, GroupSpec, StartPolicy
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultPlan, FaultyReply
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -179,7 +180,7 @@ async def test_a_configured_identity_overrides_the_table():
 async def test_an_unknown_device_is_described_with_its_identity_and_never_moved():
     chain = build_chain(ChainSpec((ModuleSpec("picservo-v4"), ModuleSpec("picio", settings=ModuleSettings(version=9)))))
     chain.modules[1].profile = type(chain.modules[1].profile)("toaster", "Toaster", 123, range(256), "identify")
-    described = LineSpec(modules=(ModuleEntry(2, "pic-step", (123, 9)),))
+    described = LineSpec(modules=(ModuleConfig(address=2, model="pic-step", identity=(123, 9)),))
     async with bare_network(chain, specs("pic-servo-v4")) as line:
         with pytest.raises(NetworkMismatch, match=r"address = 2 and model = \"pic-step\", identity = \[123, 9\]"):
             await line.network.bring_up()
@@ -198,7 +199,7 @@ async def test_an_unknown_device_is_described_with_its_identity_and_never_moved(
 
 async def test_a_missing_module_is_named():
     chain = chain_of("ls182ap", "picservo-v4")
-    expecting_io = LineSpec(modules=(ModuleEntry(3, "pic-io"),))
+    expecting_io = LineSpec(modules=(ModuleConfig(address=3, model="pic-io"),))
     async with bare_network(chain, PAIR, line=expecting_io) as line:
         with pytest.raises(NetworkMismatch, match=r"address 3 \(module\): expected PIC-I/O.*nothing there"):
             await line.network.bring_up()

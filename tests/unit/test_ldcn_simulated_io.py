@@ -67,7 +67,7 @@ def test_outputs_read_back_what_was_commanded_and_inputs_ignore_it():
 
 
 def test_the_frames_of_a_centrifuges_cabinet_are_obeyed():
-    host = IoHost(IoWiring(low=frozenset({4}), wires={7: 10}))
+    host = IoHost(IoWiring(low=(4,), wires=((10, 7),)))
     for data in ("20 ff 0f", "20 df 0f", "20 df 0e", "20 df 0c", "20 df 08", "26 00 00", "12 03"):
         command, *values = bytes.fromhex(data)
         reply = host.send(1, CommandCode(command & 0x0F), *values)
@@ -79,7 +79,7 @@ def test_the_frames_of_a_centrifuges_cabinet_are_obeyed():
 
 
 def test_a_line_follows_the_output_that_is_wired_to_it_and_else_its_own_level():
-    host = IoHost(IoWiring(low=frozenset({2}), wires={2: 9}))
+    host = IoHost(IoWiring(low=(2,), wires=((9, 2),)))
     as_input = host.look(1).levels
     host.do(SetDirection(ALL & ~0x100))
     host.do(SetOutput(0x100))
@@ -92,7 +92,7 @@ def test_a_line_follows_the_output_that_is_wired_to_it_and_else_its_own_level():
 
 
 def test_an_output_moves_a_cylinder_with_a_sensor_at_either_end():
-    host = IoHost(IoWiring(wires={1: 9}, inverted_wires={2: 9}))
+    host = IoHost(IoWiring(wires=((9, 1),), inverted_wires=((9, 2),)))
     host.do(SetDirection(ALL & ~0x100))
 
     seen = []
@@ -176,7 +176,7 @@ def test_stored_outputs_take_effect_with_the_start_of_a_servo_group():
 
 
 def test_synch_input_captures_levels_and_timer_where_servos_save_home():
-    host = IoHost(IoWiring(low=frozenset({1})))
+    host = IoHost(IoWiring(low=(1,)))
     host.do(SetTimerMode(enabled=True))
     host.wait(0.25)
 
@@ -236,7 +236,7 @@ def test_the_timer_runs_on_the_modules_clock(prescale):
 
 
 def test_the_counter_counts_rising_edges_of_line_10_while_it_is_an_input():
-    host = IoHost(IoWiring(low=frozenset({10})))
+    host = IoHost(IoWiring(low=(10,)))
     host.do(SetTimerMode(enabled=True, counter=True, prescale=2))
     for _ in range(6):
         host.module.drive_line(10, high=True, at_s=host.now_s)
@@ -254,7 +254,7 @@ def test_the_counter_counts_rising_edges_of_line_10_while_it_is_an_input():
 
 
 def test_the_counter_sees_an_output_that_is_wired_to_line_10():
-    host = IoHost(IoWiring(wires={10: 1}))
+    host = IoHost(IoWiring(wires=((1, 10),)))
     host.do(SetDirection(ALL & ~0x001))
     host.do(SetOutput(0))
     host.do(SetTimerMode(enabled=True, counter=True))

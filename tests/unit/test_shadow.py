@@ -56,7 +56,7 @@ class Watched:
 def prompt(number: int):
     """Return a drawn machine without dead time, which takes a third of the processor time."""
     drawn = list(drawn_plants(SEED, PLANTS))[number]
-    return replace(drawn, motor=replace(drawn.motor, delay_s=0.0))
+    return replace(drawn, motor=drawn.motor.model_copy(update={"delay_s": 0.0}))
 
 
 @pytest.fixture(scope="module", params=[2, 13])

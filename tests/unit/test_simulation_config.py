@@ -2,7 +2,6 @@
 
 import re
 import shlex
-from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -15,9 +14,8 @@ from ldcnd.sim.faults import FaultKind, LineFault
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, build_chain
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
-from ldcnd.sim.ldcn.simulation import PlantConfig, SimulatedChainConfig, SimulationConfig
+from ldcnd.sim.ldcn.simulation import SimulatedChainConfig, SimulationConfig
 from ldcnd.sim.line_config import FaultPlanConfig
-from ldcnd.sim.plant import MotorPlant
 
 TESTS = Path(__file__).parents[1]
 DOCS = TESTS.parent / "docs"
@@ -53,12 +51,6 @@ def test_a_wrong_file_is_refused_with_file_key_and_reason(tmp_path, text, compla
 
     assert refused.value.message.startswith(f"{file}: ")
     assert complaint in refused.value.message
-
-
-def test_every_constant_of_the_plant_can_be_configured():
-    travel = {"reverse_limit_counts", "forward_limit_counts", "seed"}
-
-    assert set(PlantConfig.model_fields) == {field.name for field in fields(MotorPlant)} - travel
 
 
 def test_what_is_left_out_stays_as_it_is_for_the_model(tmp_path):

@@ -108,7 +108,7 @@ def test_sixty_drawn_machines_are_identified_and_tuned():
 def test_sixty_machines_that_are_wired_wrongly_stay_within_the_distance(wrong, said):
     far = []
     for plant in drawn_plants(SEED, PLANTS):
-        axis = SimulatedAxis(PIC_SERVO_V4, replace(plant, motor=replace(plant.motor, **wrong)))
+        axis = SimulatedAxis(PIC_SERVO_V4, replace(plant, motor=plant.motor.model_copy(update=wrong)))
         try:
             axis.run(Excitation(PIC_SERVO_V4, Bounds(plant.distance_counts)).pulses())
             told = "nothing"

@@ -166,7 +166,7 @@ def test_a_trace_without_motion_tells_nothing():
 )
 def test_wrong_wires_are_found_by_pulses_within_the_distance(wrong, said):
     (plant,) = drawn_plants(SEED, 1)
-    axis = SimulatedAxis(PIC_SERVO_V4, replace(plant, motor=replace(plant.motor, **wrong)))
+    axis = SimulatedAxis(PIC_SERVO_V4, replace(plant, motor=plant.motor.model_copy(update=wrong)))
 
     with pytest.raises(DriveFault, match=said):
         axis.run(Excitation(PIC_SERVO_V4, Bounds(plant.distance_counts)).pulses())
@@ -176,7 +176,7 @@ def test_wrong_wires_are_found_by_pulses_within_the_distance(wrong, said):
 
 def test_pulses_end_in_the_drive_itself():
     (plant,) = drawn_plants(SEED, 1)
-    blind = replace(plant.motor, encoder_disconnected=True)
+    blind = plant.motor.model_copy(update={"encoder_disconnected": True})
     excitation = Excitation(PIC_SERVO_V4, Bounds(plant.distance_counts))
     pulses = excitation.pulses()
     nothing = TrialOutcome(MoveRecord(REFERENCE, MOVE, Start(), (0.0,), (0,)), tripped=False, rest_counts=0)

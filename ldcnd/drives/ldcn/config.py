@@ -1,5 +1,6 @@
 """The configuration of LDCN and NMC lines, beside what every line and axis has."""
 
+from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, ValidationInfo, model_validator
@@ -12,7 +13,7 @@ from ldcnd.drives.driver import AxisSpec, Gains
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, PIC_IO, PROFILES, HomingSource, Support, at_clock
 from ldcnd.drives.ldcn.registers import baud_divisor, encode_gains
 from ldcnd.drives.line_config import BAUDS, BusConfig
-from ldcnd.drives.network import AdoptFallback, GroupSpec, LineSpec, ModuleEntry, StartPolicy
+from ldcnd.drives.network import AdoptFallback, GroupSpec, StartPolicy
 from ldcnd.drives.toml import DeviceIdentity, Name
 
 
@@ -87,6 +88,31 @@ class ModuleConfig(Frozen):
         if self.outputs and not self.name:
             raise ValueError("outputs: they can only be set with a name of the module")
         return self
+
+
+@dataclass(frozen=True, slots=True)
+class LineSpec:
+    """The configuration of a line as a whole.
+
+    Attributes:
+        start: see `StartPolicy`.
+        adopt_fallback: see `AdoptFallback`.
+        alternate_divisors: use the other family of baud rate divisors.
+        clock_hz: of the modules.
+        snapshot: positions may be frozen at one instant, which overwrites the drives' home registers.
+        proves_places: find out at a reset which drives stand where they were powered on, see `BringUpReport.placed`.
+        modules: what is on the line besides the axes.
+        groups: at most one for each axis.
+    """
+
+    start: StartPolicy = StartPolicy.RESET
+    adopt_fallback: AdoptFallback = AdoptFallback.REFUSE
+    alternate_divisors: bool = False
+    clock_hz: int = CLOCK_HZ
+    snapshot: bool = False
+    proves_places: bool = False
+    modules: tuple[ModuleConfig, ...] = ()
+    groups: tuple[GroupSpec, ...] = ()
 
 
 class LdcnBusConfig(BusConfig):
@@ -179,11 +205,6 @@ a time take less processor time. 0 for one at a time."""
             clock_hz=self.clock_hz,
             snapshot=self.snapshot,
             proves_places=any(axis.reference == "at_reset" for axis in self.axis),
-            modules=tuple(
-                ModuleEntry(
-                    module.address, module.model, module.identity, module.name or "", module.outputs, module.rate
-                )
-                for module in self.module
-            ),
+            modules=self.module,
             groups=tuple(GroupSpec(group.name, group.axes, group.leader) for group in self.group),
         )

@@ -16,6 +16,7 @@ from typing_extensions import override
 from ldcnd.contract.errors import BusError, RegisterUnknown, ValueOutOfRange
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.samples import IoReading
+from ldcnd.drives.ldcn.config import ModuleConfig
 from ldcnd.drives.ldcn.pic_io import (
     ALL_LINES,
     LINES,
@@ -34,7 +35,7 @@ from ldcnd.drives.ldcn.pic_io import (
     timer_control,
 )
 from ldcnd.drives.ldcn.registers import TAKEN_OVER, RegisterBook
-from ldcnd.drives.network import IoDriver, ModuleEntry
+from ldcnd.drives.network import IoDriver
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, Poller, Timing, next_on_grid
 
@@ -60,8 +61,8 @@ class IoModule(Poller[IoStatus], IoDriver):
         status: the latest status byte; None while it does not answer.
     """
 
-    def __init__(self, bus: Bus, entry: ModuleEntry) -> None:
-        self.name = entry.name
+    def __init__(self, bus: Bus, entry: ModuleConfig) -> None:
+        self.name = entry.name or ""
         self.node = entry.address
         self.status: int | None = None
         self.due_at_s = asyncio.get_running_loop().time()
@@ -71,7 +72,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         self.proof = bus.proofs.expect(entry.address, f"module {entry.name}")
         self._bus = bus
         self._node = IoNode(entry.address)
-        self._period_s = 1.0 / entry.rate_hz
+        self._period_s = 1.0 / entry.rate
         self._allowed = _mask(entry.outputs)
         self._exchange = poll_io(entry.address)
         names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)

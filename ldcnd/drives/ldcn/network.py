@@ -31,6 +31,7 @@ from ldcnd.drives.ldcn.addressing import (
 )
 from ldcnd.drives.ldcn.adoption import STILL_COUNTS, UNADDRESSED, Adopted, Adoption, Found
 from ldcnd.drives.ldcn.commands import Node
+from ldcnd.drives.ldcn.config import LineSpec
 from ldcnd.drives.ldcn.gathering import Gathering
 from ldcnd.drives.ldcn.groups import Groups
 from ldcnd.drives.ldcn.io_module import IoModule
@@ -38,15 +39,7 @@ from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, StatusItem, Stat
 from ldcnd.drives.ldcn.profiles import PIC_IO, PIC_STEP, PROFILES, Support, at_clock
 from ldcnd.drives.ldcn.registers import BaudCodes
 from ldcnd.drives.ldcn.servo import LdcnAxis
-from ldcnd.drives.network import (
-    AdoptFallback,
-    BringUpReport,
-    Instant,
-    IoDriver,
-    LineSpec,
-    Network,
-    StartPolicy,
-)
+from ldcnd.drives.network import AdoptFallback, BringUpReport, Instant, IoDriver, Network, StartPolicy
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, Poller, Resync, Timing, next_on_grid
 from ldcnd.line.proof import bringing_up

@@ -25,23 +25,6 @@ from ldcnd.drives.smartstep.profiles import (
     Wiring,
 )
 
-WORD = 0xFFFF
-
-
-class TriggerMapConfig(Frozen):
-    """The bits of the trigger condition word, found on a bench; the manual's figure of them is lost."""
-
-    trace1: int = Field(ge=0, le=WORD)
-    """Object code of trace 1's value."""
-    trace2: int = Field(ge=0, le=WORD)
-    """Object code of trace 2's value."""
-    io: int = Field(ge=0, le=WORD)
-    """Object code of the signals."""
-    rising: int = Field(gt=0, le=WORD)
-    """Enable bit of the rising edge."""
-    falling: int = Field(gt=0, le=WORD)
-    """Enable bit of the falling edge."""
-
 
 class SmartStepTraceConfig(Frozen):
     """How the trace of one unit is taken to work where its manual leaves room."""
@@ -60,7 +43,7 @@ class SmartStepTraceConfig(Frozen):
     """Read everything until two readings agree: the checksum may not cover it."""
     command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
     """Gearing of command pulses to motor speed."""
-    trigger_map: TriggerMapConfig | None = None
+    trigger_map: TriggerMap | None = None
     """The bits of the trigger condition; without them the host watches for the trigger."""
     verified: bool = False
     """Whether the layout was compared with the drive, see `ldcnd doctor verify`; values are uncertain until then."""
@@ -74,7 +57,6 @@ class SmartStepTraceConfig(Frozen):
 
     def assumed_of(self, profile: SmartStepProfile) -> SmartStepProfile:
         """Return a drive's profile with these assumptions."""
-        bits = self.trigger_map
         return replace(
             profile,
             trace_word_layout=self.word_layout,
@@ -84,7 +66,7 @@ class SmartStepTraceConfig(Frozen):
             trace_chunk_bytes=self.chunk_bytes,
             trace_verify=self.verify,
             command_pulse_gear=self.command_pulse_gear,
-            trigger_map=TriggerMap(**bits.model_dump()) if bits else None,
+            trigger_map=self.trigger_map,
             trace_verified=self.verified,
         )
 

@@ -9,6 +9,10 @@ Source: manual, all chapters; where it is silent, public manuals of related driv
 from dataclasses import dataclass
 from enum import StrEnum
 
+from pydantic import Field
+
+from ldcnd.contract.frozen import Frozen
+
 
 class Framing(StrEnum):
     """How characters are made."""
@@ -89,20 +93,22 @@ class CommandPulseGear(StrEnum):
     NONE = "none"
 
 
-@dataclass(frozen=True, slots=True)
-class TriggerMap:
-    """The bits of the trigger condition word, found on a bench; there is no default.
+WORD = 0xFFFF
 
-    Attributes:
-        trace1: object code of trace 1's data, `trace2` that of trace 2's, `io` that of the I/O data.
-        rising: enable bit of the rising edge, `falling` that of the falling edge.
-    """
 
-    trace1: int
-    trace2: int
-    io: int
-    rising: int
-    falling: int
+class TriggerMap(Frozen):
+    """The bits of the trigger condition word, found on a bench; the manual's figure of them is lost."""
+
+    trace1: int = Field(ge=0, le=WORD)
+    """Object code of trace 1's value."""
+    trace2: int = Field(ge=0, le=WORD)
+    """Object code of trace 2's value."""
+    io: int = Field(ge=0, le=WORD)
+    """Object code of the signals."""
+    rising: int = Field(gt=0, le=WORD)
+    """Enable bit of the rising edge."""
+    falling: int = Field(gt=0, le=WORD)
+    """Enable bit of the falling edge."""
 
 
 RESPONSE_S = 0.3

@@ -10,10 +10,12 @@ or is pulled up. Where the data sheet leaves room:
 Source: PIC-I/O data sheet, 2.2, 3.1.
 """
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Annotated, Self
 
+from pydantic import Field, model_validator
+
+from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.ldcn.packet import StatusItem
 from ldcnd.drives.ldcn.pic_io import (
     ALL_LINES,
@@ -50,23 +52,31 @@ ITEM_BYTES_BY_PROFILE = MappingProxyType({PIC_STEP.name: STEP_ITEM_BYTES, SK_231
 not simulated."""
 
 
-@dataclass(frozen=True, slots=True)
-class IoWiring:
-    """Wiring of a PIC-I/O at power-up.
+LineNumber = Annotated[int, Field(ge=1, le=LINES)]
+Byte = Annotated[int, Field(ge=0, le=255)]
 
-    Attributes:
-        low: lines, 1 to 12, that are held low from outside; the others are pulled up.
-        wires: lines that another line drives while that is an output, each by the number of its driver.
-        adc: the values of the three A/D inputs, 0 to 255.
-        pulses_hz: of a square wave at the counter's line, for the counter only; 0 for none.
-        inverted_wires: as `wires`, driven to the opposite of the driver's level.
-    """
 
-    low: frozenset[int] = frozenset()
-    wires: Mapping[int, int] = field(default_factory=dict)
-    adc: tuple[int, int, int] = (0, 0, 0)
-    pulses_hz: float = 0.0
-    inverted_wires: Mapping[int, int] = field(default_factory=dict)
+class IoWiring(Frozen):
+    """Wiring of a PIC-I/O."""
+
+    low: tuple[LineNumber, ...] = ()
+    """Lines held low from outside; the others are pulled up."""
+    wires: tuple[tuple[LineNumber, LineNumber], ...] = ()
+    """Pairs of a line and the line that it drives while it is an output."""
+    inverted_wires: tuple[tuple[LineNumber, LineNumber], ...] = ()
+    """The same, driven to the opposite level: of the two sensors of a cylinder one sees what the other does not."""
+    adc: tuple[Byte, Byte, Byte] = (0, 0, 0)
+    """Values of the three A/D inputs, 0 to 255 for 0 to 5 V."""
+    pulses_hz: float = Field(default=0.0, ge=0, le=4_000_000)
+    """A square wave at I/O 10, for the counter."""
+
+    @model_validator(mode="after")
+    def _one_driver(self) -> Self:
+        driven = [line for _, line in (*self.wires, *self.inverted_wires)]
+        for line in driven:
+            if driven.count(line) > 1:
+                raise ValueError(f"wires, inverted_wires: line {line} is driven by more than one line")
+        return self
 
 
 class SimulatedIo(SimulatedModule):
@@ -80,8 +90,8 @@ class SimulatedIo(SimulatedModule):
 
     def __init__(self, profile: Profile, settings: ModuleSettings, wiring: IoWiring | None = None) -> None:
         wiring = wiring or IoWiring()
-        self._wires = [(line, driver, 0) for line, driver in wiring.wires.items()]
-        self._wires += [(line, driver, 1) for line, driver in wiring.inverted_wires.items()]
+        self._wires = [(line, driver, 0) for driver, line in wiring.wires]
+        self._wires += [(line, driver, 1) for driver, line in wiring.inverted_wires]
         self._low = sum(1 << line - 1 for line in wiring.low)
         self._adc = list(wiring.adc)
         self._pulses_per_cycle = wiring.pulses_hz * SERVO_CYCLE_S

@@ -10,23 +10,13 @@ from typing import Annotated, Self
 from pydantic import Field, field_validator, model_validator
 
 from ldcnd.contract.frozen import Frozen
-from ldcnd.drives.smartstep.config import WORD, TriggerMapConfig
 from ldcnd.drives.smartstep.monitors import function_switches
 from ldcnd.drives.smartstep.parameters import PARAMETERS, PN000, find_parameter, parameter_at
-from ldcnd.drives.smartstep.profiles import (
-    ByteOrder,
-    CommandPulseGear,
-    CountUnit,
-    Framing,
-    StringChecksum,
-    TraceWordLayout,
-    TriggerMap,
-    Wiring,
-)
+from ldcnd.drives.smartstep.profiles import WORD, Framing, Wiring
 from ldcnd.drives.toml import refuse_duplicates
 from ldcnd.sim.line_config import FaultyLineConfig
 from ldcnd.sim.smartstep.unit import SimulatedUnit
-from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
+from ldcnd.sim.smartstep.variant import SimulatedVariant, SimulatedVariantConfig
 
 
 class SmartStepEventConfig(Frozen):
@@ -44,39 +34,6 @@ class SmartStepEventConfig(Frozen):
     """RESET is pressed."""
     power: bool | None = None
     """It is switched off or on."""
-
-
-class SimulatedVariantConfig(Frozen):
-    """How a simulated drive behaves where the manual leaves room; the defaults are the assumptions of the driver."""
-
-    response_s: float = Field(default=0.01, ge=0, le=5)
-    """Time from a command to the first character of its reply, in seconds; the manual allows 0.2."""
-    string_checksum: StringChecksum = StringChecksum.HEADER
-    """Bytes that the checksum of a string reply covers."""
-    string_count_unit: CountUnit = CountUnit.BYTES
-    """Unit of the count in a string reference."""
-    longest_string_bytes: int = Field(default=1000, ge=2, le=1000)
-    """More is an error in number of bytes."""
-    trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
-    """Place of the signal's bit and the value in a word of the trace memory."""
-    trace_byte_order: ByteOrder = ByteOrder.BIG
-    """Half of a word that comes first in a string."""
-    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
-    """Gearing by which traced command pulses become the motor's speed."""
-    trigger_map: TriggerMapConfig | None = None
-    """The bits of the trigger condition; invented ones when missing."""
-    full_scale_settable: bool = True
-    """8701H and 8702H take settings."""
-    eeprom_changes_ram: bool = False
-    """A write to EEPROM also changes the value in use."""
-    hears_itself: bool = False
-    """It takes its own replies for commands."""
-    run_active_low: bool = True
-    """RUN is on at level 0."""
-    reset_active_low: bool = True
-    """RESET is on at level 0."""
-    alarm_output_high: bool = True
-    """/ALM is 1 in alarm."""
 
 
 class SimulatedUnitConfig(Frozen):
@@ -142,9 +99,7 @@ def simulated_units(settings: Sequence[SimulatedUnitConfig], now_s: float) -> li
 
 
 def _unit(settings: SimulatedUnitConfig, now_s: float) -> SimulatedUnit:
-    bits = settings.variant.trigger_map
-    values = settings.variant.model_dump(exclude={"trigger_map"})
-    variant = SimulatedVariant(**values, trigger_map=TriggerMap(**bits.model_dump()) if bits else BENCH_TRIGGER_MAP)
+    variant = SimulatedVariant(**settings.variant.model_dump())
     stored = {PN000: settings.number << 8}
     for name, value in settings.stored.items():
         stored[parameter_at(int(name.lower().removeprefix("pn"), 16))] = value
