@@ -6,7 +6,7 @@ happens to the machine, not what the drive or the daemon makes of it: that is wh
 
 import asyncio
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal, Self, TypedDict, Unpack
 
 from ldcnd.contract.errors import ValueOutOfRange
@@ -156,10 +156,11 @@ class RigFaults:
                 machine.slipped_counts += way
                 plant = servo.shaft.plant
                 servo.shaft.become(
-                    replace(
-                        plant,
-                        reverse_limit_counts=round(plant.reverse_limit_counts + way),
-                        forward_limit_counts=round(plant.forward_limit_counts + way),
+                    plant.model_copy(
+                        update={
+                            "reverse_limit_counts": round(plant.reverse_limit_counts + way),
+                            "forward_limit_counts": round(plant.forward_limit_counts + way),
+                        }
                     )
                 )
 
@@ -177,8 +178,8 @@ class RigFaults:
         return self._machine(
             axis,
             f"friction times {times:g}",
-            lambda plant: replace(
-                plant, friction_nm=plant.friction_nm * times, viscous_nm_s=plant.viscous_nm_s * times
+            lambda plant: plant.model_copy(
+                update={"friction_nm": plant.friction_nm * times, "viscous_nm_s": plant.viscous_nm_s * times}
             ),
             start,
         )
@@ -193,7 +194,7 @@ class RigFaults:
         return self._machine(
             axis,
             f"load of {torque_nm:g} Nm",
-            lambda plant: replace(plant, load_nm=torque_nm),
+            lambda plant: plant.model_copy(update={"load_nm": torque_nm}),
             start,
         )
 
@@ -203,7 +204,7 @@ class RigFaults:
         **start: Unpack[FaultStart],
     ) -> RigFault:
         """Open one phase of a brushless motor: no torque in two thirds of a turn, and no drive notices."""
-        return self._machine(axis, "phase lost", lambda plant: replace(plant, phase_lost=True), start)
+        return self._machine(axis, "phase lost", lambda plant: plant.model_copy(update={"phase_lost": True}), start)
 
     # -- switches and sensors ----------------------------------------------------------------------------------------
 

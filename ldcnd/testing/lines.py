@@ -11,11 +11,10 @@ from ldcnd.drives.line_config import SIMULATED, BusConfig
 from ldcnd.drives.smartstep.config import SmartStepBusConfig
 from ldcnd.sim.ldcn.simulation import (
     ENDLESS_TRAVEL_COUNTS,
-    PlantConfig,
     SimulatedLdcnLineConfig,
     SimulatedModuleConfig,
 )
-from ldcnd.sim.plant import MotorPlant
+from ldcnd.sim.plant import MotorPlant, PlantConfig
 from ldcnd.sim.smartstep.simulation import SimulatedSmartStepLineConfig, SimulatedUnitConfig
 
 FITTING_KP = 350

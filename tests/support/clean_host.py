@@ -8,7 +8,7 @@ from ldcnd.drives.driver import AxisSpec
 from ldcnd.drives.ldcn.config import LineSpec, ModuleConfig
 from ldcnd.drives.ldcn.network import ldcn_line
 from ldcnd.drives.ldcn.profiles import Support
-from ldcnd.drives.network import BringUpReport, LineSpec, ModuleEntry
+from ldcnd.drives.network import BringUpReport
 from ldcnd.line.settings import BusSettings
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.module import SimulatedModule
