@@ -252,6 +252,7 @@ class LineRate:
         common = COMMON_BAUDS if usual else tuple(round(actual_baud(code, clock_hz)) for code in COMMON_CODES)
         top = (FASTEST_BAUD,) if fastest or working == FASTEST_BAUD else ()
         others = dict.fromkeys((*top, *common, working))
+        # last, because every module answers there after a reset: what still answers elsewhere is found before
         others.pop(self.at_reset, None)
         self._possible = (*others, self.at_reset)
         self._clock_hz = clock_hz
@@ -287,6 +288,7 @@ class LineRate:
         """
         if self._bus.baud == baud:
             return
+        # "all modules must have their baud rates changed at the same time" (ibid., 5.2): one left behind is deaf
         packets = [self.set_baud(address, baud).request for address in (*self.groups, WAITING_GROUP)]
         quiet_s = commands.group_quiet_s(self.cycle_s)
         burst = unanswered(EVERYBODY, self.spaced(packets), quiet_s, repeatable=False, effect=PacketEffect.ARRANGES)
@@ -401,6 +403,7 @@ class Addressing:
         if not await self.rate.host_to(baud):
             return
         groups = (*(address for address in self._plan.addresses if address != EVERYBODY), WAITING_GROUP, EVERYBODY)
+        # no reply tells which have obeyed, so each group is reset, whether it has members at present or not
         burst = self.rate.spaced([commands.hard_reset(commands.LeaderlessGroup(address)).request for address in groups])
         reset = unanswered(EVERYBODY, burst, settle_s, repeatable=False, effect=PacketEffect.ARRANGES)
         for _ in range(2):
@@ -432,6 +435,7 @@ class Addressing:
             surplus = await self._newcomer()
         modules: dict[int, Identity] = {}
         for number in range(1, count + 1):
+            # "the host can also use this mechanism to verify that the proper number of modules are present" (ibid.)
             identity = await self.rate.who_is(waiting_address(number), patient=True)
             if identity is None:
                 return modules
@@ -464,14 +468,18 @@ class Addressing:
 
         A lost reply leaves open whether the module took the address: then it answers there.
         """
+        # whoever receives at address 0 takes it: that is harmless only while no place is meant
         address, attempts = waiting_address(number), 0
         while attempts < ADDRESSING_ATTEMPTS or asyncio.get_running_loop().time() < until_s:
             attempts += 1
+            # "the host starts by sending a Set Address command to module 0": the first that receives; it "will lower
+            # its ADDR_OUT signal", and the next one receives (PIC-SERVO manual, 4.1)
             if await self._set_address(UNADDRESSED, address, EVERYBODY):
                 return True
             if await self.rate.who_is(address):
                 self.had_address.add(number)
                 return True
+            # it may be restarting: a packet that is only half received would be completed by the next one
             if attempts >= ADDRESSING_ATTEMPTS:
                 await asyncio.sleep(RESTART_PAUSE_S)
         return False
@@ -523,6 +531,7 @@ class Addressing:
 
     async def without_leaders(self) -> None:
         """Make leaders members, so that their groups take Set Baud Rate; those that do not answer are left."""
+        # its reply would come "at the new baud rate" (PIC-SERVO manual, 5.2, "Set Baud Rate")
         for address in self._plan.leaders:
             await self._set_address(Node(address, ANY_DIALECT), address, self._plan.place(address).address)
 

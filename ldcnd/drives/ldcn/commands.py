@@ -102,6 +102,9 @@ class Node(Destination[StatusPacket]):
         Raises:
             NotSupported: of this module nothing but status byte and identity can be decoded.
         """
+        # "A non-permanent version of the define status command: ... subsequent status packets will include only the
+        # data
+        # bytes previously specified" (PIC-SERVO manual, 5.2, "Read Status")
         asked = self.items if items is None else items
         if self.profile.support is Support.IDENTIFY and asked & ~StatusItem.IDENTITY:
             raise NotSupported(f"{self.profile.title}: only status byte and identity can be decoded, not {asked!r}")
@@ -114,6 +117,7 @@ class Node(Destination[StatusPacket]):
             reply_bytes=reply_bytes,
             check=check_status,
             decode=status_decoder(self.profile, asked),
+            # "stored in an internal buffer until the end of the current servo cycle (0.51 millisec. max.)" (ibid., 4.1)
             response_s=CYCLE_CLOCKS / self.profile.clock_hz,
             repeatable=repeatable,
             total_bytes=total_bytes,
@@ -179,6 +183,7 @@ def spaced(packets: Sequence[bytes], byte_s: float, cycle_s: float = SERVO_CYCLE
     previous command" (PIC-SERVO manual, 4.1). Nulls fill the time: outside a packet modules skip them, and they keep
     the distance whatever an adapter does to the piece as a whole.
     """
+    # "each module will ignore any incoming data until it sees a header byte" (PIC-SERVO manual, 4.1)
     gap = bytes(math.ceil(cycle_s / byte_s))
     return gap.join(packets)
 
@@ -239,6 +244,7 @@ RELIEVING = frozenset(
 
 def reset_position(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Set position counter and command position to 0; not to be sent during a trapezoidal move."""
+    # executed a second time, it would lose what the motor has turned meanwhile
     return _exchange(to, CommandCode.RESET_POSITION, repeatable=False)
 
 
@@ -277,7 +283,10 @@ def set_address(to: Destination[ReplyT], address: int, group: int, *, leader: bo
         ValueOutOfRange: an address is outside its range.
     """
     GROUP_ADDRESS.check(group)
+    # "if a PIC-SERVO is to be a group leader, clear bit 7 of the desired group address in the second data byte"
+    # (PIC-SERVO manual, 5.2, "Set Address")
     data = ADDRESS.encode(address) + bytes((group & ~GROUP_MEMBER if leader else group,))
+    # a second one would reach whoever waits at this address by then: the first one lets the next module receive
     return _exchange(to, CommandCode.SET_ADDRESS, data, repeatable=False)
 
 
@@ -287,6 +296,7 @@ def define_status(to: Destination[ReplyT], items: StatusItem) -> Exchange[ReplyT
     Raises:
         NotSupported: the layout of these items is not known for this module.
     """
+    # its own reply has them already: "the status packet returned in response to this command will include" them (ibid.)
     return _exchange(to, CommandCode.DEFINE_STATUS, bytes((items,)), items=items)
 
 
@@ -307,11 +317,13 @@ def load_trajectory(to: Destination[ReplyT], trajectory: Trajectory) -> Exchange
         NotSupported: see `encode_trajectory`.
     """
     data = encode_trajectory(_dialect(to), trajectory)
+    # "if bit 7 is clear, the command data will be buffered" (PIC-SERVO manual, 5.2): the same bytes again do no harm
     return _exchange(to, CommandCode.LOAD_TRAJECTORY, data, repeatable=not trajectory.start_now)
 
 
 def start_motion(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Execute the trajectory loaded last."""
+    # a second one would begin a motion again that has ended, or that was stopped meanwhile
     return _exchange(to, CommandCode.START_MOTION, repeatable=False)
 
 
@@ -343,12 +355,15 @@ def stop_motor(to: Destination[ReplyT], control: StopControl, position: int | No
     if (position is not None) != bool(control & StopControl.HERE):
         raise ValueOutOfRange("Stop Motor takes a position exactly with the bit for stopping here", value=position)
     data = bytes((control,)) + (POSITION.encode(position) if position is not None else b"")
+    # HERE moves the motor, and the bits of the lock and of the advanced features change more than a stop does
     effect = PacketEffect.RELIEVES if control in RELIEVING else PacketEffect.CHANGES
     return _exchange(to, CommandCode.STOP_MOTOR, data, effect=effect)
 
 
 def close_loop(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Close the loop at the present position: the bytes of an abrupt stop, which take energy out of a closed loop."""
+    # "if the velocity servo was previously disabled, the motor will simply start servoing to its current position"
+    # (PIC-SERVO manual, 5.2, "Stop Motor")
     control = StopControl.AMP_ENABLE | StopControl.ABRUPT
     return _exchange(to, CommandCode.STOP_MOTOR, bytes((control,)), effect=PacketEffect.CHANGES)
 
@@ -390,6 +405,7 @@ def add_path_points(
         ValueOutOfRange: a point does not fit, or there are too many.
     """
     data = encode_points(_dialect(to), points, fast_path=fast_path)
+    # a point says how far to go from the one before: sent twice it moves the rest of the path
     return _exchange(to, CommandCode.ADD_PATH_POINTS, data, repeatable=False)
 
 
@@ -401,6 +417,7 @@ def start_path(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """
     if not _dialect(to).path_points:
         raise NotSupported(f"{_dialect(to).title} has no path mode")
+    # without points the same command starts the path (PIC-SERVO SC data sheet, 5.2)
     return _exchange(to, CommandCode.ADD_PATH_POINTS, repeatable=False)
 
 
@@ -412,6 +429,7 @@ def set_homing(to: Destination[ReplyT], control: HomingControl) -> Exchange[Repl
         NotSupported: the module lacks a source, or does not stop on home.
     """
     check_homing(control, to.profile)
+    # every one captures anew: "the home_in_progress bit in the status byte is set when this command is issued"
     return _exchange(to, CommandCode.SET_HOMING_MODE, bytes((control,)))
 
 
@@ -428,6 +446,7 @@ def set_baud(
     top = to.profile.top_baud if to.profile else COMMON_TOP_BAUD
     if baud > top:
         raise ValueOutOfRange(f"{baud} baud is above {top}", value=baud, limit=top, nearest=top)
+    # once more at the old rate it is noise to those that have obeyed, and nothing tells whether any has not
     return _exchange(to, CommandCode.SET_BAUD_RATE, bytes((baud_divisor(baud, codes, clock_hz),)), repeatable=False)
 
 
@@ -438,6 +457,7 @@ def clear_sticky_bits(to: Destination[ReplyT]) -> Exchange[ReplyT]:
 
 def save_home(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Save the present position in the home register."""
+    # a second one would save the place that the motor has reached by then
     return _exchange(to, CommandCode.SAVE_CURRENT_POSITION_AS_HOME, repeatable=False)
 
 
@@ -448,6 +468,7 @@ def no_operation(to: Destination[ReplyT]) -> Exchange[ReplyT]:
 
 def hard_reset(to: Node | LeaderlessGroup) -> Exchange[None]:
     """Put modules back into the state after power-up: 19200 baud, address 0, motor off; not answered."""
+    # "no status will be returned" (PIC-SERVO manual, 5.2, "Hard Reset"): whether it was executed is seen by its effect
     request = encode_packet(Packet(to.address, CommandCode.HARD_RESET))
     return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False, effect=EFFECTS[CommandCode.HARD_RESET])
 
@@ -463,6 +484,7 @@ def configure_start_up(to: Node, start_up: StartUp) -> Exchange[None]:
         ValueOutOfRange: the address is a group's: it would rewrite every module in it.
     """
     _require_sc(to, "saving its configuration")
+    # address 0 is every module that receives and has none, a group is all of it: one EEPROM is meant
     ADDRESS.check(to.address)
     request = encode_packet(Packet(to.address, CommandCode.HARD_RESET, bytes((start_up,))))
     return unanswered(to.address, request, EEPROM_SETTLE_S, repeatable=False)

@@ -77,6 +77,7 @@ def encode_packet(packet: Packet) -> bytes:
             limit=nearest,
             nearest=nearest,
         )
+    # "the upper nibble contains the number of additional data bytes required for that command" (PIC-SERVO manual, 4.1)
     count = len(packet.data)
     if count > MOST_DATA_BYTES:
         raise ValueOutOfRange(
@@ -85,6 +86,7 @@ def encode_packet(packet: Packet) -> bytes:
             limit=MOST_DATA_BYTES,
             nearest=MOST_DATA_BYTES,
         )
+    # "8-bit sum of the Module Address byte thru the last additional data byte": the header is not in it
     body = bytes((packet.address, count << 4 | packet.command)) + packet.data
     return bytes((HEADER,)) + body + bytes((sum(body) & 0xFF,))
 
@@ -95,6 +97,7 @@ def decode_packet(data: bytes) -> Packet:
     Raises:
         BadReply: no header, another length than the command byte says, or a wrong checksum.
     """
+    # a module would skip to the next header; here the bytes are one packet or none
     if not data or data[0] != HEADER:
         raise BadReply(f"a packet begins with the header AA, not with {data[:1].hex() or 'nothing'}")
     if len(data) < FRAME_BYTES:
@@ -145,6 +148,7 @@ class PacketReader:
 
     def feed(self, byte: int) -> ReceivedPacket | None:
         """Take the next byte of the line, 0 to 255; return the packet that it completes."""
+        # "when waiting for a new command, each module will ignore any incoming data until it sees a header byte"
         if not self._missing:
             if byte == HEADER:
                 self._missing = FRAME_BYTES - 1
@@ -158,6 +162,7 @@ class PacketReader:
         body = bytes(self._body)
         self._body.clear()
         packet = Packet(body[0], CommandCode(body[1] & 0x0F), body[2:-1])
+        # "the command will not be executed, but a status packet will still be returned" (PIC-SERVO manual, 4.1)
         return ReceivedPacket(packet, checksum_ok=sum(body[:-1]) & 0xFF == body[-1])
 
 
@@ -237,13 +242,17 @@ STATUS_BYTE_ONLY = StatusItem(0)
 class StatusFlag(IntFlag):
     """The status byte, by PIC-SERVO names; with `pic_ae_diagnostics` bits 3 to 6 mean more, see faults.py."""
 
+    # "set otherwise, including while the position servo is disabled" (PIC-SERVO manual, 5.3)
     MOVE_DONE = 0x01
     CHECKSUM_ERROR = 0x02  # the node rejected *our* packet
     OVERCURRENT = 0x04  # reserved on LS-182AP
+    # "set if motor power is greater than 12v" (ibid.)
     POWER_ON = 0x08
     POSITION_ERROR = 0x10
+    # "also set whenever the position servo is disabled. Must be cleared by user" is said of the bit above (ibid.)
     LIMIT1 = 0x20  # LS-182AP: reverse limit, or diagnostic bit
     LIMIT2 = 0x40  # LS-182AP: forward limit, or diagnostic bit
+    # "reset to zero once the home position has been captured" (ibid.)
     HOME_IN_PROGRESS = 0x80
 
 
@@ -251,10 +260,13 @@ class AuxFlag(IntFlag):
     """The auxiliary status byte."""
 
     INDEX = 0x01  # complement of the index input (its level with `live_aux`), or diagnostic bit
+    # sticky, as is the overrun below: "cleared with the Clear Sticky Bits command" (ibid.)
     POSITION_WRAP = 0x02
     SERVO_ON = 0x04
+    # this one and the next: "cleared when the next move is started" (ibid.)
     ACCEL_DONE = 0x08  # with `live_aux`: accelerating now
     SLEW_DONE = 0x10  # with `live_aux`: at constant velocity, or standing
+    # "typically not serious, only periodically introducing a small fraction of a millisecond delay" (ibid.)
     SERVO_OVERRUN = 0x20
     PATH_MODE = 0x40  # a path runs
     MOTION_LOCKED = 0x80  # LS-182AP from version 22 on
@@ -297,6 +309,7 @@ def item_bytes(profile: Profile, items: StatusItem) -> int:
     """Return how many data bytes a status packet of this device carries for these items, 0 to 17."""
     mask = int(items)
     return (
+        # "the status data will always be sent in the order listed" (PIC-SERVO manual, 5.2, "Define Status")
         (4 if mask & _POSITION else 0)
         + (profile.adc_bytes if mask & _ADC else 0)
         + (2 if mask & _VELOCITY else 0)
@@ -335,6 +348,7 @@ def encode_status(profile: Profile, items: StatusItem, status: StatusPacket) -> 
     if mask & _ADC:
         body += (status.adc or 0).to_bytes(profile.adc_bytes, "little")
     if mask & _VELOCITY:
+        # "the signed 16 bit integer returned is the negative of the velocity in units of counts per servo tick" (ibid.)
         body += (profile.velocity_sign * (status.velocity or 0)).to_bytes(2, "little", signed=True)
     if mask & _AUX:
         body.append(status.aux or 0)
@@ -366,6 +380,7 @@ def status_decoder(profile: Profile, items: StatusItem) -> Callable[[bytes], Sta
     unpack = layout.unpack
 
     def decode(data: bytes) -> StatusPacket:
+        # no length travels with it: two devices send different layouts of one length, so only the mask tells
         if len(data) != expected:
             raise BadReply(f"{profile.title}: {len(data)} status bytes, mask {mask:02X} makes {expected}")
         if (sum(data) - data[-1]) & 0xFF != data[-1]:

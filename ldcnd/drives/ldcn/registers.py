@@ -64,6 +64,7 @@ def baud_divisor(baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int =
     Raises:
         ValueOutOfRange: no divisor makes this rate; names the nearest that one makes.
     """
+    # vendors print some divisors that are not the nearest ones; drives are known to answer at those
     if clock_hz == CLOCK_HZ and (printed := BAUD_DIVISORS[codes].get(baud)) is not None:
         return printed
     divisor = min(max(round(clock_hz / CLOCKS_PER_BIT / baud) - 1, 0), MOST_DIVISOR) if baud > 0 else MOST_DIVISOR
@@ -80,6 +81,7 @@ def baud_divisor(baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock_hz: int =
 
 def actual_baud(divisor: int, clock_hz: int = CLOCK_HZ) -> float:
     """Return the rate that a module really uses with this code, 0 to 255."""
+    # "programmed directly into the PIC16C73's SPBRG register with the bit BRGH = 1" (PIC-SERVO manual, 5.2)
     return clock_hz / CLOCKS_PER_BIT / (divisor + 1)
 
 
@@ -115,6 +117,7 @@ def encode_gains(profile: Profile, gains: Gains) -> bytes:
         ValueOutOfRange: a value does not fit its register.
         NotSupported: the device lacks a register that is not at its default.
     """
+    # "versions 1, 2 & 3 will simply ignore the 14th data byte" (PIC-SERVO manual, 5.2): it would not do what was asked
     if gains.deadband and profile.gain_bytes < BYTES_WITH_DEADBAND:
         raise NotSupported(f"{profile.title} has no deadband compensation")
     if gains.step_multiplier != 1 and profile.gain_bytes < _BYTES_WITH_STEP_MULTIPLIER:
@@ -133,6 +136,8 @@ def decode_gains(profile: Profile, data: bytes) -> Gains:
     values = []
     at = 0
     for field in gain_fields(profile):
+        # "if only 13 data bytes are sent, version 4 will use a default value of zero for the deadband" (ibid., "Set
+        # Gain")
         present = field is not _STEP_MULTIPLIER or at < len(data)
         values.append(field.decode(data[at:]) if present else 1)
         at += field.width
@@ -147,7 +152,11 @@ def gain_fields(profile: Profile) -> tuple[RegisterField, ...]:
         _KI,
         _IL,
         _OL,
+        # odd and even values limit by opposite signs of the sense voltage, "setting CL to 0 effectively disables" it
+        # (ibid.)
         _CL if profile.current_limit else _RESERVED_CL,
+        # 0 opens the loop at the first count of error: the manual's least for motion is EL <> 0 (LS-182AP manual,
+        # step 3)
         RegisterField("EL", 2, 0, profile.most_error_limit),
         _SR,
     )
@@ -259,6 +268,7 @@ class RegisterBook:
 
     def _either(self, name: str, value: int) -> Unknown:
         match self[name]:
+            # the reply was lost, not the packet, or the packet itself: both happen on a noisy line
             case Known(old):
                 return Unknown(REPLY_LOST, (old, int(value)))
             case Unknown(_, among) if among:
@@ -332,11 +342,15 @@ class ServoRegisters(RegisterBook):
 
         What a PIC-SERVO SC has saved in its EEPROM is restored by power-up only, and is overwritten at power-on.
         """
+        # "whether the limit1 and 2 signals are inputs (default) or outputs" (PIC-SERVO manual, 5.2, "I/O Control")
         pins = {name: int(is_input) for name, (is_input, _) in LIMIT_PINS.items()}
+        # "all gain parameters and limit values are set to zero; the servo rate divisor is set to 1" (ibid., "Powerup")
         self.note(dict.fromkeys(self._holdings, 0) | {"sr": 1, "step_multiplier": 1} | pins, Provenance.RESET)
 
     def taken_over(self) -> None:
         """Another host has left the drive as it is: its gains may be those of the configuration."""
+        # Set Gain, Load Trajectory and I/O Control have no counterpart that reads: what the other host wrote is not
+        # seen
         self.forget(TAKEN_OVER)
         if self.gains:
             self.assume(asdict(self.gains), f"{TAKEN_OVER}; this is what the configuration says")
@@ -349,6 +363,7 @@ class ServoRegisters(RegisterBook):
     @property
     def divisor(self) -> int | None:
         """The servo rate divisor on which velocity and acceleration depend; None while it is not known."""
+        # "the servo tick rate is also used as the profiling timebase" (ibid., "Set Gain"); not so on every model
         return self.known("sr") if self._profile.divisor_slows_profile else 1
 
     @property
@@ -364,6 +379,7 @@ class ServoRegisters(RegisterBook):
                 return self._cycle_s * value, False
             case Assumed(value):
                 return self._cycle_s * value, True
+            # the shortest tick that is possible makes the highest velocity: no limit is taken for kept that is not
             case Unknown(_, among):
                 return self._cycle_s * min(among, default=1), True
 

@@ -174,6 +174,7 @@ STOP_CONTROLS = {
 
 def reading_items(profile: Profile, items: frozenset[TelemetryItem]) -> StatusItem:
     """Return the status items that a drive must send for these telemetry items."""
+    # the auxiliary byte alone tells whether the loop is closed: the position error bit is set for other reasons, too
     mask = STATE_ITEMS
     if TelemetryItem.ADC in items:
         mask |= StatusItem.ADC
@@ -289,6 +290,8 @@ class LdcnAxis(Moves):
     def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         first: tuple[Exchange[Any], ...] = ()
         offset = self.state.offset_counts
+        # "the goal position should not differ from the current position by more than 0x7FFFFFFF" (PIC-SERVO manual,
+        # 5.2)
         if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
             first, offset = (commands.reset_position(self._node),), self.state.counts
         if self.state.known.closed and self._book.gains and not self._book.loaded:
@@ -305,10 +308,13 @@ class LdcnAxis(Moves):
         if not on:
             await self.stop(StopMode.OFF)
             return
+        # it may have been reset unseen, and then "all gain parameters and limit values are set to zero"
         if self._book.gains and not (self.state.known.closed and self._book.loaded):  # it may have been reset unseen
             await self.set_gains(self._book.gains)
         if self.profile.pic_ae_diagnostics and self.state.known.pic_ae is not False:
             await self._check_without_power_driver()
+        # "the Stop Motor command must be issued initially to set amp_en before other motion commands" (PIC-SERVO
+        # manual, 5.2)
         if self.profile.pic_ae_diagnostics and not self._initialised:
             await self._initialise_registers()
         self._initialised = True
@@ -395,8 +401,11 @@ class LdcnAxis(Moves):
 
     async def stop(self, mode: StopMode) -> StopMode:
         """See `Moves`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
+        # a stop that holds would close the loop of a motor that was switched off
         if self.switched_off:
             mode = StopMode.OFF
+        # "the current command velocity and the goal velocity will be set to zero": in some firmware that is the
+        # register
         self._book.forget("some firmware clears it with a stop", ("velocity",))
         off = mode is StopMode.OFF
         self._switching_off += off
@@ -404,6 +413,7 @@ class LdcnAxis(Moves):
             await self._stop_motor(STOP_CONTROLS[mode])
         finally:
             self._switching_off -= off
+        # an armed capture would stop a later motion, and end it as if it had found its home
         if self.state.homing_armed:
             with contextlib.suppress(RequestRefused):  # not known to be this drive: the next motion disarms it
                 await self._bus.execute(commands.set_homing(self._node, HomingControl(0)), Lane.STOP)
@@ -501,6 +511,7 @@ class LdcnAxis(Moves):
             await self._check_sensor()
         if isinstance(motion, PwmOutput) and not self.state.loop_may_open:
             await self._put_acceleration_in_force(trajectory)
+        # LS-182AP from version 22 on locks motion when a capture on a limit switch has stopped it
         if self.state.motion_locked:
             await self._bus.execute(commands.stop_motor(self._node, StopControl.AMP_ENABLE | StopControl.LOCK_DISABLE))
         await self._arm(motion, home)
@@ -634,6 +645,8 @@ class LdcnAxis(Moves):
         The manuals let a smooth stop use "the current acceleration rate" and do not say whether loading makes a rate
         current or only a start does; after a reset the difference is a motor that is never slowed down.
         """
+        # "causing the motor to decelerate to a stop at the current acceleration rate" (PIC-SERVO manual, 5.2, "Stop
+        # Motor")
         standing = Trajectory(velocity=0, acceleration=trajectory.acceleration, mode=ProfileMode.VELOCITY)
         await self._load(standing)
         await self._bus.execute(commands.start_motion(self._node))
@@ -678,6 +691,7 @@ class LdcnAxis(Moves):
             PacketRejected: the drive received it damaged, and nothing shows that it has started; it is not sent again.
         """
         try:
+            # sent twice, it could begin a motion again that has ended or was stopped meanwhile
             status = await self._bus.execute(commands.start_motion(self._node), once=True)
         except PacketRejected:
             if await self._has_started():
@@ -694,6 +708,7 @@ class LdcnAxis(Moves):
         """Look for a witness: a profile that runs, the target reached, or a velocity."""
         status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
         control, velocity = self._book.known(TRAJECTORY_CONTROL), self._book.known("velocity")
+        # "clear when in the middle of a trapezoidal profile move" (PIC-SERVO manual, 5.3): this drive runs
         if control is None or not control & TrajectoryControl.SERVO or not status.flags & StatusFlag.MOVE_DONE:
             return True
         target = None if control & TrajectoryControl.VELOCITY_MODE else self._book.known("position")
@@ -713,6 +728,8 @@ class LdcnAxis(Moves):
         await self._load_gains()
         control = StopControl.AMP_ENABLE | StopControl.HERE
         counter = position_counts - self.state.offset_counts
+        # "if the stopping position is too far from the current position, a position error will be generated" (ibid.,
+        # 5.2)
         if abs(counter) > LARGEST_COUNT:
             raise ValueOutOfRange(
                 f"axis {self.spec.name}: set-point {position_counts} is beyond the drive's 32-bit counter",
@@ -807,6 +824,7 @@ class LdcnAxis(Moves):
                 value=gains.sr,
                 remedy=Remedy("{} and wait", step("halt")),
             )
+        # a lost reply leaves each register the old or the new value, and the next motion loads them again
         with self._book.writing(asdict(gains)):
             await self._bus.execute(exchange)
         self._book.gains = gains
@@ -815,6 +833,7 @@ class LdcnAxis(Moves):
         """See `Moves`; PIC-SERVO version 4 only."""
         if not self.profile.limit_outputs:
             raise NotSupported(f"{self.profile.title} has no limit pins that can be outputs", axis=self.spec.name)
+        # "sets the output values" of both pins in one byte (PIC-SERVO manual, 5.2): one cannot be left out
         values = {FAST_PATH: 0}  # of PIC-SERVO CMC, in the same byte
         for (name, bits), mode in zip(LIMIT_PINS.items(), (limit1, limit2), strict=True):
             value = self._book.known(name) if mode is None else pin_bits(mode, *bits)
