@@ -1,12 +1,15 @@
 """Time of one exchange on the line, in seconds, without hardware. Pure: independent of clock and family.
 
 An exchange is a request, a wait for the drive, a reply, and the delay of the adapter and the host before the next
-request can begin. Only the wait varies from one exchange to the next.
+request can begin. Only the wait varies from one exchange to the next. The exchanges of a model are in its price list,
+so that the bus budget can be computed before there is a line.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from ldcnd.contract.samples import TelemetryItem
 from ldcnd.line.exchange import Exchange
 from ldcnd.line.settings import LINGER_S
 
@@ -85,3 +88,25 @@ def cost_of(exchange: Exchange[Any], timing: LineTiming) -> Cost:
         overhead_s=timing.turnaround_s + adapter_s + linger_s,
         ends_early=answered and exchange.repeatable,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class PriceList:
+    """The exchanges of one model at one rate.
+
+    Attributes:
+        node_baud: the rate at which the drive answers when it is set to use the nominal one.
+        reading: the exchange that reads these telemetry items, and the drive's state with them.
+        commands: every other exchange that is made while the line is in use, by name, in its longest form.
+        probe: the exchange in the place of a stop, to measure how long one would wait.
+        stop: what brings a motor to rest; None for drives that the line cannot move.
+        flush: what clears the line after a loss, `settle_s` the pause behind it.
+    """
+
+    node_baud: float
+    reading: Callable[[frozenset[TelemetryItem]], Exchange[Any]]
+    commands: Mapping[str, Exchange[Any]]
+    probe: Exchange[Any]
+    stop: Exchange[Any] | None
+    flush: bytes
+    settle_s: float

@@ -1,8 +1,8 @@
 """Path mode on a simulated axis: what a host sends, in points of counts and cycles."""
 
 from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusPacket
-from ldcnd.drives.ldcn.path import PathPoint, encode_points
 from ldcnd.drives.ldcn.registers import FRACTION, SERVO_CYCLE_S
+from ldcnd.drives.ldcn.trajectory import PathPoint, encode_points
 from ldcnd.sim.ldcn.chain import model
 from ldcnd.sim.plant import MotorPlant
 from tests.support.simulated_axis import SimulatedAxis

@@ -9,7 +9,7 @@ from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.cost import LineTiming, cost_of
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.costs import price_list
+from ldcnd.drives.ldcn.family import price_list
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
 from ldcnd.drives.smartstep.costs import price_list as smartstep_price_list

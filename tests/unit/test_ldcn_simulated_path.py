@@ -9,10 +9,9 @@ from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.commands import Node, add_path_points, start_path
 from ldcnd.drives.ldcn.controls import IoOption, StopControl
 from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, StatusFlag
-from ldcnd.drives.ldcn.path import PathPoint, decode_point, encode_point
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.registers import FRACTION, encode_gains
-from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.drives.ldcn.trajectory import PathPoint, ProfileMode, Trajectory, decode_point, encode_point
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import HalfPoint, LimitInPath, PathOverflow, PathWithoutServo

@@ -23,7 +23,6 @@ from ldcnd.drives.ldcn.packet import (
     encode_packet,
     encode_status,
 )
-from ldcnd.drives.ldcn.path import PathPoint, decode_point
 from ldcnd.drives.ldcn.profiles import PROFILES, DeviceKind
 from ldcnd.drives.ldcn.received import (
     AddPathPoints,
@@ -43,7 +42,7 @@ from ldcnd.drives.ldcn.received import (
     interpret_bytes,
 )
 from ldcnd.drives.ldcn.registers import BAUD_DIVISORS, BaudCodes, baud_divisor, module_baud
-from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
+from ldcnd.drives.ldcn.trajectory import PathPoint, ProfileMode, Trajectory, decode_point
 
 VECTORS = Path(__file__).parents[1] / "vectors"
 ROWS = [row for name in ("ldcn-nmc.json", "sc-io.json") for row in json.loads((VECTORS / name).read_text())]

@@ -27,7 +27,7 @@ from ldcnd.drives.ldcn.addressing import (
 )
 from ldcnd.drives.ldcn.adoption import MOTION_ITEMS, STILL_COUNTS, WATCH_S, Found
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.costs import price_list
+from ldcnd.drives.ldcn.family import price_list
 from ldcnd.drives.ldcn.faults import Knowledge, diagnose
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import PIC_IO, PROFILES, Profile, Support

@@ -43,10 +43,9 @@ from ldcnd.drives.ldcn.packet import (
     status_bytes,
     status_decoder,
 )
-from ldcnd.drives.ldcn.path import PathPoint, encode_points
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, Profile, Support
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, BaudCodes, baud_divisor, encode_gains
-from ldcnd.drives.ldcn.trajectory import Trajectory, encode_trajectory
+from ldcnd.drives.ldcn.trajectory import PathPoint, Trajectory, encode_points, encode_trajectory
 from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
 from ldcnd.line.settings import HOST_LATE_S
 

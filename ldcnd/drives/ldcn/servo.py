@@ -56,14 +56,16 @@ from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, StopControl, blocking_pin, pin_bits
 from ldcnd.drives.ldcn.faults import FaultCode, sensor_lost
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket, status_decoder
-from ldcnd.drives.ldcn.path import MOST_POINTS_PER_PACKET, PathPoint, most_step
 from ldcnd.drives.ldcn.profiles import HomingSource, Profile
 from ldcnd.drives.ldcn.record import DriveState
 from ldcnd.drives.ldcn.registers import FAST_PATH, FRACTION, LIMIT_PINS, TRAJECTORY_CONTROL, ServoRegisters, Unknown
 from ldcnd.drives.ldcn.trajectory import (
+    MOST_POINTS_PER_PACKET,
+    PathPoint,
     ProfileMode,
     Trajectory,
     TrajectoryControl,
+    most_step,
     quantised,
     trajectory_of,
     trajectory_values,

@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from ldcnd.contract.samples import MonitorName, TelemetryItem
-from ldcnd.drives.price_list import PriceList
+from ldcnd.drives.cost import PriceList
 from ldcnd.drives.smartstep import commands
 from ldcnd.drives.smartstep.addresses import TRACE_1_AREA, OperatingMode, TraceRegister
 from ldcnd.drives.smartstep.commands import string_reference

@@ -16,9 +16,8 @@ from collections import deque
 from collections.abc import Iterable
 from math import isqrt
 
-from ldcnd.drives.ldcn.path import REVERSE, SPEED_MASK, point_cycles
 from ldcnd.drives.ldcn.registers import FRACTION
-from ldcnd.drives.ldcn.trajectory import ProfileMode
+from ldcnd.drives.ldcn.trajectory import REVERSE, SPEED_MASK, ProfileMode, point_cycles
 from ldcnd.sim.ldcn.quirks import ModuleSettings, PathOverflow
 
 _SPEED_SHIFT = 8
