@@ -81,7 +81,7 @@ def trace_config(variant: SimulatedVariant, assumed: Mapping[str, object], *, lo
         "word_layout": variant.trace_word_layout,
         "byte_order": variant.trace_byte_order,
         "string_count_unit": variant.string_count_unit,
-        "trigger_map": {name: getattr(bits, name) for name in type(bits).__slots__},
+        "trigger_map": bits.model_dump(),
         **assumed,
     }
 

@@ -364,7 +364,7 @@ def _programmed(what: str, unit: str, value: float, ceiling: float, factor: floa
     return min(register, most_register)
 
 
-# -- path points ---------------------------------------------------------------------------------------------------------
+# -- path points -------------------------------------------------------------------------------------------------------
 
 REVERSE = 0x0001
 LONG_PERIOD = 0x0002
