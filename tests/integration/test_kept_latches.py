@@ -12,6 +12,7 @@ from ldcnd.axis import kept as kept_files
 from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, QuickStop, Reset
 from ldcnd.contract.errors import OutcomeUnknown, RequestRefused, WrongState
 from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.drives.ldcn.config import ModuleConfig
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.power import FaultCondition
 from tests.integration.test_kept_references import chain_of, keeping
@@ -265,7 +266,9 @@ async def test_a_disk_that_hangs_delays_the_answer_by_a_bounded_time_and_the_pac
 async def test_an_axis_that_is_not_configured_for_a_while_is_latched_when_it_is_back(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     (bus,) = config.bus
-    fewer = config.model_copy(update={"bus": (bus.model_copy(update={"axis": bus.axis[:3], "group": ()}),)})
+    no_axis = ModuleConfig(address=4, model="pic-servo-v4")
+    changes = {"axis": bus.axis[:3], "module": (no_axis,), "group": ()}
+    fewer = config.model_copy(update={"bus": (bus.model_copy(update=changes),)})
     async with rig_on(chain, config) as rig:
         await up(rig)
         await rig.client.stop("c")

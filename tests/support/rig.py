@@ -95,7 +95,18 @@ def openers_of(config: RigConfig, chains: Mapping[str, Chain]) -> dict[str, Open
 
 
 def two_axes() -> RigConfig:
-    """Return the simulated rig with its first two axes only."""
+    """Return the simulated rig with its first two axes and their drives only."""
+    return first_axes(2)
+
+
+def first_axes(count: int, **changes: object) -> RigConfig:
+    """Return the simulated rig with its first axes and their drives only, each axis with these changes."""
     config = load_config(SIMULATED)
-    (bus,) = config.bus
-    return config.model_copy(update={"bus": (bus.model_copy(update={"axis": bus.axis[:2]}),)})
+    (bus,), (line,) = config.bus, config.sim
+    axes = tuple(axis.model_copy(update=changes) for axis in bus.axis[:count])
+    return config.model_copy(
+        update={
+            "bus": (bus.model_copy(update={"axis": axes, "group": ()}),),
+            "sim": (line.model_copy(update={"module": line.module[:count]}),),
+        }
+    )

@@ -100,7 +100,7 @@ def test_a_fault_leads_to_its_page(code, page):
 def test_the_published_fault_names_its_page():
     tracker = tracked(link=LinkState.UP)
 
-    tracker.take(DriveLost(now_ns=1))
+    tracker.take(DriveLost(now_ns=1, another=False))
 
     assert [fault.page for fault in tracker.status.active_faults] == ["faults/link_lost"]
 
