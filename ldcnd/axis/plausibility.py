@@ -7,7 +7,7 @@ module. Judging is pure; time is an input.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum, IntEnum
 
 from ldcnd.drives.axis_config import AxisConfig
@@ -275,13 +275,17 @@ class PlausibilityGate:
         return abs(reading.velocity_counts_per_s) > fastest + 2 * reading.velocity_resolution_counts_per_s
 
     def _agrees(self, unconfirmed: _Seen, reading: AxisReading, timing: Timing) -> bool:
-        led = self._is_led(unconfirmed, reading, timing.true_until_s, exactly=self._far)
-        if not led or not _same_status(unconfirmed[0], reading):
-            return False
-        # a false velocity would explain any way to the next reading: one that no axis has must be shown twice
         before, now = unconfirmed[0].velocity_counts_per_s, reading.velocity_counts_per_s
         highest = self._speed if reading.enabled else self._turned_by_hand
-        return abs(now) <= highest or (now * before > 0 and abs(now) <= ALIKE * abs(before))
+        # a false velocity would explain any way from one reading to the next: one that no axis has must be shown twice
+        if abs(now) > highest and not (now * before > 0 and abs(now) <= ALIKE * abs(before)):
+            return False
+        if abs(before) > highest >= abs(now):
+            unconfirmed = replace(unconfirmed[0], velocity_counts_per_s=now), unconfirmed[1]
+        # what begins to move without a command shows its speed as well
+        exactly = self._far or not self._expected
+        led = self._is_led(unconfirmed, reading, timing.true_until_s, exactly=exactly)
+        return led and _same_status(unconfirmed[0], reading)
 
     def is_out_of_reach(self, reading: AxisReading, by_s: float) -> bool:
         """Tell whether no motion can have led to a reading by then, in loop time, from the last one believed."""

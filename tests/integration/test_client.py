@@ -83,6 +83,7 @@ def test_no_call_of_the_asyncio_client_is_missing_from_the_blocking_one():
             "halt_now",
             "halt_unfinished",
             "begun",
+            "client",
             "lost",
             "outcome",
             "under_way",

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.client.events import latest_events
-from ldcnd.client.rig import Rig
+from ldcnd.client.rig import Rig, UnfinishedMotion
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.catalogue import BY_VERB
 from ldcnd.contract.commands import About, AxisCommand, Effect
@@ -120,8 +120,9 @@ def test_a_program_inside_lease_hold_uses_its_control_and_leaves_it_to_its_holde
             async with robot.control("x", client="program") as x:
                 await x.power(on=True)
                 await (await x.move_relative(1.0)).done()
-        async with robot.control("x", client="program") as x:
-            await x.move_velocity(5.0)
+        with pytest.warns(UnfinishedMotion, match="x: move_velocity"):
+            async with robot.control("x", client="program") as x:
+                await x.move_velocity(5.0)
         await asyncio.sleep(1.0)
         assert (await client.state("x")).command is None  # what was not waited for was halted at the end
         async with robot.control("y", client="program") as y:

@@ -145,7 +145,7 @@ async def test_a_drive_that_was_reset_is_said_when_it_has_its_address_again():
         state = await rig.until("x", lambda state: state.link is LinkState.UP and not state.referenced)
         events = await said(rig, "x")
 
-    assert state.state is AxisState.DISABLED
+    assert (state.state, state.enabled) == (AxisState.ERROR_STOP, False)
     assert [event.code for event in events] == ["drive_reset"]
 
 

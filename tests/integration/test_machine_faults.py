@@ -6,7 +6,7 @@ The judge is what was built into the simulated machine.
 import asyncio
 import random
 from contextlib import asynccontextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import pytest
 
@@ -88,25 +88,27 @@ def drawn_machine(kind, number):
     upper = {"reverse_limit_counts": -80_000, "stop_margin_counts": -40_000, "forward_limit_counts": 40_000}
     match kind:
         case "hangs":
-            return WrongMachine(kind, number, replace(right, load_nm=-load * nm, **lower))
+            return WrongMachine(kind, number, right.model_copy(update={"load_nm": -load * nm} | lower))
         case "hangs forward":
-            return WrongMachine(kind, number, replace(right, load_nm=load * nm, **upper))
+            return WrongMachine(kind, number, right.model_copy(update={"load_nm": load * nm} | upper))
         case "hangs behind a brake":
-            return WrongMachine(kind, number, replace(right, load_nm=-load * nm), braked=True)
+            return WrongMachine(kind, number, right.model_copy(update={"load_nm": -load * nm}), braked=True)
         case "motor reversed":
-            return WrongMachine(kind, number, replace(right, motor_reversed=True))
+            return WrongMachine(kind, number, right.model_copy(update={"motor_reversed": True}))
         case "encoder disconnected":
-            return WrongMachine(kind, number, replace(right, encoder_disconnected=True))
+            return WrongMachine(kind, number, right.model_copy(update={"encoder_disconnected": True}))
         case "brake closed":
             return WrongMachine(kind, number, right, (FaultCondition.STALLED,))
         case "coupling loose":
-            return WrongMachine(kind, number, replace(right, coupling_grip=0.0))
+            return WrongMachine(kind, number, right.model_copy(update={"coupling_grip": 0.0}))
         case "no supply":
             return WrongMachine(kind, number, right, (FaultCondition.MOTOR_POWER_OFF,))
         case "weak supply":
-            return WrongMachine(kind, number, replace(right, supply_v=supply_v * dice.uniform(0.005, 0.02)))
+            return WrongMachine(
+                kind, number, right.model_copy(update={"supply_v": supply_v * dice.uniform(0.005, 0.02)})
+            )
         case "at its end":
-            return WrongMachine(kind, number, replace(right, **dice.choice((lower, upper))))
+            return WrongMachine(kind, number, right.model_copy(update=dice.choice((lower, upper))))
         case _:
             return WrongMachine(kind, number, right)
 

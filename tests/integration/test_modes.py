@@ -316,7 +316,7 @@ async def test_a_move_during_a_duty_is_refused():
         await rig.power_on()
         await rig.send(SetPwm(duty=0.0, duration_s=1.0))
 
-        with pytest.raises(WrongState, match="continuous_motion"):
+        with pytest.raises(WrongState, match="is moving at a velocity"):
             await rig.send(MoveAbsolute(position=1.0))
 
 

@@ -122,9 +122,10 @@ async def compared(model: str, settings: list[ModuleSettings]) -> None:
             module.power(on=True, at_s=asyncio.get_running_loop().time())
         for name in names[1:]:
             state = await rig.until(
-                name, lambda state: state.link is LinkState.UP and state.state is AxisState.DISABLED
+                name, lambda state: state.link is LinkState.UP and state.state is AxisState.ERROR_STOP
             )
             assert not state.referenced
+            assert not state.enabled
         if model == "pic-servo-cmc":
             replies = [await rig.client.ask(SetIo(module=f"io{place}", low=[4], pwm1=0.5)) for place in (1, 2)]
             assert replies[0].levels == replies[1].levels

@@ -57,7 +57,7 @@ def test_the_captures_show_what_they_are_named_for():
     assert (ends["clean_start"]["verb"], ends["clean_start"]["status"]) == ("move_absolute", "done")
     assert values(published["clean_start"], "x/position")[-1]["value"] == pytest.approx(15.0, abs=0.01)
     assert (ends["power_loss"]["status"], ends["power_loss"]["client"]) == ("failed", "bench")
-    assert values(published["power_loss"], "x/state")[-1]["state"] == "disabled"
+    assert values(published["power_loss"], "x/state")[-1]["state"] == "error_stop"
     assert ends["corrupted_line"]["status"] == "done"
     assert "is damaged" in {record.note for record in kept("corrupted_line")[0].records}
 

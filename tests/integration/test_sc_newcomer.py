@@ -6,7 +6,7 @@ import pytest
 
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import MoveAbsolute, Power
-from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.contract.samples import LinkState
 from ldcnd.drives.ldcn.controls import StartUp
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -58,7 +58,7 @@ async def test_an_sc_that_restarts_is_reset_before_it_is_addressed_and_the_other
         newcomer.power(on=False, at_s=asyncio.get_running_loop().time())
         await asyncio.sleep(2)
         newcomer.power(on=True, at_s=asyncio.get_running_loop().time())
-        back = await rig.until("y", lambda state: state.link is LinkState.UP and state.state is AxisState.DISABLED)
+        back = await rig.until("y", lambda state: state.link is LinkState.UP and not state.enabled)
         await asyncio.sleep(0.5)
         energised = (newcomer.stage.drives, newcomer.loop.servo_on)
         await asyncio.sleep(14)  # the others arrive

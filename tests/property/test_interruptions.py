@@ -436,7 +436,7 @@ class Run:
         async with life(settings, self.chain, "second") as (daemon, broker, _), broker.session() as session:
             rig = RigClient(session, "sim")
             await all_up(daemon, 30.0)
-            unknown = {name for name in self._ann.latched if not daemon.rig.axes[name].tracker.stop_latched}
+            unknown = {name for name in self._ann.latched if not daemon.rig.axes[name].tracker.status.stop_latched}
             witness.wrong += [f"{name} was latched and is not" for name in unknown]
             for name, command in (*self._ann.sent[-4:], *self._bob.sent[-2:]):
                 if command.effect is not Effect.REST and not command.takes_energy_out:
@@ -501,7 +501,7 @@ async def all_up(daemon: Daemon, within_s: float) -> None:
     """Return as soon as every drive answers."""
     async with asyncio.timeout(within_s):
         await daemon.wait_up()
-        while any(each.tracker.link is not LinkState.UP for each in daemon.rig.axes.values()):
+        while any(each.tracker.status.link is not LinkState.UP for each in daemon.rig.axes.values()):
             await asyncio.sleep(0.05)
 
 

@@ -7,7 +7,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, TypeVar, cast
 
 from ldcnd.client.axis import Axis as ClientAxis
-from ldcnd.client.axis import Positions
+from ldcnd.client.axis import Positions, at_rest
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.motion import Motion, Position
 from ldcnd.client.rig import Rig
@@ -431,6 +431,7 @@ class PlanAxis(ReadableAxis):
                         raise
                     await asyncio.shield(self._newest.wrapped())
         except TimeoutError:
+            await at_rest(self._axis)  # what a plan does next may move another axis into its way
             raise SessionError(
                 f"axis {self._info.axis}: it did not reach {target:g} {self._info.unit} within {within_s:g} s and was"
                 " halted",
