@@ -17,6 +17,7 @@ from ldcnd.daemon.daemon import Daemon
 from ldcnd.line.transport import Opener
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.known import opener_of
+from ldcnd.sim.ldcn.simulation import SimulatedLdcnLineConfig
 from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 
 EPOCH_NS = 1_700_000_000_000_000_000
@@ -103,6 +104,7 @@ def first_axes(count: int, **changes: object) -> RigConfig:
     """Return the simulated rig with its first axes and their drives only, each axis with these changes."""
     config = load_config(SIMULATED)
     (bus,), (line,) = config.bus, config.sim
+    assert isinstance(line, SimulatedLdcnLineConfig)
     axes = tuple(axis.model_copy(update=changes) for axis in bus.axis[:count])
     return config.model_copy(
         update={
