@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.contract.commands import BufferMode, Direction, Halt, MoveRelative, Power, Reset, Stop
+from ldcnd.contract.commands import BufferMode, Direction, Halt, MoveAbsolute, MoveRelative, Power, Reset, Stop
 from ldcnd.contract.errors import (
     CommandExpired,
     CommandIdReused,
@@ -228,6 +228,20 @@ async def test_a_move_that_aborts_a_path_begins_where_its_axis_has_come_to_rest(
         await asyncio.sleep(0.5)
 
         assert walker.position / 65536 == pytest.approx(ended_at + 2000, abs=40)  # the shaft settles
+        assert await rests(chain)
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("after_s", [0.31, 0.5, 0.97])
+async def test_the_stop_of_a_path_does_not_stop_the_move_that_has_aborted_it(name, after_s):
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        await rig.client.ask(path(speed=15.0))
+        await asyncio.sleep(after_s)
+        reply = await rig.client.command(name, MoveAbsolute(position=-9.0, buffer_mode=BufferMode.ABORTING))
+        await rig.client.wait_for_end(name, reply.command_id)
+
+        assert drive(chain, 1 + NAMES.index(name)).shaft.position_counts == pytest.approx(-9000, abs=30)
         assert await rests(chain)
 
 

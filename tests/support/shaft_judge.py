@@ -48,6 +48,8 @@ PATH_COUNTS = 150.0
 """So far an axis may be beside its polyline: the points of corners, and what the servo lags."""
 SEEN_WITHIN_S = 0.4
 """Until a daemon knows at the latest that a drive has opened its loop: it is polled six times a second."""
+ARRIVES_S = 0.05
+"""From when a packet is written until its drive executes it."""
 CAME_S = 1e-6
 """What is sent arrives at once; the turn of the loop in which it does takes no longer."""
 
@@ -145,6 +147,7 @@ class ShaftJudge(Witness):
         self._goals: dict[str, float] = {}
         self._naming: dict[str, int] = defaultdict(int)
         self._up: set[str] = set()
+        self._reset_s: dict[str, float] = {}
         self.modules: list[SimulatedDrive] = []
         for address, names in axes.items():
             if len(names) == 1 and address <= len(chain.modules):
@@ -165,6 +168,7 @@ class ShaftJudge(Witness):
         asked = self.asked.setdefault(command.command_id, Asked(axis, command))
         asked.sent_s.append(self.now_s)
         if isinstance(command, Reset):
+            self._reset_s[axis] = self.now_s
             self.stops.pop(axis, None)
             self.latched.pop(axis, None)
         if isinstance(command, Jog):
@@ -191,8 +195,9 @@ class ShaftJudge(Witness):
             self.zeros[asked.axis] = (here - counts,)
 
     def stopped(self, axis: str) -> None:
-        """Note a stop that is about to be sent."""
-        self.stops[axis] = self.now_s
+        """Note a stop that is about to be sent; which of it and a reset of the same instant comes last is open."""
+        if self.now_s > self._settled_s(self._reset_s.get(axis, -math.inf)):
+            self.stops[axis] = self.now_s
 
     def kept(self, axes: tuple[str, ...], since_s: float) -> None:
         """Note that the latches of a stop outlast the daemon, for those that no reset has followed."""
@@ -344,8 +349,8 @@ class ShaftJudge(Witness):
             case _:
                 return
         begun = self._next.pop(name, None)
-        if begun is None:
-            return
+        if begun is None or self.now_s > begun.at_s + ARRIVES_S:
+            return  # the packet that was to begin it was damaged on its way; this one goes nowhere
         self.begun[name] = begun
         profile, request = drive.loop.trajectory, self.asked[begun.command_id].command
         loose = drive.shaft.position_counts - drive.loop.position  # of the shaft and the drive's own counter

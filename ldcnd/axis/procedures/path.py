@@ -244,13 +244,15 @@ class SharedPath(Rendezvous):
         closed = {
             name
             for name, share in self._shares.items()
-            if share.member.motion.tracker.status.energised and not share.tripped
+            if share.member.motion.tracker.status.energised and not share.tripped and not share.member.has_gone_on
         }
         try:
             await self._network.stop_together(StopMode.SMOOTH, frozenset(closed))
         except BusError as error:
             log.error("stop of a path not sent to the group", reason=error.message)
         for name, share in self._shares.items():
+            if share.member.has_gone_on:
+                continue
             try:  # a stop that holds would close the loop of a drive that has tripped
                 await share.member.motion.driver.stop(StopMode.SMOOTH if name in closed else StopMode.OFF)
             except BusError as error:
@@ -269,6 +271,12 @@ class PathMember(Procedure):
         self._corners: tuple[float, ...] = ()
         self._here = 0
         self._announced = False
+
+    @property
+    def has_gone_on(self) -> bool:
+        """Whether another command moves the axis, for which it was brought to rest: it must not be stopped again."""
+        command = self.motion.tracker.status.command
+        return command is not None and command.command_id != self.permit.command_id
 
     @property
     def steps(self) -> tuple[int, ...]:
