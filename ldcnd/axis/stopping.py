@@ -211,7 +211,8 @@ class AxisStops:
             try:
                 mode = await self._drive.stop(mode)
             except BusError as error:
-                log.error("stop not confirmed", axis=self._name, reason=error.message)
+                known = status.stop and status.stop.fault  # while a line is down this comes again with every try
+                (log.debug if known else log.error)("stop not confirmed", axis=self._name, reason=error.message)
                 if self._bus.is_open:
                     continue
                 return False
