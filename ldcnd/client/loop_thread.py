@@ -5,6 +5,7 @@ import concurrent.futures
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from contextlib import AbstractAsyncContextManager, contextmanager
+from contextvars import ContextVar
 from typing import Any, TypeVar, TypeVarTuple
 
 ResultT = TypeVar("ResultT")
@@ -30,10 +31,15 @@ class LoopThread:
         """Run a coroutine to its end; an interrupted wait cancels it."""
         future = self.start(work)
         try:
+            self.wait(future)
             return future.result()
         except BaseException:
             future.cancel()
             raise
+
+    def wait(self, *futures: concurrent.futures.Future[Any]) -> None:
+        """Wait until one of them is done."""
+        concurrent.futures.wait(futures, return_when=concurrent.futures.FIRST_COMPLETED)
 
     @contextmanager
     def inside(self, context: AbstractAsyncContextManager[ResultT]) -> Iterator[ResultT]:
@@ -48,13 +54,13 @@ class LoopThread:
 
         staying = asyncio.run_coroutine_threadsafe(stay(), self._loop)
         try:
-            first: set[concurrent.futures.Future[Any]] = {entered, staying}
-            concurrent.futures.wait(first, return_when=concurrent.futures.FIRST_COMPLETED)
+            self.wait(entered, staying)
             if not entered.done():
                 staying.result()  # raises why it could not be entered
             yield entered.result()
         finally:
             self._loop.call_soon_threadsafe(leaving.set)
+            self.wait(staying)
             staying.result()
 
     def each(self, items: AsyncIterator[ResultT]) -> Iterator[ResultT]:
@@ -69,13 +75,20 @@ class LoopThread:
             yield item[0]
 
 
+LENT: ContextVar[LoopThread | None] = ContextVar("LENT", default=None)
+"""A loop that runs already, and that this program uses in place of one of its own: a rehearsal lends its own."""
+
+
 @contextmanager
 def loop_thread() -> Iterator[LoopThread]:
-    """Run an event loop in a thread for as long as the context lasts.
+    """Run an event loop in a thread for as long as the context lasts, or use the one that is lent.
 
     Raises:
         OSError: there can be no loop, such as without a file descriptor left.
     """
+    if lent := LENT.get():
+        yield lent
+        return
     running: concurrent.futures.Future[tuple[asyncio.AbstractEventLoop, asyncio.Event]] = concurrent.futures.Future()
 
     async def stay() -> None:

@@ -85,13 +85,17 @@ class _Undeclarable(Protocol):
 
 
 @asynccontextmanager
-async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator["ZenohSession"]:
-    """Join the network for as long as the context lasts.
+async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
+    """Join the network for as long as the context lasts; a loop that brings a network of its own has none other.
 
     Raises:
         ConfigError: Zenoh does not accept a setting or the configuration file.
         SessionError: an endpoint cannot be used; says which and what to do.
     """
+    if own := getattr(asyncio.get_running_loop(), "network", None):  # of a rehearsal
+        async with own() as session:
+            yield session
+            return
     config = zenoh_config(settings)
     listen, connect = endpoints(config, "listen"), endpoints(config, "connect")
     if listen:

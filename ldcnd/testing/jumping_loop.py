@@ -12,9 +12,12 @@ import selectors
 from bisect import bisect_left
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
+from contextlib import AbstractAsyncContextManager
 from contextvars import Context
 from itertools import count
 from typing import Any
+
+from ldcnd.net.session import Session
 
 NS_PER_S = 1e9
 NEXT_TO_S = 1e-10
@@ -39,12 +42,14 @@ class _JumpingSelector(selectors.SelectSelector):
     Attributes:
         poked: the loop's own pipe was written to; as long as it was not, and nothing else is watched, nothing is ready.
         signalled: signals write to that pipe too.
+        held: number of threads that run and may still ask for something now: the clock stands while there is one.
     """
 
     def __init__(self, now_s: float, awake_at_s: Sequence[float]) -> None:
         super().__init__()
         self.poked = True
         self.signalled = False
+        self.held = 0
         self.now_s = now_s
         self.awake_at_s = sorted(awake_at_s)
         self.arrivals: list[tuple[float, int, Happening]] = []
@@ -56,6 +61,8 @@ class _JumpingSelector(selectors.SelectSelector):
             ready = super().select(0)
         if ready or (timeout is not None and timeout <= 0):
             return ready
+        if self.held:
+            return super().select(LONGEST_NAP_S)
         while self.arrivals and self.arrivals[0][2].callback is None:
             heapq.heappop(self.arrivals)
         if timeout is None and not self.arrivals:
@@ -85,7 +92,12 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         starts_at_s: what its clock shows at first, in seconds.
         awake_at_s: the instants at which the process that is imitated is known to have been awake: timers
             come then, as late as they came there. None for a process that is never late.
+
+    Attributes:
+        network: opens a session of the network that programs on this loop join instead of any other; None for theirs.
     """
+
+    network: Callable[[], AbstractAsyncContextManager[Session]] | None = None
 
     def __init__(self, starts_at_s: float = 0.0, awake_at_s: Sequence[float] = ()) -> None:
         self._jumping = _JumpingSelector(starts_at_s, awake_at_s)
@@ -111,6 +123,10 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         """Handle a signal: from now on every select is a real one, because a signal writes to the pipe by itself."""
         super().add_signal_handler(sig, callback, *args)
         self._jumping.signalled = True
+
+    def hold(self, threads: int) -> None:
+        """Let the clock stand for so many more threads, or for fewer; called on the loop's own thread."""
+        self._jumping.held += threads
 
     def hold_up(self, duration_s: float) -> None:
         """Let time pass as if the callback that runs now had taken so long."""

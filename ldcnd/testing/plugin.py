@@ -24,14 +24,25 @@ def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line("markers", "ldcnd_rig(file, seed=None): the configuration on which `ldcnd_rig` rehearses")
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Let pytest-asyncio find the clock of tests on a rig, also where it runs only what is marked."""
+    _mark(metafunc.definition)
+
+
 @pytest.hookimpl(wrapper=True, trylast=True)
 def pytest_pycollect_makeitem() -> Generator[None, Any, Any]:
     """Let tests on a rig be run by pytest-asyncio, also where it runs only what is marked."""
     made = yield
     for item in made if isinstance(made, list) else [made]:
-        if isinstance(item, pytest.Function) and RIG in item.fixturenames and inspect.iscoroutinefunction(item.obj):
-            item.add_marker(pytest.mark.asyncio)
+        if isinstance(item, pytest.Function):
+            _mark(item)
     return made
+
+
+def _mark(item: pytest.Function) -> None:
+    if RIG in item.fixturenames and inspect.iscoroutinefunction(item.obj):
+        item.add_marker(pytest.mark.asyncio)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -59,6 +70,12 @@ def _async_fixture(function: Callable[..., AsyncIterator[Any]]) -> Any:  # noqa:
 
 async def _rig(request: pytest.FixtureRequest) -> "AsyncIterator[SimulatedRig]":
     """Rehearse on the rig that `@pytest.mark.ldcnd_rig("rig.toml")` names, beside the test, or on one of four axes."""
+    if not inspect.iscoroutinefunction(request.function):
+        pytest.fail(
+            "ldcnd_rig needs a test that is `async def`; a program that waits without asyncio runs in one by"
+            " `await ldcnd_rig.run_blocking(program)`",
+            pytrace=False,
+        )
     from ldcnd.config.rig import example  # noqa: PLC0415 - see above
     from ldcnd.testing.rig import simulated_rig  # noqa: PLC0415
 

@@ -5,7 +5,7 @@ import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from contextlib import AsyncExitStack, asynccontextmanager
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 from typing_extensions import override
 
@@ -21,6 +21,7 @@ from ldcnd.net.hand_over import Answer
 from ldcnd.net.session import NO_PARAMETERS, QUERY_TIMEOUT_S, Publication
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.known import SIMULATED, opener_of
+from ldcnd.testing.blocking import run_in_thread
 from ldcnd.testing.faults import Processes, RigFaults
 from ldcnd.testing.jumping_loop import JumpingLoop
 from ldcnd.testing.lines import simulated_config
@@ -28,6 +29,7 @@ from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 from ldcnd.testing.timeline import Timeline
 from ldcnd.testing.truth import Machine, Truth
 
+P = ParamSpec("P")
 ResultT = TypeVar("ResultT")
 
 BEGINS_NS = 1_700_000_000_000_000_000
@@ -146,14 +148,14 @@ class SimulatedRig:
         broker: the network; others can join it.
     """
 
-    def __init__(self, config: RigConfig, broker: MemoryBroker, lines: Mapping[str, Chain]) -> None:
+    def __init__(self, config: RigConfig, broker: MemoryBroker, lines: Mapping[str, Chain], loop: JumpingLoop) -> None:
         self.config = config
         self.broker = broker
         self.lines = lines
         self.client: Rig
         self.timeline = Timeline(lambda: self.now_s, BEGINS_NS)
         self._session: _ClientSession
-        self._loop = asyncio.get_running_loop()
+        self._loop = loop
         self._zero_s = self._loop.time()
         self._daemon: Daemon | None = None
         self._life = _Life()
@@ -217,8 +219,21 @@ class SimulatedRig:
         names = axes or tuple(self._machines)
         await self.until(lambda: all(self.truth(name).at_rest for name in names), within_s)
 
+    async def run_blocking(self, program: Callable[P, ResultT], *args: P.args, **kwargs: P.kwargs) -> ResultT:
+        """Run a program that has no event loop, such as one that uses `ldcnd.open`, and return its result.
+
+        It runs in a thread of its own. The clock stands while it computes, and jumps while it waits for the client or
+        in `time.sleep`; `time.time` and `time.monotonic` show the rig's clock there.
+
+        Args:
+            program: what is run; `ldcnd.open()` and `ldcnd.connect_blocking()` in it reach this rig.
+            args: of the program.
+            kwargs: of the program.
+        """
+        return await run_in_thread(self._loop, lambda: self._now_ns() / 1e9, program, *args, **kwargs)
+
     async def start_daemon(self) -> None:
-        """FaultStart a daemon on the same lines, and wait until they are up.
+        """Start a daemon on the same lines, and wait until they are up.
 
         Raises:
             TimeoutError: they do not come up within a minute of the rig's clock.
@@ -326,24 +341,26 @@ async def simulated_rig(config: RigConfig | Path | str, *, seed: int | None = No
         ConfigError: the file is none of a rig.
         NotSupported: the program does not run on the jumping clock.
     """
-    if not isinstance(asyncio.get_running_loop(), JumpingLoop):
+    loop = asyncio.get_running_loop()
+    if not isinstance(loop, JumpingLoop):
         raise NotSupported(
             "a rehearsal needs the jumping clock, and this program runs on the wall clock",
             remedy="run it by ldcnd.testing.run, or as a test that asks for the fixture ldcnd_rig",
         )
     found = config if isinstance(config, RigConfig) else load_config(Path(config))
     settings = simulated_config(found, seed=seed)
-    now_s = asyncio.get_running_loop().time()
     simulated = {line.name: line for line in settings.sim}
     lines = {
-        bus.name: SIMULATED[bus.family].chain(simulated[bus.simulated], bus, now_s) for bus in settings.bus
+        bus.name: SIMULATED[bus.family].chain(simulated[bus.simulated], bus, loop.time()) for bus in settings.bus
     }  # fmt: skip
     broker = MemoryBroker()
-    rig = SimulatedRig(settings, broker, lines)
+    rig = SimulatedRig(settings, broker, lines, loop)
     async with AsyncExitStack() as stack:
         session = _ClientSession(broker)
         stack.push_async_callback(session.close)
         stack.push_async_callback(rig.close)
+        loop.network = broker.session
+        stack.callback(setattr, loop, "network", None)
         await rig.start_daemon()
         await rig.join(session)
         yield rig

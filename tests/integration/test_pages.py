@@ -30,6 +30,7 @@ ELSEWHERE = {
     "deploy/INSTALL.md": "test_every_command_of_the_guide_works",
     "docs/how-to/replay-a-capture.md": "test_what_the_page_does_with_a_capture_can_be_done",
     "docs/how-to/take-a-trace.md": "test_a_move_is_traced_to_a_file_shown_and_drawn",
+    "docs/how-to/test-your-program.md": "test_the_blocks_of_the_page_run_in_an_empty_folder",
     "docs/how-to/watch-an-axis.md": "test_the_blocks_of_the_page_tune_an_axis_and_watch_it",
 }
 """Pages whose commands another test runs."""

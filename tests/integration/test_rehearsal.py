@@ -1,6 +1,9 @@
 """Programs that move machines, tried on a rig in the process of a test."""
 
 import asyncio
+import subprocess
+import sys
+import time
 from dataclasses import dataclass
 
 import pytest
@@ -8,6 +11,7 @@ import pytest
 import ldcnd
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.testing import run, simulated_rig
+from tests.support.pages import ROOT, blocks_of
 from tests.support.rig import SIMULATED
 
 
@@ -27,6 +31,40 @@ async def test_a_program_moves_a_rig_that_does_not_exist(ldcnd_rig):
     assert places == pytest.approx(range(1, 11), abs=0.02)
     assert ldcnd_rig.truth("x").position == pytest.approx(10, abs=0.02)
     assert ldcnd_rig.truth("x").at_rest
+
+
+async def test_a_program_that_connects_by_itself_reaches_the_rig_of_its_test(ldcnd_rig):
+    async with ldcnd.connect() as rig:
+        assert rig.name == ldcnd_rig.config.rig
+        assert await scan(rig, (1, 2)) == pytest.approx([1, 2], abs=0.02)
+
+
+def slow_scan(places):
+    found = []
+    with ldcnd.connect_blocking("tcp/127.0.0.1:1") as rig, rig.control("x", client="scan") as x:
+        x.power(on=True)
+        for place in places:
+            x.move_absolute(place).done()
+            began_s = time.monotonic()
+            time.sleep(30)
+            found.append((x.position.value, time.monotonic() - began_s))
+    return found
+
+
+async def test_a_blocking_program_waits_on_the_clock_of_the_rig(ldcnd_rig):
+    began_s, real_s = ldcnd_rig.now_s, time.monotonic()
+    found = await ldcnd_rig.run_blocking(slow_scan, [1, -1, 2])
+    assert [place for place, _ in found] == pytest.approx([1, -1, 2], abs=0.02)
+    assert [waited_s for _, waited_s in found] == pytest.approx([30] * 3, abs=0.001)
+    assert 90 < ldcnd_rig.now_s - began_s < 100
+    assert time.monotonic() - real_s < 60
+    assert ldcnd_rig.truth("x").at_rest
+
+
+async def test_a_blocking_program_fails_where_its_machine_does(ldcnd_rig):
+    ldcnd_rig.faults.jam("x", at=0.5)
+    with pytest.raises(ldcnd.LdcndError, match="move_absolute"):
+        await ldcnd_rig.run_blocking(slow_scan, [1, -1, 2])
 
 
 async def test_a_jam_ends_the_program_where_it_is(ldcnd_rig):
@@ -201,3 +239,36 @@ async def test_no_rehearsal_on_the_wall_clock():
         async with simulated_rig(SIMULATED):
             pass
     assert "ldcnd_rig" in found.value.remedy
+
+
+MY_LAB = """
+async def scan(rig):
+    async with rig.control("x", client="scan") as x:
+        await x.power(on=True)
+        for place in (2, 4, 6, 8):
+            await (await x.move_absolute(place)).done()
+"""
+
+
+def test_the_blocks_of_the_page_run_in_an_empty_folder(tmp_path):
+    in_a_test, alone = (
+        block.text for block in blocks_of(ROOT / "docs/how-to/test-your-program.md") if block.language == "python"
+    )
+    (tmp_path / "rig.toml").write_text(SIMULATED.read_text())
+    (tmp_path / "my_lab.py").write_text(MY_LAB)
+    (tmp_path / "test_scan.py").write_text(in_a_test)
+    (tmp_path / "alone.py").write_text("from my_lab import scan\n" + alone)
+
+    def python(*words):
+        command = [sys.executable, *words]
+        return subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=50, check=False)  # noqa: S603
+
+    assert "1 passed" in (passes := python("-m", "pytest", "-p", "no:cacheprovider")).stdout, passes.stdout
+    assert python("alone.py").returncode == 0
+
+    (tmp_path / "my_lab.py").write_text(MY_LAB.replace("await (await x.move_absolute(place)).done()", "pass"))
+    fails = python("-m", "pytest", "-p", "no:cacheprovider").stdout
+    assert "1 failed" in fails
+    assert "DID NOT RAISE" in fails
+    assert "what happened on the rig" in fails
+    assert "x power" in fails

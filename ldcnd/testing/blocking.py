@@ -1,0 +1,126 @@
+"""Programs without an event loop on the jumping clock: in a thread, whose waits jump with the clock of the rig.
+
+The clock stands while the thread computes and goes on while it waits for the client or in `time.sleep`, so that such a
+program is as repeatable as one of asyncio. What it waits for by other means takes real time, and none on the rig.
+"""
+
+import asyncio
+import concurrent.futures
+import contextvars
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, ParamSpec, SupportsIndex, TypeVar, cast
+
+from typing_extensions import override
+
+from ldcnd.client.loop_thread import LENT, LoopThread
+from ldcnd.testing.jumping_loop import JumpingLoop
+
+P = ParamSpec("P")
+ResultT = TypeVar("ResultT")
+
+
+class PacedLoop(LoopThread):
+    """The rig's loop as a program in another thread sees it: while the program waits, and only then, time passes."""
+
+    def __init__(self, loop: JumpingLoop) -> None:
+        super().__init__(loop)
+        self._clock = loop
+
+    @override
+    def wait(self, *futures: concurrent.futures.Future[Any]) -> None:
+        """Wait until one of them is done; the clock stands again from that very instant on."""
+        over = threading.Event()
+
+        def end(_: concurrent.futures.Future[Any]) -> None:
+            if not over.is_set():
+                self._clock.hold(+1)
+                over.set()
+
+        def begin() -> None:  # on the loop, where the work ends as well: neither passes the other by
+            self._clock.hold(-1)
+            for future in futures:
+                future.add_done_callback(end)
+
+        self.call(begin)
+        over.wait()
+
+    def now_s(self) -> float:
+        """Return what the clock shows, in seconds."""
+        return self._clock.time()
+
+
+_sleep, _monotonic, _time = time.sleep, time.monotonic, time.time
+_guests: dict[int, tuple[PacedLoop, Callable[[], float]]] = {}
+"""By the thread of a program: its loop, and the wall clock of its rig."""
+_changing = threading.Lock()
+
+
+def _sleep_here(seconds: float | SupportsIndex) -> None:
+    guest = _guests.get(threading.get_ident())
+    if guest is None:
+        _sleep(seconds)
+    else:
+        guest[0].run(asyncio.sleep(float(seconds)))
+
+
+def _monotonic_here() -> float:
+    guest = _guests.get(threading.get_ident())
+    return guest[0].now_s() if guest else _monotonic()
+
+
+def _time_here() -> float:
+    guest = _guests.get(threading.get_ident())
+    return guest[1]() if guest else _time()
+
+
+def _enter(guest: tuple[PacedLoop, Callable[[], float]]) -> None:
+    with _changing:
+        _guests[threading.get_ident()] = guest
+        time.sleep, time.monotonic, time.time = _sleep_here, _monotonic_here, _time_here
+
+
+def _leave() -> None:
+    with _changing:
+        del _guests[threading.get_ident()]
+        if not _guests:
+            time.sleep, time.monotonic, time.time = _sleep, _monotonic, _time
+
+
+async def run_in_thread(
+    loop: JumpingLoop, wall_s: Callable[[], float], program: Callable[P, ResultT], *args: P.args, **kwargs: P.kwargs
+) -> ResultT:
+    """Run a program without an event loop to its end; see `SimulatedRig.run_blocking`.
+
+    Args:
+        loop: the rig's.
+        wall_s: the rig's wall clock, seconds since 1970.
+        program: what is run.
+        args: of the program.
+        kwargs: of the program.
+    """
+    paced, ended = PacedLoop(loop), cast("asyncio.Future[ResultT]", loop.create_future())
+    context = contextvars.copy_context()
+    context.run(LENT.set, paced)
+
+    def end(outcome: Callable[[], None]) -> None:
+        loop.hold(-1)
+        if not ended.done():
+            outcome()
+
+    def live() -> None:
+        _enter((paced, wall_s))
+        try:
+            outcome = partial(ended.set_result, context.run(program, *args, **kwargs))
+        except BaseException as error:  # noqa: BLE001 - it is raised where the program is waited for
+            outcome = partial(ended.set_exception, error)
+        finally:
+            _leave()
+        paced.call(end, outcome)
+
+    loop.hold(+1)
+    # a daemon: a program that waits for what never comes does not keep pytest from ending
+    threading.Thread(target=live, name="blocking program", daemon=True).start()
+    return await ended
