@@ -6,14 +6,26 @@
             await my_scan(ldcnd_rig.client)
         assert ldcnd_rig.truth("x").at_rest
 
-With pytest the fixtures `ldcnd_rig` and `ldcnd_endpoint` are there as soon as ldcnd is installed; without it, `run` and
-`simulated_rig` do the same.
+With pytest the fixtures `ldcnd_rig` and, in real time for other processes, `ldcnd_served_rig` are there as soon as
+ldcnd is installed; without it, `run`, `simulated_rig` and `served_rig` do the same.
 """
 
 from ldcnd.testing.faults import RigFault, RigFaults
 from ldcnd.testing.jumping_loop import JumpingLoop
 from ldcnd.testing.lines import simulated_config
 from ldcnd.testing.rig import SimulatedRig, run, simulated_rig
+from ldcnd.testing.served import ServedRig, served_rig
 from ldcnd.testing.truth import Truth
 
-__all__ = ["JumpingLoop", "RigFault", "RigFaults", "SimulatedRig", "Truth", "run", "simulated_config", "simulated_rig"]
+__all__ = [
+    "JumpingLoop",
+    "RigFault",
+    "RigFaults",
+    "ServedRig",
+    "SimulatedRig",
+    "Truth",
+    "run",
+    "served_rig",
+    "simulated_config",
+    "simulated_rig",
+]

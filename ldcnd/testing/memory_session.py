@@ -87,7 +87,7 @@ class MemoryBroker:
 
     @asynccontextmanager
     async def session(
-        self, login: str | None = None, overhear: OnSample | None = None
+        self, login: str | None = None, *, overhear: OnSample | None = None
     ) -> AsyncIterator["MemorySession"]:
         """Join the network for as long as the context lasts.
 

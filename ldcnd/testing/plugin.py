@@ -1,4 +1,4 @@
-"""The plugin for pytest: the fixture `ldcnd_rig`, and what a failed test with it shows.
+"""The plugin for pytest: the fixtures `ldcnd_rig` and `ldcnd_served_rig`, and what a failed test with it shows.
 
 Loaded by pytest wherever ldcnd is installed, so it imports nothing of ldcnd before a test asks for a rig.
 """
@@ -6,7 +6,7 @@ Loaded by pytest wherever ldcnd is installed, so it imports nothing of ldcnd bef
 import asyncio
 import inspect
 import tempfile
-from collections.abc import AsyncIterator, Callable, Generator, Mapping
+from collections.abc import AsyncIterator, Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +14,7 @@ import pytest
 
 if TYPE_CHECKING:
     from ldcnd.testing.rig import SimulatedRig
+    from ldcnd.testing.served import ServedRig
 
 RIG = "ldcnd_rig"
 EXAMPLE = "simulated.toml"
@@ -76,17 +77,37 @@ async def _rig(request: pytest.FixtureRequest) -> "AsyncIterator[SimulatedRig]":
             " `await ldcnd_rig.run_blocking(program)`",
             pytrace=False,
         )
-    from ldcnd.config.rig import example  # noqa: PLC0415 - see above
-    from ldcnd.testing.rig import simulated_rig  # noqa: PLC0415
+    from ldcnd.testing.rig import simulated_rig  # noqa: PLC0415 - see above
 
-    marker = request.node.get_closest_marker(RIG)
-    file = request.path.parent / marker.args[0] if marker and marker.args else example(EXAMPLE)
-    async with simulated_rig(file, seed=marker.kwargs.get("seed") if marker else None) as rig:
+    file, seed = _asked_for(request)
+    async with simulated_rig(file, seed=seed) as rig:
         request.node.stash[RIG_OF_TEST] = rig
         yield rig
 
 
+def _asked_for(request: pytest.FixtureRequest) -> tuple[Path, int | None]:
+    """Return the configuration and the seed of the marker of a test."""
+    from ldcnd.config.rig import example  # noqa: PLC0415 - see above
+
+    marker = request.node.get_closest_marker(RIG)
+    file = request.path.parent / marker.args[0] if marker and marker.args else example(EXAMPLE)
+    return file, marker.kwargs.get("seed") if marker else None
+
+
 ldcnd_rig = _async_fixture(_rig)
+
+
+@pytest.fixture
+def ldcnd_served_rig(request: pytest.FixtureRequest) -> "Iterator[ServedRig]":
+    """Serve the rig of the marker `ldcnd_rig` in real time, for programs in other processes."""
+    from ldcnd.testing.served import served_rig  # noqa: PLC0415 - see above
+
+    file, seed = _asked_for(request)
+    with served_rig(file, seed=seed) as rig:
+        request.node.stash[RIG_OF_TEST] = rig.ask(lambda served: served)
+        yield rig
+
+
 RIG_OF_TEST = pytest.StashKey["SimulatedRig"]()
 
 
@@ -96,7 +117,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     report = yield
     rig = item.stash.get(RIG_OF_TEST, None)
     if rig is not None and report.when == "call" and report.failed:
-        lines = [str(rig.timeline)]
+        lines = [str(rig.timeline), rig.packets()]
         name = "".join(letter if letter.isalnum() else "_" for letter in item.name)
         picture = rig.timeline.draw(Path(tempfile.mkdtemp(prefix="ldcnd-")) / f"{name}.png")
         if picture:

@@ -3,9 +3,9 @@
 import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, ParamSpec, Protocol, TypeVar
 
 from typing_extensions import override
 
@@ -16,13 +16,15 @@ from ldcnd.contract.errors import NotSupported, OutcomeUnknown, UnknownAxis
 from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
+from ldcnd.drives.known import FAMILIES
+from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.line.transport import Opener, Receiver, Transport
 from ldcnd.net.hand_over import Answer
-from ldcnd.net.session import NO_PARAMETERS, QUERY_TIMEOUT_S, Publication
+from ldcnd.net.session import NO_PARAMETERS, QUERY_TIMEOUT_S, OnSample, Publication, Session
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.known import SIMULATED, opener_of
 from ldcnd.testing.blocking import run_in_thread
-from ldcnd.testing.faults import Processes, RigFaults
+from ldcnd.testing.faults import Change, Processes, RigFaults
 from ldcnd.testing.jumping_loop import JumpingLoop
 from ldcnd.testing.lines import simulated_config
 from ldcnd.testing.memory_session import MemoryBroker, MemorySession
@@ -136,6 +138,13 @@ class _ClientSession(MemorySession):
         )
 
 
+class Network(Protocol):
+    """What the sessions of a rig share: a `MemoryBroker`, or Zenoh in real time."""
+
+    def session(self, *, overhear: OnSample | None = None) -> AbstractAsyncContextManager[Session]:
+        """Join it; `overhear` gets every sample that this session publishes."""
+
+
 class SimulatedRig:
     """A rig that is rehearsed on; made by `simulated_rig`.
 
@@ -145,18 +154,25 @@ class SimulatedRig:
         faults: what may go wrong, by name.
         timeline: what has happened.
         lines: the simulated lines, by name of the bus.
-        broker: the network; others can join it.
+        network: others can join it.
     """
 
-    def __init__(self, config: RigConfig, broker: MemoryBroker, lines: Mapping[str, Chain], loop: JumpingLoop) -> None:
+    def __init__(
+        self,
+        config: RigConfig,
+        network: Network,
+        lines: Mapping[str, Chain],
+        begins_ns: int,
+        lose_client: tuple[Change, Change],
+    ) -> None:
         self.config = config
-        self.broker = broker
+        self.network = network
         self.lines = lines
         self.client: Rig
-        self.timeline = Timeline(lambda: self.now_s, BEGINS_NS)
-        self._session: _ClientSession
-        self._loop = loop
+        self._loop = asyncio.get_running_loop()
         self._zero_s = self._loop.time()
+        self._begins_ns = begins_ns
+        self.timeline = Timeline(lambda: self.now_s, begins_ns)
         self._daemon: Daemon | None = None
         self._life = _Life()
         self._serving: asyncio.Task[None] | None = None
@@ -170,7 +186,7 @@ class SimulatedRig:
         }
         processes = Processes(
             kill_daemon=(lambda _: self._later(self.kill_daemon()), lambda _: self._later(self.start_daemon())),
-            lose_client=(lambda _: self._cut(on=True), lambda _: self._cut(on=False)),
+            lose_client=lose_client,
         )
         self.faults = RigFaults(self._machine, lines, self.truth, self._loop, processes, self.timeline.note)
 
@@ -199,6 +215,22 @@ class SimulatedRig:
         machine, daemon = self._machine(axis), self._daemon
         place_of = daemon.rig.axes[axis].tracker.status.scale.position if daemon else None
         return machine.look(self._loop.time(), place_of)
+
+    def packets(self, count: int = 12) -> str:
+        """Return the last packets of each line, in words; those of a daemon that was killed are gone with it."""
+        told: list[str] = []
+        for line in self._daemon.rig.buses if self._daemon else ():
+            models = {axis.config.address: axis.config.model for axis in line.axes}
+            describe = FAMILIES[line.family].describe(models)
+            packets = [
+                record for record in line.bus.wire_log.records() if record.event in (WireEvent.SENT, WireEvent.RECEIVED)
+            ]
+            told.append(f"the last packets on {line.bus.settings.name}:")
+            told += [
+                f"{record.at_s - self._zero_s:9.3f} s  {record.event:<8} {describe(record) or record.data.hex(' ')}"
+                for record in packets[-count:]
+            ]
+        return "\n".join(told)
 
     async def until(self, condition: Callable[[], bool], within_s: float = 60.0) -> None:
         """Wait until something is so; it is asked every 10 ms of the rig's clock.
@@ -230,6 +262,8 @@ class SimulatedRig:
             args: of the program.
             kwargs: of the program.
         """
+        if not isinstance(self._loop, JumpingLoop):
+            return await asyncio.to_thread(program, *args, **kwargs)
         return await run_in_thread(self._loop, lambda: self._now_ns() / 1e9, program, *args, **kwargs)
 
     async def start_daemon(self) -> None:
@@ -279,7 +313,7 @@ class SimulatedRig:
         openers = {
             bus.name: life.opener(opener_of(bus, config.sim, self.lines[bus.name])) for bus in config.bus
         }  # fmt: skip
-        async with self.broker.session(overhear=self._overheard) as session:
+        async with self.network.session(overhear=self._overheard) as session:
             self._daemon = build_daemon(
                 config, session, self._now_ns, f"run{self._runs}", openers, lambda: f"lease-{self._loop.time():.9f}"
             )
@@ -290,10 +324,7 @@ class SimulatedRig:
         self.timeline.take(sample)
 
     def _now_ns(self) -> int:
-        return BEGINS_NS + round(self.now_s * 1e9)
-
-    def _cut(self, *, on: bool) -> None:
-        self._session.cut = on
+        return self._begins_ns + round(self.now_s * 1e9)
 
     def _machine(self, axis: str) -> Machine:
         if axis not in self._machines:
@@ -305,9 +336,8 @@ class SimulatedRig:
         self._errands.add(task)
         task.add_done_callback(self._errands.discard)
 
-    async def join(self, session: "_ClientSession") -> None:
+    async def join(self, session: Session) -> None:
         """Connect the rig's own client, and wait until every drive answers."""
-        self._session = session
         client = RigClient(session, self.config.rig)
         self.client = Rig(client, await client.daemon())
         async with asyncio.timeout(UP_WITHIN_S):
@@ -347,16 +377,12 @@ async def simulated_rig(config: RigConfig | Path | str, *, seed: int | None = No
             "a rehearsal needs the jumping clock, and this program runs on the wall clock",
             remedy="run it by ldcnd.testing.run, or as a test that asks for the fixture ldcnd_rig",
         )
-    found = config if isinstance(config, RigConfig) else load_config(Path(config))
-    settings = simulated_config(found, seed=seed)
-    simulated = {line.name: line for line in settings.sim}
-    lines = {
-        bus.name: SIMULATED[bus.family].chain(simulated[bus.simulated], bus, loop.time()) for bus in settings.bus
-    }  # fmt: skip
+    settings = simulated_config(loaded(config), seed=seed)
     broker = MemoryBroker()
-    rig = SimulatedRig(settings, broker, lines, loop)
+    session = _ClientSession(broker)
+    cut = (lambda _: setattr(session, "cut", True), lambda _: setattr(session, "cut", False))
+    rig = SimulatedRig(settings, broker, lines_of(settings), BEGINS_NS, cut)
     async with AsyncExitStack() as stack:
-        session = _ClientSession(broker)
         stack.push_async_callback(session.close)
         stack.push_async_callback(rig.close)
         loop.network = broker.session
@@ -364,3 +390,15 @@ async def simulated_rig(config: RigConfig | Path | str, *, seed: int | None = No
         await rig.start_daemon()
         await rig.join(session)
         yield rig
+
+
+def loaded(config: RigConfig | Path | str) -> RigConfig:
+    """Return a rig; from its file, if that is given."""
+    return config if isinstance(config, RigConfig) else load_config(Path(config))
+
+
+def lines_of(config: RigConfig) -> dict[str, Chain]:
+    """Make the simulated lines of a rig; their clock is that of the running loop."""
+    simulated = {line.name: line for line in config.sim}
+    now_s = asyncio.get_running_loop().time()
+    return {bus.name: SIMULATED[bus.family].chain(simulated[bus.simulated], bus, now_s) for bus in config.bus}

@@ -1,0 +1,124 @@
+"""A simulated rig in real time, on an endpoint: for programs in other processes, and in other languages."""
+
+import os
+import socket
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+from ldcnd.client.loop_thread import LoopThread, loop_thread
+from ldcnd.config.rig import RigConfig
+from ldcnd.contract.errors import NotSupported
+from ldcnd.contract.keys import Keys
+from ldcnd.net.session import OnSample, Session
+from ldcnd.net.zenoh_session import open_zenoh_session
+from ldcnd.net.zenoh_settings import ZenohSettings
+from ldcnd.testing.lines import simulated_config
+from ldcnd.testing.rig import SimulatedRig, lines_of, loaded
+
+ResultT = TypeVar("ResultT")
+
+COARSE_MS = 50.0
+"""Least margin of the deadlines of replies: simulated lines are paced by the timers of this process."""
+CONNECT = "LDCND_CONNECT"
+"""The variable in which programs find the endpoint of their rig."""
+
+
+class ServedRig:
+    """A rig in real time that other programs connect to; made by `served_rig`.
+
+    Attributes:
+        endpoint: of its daemon, as `ldcnd --connect` and `ldcnd.connect` take it.
+    """
+
+    def __init__(self, endpoint: str, thread: LoopThread, rig: SimulatedRig) -> None:
+        self.endpoint = endpoint
+        self._thread = thread
+        self._rig = rig
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """The environment of a program that finds this rig without being told where it is."""
+        return {**os.environ, CONNECT: self.endpoint}
+
+    def ask(self, question: Callable[[SimulatedRig], ResultT]) -> ResultT:
+        """Return what a function says of the rig, or let it change something there; it must not wait.
+
+            rig.ask(lambda rig: rig.faults.jam("x", at=7.5))
+            rig.ask(lambda rig: rig.truth("x").position)
+
+        Args:
+            question: gets the rig, whose clock is the real one.
+        """
+
+        async def answer() -> ResultT:
+            return question(self._rig)
+
+        return self._thread.run(answer())
+
+    def until(self, condition: Callable[[SimulatedRig], bool], within_s: float = 10.0) -> None:
+        """Wait until something is so.
+
+        Raises:
+            TimeoutError: it was not within so many seconds.
+        """
+        self._thread.run(self._rig.until(lambda: condition(self._rig), within_s))
+
+
+@contextmanager
+def served_rig(config: RigConfig | Path | str, *, seed: int | None = None) -> Iterator[ServedRig]:
+    """Serve a simulated rig in real time until the context ends; its lines are up when the context begins.
+
+    Args:
+        config: the rig, or its file; see `simulated_config`.
+        seed: of everything that is drawn.
+
+    Raises:
+        ConfigError: the file is none of a rig.
+        TimeoutError: its lines do not come up.
+    """
+    settings = simulated_config(loaded(config), seed=seed)
+    slow = (bus.model_copy(update={"margin_ms": max(bus.margin_ms, COARSE_MS)}) for bus in settings.bus)
+    settings = settings.model_copy(update={"bus": tuple(slow)})
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    with loop_thread() as thread, thread.inside(_serving(settings, endpoint)) as rig:
+        yield ServedRig(endpoint, thread, rig)
+
+
+@asynccontextmanager
+async def _serving(config: RigConfig, endpoint: str) -> AsyncIterator[SimulatedRig]:
+    def cannot(_: float) -> None:
+        raise NotSupported("the clients of this rig are other programs", remedy="end their processes")
+
+    rig = SimulatedRig(config, _Zenoh(config.rig, endpoint), lines_of(config), time.time_ns(), (cannot, cannot))
+    async with AsyncExitStack() as stack:
+        stack.push_async_callback(rig.close)
+        await rig.start_daemon()
+        client = ZenohSettings(mode="client", connect=(endpoint,))
+        await rig.join(await stack.enter_async_context(open_zenoh_session(client)))
+        yield rig
+
+
+class _Zenoh:
+    """The network of a rig that listens on one endpoint; each of its daemons in turn."""
+
+    def __init__(self, rig: str, endpoint: str) -> None:
+        self._telemetry = Keys(rig).all_telemetry
+        self._settings = ZenohSettings(listen=(endpoint,))
+
+    @asynccontextmanager
+    async def session(self, *, overhear: OnSample | None = None) -> AsyncIterator[Session]:
+        """Join it."""
+        async with open_zenoh_session(self._settings) as session:
+            if overhear:
+                await session.subscribe(self._telemetry, overhear)
+            yield session
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
