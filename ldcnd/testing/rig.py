@@ -138,7 +138,7 @@ class _ClientSession(MemorySession):
         )
 
 
-class Network(Protocol):
+class RigNetwork(Protocol):
     """What the sessions of a rig share: a `MemoryBroker`, or Zenoh in real time."""
 
     def session(self, *, overhear: OnSample | None = None) -> AbstractAsyncContextManager[Session]:
@@ -160,7 +160,7 @@ class SimulatedRig:
     def __init__(
         self,
         config: RigConfig,
-        network: Network,
+        network: RigNetwork,
         lines: Mapping[str, Chain],
         begins_ns: int,
         lose_client: tuple[Change, Change],
