@@ -5,6 +5,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
+from ldcnd.config.interlocks import InterlockConfig, check_interlocks
 from ldcnd.config.simulated import SimulatedLine, simulator
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
@@ -108,6 +109,8 @@ class RigConfig(Frozen):
     """A wire that changes its level while the daemon works."""
     bus: tuple[Bus, ...] = Field(min_length=1)
     """The lines."""
+    interlock: tuple[InterlockConfig, ...] = Field(default=(), max_length=100)
+    """What motions and outputs require of the machine; software, and no safety function."""
     sim: tuple[SimulatedLine, ...] = ()
     """Simulated lines, used by ports of the form sim:NAME."""
 
@@ -120,7 +123,9 @@ class RigConfig(Frozen):
     def _consistent(self) -> Self:
         refuse_duplicates("bus", [bus.name for bus in self.bus])
         named = [name for bus in self.bus for name in bus.module_names]
+        named += [name for bus in self.bus for name in (*bus.inputs, *bus.outputs)]
         refuse_duplicates("axis", [axis.name for bus in self.bus for axis in bus.axis] + named)
+        check_interlocks(self.interlock, self.bus)
         refuse_duplicates("sim", [line.name for line in self.sim])
         ports = [bus.port for bus in self.bus]
         refuse_duplicates("port", ports)

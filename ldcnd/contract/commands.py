@@ -60,6 +60,30 @@ class Verb(StrEnum):
     TRACE_ABORT = "trace_abort"
 
 
+class MotionKind(StrEnum):
+    """Kind of a motion, for interlocks and sets of gains."""
+
+    POSITION = "position"
+    """A motion to a place: `move_absolute`, `move_relative`, groups, paths, `probe`, `track`, `move_analog`."""
+    VELOCITY = "velocity"
+    """A motion at a velocity or duty: `move_velocity`, `jog`, `set_pwm`."""
+    HOME = "home"
+    """The search for the reference position: `home`."""
+
+
+_KINDS = {
+    Verb.MOVE_VELOCITY: MotionKind.VELOCITY,
+    Verb.JOG: MotionKind.VELOCITY,
+    Verb.SET_PWM: MotionKind.VELOCITY,
+    Verb.HOME: MotionKind.HOME,
+}
+
+
+def kind_of(verb: Verb) -> MotionKind:
+    """Return the kind of the motion that a command begins."""
+    return _KINDS.get(verb, MotionKind.POSITION)
+
+
 class About(StrEnum):
     """Target of a command: an axis, or the rig as a whole."""
 

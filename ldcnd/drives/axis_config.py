@@ -6,7 +6,7 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from ldcnd.contract.commands import HomeMethod, HomeStop
+from ldcnd.contract.commands import HomeMethod, HomeStop, MotionKind
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.plan import PollPriority
@@ -204,6 +204,11 @@ class AxisConfig(Frozen):
     """Software limits, in axis units."""
     gains: GainsConfig | None = None
     """Gains of the position loop; without them the loop of this drive stays open."""
+    gain_sets: Mapping[Name, GainsConfig] = {}
+    """Further sets of gains by name, with the `sr` of `gains`; `set_gains` loads one by its name."""
+    gains_for: Mapping[MotionKind, Name] = {}
+    """Set of gains for each kind of motion, loaded at standstill before one begins; `gains` serve the others, and the \
+loop closes with those for `position`."""
     reference: Literal["required", "at_reset"] = "required"
     """Whether absolute moves need home or set_position first, or the place where the drive was powered on \
 counts as 0. The latter only for a line that no host has used since: after a restart with powered drives, home again."""
@@ -233,6 +238,8 @@ ahead, also if the host is dead; moving off a switch stays possible. Not for `tr
 on their limit inputs."""
     jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)
     """Time after which the drive itself ends a motion at constant velocity that no software limit ends, seconds."""
+    longest_run_s: float | None = Field(default=None, gt=0, le=86_400)
+    """Longest duration that a `move_velocity` may ask for, in seconds; without it `jog_horizon_s`."""
     jog_reach_s: float = Field(default=5.0, gt=0, le=3600)
     """How far ahead the goal of a jog is, in seconds, in a drive that takes no other goal before it stands: if the \
 daemon dies it runs on for as long, and a jog that is held for longer pauses there. PIC-SERVO SC gets nearer goals."""
@@ -262,6 +269,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             raise ValueError(f"velocity {self.velocity} is above limits.velocity {limits.velocity}")
         if limits.acceleration is not None and self.acceleration > limits.acceleration:
             raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
+        self._check_gain_sets()
         self._check_tracking()
         return self
 
@@ -276,14 +284,24 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
         """Level of a limit switch input while the switch is actuated."""
         return self.home.switch_active if self.home else "high"
 
+    def _check_gain_sets(self) -> None:
+        """Refuse sets that `gains` do not stand for, and names of sets that there are not."""
+        for name, gains in self.gain_sets.items():
+            if self.gains is None or gains.sr != self.gains.sr:
+                raise ValueError(f"gain_sets.{name}: its sr is not that of gains")
+        for kind, name in self.gains_for.items():
+            if name not in self.gain_sets:
+                raise ValueError(f"gains_for.{kind.value}: there is no set {name!r} in gain_sets")
+
     def _check_tracking(self) -> None:
         """Refuse bounds of `track` that would trip the drive or outrun the axis."""
         tracking, limits = self.tracking, self.limits
         if tracking is None:
             return
         step_counts = tracking.step * abs(self.signed_counts_per_unit)
-        if self.gains and step_counts >= self.gains.el:
-            raise ValueError(f"tracking.step is {step_counts:g} counts, not below gains.el {self.gains.el}")
+        for gains in filter(None, (self.gains, *self.gain_sets.values())):
+            if step_counts >= gains.el:
+                raise ValueError(f"tracking.step is {step_counts:g} counts, not below the el {gains.el} of its gains")
         if limits.velocity is not None and tracking.step * tracking.rate > limits.velocity:
             raise ValueError(
                 f"tracking.step x rate is {tracking.step * tracking.rate:g}, above limits.velocity {limits.velocity}"

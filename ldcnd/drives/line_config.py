@@ -1,5 +1,6 @@
 """The configuration of one line: its port, its rate, and what is on it."""
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
@@ -38,6 +39,45 @@ class RecorderConfig(Frozen):
     """How far back it reaches."""
     memory_mb: int = Field(default=16, ge=1, le=4096)
     """The oldest packets go sooner when all take more; 16 MB are about 200000 exchanges."""
+
+
+class InputConfig(Frozen):
+    """A named input of an I/O module."""
+
+    line: int = Field(ge=1, le=12)
+    """Line of the module."""
+    inverted: bool = False
+    """Whether a low level makes it true."""
+    debounce_ms: float = Field(default=0.0, ge=0, le=10_000)
+    """Time for which a level must stay before it counts; an input that changes for longer than twice that, and two \
+polls, is unknown."""
+
+
+OutputLevel = Literal["high", "low", "keep"]
+
+
+class OutputLossConfig(Frozen):
+    """Level of an output after a loss; an interlock that forbids it leaves the output as it is."""
+
+    client: OutputLevel = "keep"
+    """The lease of an axis on the module's line has expired, or was taken by force."""
+    bus: OutputLevel = "keep"
+    """The module was out of reach; acts when it answers again, until then it holds its outputs."""
+    daemon: OutputLevel = "keep"
+    """The daemon is shut down; where it is killed the module holds its outputs."""
+
+
+class OutputConfig(Frozen):
+    """An output of an I/O module, and its level in each situation; `keep` writes nothing."""
+
+    line: int = Field(ge=1, le=12)
+    """Line of the module."""
+    start: OutputLevel = "keep"
+    """Level after the reset of the module at the start of the daemon; a module that is taken over keeps its outputs."""
+    reset: OutputLevel = "keep"
+    """Level after the module has lost its power or was reset later on."""
+    loss: OutputLossConfig = OutputLossConfig()
+    """Level after a loss of the client, the line or the daemon."""
 
 
 class BusConfig(Frozen):
@@ -91,6 +131,16 @@ refuse, and skip where the drives' speed only shows on site."""
     def module_names(self) -> tuple[str, ...]:
         """Names of modules that are no axes."""
         return ()
+
+    @property
+    def inputs(self) -> Mapping[str, tuple[InputConfig, float]]:
+        """Inputs of its modules by name, each with the poll rate of its module in Hz."""
+        return {}
+
+    @property
+    def outputs(self) -> Mapping[str, tuple[OutputConfig, float]]:
+        """Outputs of its modules by name, likewise; those without a name of their own are left out."""
+        return {}
 
     @property
     def takes_over(self) -> bool:

@@ -1,9 +1,10 @@
 """The configuration of LDCN and NMC lines, beside what every line and axis has."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, Field, ValidationInfo, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 from typing_extensions import override
 
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
@@ -12,9 +13,9 @@ from ldcnd.drives.axis_config import MovedAxisConfig
 from ldcnd.drives.driver import AxisSpec, Gains
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, PIC_IO, PROFILES, HomingSource, Support, at_clock
 from ldcnd.drives.ldcn.registers import baud_divisor, encode_gains
-from ldcnd.drives.line_config import BAUDS, BusConfig
+from ldcnd.drives.line_config import BAUDS, BusConfig, InputConfig, OutputConfig
 from ldcnd.drives.network import AdoptFallback, GroupSpec, StartPolicy
-from ldcnd.drives.toml import DeviceIdentity, Name
+from ldcnd.drives.toml import DeviceIdentity, Name, refuse_duplicates
 
 
 def _known_model(model: str) -> str:
@@ -41,9 +42,9 @@ class LdcnAxisConfig(MovedAxisConfig):
     @model_validator(mode="after")
     def _gains_fit_the_drive(self) -> Self:
         """Refuse gains that the registers of this model do not take."""
-        if self.gains:
+        for gains in filter(None, (self.gains, *self.gain_sets.values())):
             try:
-                encode_gains(PROFILES[self.model], Gains(**self.gains.model_dump()))
+                encode_gains(PROFILES[self.model], Gains(**gains.model_dump()))
             except (ValueOutOfRange, NotSupported) as error:
                 raise ValueError(f"gains of {self.model}: {error.message}") from None
         return self
@@ -65,6 +66,13 @@ class LdcnAxisConfig(MovedAxisConfig):
         return AxisSpec(self.name, self.address, self.model, gains, self.identity, limit_stop)
 
 
+def _by_name(outputs: object) -> object:
+    """Return outputs by name; a line without one of its own is called by its number."""
+    if isinstance(outputs, list | tuple):
+        return {str(line): {"line": line} for line in outputs}
+    return outputs
+
+
 class ModuleConfig(Frozen):
     """A module that is on a line and is no axis: an I/O module, a drive of a model that ldcnd only identifies."""
 
@@ -76,17 +84,27 @@ class ModuleConfig(Frozen):
     """Identity of the module, given in the same way as that of an axis."""
     name: Name | None = None
     """Name of a PIC-I/O: its inputs are published and its outputs can be set under it; unique among the axes."""
-    outputs: tuple[Annotated[int, Field(ge=1, le=12)], ...] = ()
-    """Lines of a PIC-I/O that may be driven; all others stay inputs. None is driven before a request sets it."""
+    inputs: Mapping[Name, InputConfig] = Field(default={}, max_length=12)
+    """Named inputs of a PIC-I/O."""
+    outputs: Annotated[Mapping[Name, OutputConfig], BeforeValidator(_by_name)] = Field(default={}, max_length=12)
+    """Lines of a PIC-I/O that may be driven, by name, or a list of their numbers; all others stay inputs. None is \
+driven before a request or one of its own keys sets it."""
     rate: float = Field(default=5.0, gt=0, le=500)
     """Polling rate of a PIC-I/O, in Hz."""
 
     @model_validator(mode="after")
     def _has_terminals(self) -> Self:
-        if (self.name or self.outputs) and self.model != PIC_IO.name:
-            raise ValueError(f"name and outputs: a {self.model} has no lines to serve")
-        if self.outputs and not self.name:
-            raise ValueError("outputs: they can only be set with a name of the module")
+        named: dict[str, InputConfig | OutputConfig] = {**self.inputs, **self.outputs}
+        if (self.name or named) and self.model != PIC_IO.name:
+            raise ValueError(f"name, inputs and outputs: a {self.model} has no lines to serve")
+        if named and not self.name:
+            raise ValueError("inputs and outputs: they can only be used with a name of the module")
+        refuse_duplicates("name", [*self.inputs, *self.outputs])
+        lines = [each.line for each in self.inputs.values()] + [each.line for each in self.outputs.values()]
+        refuse_duplicates("line", [f"{line}" for line in lines])
+        for name, each in named.items():
+            if name.isdigit() and name != f"{each.line}":
+                raise ValueError(f"{name}: a number names the line of that number, and this is line {each.line}")
         return self
 
 
@@ -152,6 +170,21 @@ a time take less processor time. 0 for one at a time."""
     @override
     def module_names(self) -> tuple[str, ...]:
         return tuple(module.name for module in self.module if module.name)
+
+    @property
+    @override
+    def inputs(self) -> Mapping[str, tuple[InputConfig, float]]:
+        return {name: (each, module.rate) for module in self.module for name, each in module.inputs.items()}
+
+    @property
+    @override
+    def outputs(self) -> Mapping[str, tuple[OutputConfig, float]]:
+        return {
+            name: (each, module.rate)
+            for module in self.module
+            for name, each in module.outputs.items()
+            if not name.isdigit()
+        }
 
     @property
     @override

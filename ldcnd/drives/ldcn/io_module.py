@@ -73,7 +73,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         self._bus = bus
         self._node = IoNode(entry.address)
         self._period_s = 1.0 / entry.rate
-        self._allowed = _mask(entry.outputs)
+        self._allowed = _mask(each.line for each in entry.outputs.values())
         self._exchange = poll_io(entry.address)
         names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)
         self._book = RegisterBook(names, lambda: asyncio.get_running_loop().time())
