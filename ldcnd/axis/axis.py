@@ -19,7 +19,7 @@ from ldcnd.axis.host_tracer import HostTracer, host_channels
 from ldcnd.axis.kept import KeptFiles
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.parameters import Parameters
-from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right
+from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Violations
 from ldcnd.axis.plausibility import PlausibilityGate
 from ldcnd.axis.preview import preview
 from ldcnd.axis.procedures.jog import Hold
@@ -33,6 +33,7 @@ from ldcnd.axis.stopping import AxisStops, takes_energy_out
 from ldcnd.axis.telemetry import AxisTelemetry, Note
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.axis.turns import CommandQueue
+from ldcnd.config.interlocks import InterlockKind
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import (
     AxisCommand,
@@ -43,6 +44,7 @@ from ldcnd.contract.commands import (
     Jog,
     Move,
     MoveAbsolute,
+    Power,
     Preview,
     PreviewReply,
     QuickStop,
@@ -50,6 +52,7 @@ from ldcnd.contract.commands import (
     ShadowReply,
     Stop,
     Verb,
+    kind_of,
 )
 from ldcnd.contract.errors import LdcndError, NotSupported, OutcomeUnknown, WrongState
 from ldcnd.contract.events import REFERENCE, CommandStatus
@@ -242,6 +245,8 @@ class AxisService:
         """
         permit = permit or self.permit(self._next_command_id(), command.verb)
         if self.stops.possible and (mode := takes_energy_out(command)):
+            if isinstance(command, Power):
+                await self._ask_to_open_loop()
             return await self._take_energy_out(permit, command, mode)
         self._check_takes(command.verb)
         if not self._queue.free:
@@ -260,6 +265,36 @@ class AxisService:
                 f"axis {self.config.name}: {self.config.model} cannot {verb}", axis=self.config.name, value=verb.value
             )
 
+    def interlock(self, violations: Violations) -> None:
+        """Have motions and power obey interlocks."""
+        self._gate.violations = violations
+
+    @property
+    def commanded_counts_per_s(self) -> float:
+        """How fast the latest motion may have the drive turn, counts a second."""
+        return self._gate.counts_per_s
+
+    async def _ask_to_open_loop(self) -> None:
+        """Bring an axis to rest that an interlock keeps from being switched off: a load would fall; nothing else does.
+
+        Raises:
+            InterlockViolated: it holds its position.
+        """
+        if not self.tracker.status.energised:
+            return
+        for violation in self._gate.violations(InterlockKind.POWER_OFF, 0.0):
+            await self.stops.bring_to_rest(StopMode.SMOOTH)
+            raise violation
+
+    def _violations(self, verb: Verb, speed: float | None) -> list[tuple[LdcndError, bool]]:
+        """Return what interlocks forbid a command with; at the speed of moves that name none when that is left out."""
+        if verb is Verb.POWER:
+            return [(error, False) for error in self._gate.violations(InterlockKind.POWER_ON, 0.0)]
+        if AXIS_COMMANDS[verb].effect is not Effect.MOTION:
+            return []
+        speed = self.config.velocity if speed is None else abs(speed)
+        return [(error, False) for error in self._gate.violations(InterlockKind(kind_of(verb)), speed)]
+
     def obstacles(self, verb: Verb) -> list[tuple[LdcndError, bool]]:
         """Return all that a command would be refused with now, the first first; and whether that ends with a motion."""
         try:
@@ -268,11 +303,21 @@ class AxisService:
             return [(error, False)]
         found = guards.obstacles(guards.needs(verb), self.tracker, self._moves)
         if guards.goes_on(verb, self.tracker):
-            return [(error, False) for error, guard in found if guard is not guards.check_stands]
-        return [(error, guard is guards.check_stands) for error, guard in found]
+            causes = [(error, False) for error, guard in found if guard is not guards.check_stands]
+        else:
+            causes = [(error, guard is guards.check_stands) for error, guard in found]
+        return causes + self._violations(verb, None)
 
-    def obstacles_to_motion(self, *, absolute: bool) -> list[tuple[LdcndError, bool]]:
-        """Return all that keeps the axis from a motion, each cause once: what has stopped its drive one by one."""
+    def obstacles_to_motion(
+        self, *, absolute: bool, turns: bool = False, speed: float | None = None
+    ) -> list[tuple[LdcndError, bool]]:
+        """Return all that keeps the axis from a motion, each cause once: what has stopped its drive one by one.
+
+        Args:
+            absolute: the motion is to a position.
+            turns: it is at a velocity.
+            speed: of it, in units a second; that of moves which name none when missing.
+        """
         able = self.driver.capabilities
         moves = any(command.effect is Effect.MOTION and verb in able for verb, command in AXIS_COMMANDS.items())
         absolute = absolute and Verb.MOVE_ABSOLUTE in able
@@ -288,6 +333,8 @@ class AxisService:
                 causes.append((guards.error_stop(self.tracker, faults), False))
             elif error not in first:
                 causes.append((error, guard is guards.check_stands))
+        if moves:
+            causes += self._violations(Verb.MOVE_VELOCITY if turns else Verb.MOVE_ABSOLUTE, speed)
         if not moves:
             text = f"axis {name}: its drive takes no motion over the line"
             causes.append((NotSupported(text, axis=name, remedy=NO_COMMAND_HELPS), False))

@@ -8,14 +8,15 @@ step of a homing, for the line) is judged by the state at its start, not by the 
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 from ldcnd.axis.guards import TO_MOVE, TO_POWER, Guard, check, require
 from ldcnd.axis.tracker import AxisTracker
-from ldcnd.contract.commands import PinMode, Verb
-from ldcnd.contract.errors import CommandAborted, Remedy, RequestRefused, ShuttingDown, StopLatched, step
+from ldcnd.config.interlocks import InterlockKind
+from ldcnd.contract.commands import PinMode, Verb, kind_of
+from ldcnd.contract.errors import CommandAborted, LdcndError, Remedy, RequestRefused, ShuttingDown, StopLatched, step
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import (
     AnalogMotion,
@@ -77,6 +78,8 @@ class Permit:
         self._right = right
         self._epoch = gate.epoch
         self._begun = False
+        self._kind = InterlockKind(kind_of(verb))
+        self._counts_per_s = 0.0  # of what it has last loaded, or is about to
 
     def still_wanted(self) -> None:
         """Raise when the command was overtaken.
@@ -130,23 +133,31 @@ class Permit:
 
     def to_move(self) -> Condition:
         """Return the condition that `ask_to_move` checks, to be checked again when a packet's turn comes."""
-        return self._condition(TO_MOVE)
+        return self._condition(TO_MOVE, self._kind)
 
-    def _condition(self, guards: tuple[Guard, ...]) -> Condition:
-        begun, tracker = self._begun, self._gate.tracker
+    def _condition(self, guards: tuple[Guard, ...], kind: InterlockKind) -> Condition:
+        begun, gate = self._begun, self._gate
 
         def condition() -> None:
             self._ask(begun=begun)
-            require(guards, tracker)
+            require(guards, gate.tracker)
+            for violation in gate.violations(kind, self._counts_per_s / abs(gate.tracker.status.scale.counts_per_unit)):
+                raise violation
 
         return condition
+
+    def _about_to(self, motion: CountsMotion | AnalogMotion | PwmOutput) -> None:
+        """Take how fast the next motion may become: interlocks may bind only fast ones."""
+        self._counts_per_s = abs(motion.velocity_counts_per_s) if isinstance(motion, CountsMotion) else math.inf
 
     # -- what can move -----------------------------------------------------------------------------------------------
 
     async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator."""
+        self._about_to(motion)
         self.ask_to_move()
         self._gate.expect(motion)
+        self._gate.counts_per_s = self._counts_per_s
         with only_while(self.to_move()):
             await self._gate.driver.load(motion, home=home)
 
@@ -167,21 +178,25 @@ class Permit:
         drive = self._gate.driver
         if Verb.TRACK not in drive.capabilities:
             raise cannot(drive.spec, "track")
+        motion = CountsMotion(position_counts, math.inf, math.inf)
+        self._about_to(motion)
         condition = self.to_move()
         self.begin()
-        self._gate.expect(CountsMotion(position_counts, math.inf, math.inf))
+        self._gate.expect(motion)
+        self._gate.counts_per_s = math.inf
         with only_while(condition):
             await drive.track(position_counts)
 
     async def add_points(self, steps: Sequence[int]) -> PathStatus:
         """Fill the drive's buffer of path points; see `Moves.add_points`. A motion begins only with `start_path`."""
+        self._counts_per_s = self._gate.counts_per_s = math.inf
         self.ask_to_move()
         with only_while(self.to_move()):
             return await self._gate.driver.add_points(steps)
 
     async def power_on(self) -> None:
         """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
-        condition = self._condition(TO_POWER)
+        condition = self._condition(TO_POWER, InterlockKind.POWER_ON)
         condition()
         was_on = self._gate.tracker.status.enabled
         try:
@@ -207,11 +222,21 @@ class Permit:
 
     def announce(self, motion: CountsMotion, *, anywhere: bool = False) -> None:
         """Have readings judged by a motion that the network is about to start; see `PlausibilityGate.expect`."""
+        self._about_to(motion)
         self._gate.expect(motion, anywhere=anywhere)
+        self._gate.counts_per_s = self._counts_per_s
 
     def begin(self) -> None:
         """Note that the next packet begins the motion: conditions made from now on do not ask `not_after`."""
         self._begun = True
+
+
+Violations = Callable[[InterlockKind, float], Iterable[LdcndError]]
+"""Yields what interlocks forbid a kind of motion at a speed with, or to open or to close the loop."""
+
+
+def _no_interlocks(_kind: InterlockKind, _speed: float) -> Iterable[LdcndError]:
+    return ()
 
 
 class Expect(Protocol):
@@ -228,6 +253,8 @@ class Gate:
         driver: of the drive; nothing but permits and the axis's stops uses it.
         tracker: of its state.
         expect: takes each motion that is about to be loaded.
+        violations: yields which interlocks forbid a kind of motion at a speed in units a second, or a change of power.
+        counts_per_s: how fast the latest motion may have the drive turn.
         epoch: number of stops so far; a permit of an earlier epoch is void.
         closed: the daemon ends; no permit holds.
     """
@@ -236,6 +263,8 @@ class Gate:
         self.driver = driver
         self.tracker = tracker
         self.expect = expect
+        self.violations: Violations = _no_interlocks
+        self.counts_per_s = 0.0
         self.epoch = 0
         self._cause = ""
         self.closed = False

@@ -1,5 +1,6 @@
 """Holds the status of one axis: takes events, and tells those who look on what has changed."""
 
+import math
 from collections.abc import Callable
 
 from ldcnd.axis.events import AxisEvent, ReadingTaken
@@ -21,6 +22,7 @@ class AxisTracker:
         name: of the axis.
         status: as of now.
         reading: the latest; None before the first.
+        read_at_s: when it was requested, in loop time.
         proof: that who answers is its drive.
     """
 
@@ -28,6 +30,7 @@ class AxisTracker:
         self.name = status.name
         self.status = status
         self.reading: AxisReading | None = None
+        self.read_at_s = -math.inf
         self.proof = proof
         self._watching: tuple[tuple[str, OnChange], ...] = ()
 
@@ -51,7 +54,7 @@ class AxisTracker:
             timing: of its exchange.
             now_ns: when it was true, UTC.
         """
-        self.reading, before = reading, self.status
+        self.reading, self.read_at_s, before = reading, timing.sent_at_s, self.status
         after = take_reading(before, ReadingTaken(reading, timing.sent_at_s, now_ns))
         if after is not before:  # most readings change nothing
             self._change(before, after)

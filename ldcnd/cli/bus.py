@@ -14,7 +14,15 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, read_whole
-from ldcnd.contract.rig_commands import IoReply, SetIo, SetIoTimer, Snapshot, SnapshotReply
+from ldcnd.contract.rig_commands import (
+    IoReply,
+    OverrideInterlock,
+    OverrideReply,
+    SetIo,
+    SetIoTimer,
+    Snapshot,
+    SnapshotReply,
+)
 from ldcnd.daemon.capture import config_of
 from ldcnd.drives.known import FAMILIES
 from ldcnd.drives.transcript import Describe
@@ -62,14 +70,14 @@ def command() -> None:
 def set_io(
     target: Target, module: str, lines: tuple[str, ...], pwm1: float | None, pwm2: float | None, lease: str | None
 ) -> None:
-    """Set outputs of the I/O module MODULE: `4=high 9=low 5=input`; what is left out stays as it is."""
-    wanted: dict[str, list[int]] = {"high": [], "low": [], "input": []}
+    """Set outputs of the I/O module MODULE: `4=high lock=low 5=input`; what is left out stays as it is."""
+    wanted: dict[str, list[int | str]] = {"high": [], "low": [], "input": []}
     for each in lines:
         line, _, level = each.partition("=")
         if level not in wanted:
             raise click.UsageError(f"{each!r} is not LINE=high, LINE=low or LINE=input")
         try:
-            wanted[level].append(read_whole(line))
+            wanted[level].append(read_whole(line) if line[:1] in "0123456789" else line)
         except NotANumber as error:
             raise click.UsageError(f"{each!r}: {error}") from None
     given = {"high": wanted["high"], "low": wanted["low"], "inputs": wanted["input"]}
@@ -90,6 +98,10 @@ def _counted(reply: IoReply, _axis: AxisInfo | None) -> Shown:
     yield reply, _shown(reply)[1:]
 
 
+def _overridden(reply: OverrideReply, _axis: AxisInfo | None) -> Shown:
+    yield reply, [f"interlock {reply.interlock} is overridden for {reply.seconds:g} s by {reply.client}"]
+
+
 def _snapshot(reply: SnapshotReply, _axis: AxisInfo | None) -> Shown:
     lines = [
         f"{each.axis:8} {each.position:14.6f} {each.unit:8} {each.counts:12d} counts"
@@ -104,6 +116,7 @@ def _snapshot(reply: SnapshotReply, _axis: AxisInfo | None) -> Shown:
 
 
 command.add_command(derived_question("set-io-timer", SetIoTimer, "module", "mode", shows=_counted))
+command.add_command(derived_question("override-interlock", OverrideInterlock, "interlock", shows=_overridden))
 command.add_command(derived_question("snapshot", Snapshot, "bus", shows=_snapshot))
 
 

@@ -128,6 +128,7 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "bus list": "",
     "bus set-io": "io 4=high 9=low",
     "bus set-io-timer": "io counter --prescale 4",
+    "bus override-interlock": "door_shut --seconds 60 --reason service --lease 0123456789abcdef",
     "bus snapshot": "line0",
     "bus wire-log": "line0 --seconds 2 --format words",
     "trace": "take x -c position --samples 200 --out x.csv",

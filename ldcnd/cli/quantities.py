@@ -111,8 +111,12 @@ def sample_text(sample: Sample) -> str:
             at = f"{sample.value:14.4f} {sample.unit}, up to {sample.error:.2g} {sample.unit} behind the edge"
             return f"latch    {at}{_worth(sample)}"
         case IoSample():
+            named = "".join(
+                f", {name} {'not known' if value is None else str(value).lower()}"
+                for name, value in sample.named.items()
+            )
             pins = "".join("01"[level] for level in sample.levels)
-            return f"io       lines 1 to 12 {pins}, A/D {sample.adc}, counter {sample.counter}{_worth(sample)}"
+            return f"io       lines 1 to 12 {pins}, A/D {sample.adc}, counter {sample.counter}{named}{_worth(sample)}"
         case StateSample():
             return f"state    {state_word(sample)}"
         case FaultSample():

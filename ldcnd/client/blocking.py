@@ -178,6 +178,7 @@ class BlockingRig(Facade[rig.Rig]):
     snapshot = _waiting(rig.Rig.snapshot)
     set_io = _waiting(rig.Rig.set_io)
     set_io_timer = _waiting(rig.Rig.set_io_timer)
+    override_interlock = _waiting(rig.Rig.override_interlock)
 
     @property
     def name(self) -> str:

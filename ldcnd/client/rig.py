@@ -27,6 +27,8 @@ from ldcnd.contract.rig_commands import (
     IoTimer,
     LinePath,
     MoveTogether,
+    OverrideInterlock,
+    OverrideReply,
     PreviewTogether,
     PreviewTogetherReply,
     Reload,
@@ -356,9 +358,9 @@ class Rig:
         self,
         module: str,
         *,
-        high: Iterable[int] = (),
-        low: Iterable[int] = (),
-        inputs: Iterable[int] = (),
+        high: Iterable[int | str] = (),
+        low: Iterable[int | str] = (),
+        inputs: Iterable[int | str] = (),
         pwm1: float | None = None,
         pwm2: float | None = None,
         lease: str | None = None,
@@ -367,7 +369,7 @@ class Rig:
 
         Args:
             module: its configured name.
-            high: numbers of lines that are driven high.
+            high: lines, by number or name, that are driven high.
             low: likewise low.
             inputs: lines that are inputs from now on.
             pwm1: share of time for which PWM output 1 is on, 0 to 1.
@@ -393,6 +395,25 @@ class Rig:
         """Choose what the counter of an I/O module counts: `timer`, `counter` (edges of line 10), or `off`."""
         return await self._client.ask(
             SetIoTimer(module=module, mode=IoTimer(mode), prescale=prescale, lease=lease, leases=self._leases())
+        )
+
+    async def override_interlock(self, interlock: str, seconds: float, reason: str) -> OverrideReply:
+        """Lift one interlock for service, for at most 600 s and while this program controls what it binds.
+
+        Args:
+            interlock: its configured name.
+            seconds: how long; 0 takes it back.
+            reason: for events and log.
+
+        Raises:
+            LeaseRequired: nothing is controlled by this program.
+            LeaseHeld: its control does not cover what the interlock binds.
+        """
+        leases = self._leases()
+        if not leases:
+            raise LeaseRequired("nothing is controlled here", remedy="use Rig.control")
+        return await self._client.ask(
+            OverrideInterlock(interlock=interlock, seconds=seconds, reason=reason, lease=leases[0])
         )
 
     async def outcome(self, command_id: str) -> CommandOutcome:

@@ -47,6 +47,7 @@ class ErrorCode(StrEnum):
     WRONG_STATE = "wrong_state"
     REGISTER_UNKNOWN = "register_unknown"
     NOT_REFERENCED = "not_referenced"
+    INTERLOCK_VIOLATED = "interlock_violated"
     STOP_LATCHED = "stop_latched"
     ABORTED = "aborted"
     AXIS_UNREACHABLE = "axis_unreachable"
@@ -396,6 +397,14 @@ class RegisterUnknown(WrongState):
 
     code = ErrorCode.REGISTER_UNKNOWN
     way_out = "send what writes the register; the message names it"
+
+
+class InterlockViolated(RequestRefused):
+    """A requirement that the configuration puts on this motion or output does not hold, or is not known to."""
+
+    code = ErrorCode.INTERLOCK_VIOLATED
+    retryable = True
+    way_out = "see to it that the requirement holds; the message names it"
 
 
 class NotReferenced(RequestRefused):

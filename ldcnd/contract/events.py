@@ -13,6 +13,8 @@ REFERENCE = "reference"
 """The verb of an event of the start: the reference that an earlier daemon has kept holds, or was refused."""
 DRIVE_CHANGED = "drive_changed"
 """The verb of an event that no command has caused: a drive was reset, or changed by another program."""
+INTERLOCK = "interlock"
+"""The verb of an event that no command has caused: an interlock has ended a motion."""
 UNSETTLED = "unsettled"
 """The verb of an event beside that of a motion that did not settle in its time."""
 
@@ -59,13 +61,14 @@ class CommandEvent(Frozen):
     number: int = Field(ge=0)
     """Grows by one with every event of the rig: a gap is filled by a request for what is missing."""
     axis: str
-    """The axis."""
+    """The axis, or the I/O module."""
     command_id: str
     """Id of the command."""
     verb: str
     """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
     motion that did not settle, `reference` for what became of a kept reference, `drive_changed` for a drive that was
-    reset or that another program has changed: these have no request."""
+    reset or that another program has changed, `interlock` for a motion that an interlock has ended, and of an I/O
+    module the situation for which its outputs were set, or `output_differs`: these have no request."""
     client: str | None
     """The client, as it calls itself; not authenticated."""
     login: str | None = None

@@ -230,7 +230,8 @@ class Snapshot(Command[SnapshotReply]):
     """Line to read; it needs `snapshot = true`."""
 
 
-Line = Annotated[int, Field(ge=1, le=12)]
+Line = Annotated[int, Field(ge=1, le=12)] | Annotated[str, Field(max_length=64)]
+"""A line of an I/O module, by its number or its configured name."""
 
 
 class IoReply(Frozen):
@@ -245,9 +246,10 @@ class IoReply(Frozen):
 
 
 class SetIo(Command[IoReply]):
-    """Set outputs of an I/O module; what is left out stays as it is. The daemon has no information on what they switch.
+    """Set outputs of an I/O module; what is left out stays as it is.
 
-    They keep their state when the daemon or its client ends: the module has no watchdog.
+    What they switch the daemon knows only by its interlocks. They keep their state when the daemon is killed: the
+    module has no watchdog.
     """
 
     verb = "set_io"
@@ -256,8 +258,8 @@ class SetIo(Command[IoReply]):
     module: str
     """Configured name of the module."""
     high: tuple[Line, ...] = ()
-    """Lines that are driven high. Only those that are configured as outputs can be; one that becomes an output may be
-    low for the time between two packets."""
+    """Lines, by number or name, that are driven high. Only those that are configured as outputs can be; one that
+    becomes an output may be low for the time between two packets."""
     low: tuple[Line, ...] = ()
     """Lines that are driven low."""
     inputs: tuple[Line, ...] = ()
@@ -299,6 +301,33 @@ class SetIoTimer(Command[IoReply]):
     """Lease, see `set_io`."""
     leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
     """Further leases."""
+
+
+class OverrideReply(Frozen):
+    """The interlock does not bind for a time: the reply to `@cmd/_/override_interlock`."""
+
+    interlock: str
+    """Name of the interlock."""
+    seconds: float
+    """Duration of the override, in seconds; 0 when it was taken back."""
+    client: str
+    """The client that holds the lease."""
+
+
+class OverrideInterlock(Command[OverrideReply]):
+    """Lift one interlock for service, for a time and no longer than the lease lasts; each override is an event."""
+
+    verb = "override_interlock"
+    about = About.RIG
+
+    interlock: str
+    """Name of the interlock."""
+    seconds: float = Field(ge=0, le=600)
+    """Duration, in seconds; 0 takes the override back."""
+    reason: str = Field(min_length=1, max_length=200)
+    """Reason, for events and log."""
+    lease: str
+    """The sender's lease: it must cover the axis that the interlock binds, or all axes on the line of its output."""
 
 
 class Rehearsal(StrEnum):
@@ -445,6 +474,7 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     Snapshot,
     SetIo,
     SetIoTimer,
+    OverrideInterlock,
     Reload,
 )
 """The commands about the rig, those about control and events included."""

@@ -1,5 +1,6 @@
 """Telemetry: what is published on `tele/<axis>/<item>`."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 
 from pydantic import Field
@@ -174,6 +175,9 @@ class IoSample(Sample, IoReading):
 
     volts: tuple[float, ...]
     """The same in volts, 5 V at full scale."""
+    named: Mapping[str, bool | None] = {}
+    """Values of the named inputs, debounced, and levels of the named outputs, true for high; null while one is not
+    known: it changes too fast, or its pin shows another level than was written."""
 
 
 class PastFault(Frozen):

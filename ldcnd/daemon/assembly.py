@@ -23,7 +23,8 @@ from ldcnd.daemon.heartbeat import Heartbeat
 from ldcnd.daemon.leases import Authority, random_token
 from ldcnd.daemon.ledger import EventLog, Ledger
 from ldcnd.daemon.line import BusService
-from ldcnd.daemon.rig import ModuleService, OwnedRig
+from ldcnd.daemon.modules import ModuleService
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.family import OpenLine
@@ -121,7 +122,7 @@ def build_daemon(
     for each in rig.axes.values():
         each.stops.latches = latches
     authority = Authority(rig.axes, required=config.authority == "leased", next_token=next_token)
-    dispatcher = Dispatcher(rig, authority, ledger, events, clock, instance)
+    dispatcher = Dispatcher(rig, authority, ledger, events, clock, instance, config.interlock)
 
     heartbeat = Heartbeat(config.heartbeat, rig) if config.heartbeat else None
     return Daemon(

@@ -21,6 +21,7 @@ from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.heartbeat import Heartbeat
 from ldcnd.daemon.leases import apply_policy
 from ldcnd.daemon.meta import Describing
+from ldcnd.daemon.modules import Situation
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.rig_commands import AnswerReload
 from ldcnd.line.capture import Capture
@@ -155,6 +156,11 @@ class Daemon:
                 serving.append(group.create_task(self._guarded(self._watch_axes()), name="liveliness"))
                 serving.append(group.create_task(self._guarded(self._latches.run()), name="latches"))
                 serving.append(group.create_task(self._guarded(leases.run()), name="leases"))
+                serving.append(group.create_task(self._guarded(self._dispatcher.interlocks.run()), name="interlocks"))
+                serving += [
+                    group.create_task(self._guarded(module.run()), name=f"module {name}")
+                    for name, module in self.rig.modules.items()
+                ]
                 serving.append(group.create_task(self._guarded(self._health.run()), name="health"))
                 if self._heartbeat:
                     serving.append(group.create_task(self._guarded(self._heartbeat.run()), name="heartbeat"))
@@ -167,6 +173,7 @@ class Daemon:
                 for axis in self.rig.axes.values():
                     axis.close()  # first: what waits now would begin behind the stop that its policy sends
                 await self._come_to_rest()
+                await self._leave_outputs()
                 await self._keep_references()
                 await self._latches.settled()
                 if self._failure:
@@ -246,6 +253,13 @@ class Daemon:
             await axis.send_pending_stop()
             await asyncio.sleep(STOP_AGAIN_S)
         await axis.take_gains_back()
+
+    async def _leave_outputs(self) -> None:
+        """The daemon ends: give the outputs the levels that they are to have then; bounded."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(STOP_TIME_S):
+                for module in self.rig.modules.values():
+                    await module.apply(Situation.DAEMON)
 
     async def _keep_references(self) -> None:
         """Keep where each axis is while its line is still up; bounded."""

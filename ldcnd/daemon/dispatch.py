@@ -14,6 +14,7 @@ from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.events import StopLatch
 from ldcnd.axis.permit import UNCONDITIONAL, Permit, Right
+from ldcnd.config.interlocks import InterlockConfig
 from ldcnd.contract.catalogue import BY_VERB, RENAMED
 from ldcnd.contract.codec import decode, encode, reply_encoding, to_json, understand
 from ldcnd.contract.commands import (
@@ -46,6 +47,7 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF, CommandAddress, Keys
 from ldcnd.contract.leases import Acquire
+from ldcnd.daemon.interlocks import Interlocks
 from ldcnd.daemon.leases import Authority, LeaseWatch
 from ldcnd.daemon.ledger import EventLog, Ledger, LedgerEntry
 from ldcnd.daemon.rig import OwnedRig
@@ -326,6 +328,7 @@ class Dispatcher:
         authority: the leases of the rig.
         leases: gives control and ends it.
         events: what happens to its commands.
+        interlocks: what motions and outputs require.
         rivals: instances of the other daemons that serve the same rig; while there is one, nothing is moved.
     """
 
@@ -337,9 +340,11 @@ class Dispatcher:
         events: EventLog,
         clock: Clock,
         instance: str,
+        interlocks: tuple[InterlockConfig, ...] = (),
     ) -> None:
         self.authority = authority
         self.leases = LeaseWatch(rig, authority, events, clock)
+        self.interlocks = Interlocks(interlocks, rig, authority, events)
         self.events = events
         self.rivals: set[str] = set()
         self._journal = Journal(rig)
@@ -349,7 +354,15 @@ class Dispatcher:
         self._clock = clock
         self._under_way: dict[str, asyncio.Event] = {}
         self._rig_commands = RigCommands(
-            rig, authority, self.leases, ledger, events, clock, self.carry_out, self._admit_lease
+            rig,
+            authority,
+            self.leases,
+            ledger,
+            events,
+            clock,
+            self.carry_out,
+            self._admit_lease,
+            interlocks=self.interlocks,
         )
 
     def serve_reloads(self, answer: AnswerReload) -> None:

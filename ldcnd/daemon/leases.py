@@ -30,6 +30,7 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.leases import SHORTEST_LEASE_S, Acquire, LeaseReply
 from ldcnd.contract.samples import Moving
 from ldcnd.daemon.ledger import EventLog
+from ldcnd.daemon.modules import Situation
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.axis_config import LossPolicy
 from ldcnd.drives.driver import StopMode
@@ -339,6 +340,10 @@ class LeaseWatch:
 
     def _lost(self, lease: Lease, axes: Iterable[str], cause: str, code: ErrorCode | None) -> None:
         axes = sorted(axes)
+        if code is ErrorCode.LEASE_EXPIRED:
+            for module in self._rig.modules.values():
+                if not lease.axes.isdisjoint(module.axes):
+                    module.enter(Situation.CLIENT)
         for name in axes:
             axis = self._rig.axes[name]
             self._note(name, lease, CommandStatus.ABORTED, f"{cause}; policy: {axis.config.loss.client.value}", code)

@@ -41,6 +41,7 @@ from ldcnd.contract.rig_commands import (
     LinePath,
     MoveTogether,
     MoveTogetherReply,
+    OverrideInterlock,
     PathReply,
     PreviewTogether,
     PreviewTogetherReply,
@@ -58,10 +59,12 @@ from ldcnd.contract.rig_commands import (
     WalkPath,
     WireLogReply,
 )
+from ldcnd.daemon.interlocks import Interlocks
 from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy
 from ldcnd.daemon.ledger import EventLog, Ledger
 from ldcnd.daemon.line import BusService
-from ldcnd.daemon.rig import ModuleService, OwnedRig
+from ldcnd.daemon.modules import ModuleService
+from ldcnd.daemon.rig import OwnedRig
 from ldcnd.line.flight_recorder import WireRecord
 from ldcnd.log import get_logger
 
@@ -111,6 +114,8 @@ class RigCommands:
         clock: Clock,
         execute: ExecuteFor,
         admit: Admit,
+        *,
+        interlocks: Interlocks,
     ) -> None:
         """Take what the daemon consists of.
 
@@ -123,6 +128,7 @@ class RigCommands:
             clock: of the daemon.
             execute: how a command of one axis is carried out.
             admit: raises when the holder of a lease, or who has none, may not move an axis.
+            interlocks: of the rig.
         """
         self._rig = rig
         self._authority = authority
@@ -132,6 +138,7 @@ class RigCommands:
         self._clock = clock
         self._execute = execute
         self._admit = admit
+        self._interlocks = interlocks
         self.answer_reload: AnswerReload = refuse_reload
 
     async def answer(self, axis: str, command: Command[Frozen], login: str | None) -> Frozen:
@@ -153,6 +160,8 @@ class RigCommands:
             case SetIoTimer():
                 module = self._rig.modules[command.module]
                 return await module.set_timer(command, lambda: self._admit_module(module, command))
+            case OverrideInterlock():
+                return self._interlocks.override(command)
             case Reload():
                 return await self.answer_reload(command, lambda name: self._refuse_held(name, command.leases))
             case Rehearse():
@@ -172,8 +181,11 @@ class RigCommands:
             case Why():
                 return self._why(self._rig.axes[axis], command)
             case Preview():
-                why = self._why(self._rig.axes[axis], Why(absolute=command.position is not None))
-                return self._rig.axes[axis].preview(command, tuple(cause.text for cause in why.causes))
+                service, to_place = self._rig.axes[axis], command.position is not None
+                turns = not to_place and command.distance is None
+                causes = service.obstacles_to_motion(absolute=to_place, turns=turns, speed=command.velocity)
+                not_admitted = refused(lambda: self._admit(axis, None))
+                return service.preview(command, tuple(each.text for each in _causes(service, not_admitted + causes)))
             case ReportShadow():
                 return self._rig.axes[axis].report_shadow(command)
             case PreviewTogether():
@@ -454,13 +466,18 @@ def _bus_of(rig: OwnedRig, name: str) -> BusService:
     return next(bus for bus in rig.buses if any(axis.config.name == name for axis in bus.axes))
 
 
-def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyReply:
-    """Say what forbids a motion of an axis, and each of its commands; `admit` raises what its sender may not."""
-    not_admitted = []
+def refused(admit: Callable[[], None]) -> list[tuple[LdcndError, bool]]:
+    """Return what a check raises as an obstacle, which does not end with a motion; none when it passes."""
     try:
         admit()
     except LdcndError as error:
-        not_admitted.append((error, False))
+        return [(error, False)]
+    return []
+
+
+def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyReply:
+    """Say what forbids a motion of an axis, and each of its commands; `admit` raises what its sender may not."""
+    not_admitted = refused(admit)
     alike: dict[tuple[str, ...], Hindered] = {}
     for verb, command in AXIS_COMMANDS.items() if request.each_command else ():
         asks_right = [] if command.effect is Effect.QUESTION else not_admitted

@@ -11,6 +11,7 @@ from ldcnd.contract.errors import NotSupported
 from ldcnd.contract.meta import ModuleInfo
 from ldcnd.contract.samples import IoReading
 from ldcnd.drives.driver import CountsMotion, Drive, StopMode
+from ldcnd.drives.line_config import InputConfig, OutputConfig
 from ldcnd.line.exchange import Poller, Timing
 from ldcnd.line.proof import Proof
 
@@ -111,12 +112,20 @@ class IoDriver(ABC):
 
     Attributes:
         name: as configured.
+        period_s: from one poll to the next, seconds.
+        inputs: its named inputs.
+        outputs: lines that may be driven, by name.
+        restarted: it was reset or lost its power; whoever acts upon that clears it.
         proof: that who answers is this module.
         observed: called with each reading.
         lost: called when a poll brought nothing.
     """
 
     name: str
+    period_s: float
+    inputs: Mapping[str, InputConfig]
+    outputs: Mapping[str, OutputConfig]
+    restarted: bool
     proof: Proof
     observed: Callable[[IoReading, Timing], None]
     lost: Callable[[], None]
@@ -134,6 +143,10 @@ class IoDriver(ABC):
             WrongState: what the others are is not known, and they are not named.
             BusError: the line failed.
         """
+
+    @abstractmethod
+    def written(self, line: int) -> bool | None:
+        """Return the level that was written to a line, true for high; None when it is no output, or not known."""
 
     @abstractmethod
     async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:

@@ -40,6 +40,7 @@ METHODS_OF_RIGS = {
     "snapshot",
     "set_io",
     "set_io_timer",
+    "override_interlock",
     "reload",
 }
 

@@ -64,6 +64,7 @@ class IoModule(Poller[IoStatus], IoDriver):
     def __init__(self, bus: Bus, entry: ModuleConfig) -> None:
         self.name = entry.name or ""
         self.node = entry.address
+        self.inputs, self.outputs = entry.inputs, entry.outputs
         self.status: int | None = None
         self.due_at_s = asyncio.get_running_loop().time()
         self.deadline_at_s = self.due_at_s
@@ -72,7 +73,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         self.proof = bus.proofs.expect(entry.address, f"module {entry.name}")
         self._bus = bus
         self._node = IoNode(entry.address)
-        self._period_s = 1.0 / entry.rate
+        self.period_s = 1.0 / entry.rate
         self._allowed = _mask(each.line for each in entry.outputs.values())
         self._exchange = poll_io(entry.address)
         names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)
@@ -83,6 +84,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         """The module was reset or lost power: all lines are inputs, PWM is 0, the timer is off (data sheet, 2.2)."""
         names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)
         self._book.note(dict.fromkeys(names, 0), Provenance.RESET)
+        self.restarted = True
 
     def adopted(self) -> None:
         """The module was taken over as it is: what is an output cannot be read.
@@ -91,6 +93,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         them.
         """
         self._book.forget(TAKEN_OVER)
+        self.restarted = False
         inputs = [DIRECTIONS[line] for line in DIRECTIONS if not self._allowed & 1 << line - 1]
         self._book.assume(dict.fromkeys(inputs, 0), "the configuration does not list the line as an output")
 
@@ -98,8 +101,8 @@ class IoModule(Poller[IoStatus], IoDriver):
 
     @override
     def next_exchange(self, now_s: float) -> Exchange[IoStatus]:
-        self.due_at_s = next_on_grid(self.due_at_s, self._period_s, now_s)
-        self.deadline_at_s = self.due_at_s + self._period_s
+        self.due_at_s = next_on_grid(self.due_at_s, self.period_s, now_s)
+        self.deadline_at_s = self.due_at_s + self.period_s
         return self._exchange
 
     @override
@@ -124,6 +127,11 @@ class IoModule(Poller[IoStatus], IoDriver):
             counter=status.counter or 0,
             pwm=None if pwm1 is None or pwm2 is None else (pwm1 / MOST_PWM, pwm2 / MOST_PWM),
         )
+
+    @override
+    def written(self, line: int) -> bool | None:
+        level = self._book.known(LEVELS[line]) if self._book.known(DIRECTIONS[line]) else None
+        return None if level is None else bool(level)
 
     # -- commands ----------------------------------------------------------------------------------------------------
 

@@ -1,0 +1,313 @@
+"""Interlocks at work: asked before a motion, a power-off or an output, watched while motion lasts, lifted for a time.
+
+Whoever is about to change something notes that first and asks afterwards: an axis has a command, an output counts as
+unknown. So of a motion and an output that forbid each other, two requests at one instant never both pass, on whatever
+lines they are.
+"""
+
+import asyncio
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+from ldcnd.axis.axis import AxisService
+from ldcnd.axis.status import MOTION_STATES, AxisStatus
+from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
+from ldcnd.contract.commands import kind_of
+from ldcnd.contract.errors import InterlockViolated, LdcndError, ValueOutOfRange
+from ldcnd.contract.events import INTERLOCK, CommandStatus
+from ldcnd.contract.rig_commands import OverrideInterlock, OverrideReply
+from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.daemon.leases import STOP_MODES, Authority
+from ldcnd.daemon.ledger import EventLog
+from ldcnd.daemon.modules import ModuleService
+from ldcnd.daemon.rig import OwnedRig
+from ldcnd.drives.axis_config import LossPolicy
+from ldcnd.log import get_logger
+
+log = get_logger("interlocks")
+
+Obstacle = Callable[[], str]
+"""Returns in words why a requirement does not hold, or is not known to; empty when it does."""
+
+
+@dataclass(slots=True)
+class Override:
+    """A rule that does not bind for a time.
+
+    Attributes:
+        until_s: when it ends at the latest, in loop time.
+        lease: under which it was asked for; it ends with that.
+        client: the holder.
+    """
+
+    until_s: float
+    lease: str
+    client: str
+
+
+@dataclass(slots=True)
+class Rule:
+    """One rule.
+
+    Attributes:
+        config: of it.
+        axis: what it binds; None for an output.
+        holders: axes whose lease an override needs.
+        requires: its requirements.
+        override: the one in force.
+        reacted: the motion under way is being ended because of it.
+    """
+
+    config: InterlockConfig
+    axis: AxisService | None
+    holders: tuple[str, ...]
+    requires: tuple[Obstacle, ...] = field(default=())
+    override: Override | None = None
+    reacted: bool = False
+
+    def violation(self, what: str, obstacle: str) -> InterlockViolated:
+        """Return the refusal of what it binds."""
+        name = self.config.name
+        return InterlockViolated(
+            f"{what}: interlock {name}: {obstacle}",
+            axis=self.axis.config.name if self.axis else None,
+            value=name,
+            remedy=f"see to it that this holds; for service override_interlock lifts {name} for a time",
+        )
+
+
+class Interlocks:
+    """The rules of one rig."""
+
+    def __init__(
+        self, rules: tuple[InterlockConfig, ...], rig: OwnedRig, authority: Authority, events: EventLog
+    ) -> None:
+        self._rig = rig
+        self._authority = authority
+        self._events = events
+        self._now_s = asyncio.get_running_loop().time
+        self._modules = {name: module for module in rig.modules.values() for name in module.names}
+        self._rules = {config.name: self._rule(config) for config in rules}
+        self._watched = [rule for rule in self._rules.values() if rule.axis and rule.config.reaction != "none"]
+        self._period_s = min((rule.config.within_ms / 1e3 / LOOKS for rule in self._watched), default=math.inf)
+        self._changed = asyncio.Event()
+        for name, axis in rig.axes.items():
+            if own := [rule for rule in self._rules.values() if rule.axis is axis]:
+                axis.interlock(partial(self._violations_of_axis, f"axis {name}", own))
+        for module in rig.modules.values():
+            module.check = self._check_outputs
+            module.changed = self._changed.set
+            module.note = partial(self._note, module.name)
+
+    def _rule(self, config: InterlockConfig) -> Rule:
+        age_s = config.within_ms / 1e3 * (1 - 1 / LOOKS)
+        axis = dict(self._rig.axes).get(config.of)
+        holders = (config.of,) if axis else self._modules[config.of].axes
+        return Rule(config, axis, holders, tuple(self._requirement(each, age_s) for each in config.requires))
+
+    def _note(self, about: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
+        self._events.note(about, verb, status, reason, code=code)
+
+    def _obstacle(self, rule: Rule) -> str:
+        """Return why a rule forbids what it binds; empty when it does not."""
+        if rule.override is not None and self._goes_on(rule, rule.override):
+            return ""
+        for requirement in rule.requires:
+            if text := requirement():
+                return text
+        return ""
+
+    # -- what must hold ----------------------------------------------------------------------------------------------
+
+    def _requirement(self, each: Requirement, age_s: float) -> Obstacle:
+        if each.axis is not None:
+            return partial(self._obstacle_of_axis, self._rig.axes[each.axis], each, age_s)
+        if each.module is not None:
+            return partial(self._obstacle_of_module, self._rig.modules[each.module], age_s)
+        name, what = (each.input, "input") if each.input else (each.output, "output")
+        assert name is not None  # noqa: S101 - a requirement names one of the four
+        return partial(self._obstacle_of_line, self._modules[name], name, what, each.value, age_s)
+
+    def _obstacle_of_module(self, module: ModuleService, age_s: float) -> str:
+        return "" if self._now_s() - module.read_at_s <= age_s else f"module {module.name} does not answer"
+
+    def _obstacle_of_line(self, module: ModuleService, name: str, what: str, wanted: bool, age_s: float) -> str:  # noqa: FBT001
+        if self._now_s() - module.read_at_s > age_s:
+            return f"{what} {name} is not known: module {module.name} does not answer"
+        value = module.value(name)
+        if value is wanted:
+            return ""
+        words = ("true", "false") if what == "input" else ("high", "low")
+        return f"{what} {name} is not known" if value is None else f"{what} {name} is {words[wanted]}"
+
+    def _obstacle_of_axis(self, axis: AxisService, each: Requirement, age_s: float) -> str:
+        tracker, name = axis.tracker, axis.config.name
+        status, reading = tracker.status, tracker.reading
+        if (
+            reading is None
+            or not tracker.proof.holds
+            or status.link is LinkState.DOWN
+            or self._now_s() - tracker.read_at_s > age_s
+        ):
+            return f"axis {name} is not known: its drive does not answer"
+        if each.standstill and not (status.rest.rests is True and not _commanded(status)):
+            return f"axis {name} does not stand, or is not known to"
+        if each.below is not None and (speed := _speed(axis)) >= each.below:
+            unit = status.unit
+            return f"axis {name} may be at {speed:.6g} {unit}/s, which is not below {each.below:g} {unit}/s"
+        in_range = (each.min, each.max) != (None, None)
+        if (each.homed or in_range) and (not status.referenced or status.position_lost):
+            return f"axis {name} is not homed"
+        if in_range:
+            here = status.scale.shown_at(reading.position_counts)
+            if (each.min is not None and here < each.min) or (each.max is not None and here > each.max):
+                return f"axis {name} is at {here:.6g} {status.unit}, outside {each.min} to {each.max}"
+        return ""
+
+    # -- asked -------------------------------------------------------------------------------------------------------
+
+    def _violations_of_axis(
+        self, what: str, rules: list[Rule], kind: InterlockKind, speed: float
+    ) -> Iterator[InterlockViolated]:
+        """Yield what forbids a motion of an axis at a speed, or to open or close its loop."""
+        for rule in rules:
+            above = rule.config.above
+            binds = kind in rule.config.kinds(output=False) and (above is None or speed > above)
+            if binds and (text := self._obstacle(rule)):
+                yield rule.violation(what, text)
+
+    def _check_outputs(self, levels: Mapping[str, bool | None]) -> None:
+        """Refuse to write outputs; see `ModuleService.check`."""
+        for rule in self._rules.values():
+            if rule.axis is not None or rule.config.of not in levels:
+                continue
+            level = levels[rule.config.of]
+            kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW
+            if kind in (None, *rule.config.kinds(output=True)) and (text := self._obstacle(rule)):
+                raise rule.violation(f"output {rule.config.of}", text)
+
+    # -- watched -----------------------------------------------------------------------------------------------------
+
+    async def run(self) -> None:
+        """Look at the motions under way, at each change of an input and often enough, until cancelled."""
+        if not self._rules:
+            return
+        async with asyncio.TaskGroup() as group:
+            while True:
+                try:
+                    async with asyncio.timeout(min(self._period_s, 1.0)):
+                        await self._changed.wait()
+                except TimeoutError:
+                    pass
+                self._changed.clear()
+                for rule in self._rules.values():
+                    if rule.override:
+                        self._goes_on(rule, rule.override)
+                for rule in self._watched:
+                    self._look(rule, group)
+
+    def _look(self, rule: Rule, group: asyncio.TaskGroup) -> None:
+        axis = rule.axis
+        if axis is None:
+            return
+        status = axis.tracker.status
+        # a drive that is out of reach takes nothing; it is looked at when it answers again
+        moves = status.energised and status.link is not LinkState.DOWN
+        if not (moves and (status.rest.rests is False or _commanded(status)) and self._binds(rule, axis, status)):
+            rule.reacted = False
+            return
+        text = self._obstacle(rule)
+        if not text:
+            rule.reacted = False
+            return
+        if rule.reacted:
+            return
+        rule.reacted = True
+        name, reaction = axis.config.name, LossPolicy(rule.config.reaction)
+        log.warning("interlock violated", axis=name, interlock=rule.config.name, reason=text, reaction=reaction.value)
+        error = rule.violation(f"axis {name}", text)
+        reason = f"{error.message}; reaction: {reaction.value}"
+        self._events.note(name, INTERLOCK, CommandStatus.ABORTED, reason, code=error.code.value)
+        group.create_task(axis.stops.bring_to_rest(STOP_MODES[reaction]), name=f"interlock {rule.config.name}")
+
+    def _binds(self, rule: Rule, axis: AxisService, status: AxisStatus) -> bool:
+        """Tell whether a rule binds the motion under way; one without a command is of any kind."""
+        kinds, command = rule.config.kinds(output=False), status.command
+        if command is None or status.state is AxisState.STOPPING:
+            if not any(kind in MOTIONS for kind in kinds):
+                return False
+        elif InterlockKind(kind_of(command.verb)) not in kinds:
+            return False
+        return rule.config.above is None or _speed(axis) > rule.config.above
+
+    # -- overridden --------------------------------------------------------------------------------------------------
+
+    def override(self, command: OverrideInterlock) -> OverrideReply:
+        """Lift a rule for a time, under a lease.
+
+        Raises:
+            ValueOutOfRange: there is no such rule.
+            LdcndError: as `Authority.admit`: the lease does not cover what it binds.
+        """
+        rule = self._rules.get(command.interlock)
+        if rule is None:
+            known = ", ".join(self._rules) or "none"
+            raise ValueOutOfRange(
+                f"there is no interlock {command.interlock!r}; there are: {known}", value=command.interlock, limit=known
+            )
+        client = ""
+        for holder in rule.holders:
+            client = self._authority.admit(holder, command.lease, None, self._now_s()) or client
+        if command.seconds > 0:
+            rule.override = Override(self._now_s() + command.seconds, command.lease, client)
+            self._say(rule, CommandStatus.EXECUTING, f"overridden for {command.seconds:g} s: {command.reason}", client)
+        elif rule.override:
+            self._end_override(rule, rule.override, "taken back")
+        return OverrideReply(interlock=command.interlock, seconds=command.seconds, client=client)
+
+    def _goes_on(self, rule: Rule, override: Override) -> bool:
+        """Tell whether an override is still in force; one that is not is ended."""
+        now_s = self._now_s()
+        if override.until_s <= now_s:
+            self._end_override(rule, override, "its time is over")
+            return False
+        try:
+            for holder in rule.holders:
+                self._authority.check_held(holder, override.lease, now_s)
+        except LdcndError:
+            self._end_override(rule, override, "the lease of its client has ended")
+            return False
+        return True
+
+    def _end_override(self, rule: Rule, override: Override, cause: str) -> None:
+        rule.override = None
+        self._say(rule, CommandStatus.DONE, f"binds again: {cause}", override.client)
+
+    def _say(self, rule: Rule, status: CommandStatus, reason: str, client: str) -> None:
+        log.warning("interlock override", interlock=rule.config.name, reason=reason, client=client)
+        reason = f"interlock {rule.config.name} {reason}"
+        self._events.note(rule.holders[0], OverrideInterlock.verb, status, reason, client=client)
+
+
+def _commanded(status: AxisStatus) -> bool:
+    return status.command is not None and status.state in MOTION_STATES
+
+
+def _speed(axis: AxisService) -> float:
+    """Return how fast an axis is at most, in units a second.
+
+    What a drive shows is whole counts in a servo cycle: of a slow motion its command says more, as long as both agree.
+    """
+    tracker = axis.tracker
+    status, reading = tracker.status, tracker.reading
+    if reading is None:
+        return math.inf
+    shown, resolution = abs(reading.velocity_counts_per_s), reading.velocity_resolution_counts_per_s
+    commanded = axis.commanded_counts_per_s
+    if _commanded(status) and status.state is not AxisState.STOPPING:
+        counts = commanded if shown <= commanded + resolution else shown + resolution
+    else:
+        counts = 0.0 if status.at_rest else shown + resolution
+    return counts / abs(status.scale.counts_per_unit)

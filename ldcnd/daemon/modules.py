@@ -1,0 +1,319 @@
+"""I/O modules under their names: named inputs, debounced, and outputs with a level for each situation, read back."""
+
+import asyncio
+import math
+from collections.abc import Callable, Mapping, Sequence
+from enum import StrEnum
+
+from ldcnd.axis.clock import Clock
+from ldcnd.contract.errors import BusError, LdcndError, MalformedRequest, ValueOutOfRange
+from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer
+from ldcnd.contract.samples import IoReading, Quality, TelemetryItem
+from ldcnd.drives.line_config import InputConfig, OutputConfig, OutputLevel
+from ldcnd.drives.network import IoDriver
+from ldcnd.line.exchange import Timing
+from ldcnd.line.proof import Condition, only_while, until_begun
+from ldcnd.log import get_logger
+from ldcnd.net.publisher import Publisher
+
+FULL_SCALE_V = 5.0
+FULL_SCALE_COUNTS = 255
+MISSES_UNTIL_BAD = 3
+DIFFERS_AFTER = 2
+"""Readings in a row in which a pin shows another level than was written, until the output counts as different."""
+APPLIED_AGAIN_S = 0.5
+"""Pause before outputs are written again whose packets were lost, seconds."""
+log = get_logger("io")
+
+
+class Situation(StrEnum):
+    """What has happened to a module or its clients, for the levels that its outputs have then."""
+
+    START = "start"
+    RESET = "reset"
+    CLIENT = "loss.client"
+    BUS = "loss.bus"
+    DAEMON = "loss.daemon"
+
+    def level_of(self, output: OutputConfig) -> bool | None:
+        """Return the level of an output; None to keep it."""
+        group, _, key = self.value.rpartition(".")
+        level: OutputLevel = getattr(output.loss if group else output, key)
+        return None if level == "keep" else level == "high"
+
+
+class NamedInput:
+    """An input by its name, from the levels that are read.
+
+    Attributes:
+        value: true or false once its level has stayed for its time; None before, and while it changes for too long.
+    """
+
+    def __init__(self, config: InputConfig, period_s: float) -> None:
+        self.line = config.line
+        self.value: bool | None = None
+        self._inverted = config.inverted
+        self._debounce_s = config.debounce_ms / 1e3
+        self._unsettled_s = 2 * (self._debounce_s + period_s)
+        self.forget()
+
+    def forget(self) -> None:
+        """The module is out of reach."""
+        self.value = None
+        self._level: bool | None = None
+        self._since_s = 0.0
+        self._unsettled_since_s: float | None = None
+
+    def take(self, level: bool, at_s: float) -> bool:  # noqa: FBT001 - a level
+        """Take the level of a reading; return whether the value has changed."""
+        level, before = level is not self._inverted, self.value
+        if level is not self._level:
+            self._level, self._since_s = level, at_s
+        if at_s - self._since_s >= self._debounce_s:
+            self.value, self._unsettled_since_s = level, None
+        elif self._unsettled_since_s is None:
+            self._unsettled_since_s = at_s
+        elif at_s - self._unsettled_since_s > self._unsettled_s:
+            self.value = None
+        return self.value is not before
+
+
+class ModuleService:
+    """One module under its name.
+
+    Attributes:
+        name: as configured.
+        axes: on its line, whose leases cover it.
+        read_at_s: when the latest reading was requested, in loop time; minus infinity while it is out of reach.
+        check: raises what forbids to write outputs, each true for high, false for low and None to let go of it.
+        changed: called when an input or what is known of an output has changed.
+        note: takes an event of the module: verb, status, reason and code.
+    """
+
+    def __init__(
+        self,
+        driver: IoDriver,
+        publisher: Publisher,
+        clock: Clock,
+        axes: tuple[str, ...],
+    ) -> None:
+        inputs, outputs = driver.inputs, driver.outputs
+        self.name = driver.name
+        self.axes = axes
+        self.read_at_s = -math.inf
+        self.check: Callable[[Mapping[str, bool | None]], None] = lambda _levels: None
+        self.changed: Callable[[], None] = lambda: None
+        self.note: Callable[[str, CommandStatus, str, str | None], None] = lambda *_: None
+        self._driver = driver
+        self._inputs = {name: NamedInput(config, driver.period_s) for name, config in inputs.items()}
+        self._outputs = outputs
+        self._names = {config.line: name for name, config in outputs.items()}
+        self._lines = {name: each.line for name, each in inputs.items()}
+        self._lines |= {name: each.line for name, each in outputs.items()}
+        self._differs = dict.fromkeys(outputs, 0)
+        self._unread_until_s: dict[str, float] = {}  # outputs of which only what is requested from then on tells
+        self._reading: IoReading | None = None
+        self._clock = clock
+        self._topic = publisher.item(driver.name, TelemetryItem.IO)
+        self._misses = 0
+        self._situation: Situation | None = None
+        self._due = asyncio.Event()
+        self._seen = False
+        self._writes = asyncio.Lock()
+        driver.observed, driver.lost = self._observed, self._lost
+
+    # -- what is known -----------------------------------------------------------------------------------------------
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of its inputs and outputs."""
+        return tuple(self._lines)
+
+    def value(self, name: str) -> bool | None:
+        """Return the value of a named input, or the level of a named output; None when it is not known.
+
+        The level of an output is that of its pin; while it is written or not driven, and while the pin shows another
+        level than was written, it is not known.
+        """
+        if each := self._inputs.get(name):
+            return each.value
+        if self._reading is None or name in self._unread_until_s or self._differs[name] >= DIFFERS_AFTER:
+            return None
+        line, outputs = self._lines[name], self._reading.outputs
+        return None if outputs is not None and line not in outputs else self._reading.levels[line - 1]
+
+    def _observed(self, reading: IoReading, timing: Timing) -> None:
+        if not self._driver.proof.holds:
+            self._lost()
+            return
+        if self._reading is None or self._driver.restarted:
+            self._returned()
+        for name in [name for name, until_s in self._unread_until_s.items() if timing.sent_at_s >= until_s]:
+            del self._unread_until_s[name]
+        self._misses, self._reading, self.read_at_s = 0, reading, timing.sent_at_s
+        changed = False
+        for each in self._inputs.values():
+            changed |= each.take(reading.levels[each.line - 1], timing.true_from_s)
+        for name, config in self._outputs.items():
+            changed |= self._compare(name, config.line, reading)
+        if changed:
+            self.changed()
+        t, t_error_ns = self._clock.stamp(timing)
+        self._topic.publish(
+            {
+                "t": t,
+                "t_error_ns": t_error_ns,
+                "seq": 0,
+                "quality": Quality.GOOD,
+                **dict(reading),
+                "volts": tuple(value / FULL_SCALE_COUNTS * FULL_SCALE_V for value in reading.adc),
+                "named": {name: self.value(name) for name in self._lines if not name.isdigit()},
+            }
+        )
+
+    def _compare(self, name: str, line: int, reading: IoReading) -> bool:
+        """Compare the pin of an output with what was written; return whether it begins to differ or ends to."""
+        written, before = self._driver.written(line), self._differs[name]
+        if written is None or written is reading.levels[line - 1]:
+            self._differs[name] = 0
+            return before >= DIFFERS_AFTER
+        self._differs[name] = min(before + 1, DIFFERS_AFTER)
+        if before != DIFFERS_AFTER - 1:
+            return False
+        reason = f"output {name} was set {_word(written)} and its pin shows {_word(not written)}: check what it drives"
+        log.error("output differs", module=self.name, output=name, reason=reason)
+        self.note("output_differs", CommandStatus.FAILED, reason, None)
+        return True
+
+    def _lost(self) -> None:
+        self._misses += 1
+        if self._misses == MISSES_UNTIL_BAD:
+            self._reading, self.read_at_s = None, -math.inf
+            for each in self._inputs.values():
+                each.forget()
+            self.changed()
+        self._topic.publish_again(Quality.BAD if self._misses >= MISSES_UNTIL_BAD else Quality.UNCERTAIN)
+
+    # -- commands ----------------------------------------------------------------------------------------------------
+
+    async def set_io(self, command: SetIo, condition: Condition) -> IoReply:
+        """Set outputs, if the sender still may and the interlocks allow it when their packets are sent.
+
+        Raises:
+            MalformedRequest: a line is named twice.
+            ValueOutOfRange: there is no such name.
+            LdcndError: as `IoDriver.set_outputs`, as the condition, or as an interlock.
+        """
+        high, low, inputs = (self._numbers(lines) for lines in (command.high, command.low, command.inputs))
+        levels: dict[int, bool] = dict.fromkeys(high, True) | dict.fromkeys(low, False)
+        if twice := sorted(set(high) & set(low)):
+            raise MalformedRequest(f"module {self.name}: line {twice[0]} cannot be high and low", value=twice[0])
+        reading = await self._write(levels, frozenset(inputs), (command.pwm1, command.pwm2), condition)
+        log.info("outputs set", module=self.name, high=high, low=low, inputs=inputs)
+        return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)
+
+    def _numbers(self, lines: Sequence[int | str]) -> tuple[int, ...]:
+        for line in lines:
+            if isinstance(line, str) and line not in self._lines:
+                known = ", ".join(self._lines) or "none"
+                raise ValueOutOfRange(
+                    f"module {self.name}: there is no line {line!r}; its names are {known}", value=line, limit=known
+                )
+        return tuple(self._lines[line] if isinstance(line, str) else line for line in lines)
+
+    async def _write(
+        self,
+        levels: Mapping[int, bool],
+        inputs: frozenset[int],
+        pwm: tuple[float | None, float | None],
+        condition: Condition,
+    ) -> IoReading:
+        asked: dict[str, bool | None] = {self._names[line]: None for line in inputs if line in self._names}
+        asked |= {self._names[line]: level for line, level in levels.items() if line in self._names}
+
+        def permitted() -> None:
+            condition()
+            self.check(asked)
+
+        async with self._writes:
+            self._check(condition)
+            # first of all: motions ask for these outputs, as this asks for motions, and never do both pass
+            self._unread_until_s |= dict.fromkeys(asked, math.inf)
+            try:
+                permitted()
+                with only_while(until_begun(permitted)):
+                    return await self._driver.set_outputs(levels, inputs, pwm)
+            finally:
+                self._unread_until_s |= dict.fromkeys(asked, asyncio.get_running_loop().time())
+
+    async def set_timer(self, command: SetIoTimer, condition: Condition) -> IoReply:
+        """Choose what is counted, if the sender still may when the packet is sent.
+
+        Raises:
+            LdcndError: as `IoDriver.set_timer`, or as the condition.
+        """
+        self._check(condition)
+        enabled, edges = command.mode is not IoTimer.OFF, command.mode is IoTimer.COUNTER
+        with only_while(condition):
+            await self._driver.set_timer(enabled=enabled, counts_edges=edges, prescale=command.prescale)
+        reading = await self._driver.set_outputs({}, frozenset(), (None, None))
+        return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)
+
+    def _check(self, condition: Condition) -> None:
+        """Refuse before anything is noted of outputs: the line asks both again when the turn of a packet has come."""
+        if not self._driver.proof.holds:
+            raise self._driver.proof.refusal()
+        condition()
+
+    # -- situations --------------------------------------------------------------------------------------------------
+
+    def _returned(self) -> None:
+        """The module answers for the first time, or again after it was out of reach."""
+        if self._driver.restarted:
+            self.enter(Situation.RESET if self._seen else Situation.START)
+        elif self._seen:
+            self.enter(Situation.BUS)
+        self._driver.restarted, self._seen = False, True
+
+    def enter(self, situation: Situation) -> None:
+        """Have the outputs written that have a level in a situation."""
+        if any(situation.level_of(output) is not None for output in self._outputs.values()):
+            self._situation = situation
+            self._due.set()
+
+    async def run(self) -> None:
+        """Write what situations call for, until cancelled."""
+        while True:
+            await self._due.wait()
+            self._due.clear()
+            situation, self._situation = self._situation, None
+            if situation and not await self.apply(situation):
+                await asyncio.sleep(APPLIED_AGAIN_S)
+                if not self._due.is_set():
+                    self.enter(situation)
+
+    async def apply(self, situation: Situation) -> bool:
+        """Write the outputs that have a level in a situation; one that may not be written stays as it is.
+
+        Returns False when packets were lost.
+        """
+        complete = True
+        for name, output in self._outputs.items():
+            level = situation.level_of(output)
+            if level is None:
+                continue
+            said = f"output {name} {_word(level)}, its level of {situation.value}"
+            try:
+                await self._write({output.line: level}, frozenset(), (None, None), lambda: None)
+            except LdcndError as error:
+                complete = complete and not isinstance(error, BusError)
+                log.warning("output not set", module=self.name, output=name, reason=error.message)
+                self.note(situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value)
+            else:
+                self.note(situation.value, CommandStatus.DONE, said, None)
+        return complete
+
+
+def _word(level: bool) -> str:  # noqa: FBT001 - a level
+    return "high" if level else "low"

@@ -1,0 +1,369 @@
+"""Interlocks: what motions, power and outputs require: asked, watched while a motion lasts, overridden for a time."""
+
+import asyncio
+
+import pytest
+from pydantic import ValidationError
+
+from ldcnd.contract.commands import (
+    Halt,
+    Home,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    Preview,
+    SetPosition,
+    Stop,
+    Why,
+)
+from ldcnd.contract.errors import InterlockViolated, LeaseHeld, LeaseUnknown
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.leases import Acquire, Release
+from ldcnd.contract.rig_commands import OverrideInterlock, SetIo
+from ldcnd.contract.samples import AxisState
+from tests.support.machine_rig import DOOR_OPENS, DOOR_SHUT, SAFE, Machine, machine, running_machine
+
+SPIN = MoveVelocity(velocity=5.0)
+LOCKED = SetIo(module="cabinet", high=("lock",))
+UNLOCKED = SetIo(module="cabinet", low=("lock",))
+
+
+async def power(rig: Machine, *axes: str) -> None:
+    for axis in axes or ("rotor", "table"):
+        await rig.client.command(axis, Power(on=True))
+
+
+async def locked(rig: Machine) -> None:
+    await rig.client.ask(LOCKED)
+    await rig.named(lock=True, door_closed=True, door_open=False)
+
+
+async def spinning(rig: Machine, speed: float = 5.0) -> None:
+    await locked(rig)
+    await power(rig)
+    await rig.client.command("rotor", MoveVelocity(velocity=speed))
+    await asyncio.sleep(1.0)
+    assert rig.speed() == pytest.approx(speed, rel=0.05)
+
+
+async def refused(rig: Machine, axis: str, command, match: str) -> InterlockViolated:
+    with pytest.raises(InterlockViolated, match=match) as refusal:
+        await rig.client.command(axis, command)
+    return refusal.value
+
+
+async def events(rig: Machine, verb: str) -> list[str]:
+    page = await rig.client.ask(ReadEvents(count=100))
+    return [event.reason or "" for event in page.events if event.verb == verb]
+
+
+# -- each requirement, each kind ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("closed_contact", "open_contact", "lock", "why"),
+    [
+        (False, False, True, "input door_closed is false"),
+        (True, True, True, "input door_open is true"),
+        (True, False, False, "output lock is low"),
+    ],
+)
+async def test_a_motion_is_refused_while_one_of_its_requirements_does_not_hold(closed_contact, open_contact, lock, why):
+    async with running_machine(machine(DOOR_SHUT)) as rig:
+        now_s = asyncio.get_running_loop().time()
+        rig.io.drive_line(3, high=closed_contact, at_s=now_s)
+        rig.io.drive_line(4, high=open_contact, at_s=now_s)
+        await rig.client.ask(LOCKED if lock else UNLOCKED)
+        await rig.named(lock=lock, door_closed=closed_contact, door_open=open_contact)
+        await power(rig)
+
+        refusal = await refused(rig, "rotor", SPIN, f"axis rotor: interlock door_shut: {why}")
+
+        assert (refusal.value, refusal.axis, refusal.page) == ("door_shut", "rotor", "faults/interlock_violated")
+        assert rig.speed() == 0
+        await rig.client.command("rotor", MoveVelocity(velocity=SAFE))  # not above it
+        await rig.client.command("table", SPIN)  # another axis
+
+
+AXIS_RULES = [
+    ({"standstill": True}, "axis table does not stand"),
+    ({"below": 0.5}, "axis table may be at"),
+    ({"min": -1.0, "max": 1.0}, "axis table is not homed"),
+    ({"max": -1.0, "homed": True}, "axis table is not homed"),
+    ({"homed": True}, "axis table is not homed"),
+]
+
+
+@pytest.mark.parametrize(("requirement", "why"), AXIS_RULES)
+async def test_a_motion_requires_another_axis_to_be_so(requirement, why):
+    rule = {"name": "clear", "of": "rotor", "requires": [{"axis": "table", **requirement}]}
+    async with running_machine(machine(rule)) as rig:
+        await power(rig)
+        if "standstill" in requirement or "below" in requirement:
+            await rig.client.command("table", MoveVelocity(velocity=2.0))
+            await refused(rig, "rotor", SPIN, why)  # at once: it is commanded, not yet seen
+            await rig.client.command("table", Halt())
+            await rig.until("table", lambda state: state.state is AxisState.STANDSTILL)
+        else:
+            await refused(rig, "rotor", SPIN, why)
+            await rig.client.command("table", SetPosition(position=-1.0))
+        await rig.client.command("rotor", SPIN)
+
+
+async def test_a_motion_requires_another_axis_to_be_in_a_range():
+    rule = {"name": "clear", "of": "rotor", "requires": [{"axis": "table", "min": 0.0, "max": 1.0}]}
+    async with running_machine(machine(rule)) as rig:
+        await power(rig)
+        await rig.client.command("table", SetPosition(position=1.5))
+        await refused(rig, "rotor", SPIN, r"axis table is at 1.5 rev, outside 0.0 to 1.0")
+        await rig.client.command("table", MoveAbsolute(position=0.5))
+        await rig.until("table", lambda state: state.state is AxisState.STANDSTILL)
+        await rig.client.command("rotor", SPIN)
+
+
+@pytest.mark.parametrize(
+    ("kind", "commands"),
+    [
+        ("position", [MoveRelative(distance=1.0)]),
+        ("velocity", [SPIN]),
+        ("home", [Home(method="index", velocity=1.0)]),
+        ("power_on", [Power(on=True)]),
+    ],
+)
+async def test_a_rule_binds_its_kinds_only(kind, commands):
+    rule = {"name": "shut", "of": "rotor", "kind": [kind], "requires": [{"input": "door_closed"}]}
+    async with running_machine(machine(rule)) as rig:
+        rig.door(closed=False)
+        await rig.named(door_closed=False)
+        kinds = {"position": MoveRelative(distance=0.1), "velocity": MoveVelocity(velocity=0.1)}
+        if kind == "power_on":
+            await refused(rig, "rotor", Power(on=True), "interlock shut")
+            return
+        await power(rig)
+        for command in commands:
+            await refused(rig, "rotor", command, "interlock shut")
+        for other, command in kinds.items():
+            if other != kind:
+                await rig.client.command("rotor", command)
+                break
+
+
+async def test_a_module_that_does_not_answer_forbids_what_requires_it():
+    rule = {"name": "there", "of": "rotor", "requires": [{"module": "cabinet"}]}
+    async with running_machine(machine(rule)) as rig:
+        await power(rig)
+        await rig.client.command("rotor", MoveRelative(distance=0.1))
+        await rig.until("rotor", lambda state: state.state is AxisState.STANDSTILL)
+        rig.io.power(on=False, at_s=asyncio.get_running_loop().time())
+        await asyncio.sleep(0.5)
+        await refused(rig, "rotor", SPIN, "module cabinet does not answer")
+
+
+# -- outputs -----------------------------------------------------------------------------------------------------------
+
+
+async def test_an_output_is_not_written_while_the_rotor_turns_or_is_about_to():
+    async with running_machine(machine(DOOR_OPENS)) as rig:
+        await spinning(rig)
+        with pytest.raises(InterlockViolated, match="output lock: interlock door_opens: axis rotor may be at 5"):
+            await rig.client.ask(UNLOCKED)
+        with pytest.raises(InterlockViolated):
+            await rig.client.ask(SetIo(module="cabinet", inputs=("lock",)))  # to let go of it may open, too
+        await rig.client.ask(LOCKED)
+        await rig.client.command("rotor", Halt())
+        await asyncio.sleep(0.1)
+        with pytest.raises(InterlockViolated):
+            await rig.client.ask(UNLOCKED)
+        await rig.until("rotor", lambda state: state.state is AxisState.STANDSTILL)
+        await rig.client.ask(UNLOCKED)
+
+        assert rig.io.latch & 1 << 9 == 0
+
+
+@pytest.mark.promise("interlock-asked-and-watched")
+@pytest.mark.parametrize("first", ["motion", "output"])
+async def test_a_motion_and_an_output_that_forbid_each_other_never_both_pass(first):
+    async with running_machine(machine(DOOR_SHUT, DOOR_OPENS)) as rig:
+        await locked(rig)
+        await power(rig)
+        motion = rig.client.command("rotor", SPIN)
+        output = rig.client.ask(UNLOCKED)
+        both = (motion, output) if first == "motion" else (output, motion)
+        results = await asyncio.gather(*both, return_exceptions=True)
+
+        assert any(isinstance(result, InterlockViolated) for result in results)
+        await asyncio.sleep(1.0)
+        assert rig.speed() < SAFE or rig.io.latch & 1 << 9
+
+
+# -- watched -----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("reaction", ["halt", "quick_stop", "power_off"])
+async def test_a_motion_is_ended_when_a_requirement_is_lost(reaction):
+    async with running_machine(machine(DOOR_SHUT | {"reaction": reaction})) as rig:
+        await spinning(rig)
+        rig.door(closed=False)
+        await asyncio.sleep(0.1)
+        assert rig.speed() < 5.0 * 0.99
+        await asyncio.sleep(2.0)
+
+        state = await rig.client.state("rotor")
+        assert state.state is (AxisState.DISABLED if reaction == "power_off" else AxisState.STANDSTILL)
+        (said,) = await events(rig, "interlock")
+        assert said == f"axis rotor: interlock door_shut: input door_closed is false; reaction: {reaction}"
+
+
+async def test_a_motion_goes_on_where_the_rule_has_no_reaction():
+    async with running_machine(machine(DOOR_SHUT | {"reaction": "none"})) as rig:
+        await spinning(rig)
+        rig.door(closed=False)
+        await asyncio.sleep(1.0)
+        assert rig.speed() == pytest.approx(5.0, rel=0.05)
+
+
+async def test_a_slow_motion_goes_on_when_only_fast_ones_are_bound():
+    async with running_machine(machine(DOOR_SHUT)) as rig:
+        await locked(rig)
+        await power(rig)
+        await rig.client.command("rotor", MoveVelocity(velocity=0.8))
+        rig.door(closed=False)
+        await asyncio.sleep(1.0)
+        assert rig.speed() == pytest.approx(0.8, rel=0.1)
+
+
+@pytest.mark.promise("interlock-asked-and-watched")
+async def test_a_motion_is_ended_within_the_bound_when_the_module_falls_silent():
+    async with running_machine(machine(DOOR_SHUT | {"within_ms": 200})) as rig:
+        await spinning(rig)
+        rig.io.power(on=False, at_s=asyncio.get_running_loop().time())
+        await asyncio.sleep(0.25)
+        assert rig.speed() < 5.0 * 0.99
+        await asyncio.sleep(1.0)
+        assert rig.speed() == 0
+
+
+# -- power -------------------------------------------------------------------------------------------------------------
+
+HANGING = {"name": "brake", "of": "table", "kind": ["power_off"], "requires": [{"output": "lock"}]}
+
+
+@pytest.mark.promise("interlock-never-a-stop")
+async def test_a_hanging_load_is_held_until_its_brake_is_set_and_stops_are_never_refused():
+    async with running_machine(machine(HANGING)) as rig:
+        await power(rig)
+        await rig.client.command("table", MoveVelocity(velocity=2.0))
+        await refused(rig, "table", Power(on=False), "interlock brake: output lock is not known")
+        await rig.until("table", lambda state: state.state is AxisState.STANDSTILL)  # its motion has ended, it holds
+        await rig.client.command("rotor", Power(on=False))
+        await rig.client.ask(LOCKED)
+        await rig.named(lock=True)
+        await rig.client.command("table", Power(on=False))
+        await rig.until("table", lambda state: state.state is AxisState.DISABLED)
+        await rig.client.ask(UNLOCKED)
+        await rig.named(lock=False)
+        await rig.client.command("table", Power(on=True))
+        reply = await rig.client.stop()
+
+        assert set(reply.confirmed) == {"rotor", "table"}
+
+
+@pytest.mark.promise("interlock-never-a-stop")
+@pytest.mark.parametrize("command", [Halt(), Stop()])
+async def test_what_takes_energy_out_is_asked_no_interlock(command):
+    rules = [
+        {"name": f"n{at}", "of": axis, "kind": ["position", "velocity", "home", "power_on", "power_off"]}
+        | {"requires": [{"input": "door_closed"}], "reaction": "none"}
+        for at, axis in enumerate(("rotor", "table"))
+    ]
+    async with running_machine(machine(*rules)) as rig:
+        await spinning(rig)
+        rig.door(closed=False)
+        await rig.named(door_closed=False)
+        await rig.client.command("rotor", command)
+        await asyncio.sleep(1.5)
+        assert rig.speed() == 0
+
+
+# -- said --------------------------------------------------------------------------------------------------------------
+
+
+async def test_why_and_preview_name_the_interlock():
+    async with running_machine(machine(DOOR_SHUT)) as rig:
+        await locked(rig)
+        await power(rig)
+        assert (await rig.client.ask(Why(absolute=False), "rotor")).can_move
+        rig.door(closed=False)
+        await rig.named(door_closed=False)
+
+        why = await rig.client.ask(Why(absolute=False, each_command=True), "rotor")
+        slow = await rig.client.ask(Preview(velocity=0.5), "rotor")
+        fast = await rig.client.ask(Preview(distance=3.0), "rotor")
+
+        assert [cause.code for cause in why.causes] == ["interlock_violated"]
+        (hindered,) = [each for each in why.commands if "move_velocity" in each.verbs]
+        assert "input door_closed is false" in hindered.causes[0].text
+        assert not slow.obstacles
+        assert "interlock door_shut" in fast.obstacles[0]
+
+
+# -- overridden --------------------------------------------------------------------------------------------------------
+
+
+def lift(seconds: float, lease: str) -> OverrideInterlock:
+    return OverrideInterlock(interlock="door_shut", seconds=seconds, reason="adjusting the door", lease=lease)
+
+
+async def test_an_override_holds_for_its_time_and_its_lease_and_is_recorded():
+    async with running_machine(machine(DOOR_SHUT)) as rig:
+        await power(rig)
+        rig.door(closed=False)
+        await rig.named(door_closed=False)
+        with pytest.raises(LeaseUnknown):
+            await rig.client.ask(lift(60.0, "made up"))
+        table = await rig.client.ask(Acquire(client="bob", axes=("table",), lease_s=60.0))
+        with pytest.raises(LeaseHeld):
+            await rig.client.ask(lift(60.0, table.lease))
+        lease = await rig.client.ask(Acquire(client="ann", axes=("rotor",), lease_s=60.0))
+        spin = SPIN.model_copy(update={"lease": lease.lease})
+        await rig.client.ask(lift(3.0, lease.lease))
+
+        await rig.client.command("rotor", spin)
+        await asyncio.sleep(2.0)
+        assert rig.speed() == pytest.approx(5.0, rel=0.05)
+        await asyncio.sleep(2.0)
+        assert rig.speed() == 0
+        await refused(rig, "rotor", spin, "door_shut")
+        await rig.client.ask(lift(60.0, lease.lease))
+        await rig.client.ask(Release(lease=lease.lease))
+        await refused(rig, "rotor", SPIN, "door_shut")
+
+        assert await events(rig, "override_interlock") == [
+            "interlock door_shut overridden for 3 s: adjusting the door",
+            "interlock door_shut binds again: its time is over",
+            "interlock door_shut overridden for 60 s: adjusting the door",
+            "interlock door_shut binds again: the lease of its client has ended",
+        ]
+
+
+# -- configuration -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"of": "spindle"}, "no axis or output 'spindle'"),
+        ({"kind": ["high"]}, "rotor takes no kind 'high'"),
+        ({"of": "lock", "kind": ["home"], "above": None}, "lock takes no kind 'home'"),
+        ({"of": "lock"}, "above is of the motion of an axis"),
+        ({"requires": [{"input": "dor"}]}, "no input 'dor'; there are: door_closed, door_open"),
+        ({"requires": [{"axis": "table", "input": "door_open"}]}, "exactly one"),
+        ({"requires": [{"input": "door_open", "below": 1.0}]}, "are of an axis"),
+        ({"requires": [{"module": "cabinet", "value": False}]}, "only an input or an output"),
+        ({"within_ms": 30}, "less than two polls"),
+    ],
+)
+def test_impossible_interlocks_are_refused_in_the_configuration(change, said):
+    with pytest.raises(ValidationError, match=said):
+        machine(DOOR_SHUT | change)
