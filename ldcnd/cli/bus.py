@@ -17,7 +17,6 @@ from ldcnd.contract.number_text import NotANumber, read_whole
 from ldcnd.contract.rig_commands import (
     IoReply,
     OverrideInterlock,
-    OverrideReply,
     SetIo,
     SetIoTimer,
     Snapshot,
@@ -85,6 +84,19 @@ def set_io(
     target.show(*_shown(target.run(lambda client: client.ask(request))))
 
 
+@command.command("override-interlock")
+@click.argument("interlock")
+@click.option("--seconds", type=Finite(0, 600), required=True, help="How long; 0 takes it back.")
+@click.option("--reason", required=True, help="For events and log.")
+@click.option("--lease", envvar="LDCND_LEASE", required=True, help="Send it under this lease.")
+@with_target
+def override_interlock(target: Target, interlock: str, seconds: float, reason: str, lease: str) -> None:
+    """Lift the interlock INTERLOCK for service, for a time and as long as the lease lasts."""
+    request = of_options(OverrideInterlock, interlock=interlock, seconds=seconds, reason=reason, lease=lease)
+    reply = target.run(lambda client: client.ask(request))
+    target.show(reply, f"interlock {reply.interlock} is overridden for {reply.seconds:g} s by {reply.client}")
+
+
 def _shown(reply: IoReply) -> tuple[IoReply, str]:
     outputs = "not known" if reply.outputs is None else ", ".join(map(str, reply.outputs)) or "none"
     return reply, f"{reply.module}: {_levels(reply.levels)}; outputs: {outputs}"
@@ -96,10 +108,6 @@ def _levels(levels: tuple[bool, ...]) -> str:
 
 def _counted(reply: IoReply, _axis: AxisInfo | None) -> Shown:
     yield reply, _shown(reply)[1:]
-
-
-def _overridden(reply: OverrideReply, _axis: AxisInfo | None) -> Shown:
-    yield reply, [f"interlock {reply.interlock} is overridden for {reply.seconds:g} s by {reply.client}"]
 
 
 def _snapshot(reply: SnapshotReply, _axis: AxisInfo | None) -> Shown:
@@ -116,7 +124,6 @@ def _snapshot(reply: SnapshotReply, _axis: AxisInfo | None) -> Shown:
 
 
 command.add_command(derived_question("set-io-timer", SetIoTimer, "module", "mode", shows=_counted))
-command.add_command(derived_question("override-interlock", OverrideInterlock, "interlock", shows=_overridden))
 command.add_command(derived_question("snapshot", Snapshot, "bus", shows=_snapshot))
 
 

@@ -87,7 +87,7 @@ class InterlockConfig(Frozen):
     kind: tuple[InterlockKind, ...] = ()
     """What it forbids while a requirement does not hold; without it all motions of the axis, or both levels."""
     above: float | None = Field(default=None, ge=0)
-    """Only motions of the axis that are faster bind, units a second; without it all."""
+    """Speed above which a motion of the axis is bound, units a second; without it every motion is."""
     requires: tuple[Requirement, ...] = Field(min_length=1, max_length=16)
     """What must hold, all of it."""
     reaction: Literal["halt", "quick_stop", "power_off", "none"] = "halt"

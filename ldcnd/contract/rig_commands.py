@@ -230,7 +230,7 @@ class Snapshot(Command[SnapshotReply]):
     """Line to read; it needs `snapshot = true`."""
 
 
-Line = Annotated[int, Field(ge=1, le=12)] | Annotated[str, Field(max_length=64)]
+Line = Annotated[int, Field(ge=1, le=12)] | Annotated[str, Field(pattern="^[a-z][a-z0-9_]*$", max_length=64)]
 """A line of an I/O module, by its number or its configured name."""
 
 

@@ -48,7 +48,7 @@ class Override:
 
 
 @dataclass(slots=True)
-class Rule:
+class BoundRule:
     """One rule.
 
     Attributes:
@@ -101,16 +101,16 @@ class Interlocks:
             module.changed = self._changed.set
             module.note = partial(self._note, module.name)
 
-    def _rule(self, config: InterlockConfig) -> Rule:
+    def _rule(self, config: InterlockConfig) -> BoundRule:
         age_s = config.within_ms / 1e3 * (1 - 1 / LOOKS)
         axis = dict(self._rig.axes).get(config.of)
         holders = (config.of,) if axis else self._modules[config.of].axes
-        return Rule(config, axis, holders, tuple(self._requirement(each, age_s) for each in config.requires))
+        return BoundRule(config, axis, holders, tuple(self._requirement(each, age_s) for each in config.requires))
 
     def _note(self, about: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
         self._events.note(about, verb, status, reason, code=code)
 
-    def _obstacle(self, rule: Rule) -> str:
+    def _obstacle(self, rule: BoundRule) -> str:
         """Return why a rule forbids what it binds; empty when it does not."""
         if rule.override is not None and self._goes_on(rule, rule.override):
             return ""
@@ -169,7 +169,7 @@ class Interlocks:
     # -- asked -------------------------------------------------------------------------------------------------------
 
     def _violations_of_axis(
-        self, what: str, rules: list[Rule], kind: InterlockKind, speed: float
+        self, what: str, rules: list[BoundRule], kind: InterlockKind, speed: float
     ) -> Iterator[InterlockViolated]:
         """Yield what forbids a motion of an axis at a speed, or to open or close its loop."""
         for rule in rules:
@@ -208,7 +208,7 @@ class Interlocks:
                 for rule in self._watched:
                     self._look(rule, group)
 
-    def _look(self, rule: Rule, group: asyncio.TaskGroup) -> None:
+    def _look(self, rule: BoundRule, group: asyncio.TaskGroup) -> None:
         axis = rule.axis
         if axis is None:
             return
@@ -232,7 +232,7 @@ class Interlocks:
         self._events.note(name, INTERLOCK, CommandStatus.ABORTED, reason, code=error.code.value)
         group.create_task(axis.stops.bring_to_rest(STOP_MODES[reaction]), name=f"interlock {rule.config.name}")
 
-    def _binds(self, rule: Rule, axis: AxisService, status: AxisStatus) -> bool:
+    def _binds(self, rule: BoundRule, axis: AxisService, status: AxisStatus) -> bool:
         """Tell whether a rule binds the motion under way; one without a command is of any kind."""
         kinds, command = rule.config.kinds(output=False), status.command
         if command is None or status.state is AxisState.STOPPING:
@@ -267,7 +267,7 @@ class Interlocks:
             self._end_override(rule, rule.override, "taken back")
         return OverrideReply(interlock=command.interlock, seconds=command.seconds, client=client)
 
-    def _goes_on(self, rule: Rule, override: Override) -> bool:
+    def _goes_on(self, rule: BoundRule, override: Override) -> bool:
         """Tell whether an override is still in force; one that is not is ended."""
         now_s = self._now_s()
         if override.until_s <= now_s:
@@ -281,11 +281,11 @@ class Interlocks:
             return False
         return True
 
-    def _end_override(self, rule: Rule, override: Override, cause: str) -> None:
+    def _end_override(self, rule: BoundRule, override: Override, cause: str) -> None:
         rule.override = None
         self._say(rule, CommandStatus.DONE, f"binds again: {cause}", override.client)
 
-    def _say(self, rule: Rule, status: CommandStatus, reason: str, client: str) -> None:
+    def _say(self, rule: BoundRule, status: CommandStatus, reason: str, client: str) -> None:
         log.warning("interlock override", interlock=rule.config.name, reason=reason, client=client)
         reason = f"interlock {rule.config.name} {reason}"
         self._events.note(rule.holders[0], OverrideInterlock.verb, status, reason, client=client)

@@ -301,7 +301,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
         step_counts = tracking.step * abs(self.signed_counts_per_unit)
         for gains in filter(None, (self.gains, *self.gain_sets.values())):
             if step_counts >= gains.el:
-                raise ValueError(f"tracking.step is {step_counts:g} counts, not below the el {gains.el} of its gains")
+                raise ValueError(f"tracking.step is {step_counts:g} counts, not below gains.el {gains.el}")
         if limits.velocity is not None and tracking.step * tracking.rate > limits.velocity:
             raise ValueError(
                 f"tracking.step x rate is {tracking.step * tracking.rate:g}, above limits.velocity {limits.velocity}"

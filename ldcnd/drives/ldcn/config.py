@@ -103,8 +103,8 @@ driven before a request or one of its own keys sets it."""
         lines = [each.line for each in self.inputs.values()] + [each.line for each in self.outputs.values()]
         refuse_duplicates("line", [f"{line}" for line in lines])
         for name, each in named.items():
-            if name.isdigit() and name != f"{each.line}":
-                raise ValueError(f"{name}: a number names the line of that number, and this is line {each.line}")
+            if name[0].isdigit() and name != f"{each.line}":
+                raise ValueError(f"{name}: a name begins with a letter, or is the number {each.line} of its line")
         return self
 
 
