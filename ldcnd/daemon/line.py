@@ -195,6 +195,8 @@ class BusService:
             for axis in self.axes:
                 axis.stops.line_up = False
                 axis.disconnected()
+            for module in self.network.io.values():
+                module.gone()
 
     def _not_up(self, error: LdcndError) -> None:
         """Keep why the line is not up; its axes show whether nothing answers, or something that is not theirs."""

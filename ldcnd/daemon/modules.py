@@ -121,7 +121,7 @@ class ModuleService:
         self._due = asyncio.Event()
         self._seen = False
         self._writes = asyncio.Lock()
-        driver.observed, driver.lost = self._observed, self._lost
+        driver.observed, driver.lost, driver.gone = self._observed, self._lost, self._gone
 
     # -- what is known -----------------------------------------------------------------------------------------------
 
@@ -189,11 +189,15 @@ class ModuleService:
     def _lost(self) -> None:
         self._misses += 1
         if self._misses == MISSES_UNTIL_BAD:
-            self._reading, self.read_at_s = None, -math.inf
-            for each in self._inputs.values():
-                each.forget()
-            self.changed()
+            self._gone()
         self._topic.publish_again(Quality.BAD if self._misses >= MISSES_UNTIL_BAD else Quality.UNCERTAIN)
+
+    def _gone(self) -> None:
+        """It is out of reach: nothing is known of its lines."""
+        self._reading, self.read_at_s = None, -math.inf
+        for each in self._inputs.values():
+            each.forget()
+        self.changed()
 
     # -- commands ----------------------------------------------------------------------------------------------------
 

@@ -119,6 +119,7 @@ class IoDriver(ABC):
         proof: that who answers is this module.
         observed: called with each reading.
         lost: called when a poll brought nothing.
+        gone: called when its line is lost.
     """
 
     name: str
@@ -129,6 +130,7 @@ class IoDriver(ABC):
     proof: Proof
     observed: Callable[[IoReading, Timing], None]
     lost: Callable[[], None]
+    gone: Callable[[], None]
 
     @abstractmethod
     async def set_outputs(

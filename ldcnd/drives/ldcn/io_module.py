@@ -70,6 +70,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         self.deadline_at_s = self.due_at_s
         self.observed: Callable[[IoReading, Timing], None] = lambda _reading, _timing: None
         self.lost: Callable[[], None] = lambda: None
+        self.gone: Callable[[], None] = lambda: None
         self.proof = bus.proofs.expect(entry.address, f"module {entry.name}")
         self._bus = bus
         self._node = IoNode(entry.address)

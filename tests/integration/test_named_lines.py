@@ -1,0 +1,160 @@
+"""Named lines of a PIC-I/O: debounced and inverted inputs, outputs with a level for each situation, read back."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.client.rig import Rig
+from ldcnd.contract.commands import MoveVelocity, Power
+from ldcnd.contract.errors import InterlockViolated, ValueOutOfRange
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.leases import Acquire, Release
+from ldcnd.contract.rig_commands import SetIo
+from ldcnd.daemon.modules import NamedInput
+from ldcnd.drives.line_config import InputConfig
+from ldcnd.sim.chain import Chain
+from tests.support.machine_rig import DOOR_OPENS, LOCK, Machine, chain_of_machine, machine, running_machine
+
+HIGH, LOW = 1 << LOCK - 1, 0
+
+
+def with_lock(**levels: object) -> dict[str, object]:
+    return {"outputs": {"lock": {"line": LOCK, **levels}}}
+
+
+async def events(rig: Machine) -> list[tuple[str, str | None]]:
+    page = await rig.client.ask(ReadEvents(axis="cabinet", count=100))
+    return [(event.verb, event.reason) for event in page.events]
+
+
+def driven(rig: Machine) -> int | None:
+    """Return the level of the lock as the simulated module drives it; None when it does not."""
+    return rig.io.latch & HIGH if rig.io.outputs & HIGH else None
+
+
+async def power_cycle(rig: Machine, off_s: float = 1.0) -> None:
+    rig.io.power(on=False, at_s=asyncio.get_running_loop().time())
+    await asyncio.sleep(off_s)
+    rig.io.power(on=True, at_s=asyncio.get_running_loop().time())
+    await asyncio.sleep(5.0)
+
+
+async def test_a_line_is_set_and_shown_by_its_name():
+    async with running_machine(machine()) as rig:
+        client = Rig(rig.client, await rig.client.daemon())
+        assert (await rig.named(door_closed=True)).named == {"door_closed": True, "door_open": False, "lock": None}
+        await client.set_io("cabinet", high=["lock"])
+        assert (await rig.named(lock=True)).outputs == (LOCK,)
+        await client.set_io("cabinet", low=[LOCK])
+        await rig.named(lock=False)
+        with pytest.raises(ValueOutOfRange, match="no line 'loc'; its names are door_closed, door_open, lock"):
+            await client.set_io("cabinet", high=["loc"])
+        assert driven(rig) == LOW
+
+
+async def test_an_inverted_input_is_true_while_its_level_is_low():
+    inputs = {"door_closed": {"line": 3, "inverted": True}, "door_open": {"line": 4, "inverted": True}}
+    async with running_machine(machine(module={"inputs": inputs})) as rig:
+        await rig.named(door_closed=False, door_open=True)
+
+
+READINGS = [
+    ("a level counts once it has stayed", [(0.0, 1), (0.05, 1), (0.1, 1)], [None, None, True]),
+    ("a short change does not", [(0.0, 1), (0.1, 1), (0.15, 0), (0.2, 1), (0.3, 1)], [None, True, True, True, True]),
+    ("a lasting one does", [(0.0, 1), (0.1, 1), (0.15, 0), (0.2, 0), (0.25, 0)], [None, True, True, True, False]),
+    (
+        "one that goes on changing is unknown, until it stays",
+        [(0.0, 1), (0.1, 1), *((0.1 + at / 20, at % 2) for at in range(1, 9)), (0.55, 0), (0.6, 0), (0.65, 0)],
+        [None, *[True] * 8, None, None, False, False],
+    ),
+]
+
+
+@pytest.mark.parametrize(("_what", "readings", "values"), READINGS, ids=[each[0] for each in READINGS])
+def test_an_input_is_debounced(_what, readings, values):
+    found = NamedInput(InputConfig(line=1, debounce_ms=100), 0.05)
+    shown = []
+    for at_s, level in readings:
+        found.take(bool(level), at_s + 1e-9 * at_s)
+        shown.append(found.value)
+
+    assert shown == values
+
+
+@pytest.mark.promise("outputs-by-command")
+async def test_an_output_has_its_level_at_the_start_and_after_a_loss_of_power():
+    async with running_machine(machine(module=with_lock(start="high", reset="low"))) as rig:
+        await rig.named(lock=True)
+        assert driven(rig) == HIGH
+        await power_cycle(rig)
+        assert driven(rig) == LOW
+
+        assert await events(rig) == [
+            ("start", "output lock high, its level of start"),
+            ("reset", "output lock low, its level of reset"),
+        ]
+
+
+async def adopted(chain: Chain, **levels: object) -> int | None:
+    async with running_machine(machine(module=with_lock()), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",)))
+        await rig.named(lock=True)
+    async with running_machine(machine(module=with_lock(**levels), start="adopt"), chain) as rig:
+        await rig.named(lock=True)  # its pin says so
+        return driven(rig)
+
+
+async def test_a_module_that_is_taken_over_keeps_its_outputs():
+    assert await adopted(chain_of_machine(), start="low", reset="low", loss={"bus": "low"}) == HIGH
+
+
+async def test_an_output_has_its_level_after_the_loss_of_its_client_and_keeps_it_after_a_release():
+    async with running_machine(machine(module=with_lock(loss={"client": "low"}))) as rig:
+        lease = (await rig.client.ask(Acquire(client="ann", axes=("rotor", "table")))).lease
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",), lease=lease))
+        await rig.client.ask(Release(lease=lease))
+        await asyncio.sleep(2.0)
+        assert driven(rig) == HIGH
+        await rig.client.ask(Acquire(client="ann", axes=("rotor",)))
+        await asyncio.sleep(2.0)
+        assert driven(rig) == LOW
+
+
+async def test_an_output_has_its_level_after_a_loss_of_the_line_and_at_the_end_of_the_daemon():
+    chain = chain_of_machine()
+    async with running_machine(machine(module=with_lock(loss={"bus": "high", "daemon": "low"})), chain) as rig:
+        await rig.client.ask(SetIo(module="cabinet", low=("lock",)))
+        rig.daemon.rig.lines["line"].bus.drop("a cable that comes loose")
+        await asyncio.sleep(10.0)
+        assert driven(rig) == HIGH
+    assert chain.modules[2].latch & HIGH == LOW
+
+
+async def test_a_level_that_an_interlock_forbids_is_not_written():
+    async with running_machine(machine(DOOR_OPENS, module=with_lock(loss={"client": "low"}))) as rig:
+        lease = (await rig.client.ask(Acquire(client="ann", lease_s=2.0))).lease
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",), lease=lease))
+        await rig.client.command("rotor", Power(on=True, lease=lease))
+        await rig.client.command("rotor", MoveVelocity(velocity=5.0, lease=lease))
+        await asyncio.sleep(3.0)
+
+        assert driven(rig) == HIGH
+        ((verb, reason),) = await events(rig)
+        assert verb == "loss.client"
+        assert "not set: output lock low, its level of loss.client: output lock: interlock door_opens" in reason
+
+
+async def test_an_output_whose_pin_shows_another_level_is_reported_and_unknown():
+    rule = {"name": "lock_shut", "of": "rotor", "requires": [{"output": "lock"}]}
+    async with running_machine(machine(rule)) as rig:
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",)))
+        await rig.named(lock=True)
+        await rig.client.command("rotor", Power(on=True))
+        rig.io.latch = LOW  # as a short circuit or another host has it
+        await rig.named(lock=None)
+
+        assert await events(rig) == [
+            ("output_differs", "output lock was set high and its pin shows low: check what it drives")
+        ]
+        with pytest.raises(InterlockViolated, match="output lock is not known"):
+            await rig.client.command("rotor", MoveVelocity(velocity=1.0))
