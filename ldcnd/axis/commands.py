@@ -33,8 +33,10 @@ from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
     CommandReply,
+    Effect,
     Home,
     Jog,
+    MotionKind,
     Move,
     MoveAbsolute,
     MoveAnalog,
@@ -49,6 +51,7 @@ from ldcnd.contract.commands import (
     SetPwm,
     Track,
     Verb,
+    kind_of,
 )
 from ldcnd.contract.errors import (
     CommandAborted,
@@ -118,6 +121,8 @@ class AxisCommands:
         carry_out = self._CARRIED_OUT.get(type(request))
         if carry_out is None:
             raise self._cannot(permit)
+        if request.effect is Effect.MOTION:
+            self.gains.choose(kind_of(request.verb))
         return await carry_out(self, permit, request)
 
     def _cannot(self, permit: Permit) -> NotSupported:
@@ -257,6 +262,7 @@ class AxisCommands:
             raise self._cannot(permit)  # a drive that can be switched off takes that as a stop
         permit.check_state()
         await self._motion.check_does_not_coast()
+        self.gains.choose(MotionKind.POSITION)
         guards.check_has_gains(self._driver)
         await permit.power_on()
         self._drop_procedure()
@@ -303,6 +309,7 @@ class AxisCommands:
             self._driver.retargets
             and not isinstance(request, Jog)
             and not isinstance(self.procedure, PathMember)
+            and not self.gains.switches(kind_of(request.verb))
             and request.buffer_mode is BufferMode.ABORTING
             and tracker.status.command is not None
             and tracker.status.command.verb in MOVES

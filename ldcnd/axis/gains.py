@@ -1,34 +1,60 @@
-"""The gains of one axis: those that it has, and those that a client has lent it for as long as its lease lasts."""
+"""The gains of one axis: those of each kind of motion, and those that a client has lent it while its lease lasts."""
 
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 from ldcnd.axis import guards
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
-from ldcnd.contract.commands import CommandReply, SetGains
+from ldcnd.axis.status import MOTION_STATES
+from ldcnd.contract.commands import CommandReply, MotionKind, SetGains
 from ldcnd.contract.errors import LeaseRequired, Remedy, ValueOutOfRange, WrongState, step
 from ldcnd.drives.driver import Gains
 
 
 class AxisGains:
-    """Loads gains, and takes back those that were lent."""
+    """Loads gains, chooses those of each kind of motion, and takes back those that were lent."""
 
     def __init__(self, motion: AxisMotion) -> None:
         self._motion = motion
         self._name = motion.config.name
         self._own: Gains | None = None  # of the axis while a client has lent it others
+        config = motion.config
+        self._sets = {name: Gains(**each.model_dump()) for name, each in config.gain_sets.items()}
+        self._of_kinds = {kind: self._sets[name] for kind, name in config.gains_for.items()}
+        self._of_others = motion.driver.gains if self._of_kinds else None
+
+    def _wanted(self, kind: MotionKind) -> Gains | None:
+        """Return the gains for a kind of motion; None where it makes no difference."""
+        return self._of_kinds.get(kind, self._of_others) if self._of_kinds and self._own is None else None
+
+    def switches(self, kind: MotionKind) -> bool:
+        """Tell whether a kind of motion takes other gains than the drive is to hold now."""
+        return self._wanted(kind) not in (None, self._motion.driver.gains)
+
+    def choose(self, kind: MotionKind) -> None:
+        """Have the drive hold the gains of a kind of motion, loaded before its first packet, if the axis stands.
+
+        Set Gain acts at once: in mid-motion it would change the force on a shaft that lags behind.
+        """
+        wanted = self._wanted(kind)
+        if wanted is not None and self._motion.tracker.status.state not in MOTION_STATES:
+            self._motion.driver.gains = wanted
 
     async def set(self, permit: Permit, request: SetGains) -> CommandReply:
         """Load gains: those that the request names, the others as they are; they act at once.
 
         Raises:
-            WrongState: the axis has none yet and the request lacks some, or the servo rate would change in motion.
-            ValueOutOfRange: the position error limit is not above a tracking step.
+            WrongState: the axis has none yet and the request lacks some, or the servo rate or the set would change in
+                motion.
+            ValueOutOfRange: there is no such set, or the position error limit is not above a tracking step.
             LeaseRequired: gains are to be lent, and the request names no lease.
         """
         permit.check_state()
         asked = {name: value for name in Gains.__slots__ if (value := getattr(request, name, None)) is not None}
+        if request.gain_set is not None:
+            guards.check_stands(self._motion.tracker)
+            asked = asdict(self._named(request.gain_set)) | asked
         held = self._motion.driver.gains
         if held is None and not {"kp", "el"} <= asked.keys():
             raise WrongState(
@@ -44,6 +70,7 @@ class AxisGains:
         if not request.lent:
             await permit.set_gains(changed)
             self._own = None
+            self._of_others = self._of_others and replace(self._of_others, **asked)
             return self._motion.reply(permit)
         if request.lease is None:
             raise LeaseRequired(
@@ -54,6 +81,18 @@ class AxisGains:
         self._own = self._own or gains  # before they are sent: a lost reply leaves open which ones act
         await permit.set_gains(changed)
         return self._motion.reply(permit)
+
+    def _named(self, name: str) -> Gains:
+        if name not in self._sets:
+            known = ", ".join(self._sets) or "none"
+            raise ValueOutOfRange(
+                f"axis {self._name} has no set of gains {name!r}; it has {known}",
+                axis=self._name,
+                value=name,
+                limit=known,
+                remedy="configure it in gain_sets",
+            )
+        return self._sets[name]
 
     def take_back(self) -> bool:
         """Have the drive hold the gains of the axis from its next motion on; tell whether others were lent to it."""

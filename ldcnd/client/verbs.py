@@ -283,6 +283,7 @@ class AxisVerbs(ABC):
     async def set_gains(
         self,
         *,
+        gain_set: str | None = None,
         kp: int | None = None,
         kd: int | None = None,
         ki: int | None = None,
@@ -297,6 +298,7 @@ class AxisVerbs(ABC):
         """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are.
 
         Args:
+            gain_set: Configured set of gains to load, at standstill; values besides it replace its own.
             kp: Position gain.
             kd: Velocity gain.
             ki: Integral gain.
@@ -311,7 +313,9 @@ class AxisVerbs(ABC):
                 the gains of before are loaded again before it closes. It needs a lease.
         """
         return await self._send(
-            lambda: SetGains(kp=kp, kd=kd, ki=ki, il=il, ol=ol, cl=cl, el=el, deadband=deadband, sr=sr, lent=lent)
+            lambda: SetGains(
+                gain_set=gain_set, kp=kp, kd=kd, ki=ki, il=il, ol=ol, cl=cl, el=el, deadband=deadband, sr=sr, lent=lent
+            )
         )
 
     async def list_parameters(self) -> ParameterList:

@@ -563,10 +563,15 @@ class SetPosition(AxisCommand[CommandReply]):
 
 
 class SetGains(AxisCommand[CommandReply]):
-    """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are."""
+    """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are.
+
+    Motions of a kind for which the configuration names a set have that set again from the next one on.
+    """
 
     verb = Verb.SET_GAINS
 
+    gain_set: str | None = Field(default=None, max_length=LONGEST_NAME)
+    """Configured set of gains to load, at standstill; values besides it replace its own."""
     kp: int | None = Field(default=None, ge=0, le=0x7FFF)
     """Position gain."""
     kd: int | None = Field(default=None, ge=0, le=0x7FFF)

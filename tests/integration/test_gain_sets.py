@@ -1,0 +1,134 @@
+"""Sets of gains by name and by kind of motion: switched at standstill, and back after faults and restarts."""
+
+import asyncio
+
+import pytest
+from pydantic import ValidationError
+
+from ldcnd.contract.commands import (
+    BufferMode,
+    Halt,
+    Home,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    Reset,
+    SetGains,
+    SetPosition,
+    Stop,
+)
+from ldcnd.contract.errors import ValueOutOfRange, WrongState
+from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.sim.ldcn.drive import SimulatedDrive
+from tests.support.machine_rig import GAINS, Machine, machine, running_machine
+
+SETS = {
+    "gentle": GAINS | {"kp": 40, "ol": 90, "el": 2000},
+    "spin": GAINS | {"kp": 30, "el": 12_000},
+}
+AXIS = {"gain_sets": SETS, "gains_for": {"home": "gentle", "velocity": "spin"}}
+
+
+def held(rig: Machine) -> tuple[int, int, int]:
+    """Return kp, ol and el that the drive of the rotor holds."""
+    drive = rig.chain.modules[0]
+    assert isinstance(drive, SimulatedDrive)
+    gains = drive.loop.gains
+    return gains.kp, gains.ol, gains.el
+
+
+POSITION, GENTLE, SPIN = (60, 250, 8000), (40, 90, 2000), (30, 250, 12_000)
+
+
+async def stands(rig: Machine) -> None:
+    await rig.until(
+        "rotor", lambda state: state.state in (AxisState.STANDSTILL, AxisState.DISABLED) and not state.command
+    )
+
+
+async def test_each_kind_of_motion_has_its_gains_from_standstill_on():
+    async with running_machine(machine(axis=AXIS)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        assert held(rig) == POSITION
+        await rig.client.command("rotor", MoveVelocity(velocity=2.0))
+        assert held(rig) == SPIN
+        await rig.client.command("rotor", Halt())
+        await stands(rig)
+        assert held(rig) == SPIN  # until another motion begins
+        await rig.client.command("rotor", MoveRelative(distance=0.5))
+        assert held(rig) == POSITION
+        await stands(rig)
+        await rig.client.command("rotor", Home(method="index", velocity=0.5))
+        assert held(rig) == GENTLE
+        info = {each.name: each.value for each in (await rig.client.axes())[0].registers}
+        assert (info["kp"], info["ol"], info["el"]) == GENTLE
+
+
+async def test_a_motion_with_other_gains_does_not_go_on_from_one_under_way():
+    async with running_machine(machine(axis=AXIS)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", SetPosition(position=0.0))
+        await rig.client.command("rotor", MoveVelocity(velocity=5.0))
+        await asyncio.sleep(1.0)
+        slowest = [rig.speed()]
+        move = asyncio.create_task(
+            rig.client.command("rotor", MoveAbsolute(position=30.0, buffer_mode=BufferMode.ABORTING))
+        )
+        while not move.done():
+            await asyncio.sleep(0.005)
+            slowest.append(rig.speed())
+            assert held(rig) == SPIN or min(slowest) < 0.2  # it stands, and settles
+        await move
+        assert held(rig) == POSITION
+
+
+@pytest.mark.parametrize("what", ["stop", "power lost"])
+async def test_the_gains_of_the_position_are_back_after_a_fault_and_a_restart(what):
+    async with running_machine(machine(axis=AXIS)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", MoveVelocity(velocity=2.0))
+        if what == "stop":
+            await rig.client.command("rotor", Stop())
+            await asyncio.sleep(1.0)
+        else:
+            drive = rig.chain.modules[0]
+            drive.power(on=False, at_s=asyncio.get_running_loop().time())
+            await asyncio.sleep(1.0)
+            drive.power(on=True, at_s=asyncio.get_running_loop().time())
+            await rig.until("rotor", lambda state: state.link is LinkState.UP)
+            await asyncio.sleep(1.0)
+        await rig.client.command("rotor", Reset())
+        await rig.client.command("rotor", Power(on=True))
+        assert held(rig) == POSITION
+        await rig.client.command("rotor", MoveVelocity(velocity=2.0))
+        assert held(rig) == SPIN
+
+
+async def test_a_set_is_loaded_by_its_name_at_standstill():
+    async with running_machine(machine(axis=AXIS)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", SetGains(gain_set="gentle", ol=100))
+        assert held(rig) == (40, 100, 2000)
+        await rig.client.command("rotor", MoveRelative(distance=0.5))  # of a kind without a set
+        assert held(rig) == (40, 100, 2000)
+        with pytest.raises(WrongState):
+            await rig.client.command("rotor", SetGains(gain_set="spin"))
+        await stands(rig)
+        with pytest.raises(ValueOutOfRange, match="no set of gains 'fast'; it has gentle, spin"):
+            await rig.client.command("rotor", SetGains(gain_set="fast"))
+        await rig.client.command("rotor", MoveVelocity(velocity=2.0))
+        assert held(rig) == SPIN
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"gains_for": {"home": "soft"}}, "no set 'soft' in gain_sets"),
+        ({"gain_sets": {"spin": GAINS | {"sr": 3}}}, "its sr is not that of gains"),
+        ({"gain_sets": {"spin": GAINS | {"cl": 2, "ol": 300}}}, "ol"),
+    ],
+)
+def test_impossible_sets_are_refused_in_the_configuration(change, said):
+    with pytest.raises(ValidationError, match=said):
+        machine(axis=AXIS | change)
