@@ -142,7 +142,7 @@ async def load(axis: Axis, gains: dict[str, int]) -> None:
         WrongState: it does not come to rest.
     """
     await open_loop(axis)
-    await axis.set_gains(**gains, lent=False)
+    await axis.set_gains(gain_set=None, **gains, lent=False)
 
 
 async def restore(axis: Axis, kept: KeptGains) -> None:

@@ -157,7 +157,7 @@ class MotorDirection(Step):
         # from half the position error limit on the output is at its limit
         kp = min(math.ceil(2 * PWM_PER_GAIN * output / el), REGISTER_MOST)
         lowered = {"kp": kp, "kd": min(DAMPING * kp, REGISTER_MOST), "ki": 0, "il": 0, "ol": output, "el": el}
-        await axis.set_gains(**lowered, lent=True)
+        await axis.set_gains(gain_set=None, **lowered, lent=True)
         sign = -1 if site.info.direction == "reverse" else 1
         before = await rest_counts(axis)
         lead = _lead(site, el)

@@ -264,7 +264,7 @@ class _Trials:
     async def _try(self, trial: Trial) -> TrialOutcome:
         axis, counts_per_unit = self._axis, self._plan.counts_per_unit
         from_counts = await self.rest_counts()
-        await axis.set_gains(**registers_of(trial.gains, self._old), lent=True)
+        await axis.set_gains(gain_set=None, **registers_of(trial.gains, self._old), lent=True)
         await axis.power(on=True)
         try:
             samples = math.ceil((trial.lasts_s + LEAD_S) / self.interval_s)
