@@ -270,6 +270,8 @@ class RigClient:
         if not answers:
             whose = "" if axis == RIG_ITSELF else f"axis {axis}: "
             raise await self._unanswered(f"{whose}{command.verb}")
+        if command.takes_energy_out:
+            answers = [_of_everyone(answers)]
         return self._one(answers, command.reply_model())
 
     async def stop(self, axis: str | None = None, timeout_s: float = 5.0, client: str | None = None) -> StopReply:
@@ -279,7 +281,19 @@ class RigClient:
         answers = await self.session.query(
             self.keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True, everyone=True
         )
-        return self._one(answers, StopReply)
+        replies = [self._decoded(answer, StopReply) for answer in answers if not answer.is_error]
+        if not replies:
+            return self._one(answers, StopReply)
+        # the drives confirm it to the daemon that has the line: whichever of them says so, it is so
+        axes = tuple(dict.fromkeys(name for reply in replies for name in reply.axes))
+        confirmed, kept = (
+            {name for reply in replies for name in getattr(reply, what)} for what in ("confirmed", "kept")
+        )
+        return StopReply(
+            axes=axes,
+            confirmed=tuple(name for name in axes if name in confirmed),
+            kept=tuple(name for name in axes if name in kept),
+        )
 
     async def position(self, axis: str) -> PositionSample | None:
         """Return the axis's last position, or None when there is none yet."""
@@ -409,6 +423,18 @@ class RigClient:
         if answer.is_error:
             raise decode_error(answer.payload, answer.encoding)
         return decode_received(model, answer.payload, answer.encoding)
+
+
+def _of_everyone(answers: list[Answer]) -> Answer:
+    """Return the answer to what was asked of all daemons of a rig, of which one has the line: what it achieved there.
+
+    Another one that refuses, as at its end, hides no success, and no outcome that is not known.
+    """
+    accepted = [answer for answer in answers if not answer.is_error]
+    unknown = (
+        answer for answer in answers if isinstance(decode_error(answer.payload, answer.encoding), OutcomeUnknown)
+    )
+    return accepted[-1] if accepted else next(unknown, answers[-1])
 
 
 async def find_rigs(session: Session) -> list[DaemonInfo]:

@@ -15,8 +15,10 @@ from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.codec import Encoding, encode
-from ldcnd.contract.commands import Power, SetPosition
+from ldcnd.contract.commands import Halt, MoveVelocity, Power, SetPosition
+from ldcnd.contract.errors import ShuttingDown
 from ldcnd.contract.health import DaemonHealth
+from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample, Quality, StateSample
 from ldcnd.lab.epics.gateway import gateway
 from ldcnd.lab.recording.recorder import Recorder
@@ -216,3 +218,27 @@ async def test_a_plain_zenoh_session_deceives_no_client():
                         found.append((await anext(samples))[1].value)
 
     assert FALSE_MM not in found
+
+
+@pytest.mark.promise("stop-in-any-state")
+@pytest.mark.parametrize("own", [True, False])
+async def test_a_daemon_that_ends_hides_no_halt_and_no_stop_of_the_one_that_has_the_line(own):
+    async with running_rig() as running, running.broker.session() as other:
+        await running.until("x", lambda state: state.link == "up")
+        client = running.client
+        await client.command("x", Power(on=True))
+
+        def refuse(query):
+            asyncio.get_running_loop().call_later(0.5, query.refuse, ShuttingDown("the daemon is stopping"))
+
+        keys = Keys("sim")
+        for key in ("ldcn/sim/@cmd/**", *keys.all_stops):
+            await other.serve(key, refuse, complete=True)
+        if not own:  # whose client has been told of both, and knows neither as the one it commands
+            client = RigClient(running.session, "sim")
+        await running.client.command("x", MoveVelocity(velocity=5.0, instance="test"))
+        halted = await client.command("x", Halt(instance="test"))
+        stopped = await client.stop()
+
+    assert halted.status == "accepted"
+    assert stopped.confirmed == ("x", "y", "z", "c")
