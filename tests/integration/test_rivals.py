@@ -234,8 +234,12 @@ async def test_a_daemon_that_ends_hides_no_halt_and_no_stop_of_the_one_that_has_
         keys = Keys("sim")
         for key in ("ldcn/sim/@cmd/**", *keys.all_stops):
             await other.serve(key, refuse, complete=True)
-        if not own:  # whose client has been told of both, and knows neither as the one it commands
+        if not own:  # the client takes the other one for its daemon
+            info = (await client.daemon()).model_copy(update={"instance": "rival", "started": EPOCH_NS + 10**12})
+            told = encode(info, Encoding.JSON)
+            await other.serve(keys.daemon, lambda query: query.reply(*told), complete=True)
             client = RigClient(running.session, "sim")
+            assert (await client.daemon()).instance == "rival"
         await running.client.command("x", MoveVelocity(velocity=5.0, instance="test"))
         halted = await client.command("x", Halt(instance="test"))
         stopped = await client.stop()
