@@ -524,6 +524,7 @@ class Play:
 
     async def _cut(self, act: Act) -> None:
         self._disturb(act.for_s)
+        self.judge.out_of_reach.append((self.judge.now_s, self.judge.now_s + act.for_s))
         self.judge.chain.unplug(self.judge.now_s, act.for_s)
 
     async def _freeze(self, act: Act) -> None:
@@ -531,6 +532,7 @@ class Play:
         assert isinstance(loop, JumpingLoop)
         self._disturb(act.for_s)
         self.judge.frozen.append((loop.time(), loop.time() + act.for_s))
+        self.judge.out_of_reach.append((loop.time(), loop.time() + act.for_s))
         loop.hold_up(act.for_s)
 
     async def _power_loss(self, act: Act) -> None:

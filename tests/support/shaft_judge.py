@@ -50,6 +50,8 @@ SEEN_WITHIN_S = 0.4
 """Until a daemon knows at the latest that a drive has opened its loop: it is polled six times a second."""
 ARRIVES_S = 0.05
 """From when a packet is written until its drive executes it."""
+REACHED_WITHIN_S = 1.5
+"""From when a cable is back or a process goes on until a motion that went on meanwhile is brought to rest."""
 CAME_S = 1e-6
 """What is sent arrives at once; the turn of the loop in which it does takes no longer."""
 
@@ -120,6 +122,7 @@ class ShaftJudge(Witness):
         ended: those that were told to end, and when.
         tripped: of each axis, when its drive last opened its loop by itself.
         frozen: when the process was held up, and until when.
+        out_of_reach: when no daemon could reach the drives, and until when.
         motions: how many were begun.
         modules: the drives, in the order of the chain.
     """
@@ -139,6 +142,8 @@ class ShaftJudge(Witness):
         self.ended: dict[str, float] = {}
         self.tripped: dict[str, float] = {}
         self.frozen: list[tuple[float, float]] = []
+        self.out_of_reach: list[tuple[float, float]] = []
+        self._beyond: dict[str, float] = defaultdict(float)
         self.begun: dict[str, Begun] = {name: Begun() for name in self.settings}
         self.renewed: dict[str, float] = {}
         self.motions = 0
@@ -438,6 +443,9 @@ class ShaftJudge(Witness):
 
     # -- places ------------------------------------------------------------------------------------------------------
 
+    def _is_out_of_reach(self) -> bool:
+        return any(since_s <= self.now_s <= until_s + REACHED_WITHIN_S for since_s, until_s in self.out_of_reach)
+
     async def watch(self) -> None:
         """Look at the shafts again and again."""
         while True:
@@ -460,8 +468,13 @@ class ShaftJudge(Witness):
             low, high = axis.limits.position_min, axis.limits.position_max
             if low is None or high is None or drive.loop.trajectory.at_rest:
                 continue
+            asked = self.asked.get(begun.command_id or "")
             position, spare = (drive.shaft.position_counts - zeros[0]) / counts, LIMIT_COUNTS / abs(counts)
-            if not low - spare <= position <= high + spare:
+            beyond = max(low - position, position - high)
+            before, self._beyond[name] = self._beyond[name], beyond
+            if asked and isinstance(asked.command, MoveVelocity | Jog) and self._is_out_of_reach():
+                continue  # a motion without an end in the drive goes on while nothing can reach it
+            if beyond > max(spare, before):  # from where that has led, it may come back
                 self.wrong.append(
                     f"{self.now_s:.4f}: {name} is at {position:.3f} in {begun.command_id}, beyond its limits"
                 )
