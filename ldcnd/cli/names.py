@@ -17,6 +17,7 @@ GROUPS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         ),
         "reload": ("ldcnd.cli.rig:reload", "Have a daemon read its configuration again."),
         "sim": ("ldcnd.cli.sim", "Simulate a line of drives behind a pseudo-terminal."),
+        "twin": ("ldcnd.cli.twin:twin", "Rehearse a program on a simulated rig that stands as the running one."),
     },
     "Operate": {
         "list": ("ldcnd.cli.looking:list_axes", "Show every axis: where it is, its state, what is wrong with it."),
@@ -88,6 +89,7 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "check-config": "rig.toml",
     "plan": "rig.toml",
     "sim": "--pty ./port --chain pic-servo-sc,pic-io",
+    "twin": "rig.toml --at tcp/127.0.0.1:7600 --report night.json",
     "list": "",
     "move": "x 10 --wait",
     "jog": "x -5",

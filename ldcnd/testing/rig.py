@@ -30,6 +30,7 @@ from ldcnd.testing.lines import simulated_config
 from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 from ldcnd.testing.timeline import Timeline
 from ldcnd.testing.truth import Machine, Truth
+from ldcnd.testing.twin import RigState, config_of_twin, place, restore
 
 P = ParamSpec("P")
 ResultT = TypeVar("ResultT")
@@ -188,7 +189,7 @@ class SimulatedRig:
             kill_daemon=(lambda _: self._later(self.kill_daemon()), lambda _: self._later(self.start_daemon())),
             lose_client=lose_client,
         )
-        self.faults = RigFaults(self._machine, lines, self.truth, self._loop, processes, self.timeline.note)
+        self.faults = RigFaults(self.machine, lines, self.truth, self._loop, processes, self.timeline.note)
 
     @property
     def now_s(self) -> float:
@@ -212,7 +213,7 @@ class SimulatedRig:
         Raises:
             UnknownAxis: there is no such axis.
         """
-        machine, daemon = self._machine(axis), self._daemon
+        machine, daemon = self.machine(axis), self._daemon
         place_of = daemon.rig.axes[axis].tracker.status.scale.position if daemon else None
         return machine.look(self._loop.time(), place_of)
 
@@ -326,7 +327,12 @@ class SimulatedRig:
     def _now_ns(self) -> int:
         return self._begins_ns + round(self.now_s * 1e9)
 
-    def _machine(self, axis: str) -> Machine:
+    def machine(self, axis: str) -> Machine:
+        """Return the simulated drive of an axis and what is on its shaft.
+
+        Raises:
+            UnknownAxis: there is no such axis.
+        """
         if axis not in self._machines:
             raise UnknownAxis(f"there is no axis {axis!r}; there are {', '.join(self._machines)}", value=axis)
         return self._machines[axis]
@@ -358,7 +364,9 @@ class SimulatedRig:
 
 
 @asynccontextmanager
-async def simulated_rig(config: RigConfig | Path | str, *, seed: int | None = None) -> AsyncIterator[SimulatedRig]:
+async def simulated_rig(
+    config: RigConfig | Path | str, *, seed: int | None = None, state: RigState | None = None
+) -> AsyncIterator[SimulatedRig]:
     """Rehearse on a rig until the context ends; its lines are up when the context begins.
 
     Ports become simulated lines, see `simulated_config`; nothing leaves the process, nothing is written.
@@ -366,9 +374,11 @@ async def simulated_rig(config: RigConfig | Path | str, *, seed: int | None = No
     Args:
         config: the rig, or its file.
         seed: of everything that is drawn; the same seed gives the same bytes on the line.
+        state: of the rig that it stands for, see `ldcnd.testing.twin`; where drives stand after their first power-up,
+            when missing.
 
     Raises:
-        ConfigError: the file is none of a rig.
+        ConfigError: the file is none of a rig, or of another rig than the state.
         NotSupported: the program does not run on the jumping clock.
     """
     loop = asyncio.get_running_loop()
@@ -378,6 +388,8 @@ async def simulated_rig(config: RigConfig | Path | str, *, seed: int | None = No
             remedy="run it by ldcnd.testing.run, or as a test that asks for the fixture ldcnd_rig",
         )
     settings = simulated_config(loaded(config), seed=seed)
+    if state:
+        settings = config_of_twin(settings, state)
     broker = MemoryBroker()
     session = _ClientSession(broker)
     cut = (lambda _: setattr(session, "cut", True), lambda _: setattr(session, "cut", False))
@@ -387,8 +399,12 @@ async def simulated_rig(config: RigConfig | Path | str, *, seed: int | None = No
         stack.push_async_callback(rig.close)
         loop.network = broker.session
         stack.callback(setattr, loop, "network", None)
+        if state:
+            place(rig.machine, state)
         await rig.start_daemon()
         await rig.join(session)
+        if state:
+            await restore(rig.client, state)
         yield rig
 
 

@@ -3,7 +3,7 @@
 import os
 import socket
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -17,6 +17,8 @@ from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.testing.lines import simulated_config
 from ldcnd.testing.rig import SimulatedRig, lines_of, loaded
+from ldcnd.testing.run_report import RunReport, watch_run
+from ldcnd.testing.twin import RigState, config_of_twin, place, restore
 
 ResultT = TypeVar("ResultT")
 
@@ -43,6 +45,18 @@ class ServedRig:
         """The environment of a program that finds this rig without being told where it is."""
         return {**os.environ, CONNECT: self.endpoint}
 
+    def watch(self, ended: Callable[[], Awaitable[object]]) -> RunReport:
+        """Watch the rig until something has ended, and return the report of the run.
+
+        Args:
+            ended: is called on the rig's loop, and returns what is waited for.
+        """
+
+        async def watching() -> RunReport:
+            return await watch_run(self._rig.client.client, ended())
+
+        return self._thread.run(watching())
+
     def ask(self, question: Callable[[SimulatedRig], ResultT]) -> ResultT:
         """Return what a function says of the rig, or let it change something there; it must not wait.
 
@@ -68,36 +82,50 @@ class ServedRig:
 
 
 @contextmanager
-def served_rig(config: RigConfig | Path | str, *, seed: int | None = None) -> Iterator[ServedRig]:
+def served_rig(
+    config: RigConfig | Path | str,
+    *,
+    seed: int | None = None,
+    endpoint: str | None = None,
+    state: RigState | None = None,
+) -> Iterator[ServedRig]:
     """Serve a simulated rig in real time until the context ends; its lines are up when the context begins.
 
     Args:
         config: the rig, or its file; see `simulated_config`.
         seed: of everything that is drawn.
+        endpoint: on which it is served; one on the loopback interface that is free, when missing.
+        state: of the rig that it stands for; where drives stand after their first power-up, when missing.
 
     Raises:
-        ConfigError: the file is none of a rig.
+        ConfigError: the file is none of a rig, or of another rig than the state.
         TimeoutError: its lines do not come up.
     """
     settings = simulated_config(loaded(config), seed=seed)
     slow = (bus.model_copy(update={"margin_ms": max(bus.margin_ms, COARSE_MS)}) for bus in settings.bus)
     settings = settings.model_copy(update={"bus": tuple(slow)})
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
-    with loop_thread() as thread, thread.inside(_serving(settings, endpoint)) as rig:
+    if state:
+        settings = config_of_twin(settings, state)
+    endpoint = endpoint or f"tcp/127.0.0.1:{_free_port()}"
+    with loop_thread() as thread, thread.inside(_serving(settings, endpoint, state)) as rig:
         yield ServedRig(endpoint, thread, rig)
 
 
 @asynccontextmanager
-async def _serving(config: RigConfig, endpoint: str) -> AsyncIterator[SimulatedRig]:
+async def _serving(config: RigConfig, endpoint: str, state: RigState | None) -> AsyncIterator[SimulatedRig]:
     def cannot(_: float) -> None:
         raise NotSupported("the clients of this rig are other programs", remedy="end their processes")
 
     rig = SimulatedRig(config, _Zenoh(config.rig, endpoint), lines_of(config), time.time_ns(), (cannot, cannot))
     async with AsyncExitStack() as stack:
         stack.push_async_callback(rig.close)
+        if state:
+            place(rig.machine, state)
         await rig.start_daemon()
         client = ZenohSettings(mode="client", connect=(endpoint,))
         await rig.join(await stack.enter_async_context(open_zenoh_session(client)))
+        if state:
+            await restore(rig.client, state)
         yield rig
 
 

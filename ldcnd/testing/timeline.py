@@ -13,7 +13,7 @@ from pathlib import Path
 from ldcnd.contract.codec import decode_received
 from ldcnd.contract.events import CommandEvent
 from ldcnd.contract.samples import FaultSample, PositionSample, StateSample, TelemetryItem
-from ldcnd.net.session import Publication
+from ldcnd.net.session import Publication, SampleKind
 
 KEPT = 2000
 SHOWN = 30
@@ -53,6 +53,8 @@ class Timeline:
 
     def take(self, sample: Publication) -> None:
         """Add what the daemon has published."""
+        if sample.kind is not SampleKind.PUT:
+            return
         axis, _, item = sample.key.rpartition("/tele/")[2].partition("/")
         if item == TelemetryItem.POSITION:
             position = decode_received(PositionSample, sample.payload, sample.encoding)

@@ -28,6 +28,7 @@ FOLLOWED = {FIRST_RIG, *NEXT, *BY_THEMSELVES, *OPERATING}
 """Pages whose blocks are run here, all of them but those in `NOT_RUN`."""
 ELSEWHERE = {
     "deploy/INSTALL.md": "test_every_command_of_the_guide_works",
+    "docs/how-to/rehearse-a-night-run.md": "test_a_twin_is_served_to_programs_that_know_nothing_of_it",
     "docs/how-to/replay-a-capture.md": "test_what_the_page_does_with_a_capture_can_be_done",
     "docs/how-to/take-a-trace.md": "test_a_move_is_traced_to_a_file_shown_and_drawn",
     "docs/how-to/test-your-program.md": "test_the_blocks_of_the_page_run_in_an_empty_folder",

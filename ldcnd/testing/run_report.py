@@ -1,0 +1,229 @@
+"""What a run has done to a rig: watched from outside, alike on a twin and on the rig itself, so that both compare."""
+
+import asyncio
+from collections.abc import Awaitable, Iterator
+from dataclasses import dataclass, field
+
+from pydantic import Field
+
+from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.codec import decode_received
+from ldcnd.contract.events import CommandEvent, CommandStatus
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import PositionSample, TelemetryItem
+from ldcnd.net.session import Publication, SampleKind
+
+EVENT = "event"
+STOPS = ("stop", "quick_stop", "halt")
+WRITES = ("write_parameter",)
+DURATION_SHARE = 0.02
+"""Difference of durations that is worth saying, as a share."""
+TRAVEL_SHARE = 0.05
+"""The same of how near an axis came to a limit, as a share of its travel."""
+FOLLOWING_FACTOR = 2.0
+"""The same of the worst following error, as a ratio: a twin has another mechanics."""
+
+
+class AxisRun(Frozen):
+    """One axis in a run, in its units."""
+
+    unit: str
+    """Unit of the values."""
+    motions: int = Field(ge=0)
+    """Motions that began."""
+    way: float = Field(ge=0)
+    """Way that it has gone, back and forth."""
+    lowest: float
+    """Lowest position that was seen."""
+    highest: float
+    """Highest position that was seen."""
+    to_min: float | None
+    """Closest approach to the lower software limit; null without one, negative beyond it."""
+    to_max: float | None
+    """Closest approach to the upper software limit; null without one, negative beyond it."""
+    travel: float | None
+    """From one software limit to the other; null where one is missing."""
+    following_error: float = Field(ge=0)
+    """Largest following error that was seen."""
+
+
+class RunReport(Frozen):
+    """What a run has done."""
+
+    rig: str
+    """The rig."""
+    duration_s: float = Field(ge=0)
+    """From the first command to the end of the last one, in seconds of the rig."""
+    axes: dict[str, AxisRun]
+    """The axes that have moved or were commanded, by name."""
+    stops: int = Field(ge=0)
+    """Stops, quick stops and halts."""
+    refusals: tuple[str, ...]
+    """Commands that were refused, in their order: axis, verb and code."""
+    failures: tuple[str, ...]
+    """Commands that failed or were aborted, in their order: axis, verb and code or reason."""
+    eeprom_writes: int = Field(ge=0)
+    """Parameters that were written."""
+    bus_use: dict[str, float]
+    """Mean share of the time for which bytes were on the wire, by line."""
+
+    def lines(self) -> Iterator[str]:
+        """Yield the report as it is read, one line a fact."""
+        yield f"rig {self.rig}: {self.duration_s:.2f} s, {self.stops} stops, {self.eeprom_writes} EEPROM writes"
+        for name, axis in self.axes.items():
+            near = [
+                f"{distance:.6g} {axis.unit} from its {end} limit"
+                for distance, end in ((axis.to_min, "lower"), (axis.to_max, "upper"))
+                if distance is not None
+            ]
+            yield (
+                f"axis {name}: {axis.motions} motions, {axis.way:.6g} {axis.unit} of way, from {axis.lowest:.6g} to"
+                f" {axis.highest:.6g}, following error up to {axis.following_error:.3g}"
+                + (f"; at the nearest {' and '.join(near)}" if near else "")
+            )
+        yield from (f"refused: {text}" for text in self.refusals)
+        yield from (f"not done: {text}" for text in self.failures)
+        for bus, share in self.bus_use.items():
+            yield f"line {bus}: busy for {share:.0%} of the time"
+
+    def differences(self, real: "RunReport") -> Iterator[str]:
+        """Yield where another run differed from this one by more than a twin is good for."""
+        if abs(real.duration_s - self.duration_s) > DURATION_SHARE * self.duration_s:
+            yield f"duration: {self.duration_s:.2f} s rehearsed, {real.duration_s:.2f} s in the run"
+        for what in ("refusals", "failures"):
+            rehearsed, found = getattr(self, what), getattr(real, what)
+            if rehearsed != found:
+                yield f"{what}: {', '.join(rehearsed) or 'none'} rehearsed, {', '.join(found) or 'none'} in the run"
+        if self.stops != real.stops:
+            yield f"stops: {self.stops} rehearsed, {real.stops} in the run"
+        if self.eeprom_writes != real.eeprom_writes:
+            yield f"EEPROM writes: {self.eeprom_writes} rehearsed, {real.eeprom_writes} in the run"
+        for name in [*self.axes, *(name for name in real.axes if name not in self.axes)]:
+            if name not in self.axes or name not in real.axes:
+                yield f"axis {name}: moved in one of the runs only"
+            else:
+                yield from _differing(name, self.axes[name], real.axes[name])
+
+
+def _differing(name: str, rehearsed: AxisRun, real: AxisRun) -> Iterator[str]:
+    if rehearsed.motions != real.motions:
+        yield f"axis {name}: {rehearsed.motions} motions rehearsed, {real.motions} in the run"
+    span = rehearsed.travel or max(rehearsed.highest - rehearsed.lowest, real.highest - real.lowest)
+    for what, planned, found in (
+        ("lowest place", rehearsed.lowest, real.lowest),
+        ("highest place", rehearsed.highest, real.highest),
+    ):
+        if abs(planned - found) > TRAVEL_SHARE * span:
+            yield f"axis {name}: {what} {planned:.6g} {rehearsed.unit} rehearsed, {found:.6g} in the run"
+    if real.following_error > FOLLOWING_FACTOR * rehearsed.following_error + TRAVEL_SHARE * span:
+        yield (
+            f"axis {name}: following error up to {rehearsed.following_error:.3g} {rehearsed.unit} rehearsed,"
+            f" {real.following_error:.3g} in the run"
+        )
+
+
+@dataclass(slots=True)
+class _Seen:
+    """What was seen of an axis so far."""
+
+    way: float = 0.0
+    lowest: float | None = None
+    highest: float | None = None
+    following_error: float = 0.0
+    before: float | None = None
+    motions: set[str] = field(default_factory=set)
+    commanded: bool = False
+
+    def take(self, position: PositionSample) -> None:
+        value = position.value if position.turns is None else float(position.counts)
+        if self.before is not None:
+            self.way += abs(value - self.before)
+        self.before = value
+        self.lowest = value if self.lowest is None else min(self.lowest, value)
+        self.highest = value if self.highest is None else max(self.highest, value)
+        if self.commanded and position.following_error is not None:
+            self.following_error = max(self.following_error, abs(position.following_error))
+
+
+class RunWatch:
+    """Collects what a rig publishes during a run."""
+
+    def __init__(self, rig: str, axes: list[AxisInfo]) -> None:
+        self._rig = rig
+        self._axes = {axis.axis: axis for axis in axes}
+        self._seen = {axis.axis: _Seen() for axis in axes}
+        self._first_ns: int | None = None
+        self._last_ns = 0
+        self._stops = self._writes = 0
+        self._refusals: list[str] = []
+        self._failures: list[str] = []
+
+    def take(self, sample: Publication) -> None:
+        """Take what was published."""
+        axis, _, item = sample.key.rpartition("/tele/")[2].partition("/")
+        if axis not in self._seen or sample.kind is not SampleKind.PUT:
+            return
+        if item == TelemetryItem.POSITION:
+            self._seen[axis].take(decode_received(PositionSample, sample.payload, sample.encoding))
+        elif item == EVENT:
+            self._take_event(decode_received(CommandEvent, sample.payload, sample.encoding))
+
+    def _take_event(self, event: CommandEvent) -> None:
+        if self._first_ns is None:
+            self._first_ns = event.t
+        self._last_ns = max(self._last_ns, event.t)
+        seen = self._seen[event.axis]
+        seen.commanded = True
+        if event.status is CommandStatus.EXECUTING:
+            seen.motions.add(event.command_id)
+        self._stops += event.verb in STOPS and event.status is CommandStatus.DONE
+        self._writes += event.verb in WRITES and event.status is CommandStatus.DONE
+        said = f"{event.axis} {event.verb}: {event.code or event.reason}"
+        if event.status is CommandStatus.REFUSED:
+            self._refusals.append(said)
+        elif event.status in (CommandStatus.FAILED, CommandStatus.ABORTED):
+            self._failures.append(said)
+
+    def report(self, bus_use: dict[str, float]) -> RunReport:
+        """Return what was seen."""
+        return RunReport(
+            rig=self._rig,
+            duration_s=(self._last_ns - self._first_ns) / 1e9 if self._first_ns is not None else 0.0,
+            axes={name: self._of_axis(name, seen) for name, seen in self._seen.items() if seen.commanded},
+            stops=self._stops,
+            refusals=tuple(self._refusals),
+            failures=tuple(self._failures),
+            eeprom_writes=self._writes,
+            bus_use=bus_use,
+        )
+
+    def _of_axis(self, name: str, seen: _Seen) -> AxisRun:
+        info = self._axes[name]
+        low, high = info.limits.position_min, info.limits.position_max
+        lowest, highest = seen.lowest or 0.0, seen.highest or 0.0
+        return AxisRun(
+            unit=info.unit if info.modulo is None else "count",
+            motions=len(seen.motions),
+            way=seen.way,
+            lowest=lowest,
+            highest=highest,
+            to_min=None if low is None else lowest - low,
+            to_max=None if high is None else high - highest,
+            travel=None if low is None or high is None else high - low,
+            following_error=seen.following_error,
+        )
+
+
+async def watch_run(client: RigClient, ended: Awaitable[object]) -> RunReport:
+    """Watch a rig until something has ended, and return the report of it."""
+    watch, loop = RunWatch(client.rig, await client.axes()), asyncio.get_running_loop()
+    before, began_s = {bus.bus: bus.wire_busy_s for bus in await client.buses()}, loop.time()
+    async with client.published(watch.take):
+        for sample in await client.last_published():  # where the axes stand at the beginning
+            if sample.key.endswith(f"/{TelemetryItem.POSITION}"):
+                watch.take(sample)
+        await ended
+    passed_s = max(loop.time() - began_s, 1e-9)
+    busy_s = {bus.bus: max(0.0, bus.wire_busy_s - before.get(bus.bus, 0.0)) for bus in await client.buses()}
+    return watch.report({name: busy / passed_s for name, busy in busy_s.items()})

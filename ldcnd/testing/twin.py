@@ -1,0 +1,160 @@
+"""A twin: a simulated rig in the state of one that runs, on which a program is rehearsed before it moves the real one.
+
+What it is good for: the order of things, refusals, durations of profiles, how near to a limit an axis comes. What it is
+not: the mechanics on a shaft are those of the configuration's gains, or of an identified plant, so following errors are
+only an order of magnitude; temperatures and supplies are none.
+"""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config.rig import RigConfig
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.parameters import ParameterDump, ReadAllParameters
+from ldcnd.contract.samples import PositionSample, StateSample
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.config import LdcnAxisConfig
+from ldcnd.drives.smartstep.addresses import RAM_OFFSET
+from ldcnd.sim.plant import PlantConfig
+from ldcnd.sim.smartstep.simulation import SimulatedSmartStepLineConfig, SimulatedUnitConfig
+from ldcnd.testing.truth import Machine
+
+LEASE_CLIENT = "twin"
+SEEN_WITHIN_S = 10.0
+SEEN_COUNTS = 20.0
+"""So far from where it was said to stand an axis is shown at most: what a closed loop hunts."""
+
+
+@dataclass(frozen=True, slots=True)
+class RigState:
+    """How a rig stands at an instant.
+
+    Attributes:
+        axes: descriptions, by name.
+        states: by name; an axis that has not published any is missing.
+        positions: likewise.
+        parameters: of the drives that have them, by name.
+        plants: identified machines, by name.
+    """
+
+    axes: Mapping[str, AxisInfo]
+    states: Mapping[str, StateSample]
+    positions: Mapping[str, PositionSample]
+    parameters: Mapping[str, ParameterDump] = field(default_factory=dict)
+    plants: Mapping[str, PlantConfig] = field(default_factory=dict)
+
+
+async def read_state(client: RigClient, plants: Mapping[str, PlantConfig] | None = None) -> RigState:
+    """Read how a rig stands; nothing of it changes.
+
+    Args:
+        client: of the rig.
+        plants: machines that were identified, by axis.
+    """
+    axes = {axis.axis: axis for axis in await client.axes()}
+    parameters: dict[str, ParameterDump] = {}
+    for name, axis in axes.items():
+        if Verb.READ_ALL_PARAMETERS in axis.capabilities:
+            parameters[name] = await client.ask(ReadAllParameters(), name)
+    return RigState(axes, await client.states(), await client.positions(), parameters, plants or {})
+
+
+def config_of_twin(config: RigConfig, state: RigState) -> RigConfig:
+    """Return the simulated rig that stands as a rig does: gains as the drives hold them, parameters, wear.
+
+    Args:
+        config: simulated already, see `simulated_config`.
+        state: of the rig.
+
+    Raises:
+        ConfigError: the configuration is not of this rig.
+    """
+    configured = {axis.name for bus in config.bus for axis in bus.axis}
+    if configured != set(state.axes):
+        raise ConfigError(
+            f"the configuration has the axes {', '.join(sorted(configured))}, the rig that runs"
+            f" {', '.join(sorted(state.axes))}",
+            remedy="give the configuration with which the daemon was started",
+        )
+    units = {axis.name: axis.address for bus in config.bus for axis in bus.axis if axis.name in state.parameters}
+    return config.model_copy(
+        update={
+            "bus": tuple(
+                bus.model_copy(update={"axis": tuple(_axis(axis, state.axes[axis.name]) for axis in bus.axis)})
+                for bus in config.bus
+            ),
+            "sim": tuple(
+                line.model_copy(update={"unit": tuple(_unit(unit, units, state) for unit in line.unit)})
+                if isinstance(line, SimulatedSmartStepLineConfig)
+                else line
+                for line in config.sim
+            ),
+        }
+    )
+
+
+def _axis(axis: object, info: AxisInfo) -> object:
+    if not isinstance(axis, LdcnAxisConfig) or axis.gains is None:
+        return axis
+    held = {each.name: each.value for each in info.registers if each.value is not None}
+    known = {name: held[name] for name in Gains.__slots__ if name in held and name in type(axis.gains).model_fields}
+    return axis.model_copy(update={"gains": axis.gains.model_copy(update=known)})
+
+
+def _unit(unit: SimulatedUnitConfig, addresses: Mapping[str, int], state: RigState) -> SimulatedUnitConfig:
+    name = next((name for name, address in addresses.items() if address == unit.number), None)
+    if name is None:
+        return unit
+    values = state.parameters[name].values
+    stored = {each.parameter: each.stored for each in values if each.parameter != "Pn000"}
+    worn = max((each.eeprom_total or 0 for each in values), default=0)
+    return unit.model_copy(update={"stored": stored, "worn": worn})
+
+
+def place(machine_of: Callable[[str], Machine], state: RigState) -> None:
+    """Put the shafts where the axes of a rig stand, and give them their machines; before the daemon begins."""
+    _load_parameters(machine_of, state)
+    for name, position in state.positions.items():
+        machine = machine_of(name)
+        if not isinstance(machine.config, LdcnAxisConfig):
+            continue
+        module = machine.servo
+        if plant := state.plants.get(name):
+            kept = {key: getattr(module.shaft.plant, key) for key in ("reverse_limit_counts", "forward_limit_counts")}
+            module.shaft.become(module.shaft.plant.model_copy(update=plant.model_dump(exclude_unset=True) | kept))
+        turns = (position.turns or 0) * (state.axes[name].modulo or 0.0)
+        module.shaft.position_counts = (position.value + turns) * machine.config.signed_counts_per_unit
+
+
+def _load_parameters(machine_of: Callable[[str], Machine], state: RigState) -> None:
+    """Let RAM differ from EEPROM where it does on the rig."""
+    for name, dump in state.parameters.items():
+        memory = machine_of(name).unit.drive.memory
+        for value in dump.values:
+            if value.active != value.stored:
+                memory.write(RAM_OFFSET + int(value.parameter.removeprefix("Pn"), 16), value.active)
+
+
+async def restore(rig: Rig, state: RigState) -> None:
+    """Give the axes of a twin the references and latches of the rig; nothing moves.
+
+    Raises:
+        LdcndError: the daemon of the twin refused it.
+        TimeoutError: it does not show an axis where it stands.
+    """
+    for name, there in state.states.items():
+        position = state.positions.get(name)
+        if there.referenced and position is not None and Verb.SET_POSITION in state.axes[name].capabilities:
+            async with rig.control(name, client=LEASE_CLIENT) as axis:
+                await axis.set_position(position.value)
+                tolerance = SEEN_COUNTS / (state.axes[name].counts_per_unit or 1.0)
+                async with asyncio.timeout(SEEN_WITHIN_S):
+                    while abs(axis.position.value - position.value) > tolerance:
+                        await axis.news(None)
+        if there.stop_latched:
+            await rig.client.stop(name)

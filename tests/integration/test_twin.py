@@ -1,0 +1,154 @@
+"""A program is rehearsed on a twin of the rig that runs, and then does on the rig what it has done there."""
+
+import asyncio
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+import ldcnd
+from ldcnd.config.rig import load_config
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.parameters import ReadAllParameters
+from ldcnd.sim.plant import PlantConfig
+from ldcnd.testing import run, served_rig, simulated_rig
+from ldcnd.testing.run_report import RunReport, watch_run
+from ldcnd.testing.twin import read_state
+from tests.support.rig import SIMULATED
+
+MIXED = SIMULATED.with_name("mixed.toml")
+
+
+async def night(rig):
+    """Scan over most of the travel, ask for a place beyond it, and park."""
+    async with rig.control("x", "y", client="night") as (x, y):
+        await x.power(on=True)
+        await y.power(on=True)
+        for number in range(20):
+            await (await x.move_absolute(-60 + 7.5 * number)).done()
+            await (await y.move_absolute(40 - 2.0 * number, velocity=10)).done()
+        with pytest.raises(LdcndError):
+            await x.move_absolute(101.0)
+        await (await x.move_absolute(12.5)).done()
+
+
+async def seen(rig, program):
+    """Run a program on a rig; return the report of it."""
+    running = asyncio.create_task(program(rig.client), name="program")
+    report = await watch_run(rig.client.client, running)
+    await running
+    return report
+
+
+def other_machines():
+    """Return the simulated rig with other seeds, and machines that are a little heavier and stiffer."""
+    config = load_config(SIMULATED)
+    (line,) = config.sim
+    modules = tuple(
+        module.model_copy(update={"plant": PlantConfig(inertia_kg_m2=6e-5, friction_nm=0.002)})
+        for module in line.module
+    )
+    return config.model_copy(update={"sim": (line.model_copy(update={"seed": 77, "module": modules}),)})
+
+
+async def real_run(places):
+    async with simulated_rig(other_machines(), seed=77) as rig:
+        async with rig.client.control("x", "y", client="day") as (x, y):
+            await x.power(on=True)
+            await y.power(on=True)
+            await (await x.move_absolute(places[0])).done()
+            await (await y.move_absolute(places[1])).done()
+            await x.set_gains(kp=500)
+        return await read_state(rig.client.client), await seen(rig, night)
+
+
+async def twin_run(state):
+    async with simulated_rig(SIMULATED, state=state) as twin:
+        where = {name: sample.value for name, sample in (await twin.client.client.positions()).items()}
+        return where, await seen(twin, night), twin.truth("x").registers["kp"]
+
+
+def test_a_twin_stands_where_the_rig_does_and_predicts_its_run():
+    state, real = run(real_run((-31.25, 17.5)))
+    where, rehearsed, kp = run(twin_run(state))
+
+    assert where["x"] == pytest.approx(-31.25, abs=0.02)
+    assert where["y"] == pytest.approx(17.5, abs=0.02)
+    assert kp == 500
+    assert real.duration_s == pytest.approx(rehearsed.duration_s, rel=0.02)
+    assert real.refusals == rehearsed.refusals == ("x move_absolute: position_limit",)
+    for name in "xy":
+        for end in ("to_min", "to_max"):
+            near, found = getattr(rehearsed.axes[name], end), getattr(real.axes[name], end)
+            assert near == pytest.approx(found, abs=0.05 * rehearsed.axes[name].travel)
+    assert list(rehearsed.differences(real)) == []
+
+
+async def stepper():
+    config = load_config(MIXED)
+    line, steps = config.sim
+    unit = steps.unit[0].model_copy(update={"stored": {"Pn100": 70}})
+    steps = steps.model_copy(update={"unit": (unit, *steps.unit[1:])})
+    async with simulated_rig(config.model_copy(update={"sim": (line, steps)})) as rig:
+        async with rig.client.control("feed", client="day") as feed:
+            await feed.write_parameter("Pn102", 41)
+        state = await read_state(rig.client.client)
+    async with simulated_rig(MIXED, state=state) as twin:
+        dump = await twin.client.client.ask(ReadAllParameters(), "feed")
+    return {value.parameter: (value.active, value.stored) for value in dump.values}
+
+
+def test_a_twin_has_the_parameters_of_the_rig_in_both_memories():
+    values = run(stepper())
+    assert values["Pn102"] == (41, 40)
+    assert values["Pn100"][1] == 70
+
+
+def test_a_report_says_where_the_run_differed():
+    _, rehearsed = run(real_run((0, 0)))
+    other = rehearsed.model_copy(
+        update={"duration_s": rehearsed.duration_s * 1.1, "refusals": (), "stops": rehearsed.stops + 1}
+    )
+    told = " ".join(rehearsed.differences(other))
+    assert "duration" in told
+    assert "position_limit rehearsed, none in the run" in told
+    assert "stops" in told
+
+
+@pytest.mark.real_time
+def test_a_twin_is_served_to_programs_that_know_nothing_of_it(tmp_path):
+    rig_file = tmp_path / "rig.toml"
+    rig_file.write_text(SIMULATED.read_text())
+    with served_rig(rig_file) as real, ldcnd.connect_blocking(real.endpoint) as rig:
+        with rig.control("x", client="day") as x:
+            x.power(on=True)
+            x.move_absolute(4.0, velocity=20).done()
+            x.stop()
+        command = [sys.executable, "-m", "ldcnd", "twin", str(rig_file), "--report", str(tmp_path / "night.json")]
+        twin = subprocess.Popen(  # noqa: S603
+            command, env=real.environment, stdout=subprocess.PIPE, text=True
+        )
+        try:
+            assert twin.stdout is not None
+            endpoint = twin.stdout.readline().strip().removeprefix("export LDCND_CONNECT=")
+            with ldcnd.connect_blocking(endpoint, wait_s=20) as rehearsal:
+                with rehearsal.control("x", client="night") as x:
+                    assert x.position.value == pytest.approx(4.0, abs=0.02)
+                    assert x.state.sample.stop_latched
+                    x.reset()
+                    x.power(on=True)
+                    x.move_absolute(5.0, velocity=20).done()
+            time.sleep(0.1)  # events are published up to 5 ms after what they tell
+            twin.send_signal(signal.SIGINT)
+            told, _ = twin.communicate(timeout=30)
+        finally:
+            twin.kill()
+        assert real.ask(lambda there: there.truth("x").position) == pytest.approx(4.0, abs=0.02)
+
+    assert twin.returncode == 0
+    assert "axis x: " in told
+    report = RunReport.model_validate(json.loads((tmp_path / "night.json").read_text()))
+    assert report.axes["x"].highest == pytest.approx(5.0, abs=0.05)
