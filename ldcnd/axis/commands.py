@@ -27,7 +27,7 @@ from ldcnd.axis.procedures.path import PathMember, PathShareRequest
 from ldcnd.axis.procedures.probe import ProbeMove
 from ldcnd.axis.procedures.pwm import PwmRun
 from ldcnd.axis.procedures.track import SetPoint
-from ldcnd.axis.procedures.velocity import COUNTER_SHARE, VelocityChange
+from ldcnd.axis.procedures.velocity import VelocityChange
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import (
     AxisCommand,
@@ -62,7 +62,7 @@ from ldcnd.contract.errors import (
     StopLatched,
 )
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, CountsMotion, StopMode
+from ldcnd.drives.driver import AxisReading, CountsMotion, StopMode
 from ldcnd.line.exchange import Timing
 
 STEP_RETRY_S = 0.2
@@ -383,9 +383,7 @@ class AxisCommands:
         plan = motion.plan_at(request.velocity, request.acceleration)
         end = motion.limit_ahead(request.velocity) if self._tracker.status.referenced else None
         if end is None:
-            here = motion.here
-            longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(plan.motion.velocity_counts_per_s)
-            end = here + plan.velocity * min(motion.config.jog_horizon_s, longest_s)
+            end = motion.here + plan.velocity * motion.run_s(request.duration_s, plan.motion.velocity_counts_per_s)
         return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration)
 
     async def _move(

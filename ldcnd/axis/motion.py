@@ -35,6 +35,8 @@ from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, StopMode
 
+COUNTER_SHARE = 0.99
+"""Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
 
@@ -301,6 +303,31 @@ class AxisMotion:
                 math.inf if limits.acceleration is None else limits.acceleration * counts,
             ),
         )
+
+    def run_s(self, asked_s: float | None, counts_per_s: float) -> float:
+        """Return for how long a motion at a velocity goes on, within what the drive's counter holds.
+
+        Args:
+            asked_s: the requested duration; that of the configuration when missing.
+            counts_per_s: the velocity.
+
+        Raises:
+            ValueOutOfRange: the requested duration is longer than the configuration or the counter allows.
+        """
+        config, counter_s = self.config, COUNTER_SHARE * LARGEST_COUNT / abs(counts_per_s)
+        if asked_s is None:
+            return min(config.jog_horizon_s, counter_s)
+        longest_s = min(config.longest_run_s or config.jog_horizon_s, counter_s)
+        if asked_s > longest_s:
+            raise ValueOutOfRange(
+                f"axis {config.name}: a motion at this velocity lasts at most {longest_s:g} s, not {asked_s:g} s",
+                axis=config.name,
+                value=asked_s,
+                limit=longest_s,
+                nearest=longest_s,
+                remedy="send it again before its end" if longest_s == counter_s else "configure longest_run_s",
+            )
+        return asked_s
 
     def limit_ahead(self, velocity: float) -> float | None:
         """Return the software limit that a motion at this velocity runs towards, in axis units."""

@@ -142,17 +142,27 @@ class AxisVerbs(ABC):
         )
 
     async def move_velocity(
-        self, velocity: float, *, buffer_mode: BufferMode = BufferMode.REFUSE, acceleration: float | None = None
+        self,
+        velocity: float,
+        *,
+        buffer_mode: BufferMode = BufferMode.REFUSE,
+        acceleration: float | None = None,
+        duration_s: float | None = None,
     ) -> Motion:
-        """Move at a constant velocity until the next command, the software limit, or the axis's `jog_horizon_s`.
+        """Move at a constant velocity until the next command, the software limit, or the end of its duration.
 
         Args:
             buffer_mode: Effect if the axis moves already.
             velocity: Velocity in units a second, positive forward, not 0.
             acceleration: Acceleration in units a second squared; the axis default when missing.
+            duration_s: Duration at the velocity, in seconds, at most the axis's `longest_run_s`; `jog_horizon_s` when
+                missing. The drive itself ends it with a ramp, also when daemon and client are gone: it is a move of so
+                many units.
         """
         return await self._start(
-            lambda: MoveVelocity(buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration)
+            lambda: MoveVelocity(
+                buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, duration_s=duration_s
+            )
         )
 
     async def jog(

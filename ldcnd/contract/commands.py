@@ -387,9 +387,9 @@ class MoveRelative(Move):
 
 
 class MoveVelocity(Move):
-    """Move at a constant velocity until the next command, the software limit, or the axis's `jog_horizon_s`.
+    """Move at a constant velocity until the next command, the software limit, or the end of its duration.
 
-    On an axis that jogs already it changes velocity and acceleration on the fly.
+    On an axis that moves so already it changes velocity and acceleration on the fly, and its duration begins again.
     """
 
     verb = Verb.MOVE_VELOCITY
@@ -398,6 +398,9 @@ class MoveVelocity(Move):
     """Velocity in units a second, positive forward, not 0."""
     acceleration: float | None = Field(default=None, gt=0)
     """Acceleration in units a second squared; the axis default when missing."""
+    duration_s: float | None = Field(default=None, gt=0, le=86_400)
+    """Duration at the velocity, in seconds, at most the axis's `longest_run_s`; `jog_horizon_s` when missing. The drive
+    itself ends it with a ramp, also when daemon and client are gone: it is a move of so many units."""
 
 
 SHORTEST_HOLD_S, LONGEST_HOLD_S = 0.2, 1.0

@@ -10,6 +10,7 @@ from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
+from ldcnd.sim.plant import MotorPlant
 from tests.support.rig import RunningRig, running_rig
 
 MODEL = "pic-servo-sc"
@@ -20,6 +21,7 @@ SAFE = 1.0
 """Speed above which the door must be shut, in revolutions a second."""
 COUNTS = 1000.0
 GAINS = {"kp": 60, "kd": 600, "ki": 0, "il": 0, "ol": 250, "el": 8000}
+ENDLESS = MotorPlant(reverse_limit_counts=-(10**9), forward_limit_counts=10**9)
 INPUTS = {"door_closed": {"line": CLOSED}, "door_open": {"line": OPEN}}
 OUTPUTS = {"lock": {"line": LOCK}}
 DOOR_SHUT = {
@@ -59,7 +61,8 @@ def machine(
 
 def chain_of_machine() -> Chain:
     """Return its modules, with the door shut."""
-    chain = build_chain(ChainSpec((ModuleSpec(MODEL), ModuleSpec(MODEL), ModuleSpec("pic-io"))))
+    rotor, table = ModuleSpec(MODEL, plant=ENDLESS), ModuleSpec(MODEL)
+    chain = build_chain(ChainSpec((rotor, table, ModuleSpec("pic-io"))))
     io = chain.modules[2]
     assert isinstance(io, SimulatedIo)
     io.drive_line(CLOSED, high=True, at_s=0.0)

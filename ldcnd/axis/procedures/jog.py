@@ -13,10 +13,9 @@ from enum import Enum
 from typing_extensions import override
 
 from ldcnd.axis.events import CommandOver, MotionStarted
-from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.motion import COUNTER_SHARE, AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
-from ldcnd.axis.procedures.velocity import COUNTER_SHARE
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, Jog
 from ldcnd.contract.errors import LeaseExpired, PositionLimit, Remedy, step

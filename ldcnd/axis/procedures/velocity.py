@@ -2,21 +2,18 @@
 
 It begins as a trapezoid, which ends in the drive. A trapezoid must not be changed in mid-move, while velocity mode
 may be entered and changed at any time (PIC-SERVO manual, 4.4): from its first change on it runs in velocity mode,
-which has no end in the drive. The daemon ends it before the software limit or at the jog horizon; only limit switches
+which has no end in the drive. The daemon ends it before the software limit or after its duration; only limit switches
 that are armed do so without it. PIC-SERVO SC takes a new trapezoid at any time: there it keeps its end in the drive.
 """
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.motion import COUNTER_SHARE, AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveVelocity
 from ldcnd.contract.samples import AxisState
-
-COUNTER_SHARE = 0.99
-"""Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
 
 
 class VelocityChange(EndlessMotion):
@@ -37,11 +34,12 @@ class VelocityChange(EndlessMotion):
         self.permit.check_state()
         plan = motion.plan_at(request.velocity, request.acceleration)
         self._velocity, self.acceleration = plan.velocity, plan.acceleration
+        speed_counts = plan.motion.velocity_counts_per_s
+        run_s = motion.run_s(request.duration_s, speed_counts)
         self.check_room(plan.velocity)
         await self.permit.load(plan.motion)
-        speed_counts = plan.motion.velocity_counts_per_s
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
-        self._until_s = motion.clock.now_s() + min(motion.config.jog_horizon_s, COUNTER_SHARE * room_s)
+        self._until_s = motion.clock.now_s() + min(run_s, COUNTER_SHARE * room_s)
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         return motion.reply(self.permit, velocity=plan.velocity, acceleration=plan.acceleration)
 

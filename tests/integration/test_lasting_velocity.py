@@ -1,0 +1,74 @@
+"""Motions at a velocity that last as long as they are asked to, end with a ramp, and are bounded in the drive."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.contract.commands import BufferMode, MoveVelocity, Power
+from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.contract.samples import AxisState
+from tests.support.chain_rig import rig_on
+from tests.support.machine_rig import COUNTS, chain_of_machine, machine, running_machine
+
+LONG = {"longest_run_s": 3600, "jog_horizon_s": 5}
+SPIN = MoveVelocity(velocity=5.0, duration_s=20.0)
+
+
+async def test_a_motion_lasts_as_long_as_it_is_asked_to_and_ends_with_a_ramp():
+    async with running_machine(machine(axis=LONG)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        reply = await rig.client.command("rotor", SPIN)
+        await asyncio.sleep(19.0)
+        assert rig.speed() == pytest.approx(5.0, rel=0.05)
+        await asyncio.sleep(1.2)
+        assert 0.2 < rig.speed() < 4.9  # it ramps down
+        await rig.until("rotor", lambda state: state.state is AxisState.STANDSTILL, within_s=2.0)
+        assert (reply.duration_s, reply.position) == (pytest.approx(20.25, rel=1e-3), pytest.approx(100.0))
+
+
+async def test_the_same_motion_sent_again_lasts_from_then_on():
+    async with running_machine(machine(axis=LONG)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        for _ in range(4):
+            await rig.client.command("rotor", SPIN.model_copy(update={"duration_s": 5.5}))
+            await asyncio.sleep(4.0)
+            assert rig.speed() == pytest.approx(5.0, rel=0.05)
+        await asyncio.sleep(4.0)
+        assert rig.speed() == 0
+
+
+async def test_the_drive_ends_it_when_the_daemon_is_killed():
+    chain = chain_of_machine()
+    async with rig_on(chain, machine(axis=LONG)) as rig:
+        await rig.until("rotor", lambda state: state.link == "up")
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", SPIN)
+        await asyncio.sleep(1.0)
+        await rig.kill()
+        drive = chain.modules[0]
+        for after_s, speed in ((15.0, 5.0), (6.0, 0.0)):
+            await asyncio.sleep(after_s)
+            drive.catch_up(asyncio.get_running_loop().time())
+            shown = abs(drive.shaft.velocity_counts) / drive.profile.servo_cycle_s / COUNTS
+            assert shown == pytest.approx(speed, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("longest_s", "asked_s", "velocity", "said"),
+    [
+        (None, 61.0, 5.0, "lasts at most 60 s, not 61 s"),
+        (600, 601.0, 5.0, "lasts at most 600 s"),
+        (86_400, 86_400.0, 50.0, "lasts at most 42520.2 s"),  # the counter has 32 bits
+    ],
+)
+async def test_a_longer_one_than_configuration_or_counter_allow_is_refused(longest_s, asked_s, velocity, said):
+    axis = {} if longest_s is None else {"longest_run_s": longest_s}
+    async with running_machine(machine(axis=axis)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        with pytest.raises(ValueOutOfRange, match=said):
+            await rig.client.command("rotor", MoveVelocity(velocity=velocity, duration_s=asked_s))
+        with pytest.raises(ValueOutOfRange, match=said):
+            await rig.client.command(
+                "rotor", MoveVelocity(velocity=velocity, duration_s=asked_s, buffer_mode=BufferMode.ABORTING)
+            )
+        assert rig.speed() == 0
