@@ -45,7 +45,7 @@ class PacketEffect(Enum):
     RELIEVES = "relieves"
     """It takes energy out: it stops the motor or switches it off, and does nothing else."""
     ARRANGES = "arranges"
-    """It gives an address, a group or a rate, or resets who is to be given one."""
+    """It gives an address, a group, a rate or the form of replies, or resets who is to be given one."""
     CHANGES = "changes"
     """Anything else."""
 

@@ -22,7 +22,19 @@ from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.rig_commands import OverrideInterlock, SetIo
 from ldcnd.contract.samples import AxisState
-from tests.support.machine_rig import DOOR_OPENS, DOOR_SHUT, SAFE, Machine, machine, running_machine
+from ldcnd.drives.ldcn.packet import StatusItem
+from tests.support.chain_rig import rig_on
+from tests.support.machine_rig import (
+    CLOSED,
+    DOOR_OPENS,
+    DOOR_SHUT,
+    OPEN,
+    SAFE,
+    Machine,
+    chain_of_machine,
+    machine,
+    running_machine,
+)
 
 SPIN = MoveVelocity(velocity=5.0)
 LOCKED = SetIo(module="cabinet", high=("lock",))
@@ -72,8 +84,8 @@ async def events(rig: Machine, verb: str) -> list[str]:
 async def test_a_motion_is_refused_while_one_of_its_requirements_does_not_hold(closed_contact, open_contact, lock, why):
     async with running_machine(machine(DOOR_SHUT)) as rig:
         now_s = asyncio.get_running_loop().time()
-        rig.io.drive_line(3, high=closed_contact, at_s=now_s)
-        rig.io.drive_line(4, high=open_contact, at_s=now_s)
+        rig.io.drive_line(CLOSED, high=closed_contact, at_s=now_s)
+        rig.io.drive_line(OPEN, high=open_contact, at_s=now_s)
         await rig.client.ask(LOCKED if lock else UNLOCKED)
         await rig.named(lock=lock, door_closed=closed_contact, door_open=open_contact)
         await power(rig)
@@ -367,3 +379,48 @@ async def test_an_override_holds_for_its_time_and_its_lease_and_is_recorded():
 def test_impossible_interlocks_are_refused_in_the_configuration(change, said):
     with pytest.raises(ValidationError, match=said):
         machine(DOOR_SHUT | change)
+
+
+# -- taken over --------------------------------------------------------------------------------------------------------
+
+
+async def test_a_machine_that_another_host_has_left_in_mid_spin_is_taken_over_and_brought_to_rest_in_order():
+    chain = chain_of_machine()
+    async with rig_on(chain, machine(axis={"loss": {"daemon": "run_to_target"}})) as before:
+        await before.until("rotor", lambda state: state.link == "up")
+        await before.client.ask(LOCKED)
+        await before.client.command("rotor", Power(on=True))
+        await before.client.command("rotor", SPIN)
+        await asyncio.sleep(1.0)
+        await before.kill()
+    rotor, table, io = chain.modules
+    rotor.items = table.items = StatusItem(0x1F)
+    io.items = StatusItem(0x03)
+    rotor.group = table.group = 0x85
+    latch = io.latch
+
+    async with running_machine(machine(DOOR_SHUT, DOOR_OPENS, start="adopt"), chain) as rig:
+        await rig.named(lock=True, door_closed=True)
+        await asyncio.sleep(3.0)
+        assert rig.speed() == pytest.approx(5.0, rel=0.05)
+        assert (rig.io.latch, rig.io.outputs) == (latch, 1 << 9)
+        with pytest.raises(InterlockViolated):
+            await rig.client.ask(SetIo(module="cabinet", low=("lock",), pwm1=0.0, pwm2=0.0))
+        await rig.client.command("rotor", Halt())
+        await rig.until("rotor", lambda state: state.state is AxisState.STANDSTILL)
+        await rig.client.ask(UNLOCKED)
+        assert rig.io.latch == 0
+
+
+async def test_a_machine_that_is_taken_over_with_its_door_open_is_brought_to_rest():
+    chain = chain_of_machine()
+    async with rig_on(chain, machine()) as before:
+        await before.until("rotor", lambda state: state.link == "up")
+        await before.client.command("rotor", Power(on=True))
+        await before.client.command("rotor", SPIN)
+        await asyncio.sleep(1.0)
+        await before.kill()
+    chain.modules[2].drive_line(CLOSED, high=False, at_s=asyncio.get_running_loop().time())
+    async with running_machine(machine(DOOR_SHUT, start="adopt"), chain) as rig:
+        await asyncio.sleep(1.0)
+        assert rig.speed() == 0

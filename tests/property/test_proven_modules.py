@@ -98,6 +98,8 @@ def drawn(dice: random.Random) -> Line:
         there.append(there.pop(0))
     elif kind == "missing":
         there.pop()
+    elif kind == "of another host":
+        there.append("pic-io")  # on its line is one module more
     chain = build_chain(ChainSpec(tuple(ModuleSpec(name) for name in there), seed=dice.randrange(1000)))
     line = Line(kind, configured, chain, resets=kind != "of another host" and dice.random() < 0.7)
     if kind == "of another host":

@@ -250,11 +250,28 @@ async def test_a_question_that_a_stop_took_off_the_queue_is_asked_again():
     assert asked.result() == Identity(0, 4)
 
 
-async def test_adoption_refuses_a_drive_that_another_host_has_set_up():
+@pytest.mark.parametrize("items", [0x01, 0x1F, 0xFF], ids=hex)
+async def test_adoption_bares_the_replies_that_another_host_has_extended(items):
     chain = chain_of("ls182ap", "picservo-v4")
     async with bare_network(chain, PAIR) as line:
         await line.network.bring_up()
-    chain.modules[1].items = StatusItem.POSITION
+    chain.modules[1].items = StatusItem(items)
+    async with bare_network(chain, PAIR, line=ADOPT) as line:
+        report = await line.network.bring_up()
+        sent = {packet.command for packet in line.sent()}
+
+    assert "address 2: another host had it add to its replies" in report.remarks
+    assert sent == {CommandCode.READ_STATUS, CommandCode.NO_OPERATION, CommandCode.DEFINE_STATUS}
+    assert chain.modules[1].items == StatusItem(0)
+
+
+async def test_adoption_refuses_a_drive_that_keeps_its_extended_replies():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+    deaf = chain.modules[1]
+    type(deaf).__setattr__(deaf, "items", StatusItem.POSITION)
+    deaf.__class__ = type("Deaf", (type(deaf),), {"items": property(lambda _: StatusItem.POSITION, lambda *_: None)})
     async with bare_network(chain, PAIR, line=ADOPT) as line:
         with pytest.raises(NetworkMismatch, match=r"address 2 \(axis a2\) does not answer No Operation"):
             await line.network.bring_up()

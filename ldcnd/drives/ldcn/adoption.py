@@ -1,18 +1,19 @@
 """Taking over a running LDCN/NMC line.
 
-Adoption finds the line at whatever rate, identifies the modules and touches nothing: it sends nothing but nulls, Read
-Status and No Operation. Positions and motions go on; gains cannot be read back and count as those of the configuration.
+Adoption finds the line at whatever rate, identifies the modules and moves nothing: it sends nothing but nulls, Read
+Status and No Operation, and Define Status where another host has its replies contain more. Positions and motions go on;
+gains cannot be read back and count as those of the configuration.
 """
 
 import asyncio
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ldcnd.contract.errors import BusDown, BusError, NetworkMismatch
+from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import Expected, Identity, LineRate, differences
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket
+from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import Profile, Support
 from ldcnd.line.bus import Bus
 
@@ -45,11 +46,13 @@ class Adopted:
         baud: the rate it is at.
         identities: by address.
         states: flags and auxiliary byte of every servo drive, by address.
+        bared: addresses whose replies another host had extended.
     """
 
     baud: int
     identities: Mapping[int, Identity]
     states: Mapping[int, StatusPacket]
+    bared: tuple[int, ...] = ()
 
 
 class Adoption:
@@ -70,7 +73,7 @@ class Adoption:
 
         Raises:
             NetworkMismatch: a module is missing, is something else, is at another rate than the others, or answers
-                like one that another host has set up; says precisely what differs.
+                otherwise than the manual says; says precisely what differs.
             BusError: the line failed meanwhile.
         """
         await self.search()
@@ -90,10 +93,9 @@ class Adoption:
             )
         (baud,) = bauds
         await self._rate.host_to(baud)
-        for each in self._expected:
-            await self._check_default_status(each)
+        bared = tuple([each.address for each in self._expected if await self._bare_status(each)])
         states = {each.address: await self._motion_state(each) for each in self._expected if _is_servo(each)}
-        return Adopted(baud, identities, states)
+        return Adopted(baud, identities, states, bared)
 
     async def not_standing(self) -> tuple[str, ...]:
         """Return in words what keeps the line from a reset: what moves, and what is not known to stand.
@@ -166,18 +168,30 @@ class Adoption:
             if each.address not in self.found and (identity := await self._rate.who_is(each.address, patient=True)):
                 self.found[each.address] = Found(baud, identity)
 
-    async def _check_default_status(self, each: Expected) -> None:
-        """Prove that the module adds nothing to its replies: the setting of Define Status cannot be read back."""
+    async def _bare_status(self, each: Expected) -> bool:
+        """Have the module add nothing to its replies; return whether another host had it add something.
+
+        What Define Status has set cannot be read back: the reply to No Operation shows it by its length.
+        """
+        node = Node(each.address, each.profile)
         try:
-            await self._bus.execute(commands.no_operation(Node(each.address, each.profile)))
+            await self._bus.execute(commands.no_operation(node))
         except BusDown:
             raise
-        except BusError as error:
-            raise NetworkMismatch(
-                f"bus {self._bus.settings.name}: not taken over, address {each.address} ({each.what}) does not answer"
-                " No Operation with a bare status byte: another host has set it up",
-                remedy="stop that host, or reset the line",
-            ) from error
+        except BusError:
+            try:
+                await self._bus.execute(commands.define_status(node, STATUS_BYTE_ONLY))
+                await self._bus.execute(commands.no_operation(node))
+            except BusDown:
+                raise
+            except LdcndError as error:
+                raise NetworkMismatch(
+                    f"bus {self._bus.settings.name}: not taken over, address {each.address} ({each.what}) does not"
+                    " answer No Operation with a bare status byte, also after Define Status",
+                    remedy="stop the host that has set it up, or reset the line",
+                ) from error
+            return True
+        return False
 
     async def _motion_state(self, each: Expected) -> StatusPacket:
         return await self._bus.execute(commands.read_status(Node(each.address, each.profile), MOTION_ITEMS))

@@ -224,6 +224,7 @@ EFFECTS = {
     CommandCode.READ_STATUS: PacketEffect.READS,
     CommandCode.NO_OPERATION: PacketEffect.READS,
     CommandCode.SET_ADDRESS: PacketEffect.ARRANGES,
+    CommandCode.DEFINE_STATUS: PacketEffect.ARRANGES,
     CommandCode.SET_BAUD_RATE: PacketEffect.ARRANGES,
     CommandCode.HARD_RESET: PacketEffect.ARRANGES,
 }

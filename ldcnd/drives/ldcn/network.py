@@ -285,6 +285,7 @@ class LdcnNetwork(Network):
                 module.adopted()
         remarks = [f"taken over as it was, at {adopted.baud} baud; gains are assumed to be those of the configuration"]
         remarks += [f"address {address} had lost power and is disabled" for address in sorted(self._restarted)]
+        remarks += [f"address {address}: another host had it add to its replies" for address in adopted.bared]
         if adopted.baud != self._baud:
             remarks.append(f"the configuration asks for {self._baud} baud; the line stays at {adopted.baud}")
         return tuple(remarks)
