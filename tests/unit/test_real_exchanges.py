@@ -1,23 +1,36 @@
 """Requests and replies of real hardware: what simulated modules make of the requests, and decoders of the replies."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from ldcnd.drives.ldcn.packet import CommandCode, StatusItem, check_status, decode_status
-from ldcnd.drives.ldcn.pic_io import IoItem, decode_io_status
+from ldcnd.drives.ldcn.commands import Node, no_operation, set_address
+from ldcnd.drives.ldcn.packet import CommandCode, StatusItem, check_status, decode_status, encode_status
+from ldcnd.drives.ldcn.pic_io import (
+    IoItem,
+    SetDirection,
+    SetOutput,
+    decode_io_status,
+    encode_io_command,
+    encode_io_status,
+)
 from ldcnd.drives.ldcn.profiles import LS_231, PIC_IO, PIC_SERVO_V4, SK_2310G2, identify
-from ldcnd.drives.ldcn.received import decode_command
+from ldcnd.drives.ldcn.received import SetAddress, decode_command
 from ldcnd.line.exchange import ReplyVerdict
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
-from tests.support.simulated_host import SimulatedHost
+from ldcnd.sim.ldcn.power import FaultCondition
+from ldcnd.sim.ldcn.simulation import SimulationConfig
+from ldcnd.sim.plant import MotorPlant
+from tests.support.simulated_axis import SimulatedAxis
+from tests.support.simulated_host import PATIENCE_S, SimulatedHost
 
 EXCHANGES = json.loads((Path(__file__).parents[1] / "vectors" / "real-exchanges.json").read_text())
 PROFILES = {"VSpin PIC-SERVO": PIC_SERVO_V4, "VSpin PIC-I/O": PIC_IO, "LS-231SE": LS_231, "SK-2310g2": SK_2310G2}
 DIFFERENT = {
-    "VSpin PIC-SERVO": "position, home, A/D value, limit switches, phases of an earlier move: those of a real rotor",
-    "VSpin PIC-I/O": "levels and A/D value: those of a real cabinet",
+    "VSpin PIC-SERVO": "position, home, A/D value, phases of an earlier move: those of a real rotor, see below",
+    "VSpin PIC-I/O": "levels and A/D value: those of a real cabinet, see below",
     "LS-231SE": "status byte: its flags are not described, and only its identity is simulated",
     "SK-2310g2": "inputs and A/D values: those of a real machine",
 }
@@ -79,9 +92,81 @@ def test_every_reply_of_real_modules_is_taken(exchange):
         decode_status(PIC_SERVO_V4, StatusItem(mask), reply)
 
 
+@pytest.mark.parametrize(
+    "exchange", ordered("VSpin PIC-SERVO") + ordered("VSpin PIC-I/O"), ids=lambda each: each["reply"]
+)
+def test_what_a_real_module_says_is_sent_with_its_bytes(exchange):
+    reply, mask = bytes.fromhex(exchange["reply"]), exchange["mask"]
+
+    if PROFILES[exchange["device"]] is PIC_IO:
+        assert encode_io_status(IoItem(mask), decode_io_status(IoItem(mask), reply)) == reply
+    else:
+        said = decode_status(PIC_SERVO_V4, StatusItem(mask), reply)
+        assert encode_status(PIC_SERVO_V4, StatusItem(mask), said) == reply
+
+
 @pytest.mark.parametrize("exchange", EXCHANGES, ids=lambda each: f"{each['device']} {each['request']}")
-def test_every_request_to_real_modules_has_all_its_bytes(exchange):
-    assert not decode_command(PROFILES[exchange["device"]], bytes.fromhex(exchange["request"])).oddities
+def test_every_request_to_real_modules_has_all_its_bytes_and_is_sent_with_the_same(exchange):
+    profile, request = PROFILES[exchange["device"]], bytes.fromhex(exchange["request"])
+    meant = decode_command(profile, request)
+    match meant.command:
+        case SetAddress(address, group, leader):
+            sent = set_address(Node(0, profile), address, group, leader=leader).request
+        case SetOutput():
+            sent = encode_io_command(request[1], meant.command)
+        case _:
+            sent = no_operation(Node(request[1], profile)).request
+
+    assert not meant.oddities
+    assert sent == request
+
+
+def test_a_simulated_door_answers_with_the_bytes_of_a_real_one_while_it_opens():
+    pin, opens, unlocks = 9, 10, 11
+    sensors = [{"line": 5, "between": [0.25, 0.9]}, {"line": 7, "between": [1, 1]}]
+    door = {"name": "door", "module": 1, "output": opens, "travel_s": 4.0, "sensors": sensors}
+    module = {"model": "pic-io", "io": {"low": [1, 2, 3, 6]}}
+    host = SimulatedHost(build_chain(SimulationConfig.model_validate({"module": [module], "part": [door]}).spec()))
+    host.address_all()
+
+    def answer(*high):
+        host.chain.write(host.now_s, encode_io_command(1, SetOutput(sum(1 << line - 1 for line in high))))
+        host.wait(PATIENCE_S)
+        return host.send(1, CommandCode.NO_OPERATION).hex()
+
+    host.chain.write(host.now_s, encode_io_command(1, SetDirection(0x8DF)))
+    host.wait(PATIENCE_S)
+    host.send(1, CommandCode.DEFINE_STATUS, IoItem.LEVELS | IoItem.ADC1)
+    answers = [answer(pin, unlocks)]
+    for for_s in (0.5, 1.0, 3.5):
+        answers.append(answer(pin, unlocks, opens))
+        host.wait(for_s)
+
+    assert [*answers[:2], *answers[3:], answer(pin, unlocks, opens)] == [
+        each["reply"] for each in EXCHANGES if each["note"].startswith("door")
+    ]
+
+
+def test_a_simulated_rotor_that_lost_its_power_at_the_index_answers_as_a_real_one_but_for_its_current():
+    exchange = EXCHANGES[0]
+    plant = MotorPlant(counts_per_rev=8000, index_at_counts=0x2522 - 8000, index_width_counts=10)
+    rotor = SimulatedAxis("pic-servo-v4", plant=plant)
+    rotor.send(1, CommandCode.RESET_POSITION)
+    rotor.move(0x5E0)
+    rotor.finish()
+    rotor.wait(1.0)
+    rotor.send(1, CommandCode.SAVE_CURRENT_POSITION_AS_HOME)
+    rotor.move(0x2522)
+    rotor.finish()
+    rotor.wait(1.0)
+    rotor.suffer(FaultCondition.MOTOR_POWER_OFF)
+    rotor.send(1, CommandCode.DEFINE_STATUS, exchange["mask"])
+    rotor.chain.write(rotor.now_s, bytes.fromhex(exchange["request"]))
+    items = StatusItem(exchange["mask"])
+
+    shown = decode_status(PIC_SERVO_V4, items, rotor.wait(PATIENCE_S))
+
+    assert replace(shown, adc=0x4F) == decode_status(PIC_SERVO_V4, items, bytes.fromhex(exchange["reply"]))
 
 
 def test_the_real_replies_say_what_their_devices_showed():

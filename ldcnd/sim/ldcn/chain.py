@@ -27,6 +27,7 @@ from ldcnd.sim.chain import Chain, Delivery
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import IoWiring, SimulatedIo, SimulatedOther
+from ldcnd.sim.ldcn.machine import MachineConfig, Surroundings
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ModuleSettings
@@ -130,6 +131,13 @@ class Analog:
 
 
 @dataclass(frozen=True, slots=True)
+class Jam:
+    """Something that holds a part of the machine at a PIC-I/O."""
+
+    part: str
+
+
+@dataclass(frozen=True, slots=True)
 class TimedEvent:
     """Something that happens to one module by itself.
 
@@ -138,12 +146,12 @@ class TimedEvent:
         place: of the module in the chain, from 1 on.
         what: a condition that begins or ends around a drive, something at the terminals of a PIC-I/O; None for the
             module's own supply.
-        present: whether the condition begins, the line goes high, or the supply is switched on.
+        present: whether the condition or the jam begins, the line goes high, or the supply is switched on.
     """
 
     at_s: float
     place: int
-    what: FaultCondition | OutsideLevel | Analog | None
+    what: FaultCondition | OutsideLevel | Analog | Jam | None
     present: bool
 
 
@@ -159,6 +167,7 @@ class ChainSpec:
             host at any rate, for ports without a rate.
         seed: of the modules' phases and drifts.
         events: in any order.
+        machine: what stands around the terminals of its PIC-I/Os; see `SimulatedChainConfig` for what it may hold.
     """
 
     modules: tuple[ModuleSpec, ...]
@@ -167,19 +176,26 @@ class ChainSpec:
     faults: FaultPlan = field(default_factory=FaultPlan)
     seed: int = 1
     events: tuple[TimedEvent, ...] = ()
+    machine: MachineConfig = field(default_factory=MachineConfig)
 
 
 def build_chain(spec: ChainSpec) -> Chain:
     """Build the modules of a chain, all just powered up at the instant 0 of the line's clock.
 
     Raises:
-        ValueOutOfRange: a module name is unknown, there is no module, or an event is for none or for one to which it
+        ValueOutOfRange: a module name is unknown, there is no module, or or an event is for none or for one to which it
             cannot happen.
     """
     if not spec.modules:
         raise ValueOutOfRange("a simulated chain needs at least one module", value=0, limit=1, nearest=1)
     dice = random.Random(spec.seed)  # noqa: S311 - reproducible on purpose
-    modules = [_build_module(module, dice) for module in spec.modules]
+    parts = spec.machine.part
+    around = [Surroundings([part for part in parts if part.module == place]) for place, _ in enumerate(spec.modules, 1)]
+    modules = [_build_module(*each, dice) for each in zip(spec.modules, around, strict=True)]
+    for switch in spec.machine.imbalance:
+        drive = modules[switch.drive - 1]
+        if isinstance(drive, SimulatedDrive):
+            around[switch.module - 1].add(switch, drive)
     chain = Chain(modules, spec.faults, baud_check=spec.baud_check, delivery=spec.delivery)
     for event in spec.events:
         if not 1 <= event.place <= len(modules):
@@ -200,11 +216,15 @@ def _happening(event: TimedEvent, module: SimulatedModule) -> Callable[[float], 
             return lambda at_s: io.drive_line(number, high=event.present, at_s=at_s)
         case Analog(channel, value), SimulatedIo() as io:
             return lambda at_s: io.set_adc(channel, value, at_s)
+        case Jam(part), SimulatedIo() as io if io.around.has(part):
+            return lambda at_s: io.jam(part, jammed=event.present, at_s=at_s)
+    if isinstance(event.what, Jam):
+        raise ValueOutOfRange(f"module {event.place} has no part {event.what.part}", value=event.place)
     lacking = "motor" if isinstance(event.what, FaultCondition) else "terminals"
     raise ValueOutOfRange(f"module {event.place} has no {lacking} for {event.what}", value=event.place)
 
 
-def _build_module(spec: ModuleSpec, dice: random.Random) -> SimulatedModule:
+def _build_module(spec: ModuleSpec, around: Surroundings, dice: random.Random) -> SimulatedModule:
     profile, default = model(spec.name)
     phase_s, drift_ppm = dice.uniform(0.0, SERVO_CYCLE_S), dice.uniform(-MOST_DRIFT_PPM, MOST_DRIFT_PPM)
     drawn = default.model_copy(update={"phase_s": phase_s, "drift_ppm": drift_ppm})
@@ -217,4 +237,6 @@ def _build_module(spec: ModuleSpec, dice: random.Random) -> SimulatedModule:
             drive.save(spec.start_up)
             drive.restore()
         return drive
-    return SimulatedIo(profile, settings, spec.wiring) if profile is PIC_IO else SimulatedOther(profile, settings)
+    if profile is PIC_IO:
+        return SimulatedIo(profile, settings, spec.wiring, around)
+    return SimulatedOther(profile, settings)

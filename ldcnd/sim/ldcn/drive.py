@@ -121,6 +121,10 @@ class SimulatedDrive(SimulatedModule):
         self.stage.check()
         self._obey_stage()
 
+    def suffers(self, condition: FaultCondition) -> bool:
+        """Tell whether something is wrong around the drive at present."""
+        return condition in self._conditions
+
     # -- module ------------------------------------------------------------------------------------------------------
 
     @property

@@ -38,6 +38,7 @@ from ldcnd.drives.ldcn.pic_io import (
 from ldcnd.drives.ldcn.profiles import PIC_STEP, SK_2310G2, Profile
 from ldcnd.drives.ldcn.received import ReceivedCommand
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
+from ldcnd.sim.ldcn.machine import LineNumber, Surroundings
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 
@@ -52,7 +53,6 @@ ITEM_BYTES_BY_PROFILE = MappingProxyType({PIC_STEP.name: STEP_ITEM_BYTES, SK_231
 not simulated."""
 
 
-LineNumber = Annotated[int, Field(ge=1, le=LINES)]
 Byte = Annotated[int, Field(ge=0, le=255)]
 
 
@@ -86,15 +86,24 @@ class SimulatedIo(SimulatedModule):
         outputs: bits of the lines that are outputs.
         latch: the levels to which outputs are set.
         pwm: both PWM values, 0 to 255.
+        around: the parts and switches of the machine at its terminals.
     """
 
-    def __init__(self, profile: Profile, settings: ModuleSettings, wiring: IoWiring | None = None) -> None:
+    def __init__(
+        self,
+        profile: Profile,
+        settings: ModuleSettings,
+        wiring: IoWiring | None = None,
+        around: Surroundings | None = None,
+    ) -> None:
         wiring = wiring or IoWiring()
         self._wires = [(line, driver, 0) for driver, line in wiring.wires]
         self._wires += [(line, driver, 1) for driver, line in wiring.inverted_wires]
         self._low = sum(1 << line - 1 for line in wiring.low)
         self._adc = list(wiring.adc)
         self._pulses_per_cycle = wiring.pulses_hz * SERVO_CYCLE_S
+        self._unplugged = 0  # lines that something outside drives, whatever was wired to them
+        self.around = around or Surroundings()
         self.outputs = 0
         self.latch = 0
         super().__init__(profile, settings)
@@ -102,18 +111,29 @@ class SimulatedIo(SimulatedModule):
     @property
     def levels(self) -> int:
         """The levels of the twelve pins."""
-        levels = ~self._low & ALL_LINES
+        outside = ~self._low & ALL_LINES
+        levels = self.around.levels(outside, self.settings.phase_s + self._cycles_done * self._cycle_s)
         for line, driver, inverted in self._wires:
             if self.outputs & 1 << driver - 1:
                 levels = levels & ~(1 << line - 1) | ((self.latch >> driver - 1 & 1) ^ inverted) << line - 1
+        levels = levels & ~self._unplugged | outside & self._unplugged
         return levels & ~self.outputs | self.latch & self.outputs
 
     def drive_line(self, line: int, *, high: bool, at_s: float) -> None:
-        """Drive a line, 1 to 12, from outside at that instant of the line's clock; an output wins over it."""
+        """Drive a line, 1 to 12, from outside at that instant of the line's clock; an output wins over it.
+
+        The sensor or switch that was at the line is unplugged.
+        """
         self.catch_up(at_s)
         before = self.levels
         self._low = self._low & ~(1 << line - 1) | (0 if high else 1 << line - 1)
+        self._unplugged |= 1 << line - 1
         self._count_edges(before)
+
+    def jam(self, part: str, *, jammed: bool, at_s: float) -> None:
+        """Let something hold a part of the machine, or let go of it, at that instant of the line's clock."""
+        self.catch_up(at_s)
+        self.around.jam(part, jammed=jammed)
 
     def set_adc(self, channel: int, value: int, at_s: float) -> None:
         """Change the voltage at an A/D input, 1 to 3, to 0 to 255 for 0 to 5 V."""
@@ -135,7 +155,8 @@ class SimulatedIo(SimulatedModule):
         self._captured = (0, 0)
 
     def run(self, cycles: int) -> None:
-        """The module's own clock drives the timer, the world outside the counter."""
+        """The module's own clock drives the timer, the world outside the counter; the machine goes on moving."""
+        self.around.run(cycles * self._cycle_s, self.latch & self.outputs)
         if not self._mode.enabled:
             return
         if not self._mode.counter:

@@ -29,6 +29,8 @@ class FaultCondition(StrEnum):
     """Both limit switches are actuated, wherever the shaft is: the wire that they share is broken."""
     STALLED = "stalled"
     """Something holds the shaft."""
+    UNBALANCED = "unbalanced"
+    """The rotor on the shaft is out of balance: it hits the imbalance switch of its machine."""
     SLOW_PROCESSOR = "slow_processor"
     """The firmware is late for a servo cycle, which is remembered in a sticky bit and changes nothing else."""
 

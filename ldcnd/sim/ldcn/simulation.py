@@ -12,8 +12,9 @@ from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.ldcn.profiles import PIC_IO, Support, identify
 from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import FaultPlan
-from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, Analog, ChainSpec, ModuleSpec, OutsideLevel, TimedEvent
-from ldcnd.sim.ldcn.io import Byte, IoWiring, LineNumber
+from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, Analog, ChainSpec, Jam, ModuleSpec, OutsideLevel, TimedEvent
+from ldcnd.sim.ldcn.io import Byte, IoWiring
+from ldcnd.sim.ldcn.machine import LineNumber, MachineConfig
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 from ldcnd.sim.line_config import FaultyLineConfig, SimulatedFaultConfig
@@ -122,11 +123,16 @@ class LdcnEventConfig(Frozen):
     """Level from outside, with `line`."""
     value: Byte | None = None
     """Reading of `adc`, 0 to 255 for 0 to 5 V."""
+    jams: str | None = None
+    """Part of the machine at a PIC-I/O that something holds from now on, wherever it is."""
+    frees: str | None = None
+    """Part that can move again."""
 
     @model_validator(mode="after")
     def _one_thing(self) -> Self:
-        if sum(each is not None for each in (self.begins, self.ends, self.power, self.line, self.adc)) != 1:
-            raise ValueError("an event needs exactly one of begins, ends, power, line, adc")
+        given = (self.begins, self.ends, self.power, self.line, self.adc, self.jams, self.frees)
+        if sum(each is not None for each in given) != 1:
+            raise ValueError("an event needs exactly one of begins, ends, power, line, adc, jams, frees")
         if (self.line is None) is not (self.level is None):
             raise ValueError("line and level belong together")
         if (self.adc is None) is not (self.value is None):
@@ -136,20 +142,23 @@ class LdcnEventConfig(Frozen):
     @property
     def concerns_terminals(self) -> bool:
         """Whether it happens to a PIC-I/O."""
-        return self.line is not None or self.adc is not None
+        return any(each is not None for each in (self.line, self.adc, self.jams, self.frees))
 
     def spec(self, starts_at_s: float) -> TimedEvent:
         """Return what the simulator plays."""
-        what: FaultCondition | OutsideLevel | Analog | None = self.begins or self.ends
+        what: FaultCondition | OutsideLevel | Analog | Jam | None = self.begins or self.ends
+        part = self.jams or self.frees
         if self.line is not None:
             what = OutsideLevel(self.line)
         elif self.adc is not None and self.value is not None:
             what = Analog(self.adc, self.value)
-        present = self.begins is not None or self.power == "on" or self.level == "high"
+        elif part is not None:
+            what = Jam(part)
+        present = self.begins is not None or self.jams is not None or self.power == "on" or self.level == "high"
         return TimedEvent(starts_at_s + self.at_s, self.module, what, present=present)
 
 
-class SimulatedChainConfig(Frozen):
+class SimulatedChainConfig(MachineConfig):
     """A simulated line, in the order in which modules are given addresses."""
 
     seed: int = 1
@@ -171,6 +180,15 @@ class SimulatedChainConfig(Frozen):
                 raise ValueError(f"event[{number}]: module {event.module} is a {module.model} and has no terminals")
             if event.power is None and not event.concerns_terminals and not module.is_drive:
                 raise ValueError(f"event[{number}]: module {event.module} is a {module.model} and has no motor")
+            part = event.jams or event.frees
+            if part and (part, event.module) not in {(each.name, each.module) for each in self.part}:
+                raise ValueError(f"event[{number}]: module {event.module} has no part {part}")
+        for place in {*(part.module for part in self.part), *(switch.module for switch in self.imbalance)}:
+            if place > len(self.module) or not self.module[place - 1].has_terminals:
+                raise ValueError(f"part, imbalance: module {place} is no pic-io")
+        for switch in self.imbalance:
+            if switch.drive > len(self.module) or not self.module[switch.drive - 1].is_drive:
+                raise ValueError(f"imbalance: module {switch.drive} is no drive")
         return self
 
     def spec(
@@ -190,6 +208,7 @@ class SimulatedChainConfig(Frozen):
             faults=FaultPlan(tuple(fault.spec(starts_at_s) for fault in self.fault), self.seed),
             seed=self.seed,
             events=tuple(event.spec(starts_at_s) for event in self.event),
+            machine=MachineConfig(part=self.part, imbalance=self.imbalance),
         )
 
 
