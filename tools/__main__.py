@@ -1,4 +1,4 @@
-"""Writes what is generated and committed: schemas, the client's methods, reference pages.
+"""Writes what is generated and committed: schemas, the client's methods, reference pages, the contract.
 
 `python -m tools client` writes the methods of the client alone, also when those that there are cannot be loaded;
 `python -m tools check` fails when the schemas are not what the models say; `python -m tools man FOLDER` writes
@@ -19,6 +19,7 @@ from tools.verb_methods import verb_methods, with_blocking_methods
 ROOT = Path(__file__).parents[1]
 REFERENCE = ROOT / "docs" / "reference"
 SCHEMAS = ROOT / "schemas"
+KEPT = ROOT / "tests" / "kept"
 STUB = ROOT / "ldcnd" / "__init__.pyi"
 
 
@@ -64,6 +65,7 @@ def write_all() -> None:
     from tools.client_reference import client_reference  # noqa: PLC0415
     from tools.config_reference import config_reference  # noqa: PLC0415
     from tools.manual import as_markdown  # noqa: PLC0415
+    from tools.public_contract import keep  # noqa: PLC0415
 
     write_schemas(SCHEMAS)
     pages = {"configuration": config_reference(), "cli": as_markdown(), "python": client_reference()}
@@ -72,6 +74,7 @@ def write_all() -> None:
     tables = {"keys": keys_table(), "errors": errors_table(), "motor-record": rules_table()}
     for name, table in tables.items():
         renew_table(REFERENCE / f"{name}.md", table)
+    keep(KEPT, (ROOT / "CHANGELOG.md").read_text(encoding="utf-8"))
 
 
 def check() -> None:

@@ -11,6 +11,9 @@ from ldcnd.contract.health import LineCounters
 from ldcnd.contract.plan import PollPriority
 from ldcnd.contract.samples import PastFault
 
+API = 1
+"""Version of keys and payloads: it grows with a change that a program of before does not survive."""
+
 
 class DaemonInfo(Frozen):
     """The daemon that serves a rig: `meta/daemon`."""
@@ -20,7 +23,7 @@ class DaemonInfo(Frozen):
     version: str
     """Version of ldcnd."""
     api: int
-    """Version of keys and payloads; fields are only ever added within one."""
+    """Version of keys and payloads; within one, fields, verbs and error codes are only added."""
     instance: str
     """Names this run of the daemon, as in its liveliness token."""
     started: int

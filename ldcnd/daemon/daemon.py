@@ -12,7 +12,7 @@ from ldcnd.axis.latches import LatchKeeper
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.keys import Keys
-from ldcnd.contract.meta import DaemonInfo
+from ldcnd.contract.meta import API, DaemonInfo
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.capture import CaptureStore, CaptureWatch, Run, capture_of, snapshot_of
@@ -33,8 +33,6 @@ from ldcnd.version import version
 
 log = get_logger("daemon")
 
-API = 1
-"""Version of keys and payloads: within one, fields are only ever added."""
 TOKEN_PERIOD_S = 0.2
 STOP_AGAIN_S = 0.02
 """Pause between two attempts at a stop that no drive has confirmed, at the end of the daemon, seconds."""
