@@ -6,12 +6,13 @@ import contextlib
 import pytest
 
 from ldcnd.contract.commands import HomeMethod
-from ldcnd.contract.errors import NetworkMismatch, NotSupported, ReplyTimeout, StopLatched
+from ldcnd.contract.errors import BusError, NetworkMismatch, NotSupported, ReplyTimeout, StopLatched
 from ldcnd.drives.driver import CountsMotion, HomeCapture, StopMode
 from ldcnd.drives.ldcn.addressing import Expected, Identity, differences
 from ldcnd.drives.ldcn.adoption import Found
 from ldcnd.drives.ldcn.commands import Node, read_status
 from ldcnd.drives.ldcn.config import LineSpec, ModuleConfig
+from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drives.ldcn.registers import actual_baud
@@ -552,3 +553,22 @@ async def test_an_sc_that_has_kept_its_power_is_not_reset_although_it_answers_at
 
         assert CommandCode.HARD_RESET not in {packet.command for packet in line.sent(before)}
         assert chain.modules[1].loop.servo_on
+
+
+async def test_stops_that_are_not_acknowledged_never_close_the_loop_of_a_drive_that_was_reset():
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+        before = len(line.sent())
+        for place, axis in enumerate(line.network.axes.values(), 1):
+            chain.mute(place, on=True)
+            for _ in range(3):
+                with pytest.raises(BusError):
+                    await axis.stop(StopMode.SMOOTH)
+            chain.mute(place, on=False)
+            await axis.stop(StopMode.SMOOTH)
+        stops = [packet for packet in line.sent(before) if packet.command is CommandCode.STOP_MOTOR]
+
+    assert {packet.address for packet in stops} == {1, 2}
+    assert not [packet for packet in stops if packet.data[0] & StopControl.AMP_ENABLE]
+    assert not any(module.loop.servo_on for module in chain.modules)

@@ -22,6 +22,7 @@ from ldcnd.drives.driver import CountsMotion, StopMode
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import EVERYBODY, Addressing, Group, GroupPlan
 from ldcnd.drives.ldcn.commands import Node, unanswered
+from ldcnd.drives.ldcn.controls import StopControl
 from ldcnd.drives.ldcn.io_module import IoModule
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.pic_io import LINES, IoStatus
@@ -89,7 +90,7 @@ class Groups:
         finally:
             for group in groups:
                 for name in group.members:
-                    self._drives[name].state.switched_unconfirmed()
+                    self._drives[name].state.switched_unconfirmed(pic_ae=bool(control & StopControl.AMP_ENABLE))
 
     async def start(self, motions: Mapping[str, CountsMotion], still_wanted: Callable[[], None]) -> None:
         """See `Network.start_group`.

@@ -95,9 +95,13 @@ class DriveState:
         """The drive was out of reach for a while; nothing was sent to it meanwhile, by this host at least."""
         self.known = replace(self.known, seen=False)
 
-    def switched_unconfirmed(self) -> None:
-        """A Stop Motor was sent, or may have been, that was not acknowledged: it may have opened the loop."""
-        self.known = replace(self.known, pic_ae=None, nothing_latched=False, closed=False)
+    def switched_unconfirmed(self, *, pic_ae: bool) -> None:
+        """A Stop Motor was sent, or may have been, that was not acknowledged: it may have opened the loop.
+
+        What it would leave as it is known to be stays known: a motor that was off is off, whether it arrived or not.
+        """
+        known = pic_ae if self.known.pic_ae is pic_ae else None
+        self.known = replace(self.known, pic_ae=known, nothing_latched=False, closed=False)
 
     def switched(self, *, pic_ae: bool, closed: bool) -> None:
         """The drive acknowledged a Stop Motor that closes the loop, or opens it."""

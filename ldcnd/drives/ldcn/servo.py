@@ -370,7 +370,7 @@ class LdcnAxis(Moves):
         try:
             await self._bus.execute(exchange, lane)
         except BaseException:
-            self.state.switched_unconfirmed()
+            self.state.switched_unconfirmed(pic_ae=pic_ae)
             raise
         self.state.switched(pic_ae=pic_ae, closed=closed)
 
