@@ -29,7 +29,7 @@ check: .venv/ready
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	.venv/bin/mypy
-	.venv/bin/mypy examples/*.py
+	.venv/bin/mypy examples/*.py examples/lab/[aps]*.py
 	.venv/bin/lint-imports
 	$(PY) -m tests.words
 	$(PY) -m tools check

@@ -22,7 +22,7 @@ from ldcnd.testing.twin import RigState, config_of_twin, place, restore
 
 ResultT = TypeVar("ResultT")
 
-COARSE_MS = 50.0
+COARSE_MS = 300.0
 """Least margin of the deadlines of replies: simulated lines are paced by the timers of this process."""
 CONNECT = "LDCND_CONNECT"
 """The variable in which programs find the endpoint of their rig."""

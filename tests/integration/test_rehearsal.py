@@ -1,11 +1,10 @@
 """Programs that move machines, tried on a rig in the process of a test."""
 
-import asyncio
 import os
+import shutil
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -75,72 +74,6 @@ async def test_a_jam_ends_the_program_where_it_is(ldcnd_rig):
         await scan(ldcnd_rig.client)
     assert ldcnd_rig.truth("x").at_rest
     assert ldcnd_rig.truth("x").position == pytest.approx(7.5, abs=0.02)
-
-
-@dataclass
-class Case:
-    """A fault that comes in the middle of a motion to 20, and what is then so."""
-
-    begin: object
-    goes_on: bool = False
-    """The program notices nothing."""
-    arrives: bool | None = None
-    """Whether the axis does; by itself, as the program says."""
-    says: str = ""
-    """What an active fault or an event of x says."""
-    axis: str = "x"
-
-
-CASES = {
-    "jam": Case(lambda faults: faults.jam("x", at=10), says="position_error"),
-    "slip": Case(lambda faults: faults.slip("x", 0.5, at=10), goes_on=True),
-    "friction": Case(lambda faults: faults.friction("x", 5, at=10), goes_on=True),
-    "load": Case(lambda faults: faults.load("x", 0.05, at=10), goes_on=True),
-    "phase_lost": Case(lambda faults: faults.phase_lost("x", at=10), goes_on=True, says="unsettled"),
-    "limit_closed": Case(lambda faults: faults.limit_closed("x", "forward", at=10), goes_on=True),
-    "limit_stuck": Case(lambda faults: faults.limit_stuck("x", "forward"), goes_on=True),
-    "index_lost": Case(lambda faults: faults.index_lost("x"), goes_on=True),
-    "encoder_lost": Case(lambda faults: faults.encoder_lost("x", at=10), says="encoder"),
-    "encoder_stuck": Case(lambda faults: faults.encoder_stuck("x", at=10)),
-    "overheat": Case(lambda faults: faults.overheat("x", at=10), says="overheat"),
-    "overcurrent": Case(lambda faults: faults.overcurrent("x", at=10), says="overcurrent"),
-    "motor_short": Case(lambda faults: faults.motor_short("x", at=10), says="short"),
-    "overvoltage": Case(lambda faults: faults.overvoltage("x", at=10), says="overvoltage"),
-    "motor_supply_lost": Case(lambda faults: faults.motor_supply_lost("z", at=10), axis="z", says="power"),
-    "stop_input": Case(lambda faults: faults.stop_input("x", at=10), says="stop_input"),
-    "power_loss": Case(lambda faults: faults.power_loss("x", at=10, for_s=1.0), says="reset"),
-    "mute": Case(lambda faults: faults.mute("x", at=10, for_s=2.0), says="link_lost"),
-    "cable_cut": Case(lambda faults: faults.cable_cut("x", at=10, for_s=2.0), goes_on=True, says="link_lost"),
-    "noise": Case(lambda faults: faults.noise(0.05, after_s=0.5, for_s=1.0), goes_on=True),
-    "late_replies": Case(lambda faults: faults.late_replies(0.004, after_s=0.5, for_s=1.0), goes_on=True),
-    "lost_replies": Case(lambda faults: faults.lost_replies(0.05, after_s=0.5, for_s=1.0), goes_on=True),
-    "unplug": Case(lambda faults: faults.unplug(after_s=0.5, for_s=1.0), arrives=True, says="lost"),
-    "reset_by_another": Case(lambda faults: faults.reset_by_another(after_s=0.5), says="reset"),
-    "daemon_killed": Case(lambda faults: faults.daemon_killed(after_s=0.5, for_s=0.3)),
-    "client_lost": Case(lambda faults: faults.client_lost(after_s=0.5), says="lease"),
-}
-
-
-@pytest.mark.parametrize("name", CASES)
-async def test_every_fault_does_to_the_machine_what_its_name_says(ldcnd_rig, name):
-    case = CASES[name]
-    fault = case.begin(ldcnd_rig.faults)
-    arrived = False
-    try:
-        async with ldcnd_rig.client.control(case.axis, client="test") as axis, asyncio.timeout(60):
-            await axis.power(on=True)
-            await (await axis.move_absolute(20, velocity=10)).done()
-            arrived = True
-    except ldcnd.LdcndError as error:
-        ldcnd_rig.timeline.note(f"the program ends: {error}")
-    await asyncio.sleep(4)
-    told = str(ldcnd_rig.timeline)
-    print(told)
-    assert fault.begun or name in ("limit_stuck", "index_lost")
-    assert arrived == case.goes_on
-    truth = ldcnd_rig.truth(case.axis)
-    assert (abs(truth.position - 20) < 0.05) == (case.goes_on if case.arrives is None else case.arrives)
-    assert case.says in told
 
 
 def bytes_of(rig):
@@ -293,24 +226,48 @@ def test_the_blocks_of_the_page_run_in_an_empty_folder(tmp_path):
     (tmp_path / "alone.py").write_text("from my_lab import scan\n" + alone)
 
     def python(*words):
-        environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-        return subprocess.run(  # noqa: S603
-            [sys.executable, *words],
-            cwd=tmp_path,
-            env=environment,
-            capture_output=True,
-            text=True,
-            timeout=50,
-            check=False,
-        )
+        return in_folder(tmp_path, *words)
 
-    assert "2 passed" in (passes := python("-m", "pytest", "-p", "no:cacheprovider")).stdout, passes.stdout
-    assert python("alone.py").returncode == 0
+    passes = python("-m", "pytest", "-p", "no:cacheprovider")
+    assert "2 passed" in passes, passes
+    assert "Traceback" not in python("alone.py")
 
     (tmp_path / "my_lab.py").write_text(MY_LAB.replace("await (await x.move_absolute(place)).done()", "pass"))
-    fails = python("-m", "pytest", "-p", "no:cacheprovider", "test_scan.py").stdout
+    fails = python("-m", "pytest", "-p", "no:cacheprovider", "test_scan.py")
     assert "1 failed" in fails
     assert "DID NOT RAISE" in fails
     assert "what happened on the rig" in fails
     assert "x power" in fails
     assert "the last packets on line0" in fails
+
+
+def in_folder(folder, *words, python=sys.executable):
+    """Run Python in a folder, with the programs of its environment at hand; return what it printed."""
+    environment = {**os.environ, "PATH": f"{Path(python).parent}:{os.environ['PATH']}"}
+    ran = subprocess.run(  # noqa: S603
+        [python, *words], cwd=folder, env=environment, capture_output=True, text=True, timeout=200, check=False
+    )
+    return ran.stdout + ran.stderr
+
+
+def test_the_lab_of_the_examples_tries_its_own_scripts(tmp_path):
+    lab = shutil.copytree(ROOT / "examples" / "lab", tmp_path / "lab")
+    told = in_folder(lab, "-m", "pytest", "-q", "-p", "no:cacheprovider")
+    assert "6 passed" in told, told
+
+
+@pytest.mark.system
+@pytest.mark.timeout(300)
+def test_whoever_has_nothing_but_the_wheel_can_rehearse(tmp_path):
+    uv = [str(Path(sys.executable).with_name("uv"))]
+    made = tmp_path / "made"
+    subprocess.run([*uv, "build", "--wheel", "--out-dir", made, ROOT], check=True, capture_output=True)  # noqa: S603
+    (wheel,) = made.glob("*.whl")
+    subprocess.run([*uv, "venv", tmp_path / "env"], check=True, capture_output=True)  # noqa: S603
+    python = str(tmp_path / "env" / "bin" / "python")
+    wanted = f"ldcnd[testing] @ {wheel.as_uri()}"
+    subprocess.run([*uv, "pip", "install", "--python", python, wanted], check=True, capture_output=True)  # noqa: S603
+    lab = shutil.copytree(ROOT / "examples" / "lab", tmp_path / "lab")
+    shutil.copy(Path(__file__).with_name("test_named_faults.py"), lab)
+    told = in_folder(lab, "-m", "pytest", "-q", "-p", "no:cacheprovider", python=python)
+    assert "32 passed" in told, told
