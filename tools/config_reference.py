@@ -22,7 +22,7 @@ anything, and names file, key, what is wrong and what is allowed; keys that are 
 of a key stands behind the semicolon.
 """
 ELSEWHERE = {
-    "sim.module.behaviour": "[The simulated line](simulator.md#quirks) has its switches with their defaults.",
+    "sim.module.behaviour": "`schemas/rig_config.json` has its switches, `ModuleSettings`.",
     "sim.module.plant": "`schemas/rig_config.json` has its constants, `PlantConfig`.",
     "sim.unit": "[The simulated line](simulator.md#smartsteps) shows its keys.",
 }

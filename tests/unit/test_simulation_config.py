@@ -13,7 +13,7 @@ from ldcnd.sim.chain import Delivery
 from ldcnd.sim.faults import FaultKind, LineFault
 from ldcnd.sim.ldcn.chain import MODELS, OLD_NAMES, build_chain
 from ldcnd.sim.ldcn.power import FaultCondition
-from ldcnd.sim.ldcn.quirks import ModuleSettings, PositionErrorClearing
+from ldcnd.sim.ldcn.quirks import PositionErrorClearing
 from ldcnd.sim.ldcn.simulation import SimulatedChainConfig, SimulationConfig
 from ldcnd.sim.line_config import FaultPlanConfig
 
@@ -167,17 +167,6 @@ def test_the_reference_lists_the_modules_as_they_are():
     assert {name: (int(version), reset == "yes") for name, version, reset in rows} == {
         name: (settings.version, settings.always_obeys_global_reset) for name, (_, settings) in MODELS.items()
     }
-
-
-def test_the_reference_lists_every_quirk_with_its_default():
-    page = REFERENCE.read_text()
-    rows = re.findall(r"^\* `(\w+)` \((.+?)\): .+$", page[page.index("## Quirks") :], re.MULTILINE)
-    defaults = {name: field.default for name, field in ModuleSettings.model_fields.items()}
-
-    assert [name for name, _ in rows] == list(defaults)
-    for name, told in rows:
-        if isinstance(defaults[name], bool) and told in {"true", "false"}:
-            assert (told == "true") is defaults[name], name
 
 
 def test_a_version_of_another_model_is_refused():
