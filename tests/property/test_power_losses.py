@@ -168,6 +168,8 @@ class History:
             for place in kept:
                 if self.chain.modules[place].address != place + 1:
                     self.flaws.append(f"place {place + 1} was reset by the daemon")
+            if ALONE in rig.line.network.problem:
+                return  # it says what a person must do, and goes on to ask
             for place, module in enumerate(self.chain.modules, 1):
                 if module.address != place:
                     self.flaws.append(f"place {place} is not back: {module.address}; {rig.line.network.problem}")
