@@ -23,6 +23,7 @@ class AxisTracker:
         status: as of now.
         reading: the latest; None before the first.
         read_at_s: when it was requested, in loop time.
+        earlier: the reading before it, and when that was requested.
         proof: that who answers is its drive.
     """
 
@@ -31,6 +32,7 @@ class AxisTracker:
         self.status = status
         self.reading: AxisReading | None = None
         self.read_at_s = -math.inf
+        self.earlier: tuple[AxisReading | None, float] = (None, -math.inf)
         self.proof = proof
         self._watching: tuple[tuple[str, OnChange], ...] = ()
 
@@ -54,6 +56,7 @@ class AxisTracker:
             timing: of its exchange.
             now_ns: when it was true, UTC.
         """
+        self.earlier = self.reading, self.read_at_s
         self.reading, self.read_at_s, before = reading, timing.sent_at_s, self.status
         after = take_reading(before, ReadingTaken(reading, timing.sent_at_s, now_ns))
         if after is not before:  # most readings change nothing

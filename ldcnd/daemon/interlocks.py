@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from functools import partial
 
 from ldcnd.axis.axis import AxisService
+from ldcnd.axis.rest import REST_COUNTS
 from ldcnd.axis.status import MOTION_STATES, AxisStatus
 from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
 from ldcnd.contract.commands import kind_of
@@ -28,6 +29,8 @@ from ldcnd.log import get_logger
 
 log = get_logger("interlocks")
 
+HUNTING = 0.1
+"""Share of its speed by which a servo may be faster than its profile, between two readings."""
 Obstacle = Callable[[], str]
 """Returns in words why a requirement does not hold, or is not known to; empty when it does."""
 
@@ -298,16 +301,21 @@ def _commanded(status: AxisStatus) -> bool:
 def _speed(axis: AxisService) -> float:
     """Return how fast an axis is at most, in units a second.
 
-    What a drive shows is whole counts in a servo cycle: of a slow motion its command says more, as long as both agree.
+    What a drive shows is whole counts in a servo cycle. Of a slow motion its command says more, once two positions show
+    that it is not faster any more.
     """
     tracker = axis.tracker
     status, reading = tracker.status, tracker.reading
     if reading is None:
         return math.inf
-    shown, resolution = abs(reading.velocity_counts_per_s), reading.velocity_resolution_counts_per_s
-    commanded = axis.commanded_counts_per_s
+    counts = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
     if _commanded(status) and status.state is not AxisState.STOPPING:
-        counts = commanded if shown <= commanded + resolution else shown + resolution
-    else:
-        counts = 0.0 if status.at_rest else shown + resolution
+        commanded, (earlier, at_s) = axis.commanded_counts_per_s, tracker.earlier
+        if earlier is None:
+            return max(commanded, counts) / abs(status.scale.counts_per_unit)
+        way, took_s = abs(reading.position_counts - earlier.position_counts), tracker.read_at_s - at_s
+        slow = way <= commanded * (1 + HUNTING) * took_s + REST_COUNTS
+        counts = commanded if slow else max(commanded, counts)
+    elif status.at_rest:
+        counts = 0.0
     return counts / abs(status.scale.counts_per_unit)
