@@ -115,6 +115,7 @@ async def running_machine(config: RigConfig, chain: Chain | None = None) -> Asyn
         found = Machine(rig.daemon, rig.client, rig.session, rig.broker)
         object.__setattr__(found, "chain", chain)
         async with asyncio.timeout(5.0):
-            while rig.daemon.rig.modules["cabinet"].read_at_s < 0:
+            rotor, cabinet = rig.daemon.rig.axes["rotor"].tracker, rig.daemon.rig.modules["cabinet"]
+            while cabinet.read_at_s < 0 or rotor.earlier[0] is None:  # two readings tell how slow it is
                 await asyncio.sleep(0.01)
         yield found
