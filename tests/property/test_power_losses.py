@@ -165,16 +165,20 @@ class History:
             if "not proven" in rig.line.problem:
                 self.named = True  # the cycles of two modules end together: they are asked again and again
                 await asyncio.sleep(LATER_S)
-            for place in kept:
-                if self.chain.modules[place].address != place + 1:
-                    self.flaws.append(f"place {place + 1} was reset by the daemon")
-            if ALONE in rig.line.network.problem:
-                return  # it says what a person must do, and goes on to ask
-            for place, module in enumerate(self.chain.modules, 1):
-                if module.address != place:
-                    self.flaws.append(f"place {place} is not back: {module.address}; {rig.line.network.problem}")
-            if not rig.line.bus.proofs.all_hold():
-                self.flaws.append("not every module is proven")
+            self.judge_end(rig, kept)
+
+    def judge_end(self, rig, kept) -> None:
+        """Note which modules are not back where they belong, unless the daemon says what a person must do."""
+        for place in kept:
+            if self.chain.modules[place].address != place + 1:
+                self.flaws.append(f"place {place + 1} was reset by the daemon")
+        if ALONE in rig.line.network.problem:
+            return
+        for place, module in enumerate(self.chain.modules, 1):
+            if module.address != place:
+                self.flaws.append(f"place {place} is not back: {module.address}; {rig.line.network.problem}")
+        if not rig.line.bus.proofs.all_hold():
+            self.flaws.append("not every module is proven")
 
     def stands(self, module) -> bool:
         """Tell whether a drive does not move by itself."""
