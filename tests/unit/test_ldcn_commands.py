@@ -100,7 +100,11 @@ def test_a_packet_says_what_it_does(to):
             commands.stop_motor(to, amplifier | StopControl.SMOOTH),
             commands.stop_motor(to, amplifier | StopControl.ABRUPT),
         ),
-        PacketEffect.ARRANGES: (commands.hard_reset(to), commands.set_address(to, 1, 0x81)),
+        PacketEffect.ARRANGES: (
+            commands.hard_reset(to),
+            commands.set_address(to, 1, 0x81),
+            commands.define_status(to, StatusItem(0)),
+        ),
         PacketEffect.CHANGES: (
             commands.start_motion(to),
             commands.load_trajectory(to, standing),
@@ -110,7 +114,6 @@ def test_a_packet_says_what_it_does(to):
             commands.stop_motor(to, amplifier | StopControl.HERE, 5),
             commands.clear_sticky_bits(to),
             commands.reset_position(to),
-            commands.define_status(to, StatusItem(0)),
             commands.set_homing(to, HomingControl(0)),
             commands.save_home(to),
             commands.unanswered(0xFF, b"", QUIET_S, repeatable=False),
