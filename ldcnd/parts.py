@@ -16,6 +16,7 @@ EXTRAS = {
     "p4p": ("p4p", "epics-pva"),
     "prometheus_client": ("prometheus-client", "lab"),
     "pyarrow": ("pyarrow", "parquet"),
+    "segno": ("segno", "console"),
     "starlette": ("starlette", "console"),
     "textual": ("textual", "tui"),
     "uvicorn": ("uvicorn", "console"),

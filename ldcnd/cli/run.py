@@ -9,6 +9,7 @@ import sys
 from asyncio.subprocess import PIPE, Process
 from collections.abc import AsyncIterator, Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import click
@@ -16,7 +17,7 @@ import click
 from ldcnd.cli.output import Terminal, show_lines
 from ldcnd.cli.typed import CONSOLE_ADDRESS, parsed_address
 from ldcnd.config.plan import plan_rig, require_plan
-from ldcnd.config.rig import RigConfig, load_config, single_line
+from ldcnd.config.rig import RigConfig, example, load_config, single_line
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import build_models
 from ldcnd.contract.plan import BusPlan
@@ -24,7 +25,7 @@ from ldcnd.daemon.assembly import open_daemon, session_settings
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap
 from ldcnd.daemon.systemd import Notifier
-from ldcnd.listen_address import ListenAddress
+from ldcnd.listen_address import ListenAddress, parse_listen_address
 from ldcnd.log import configure_logging, get_logger
 from ldcnd.net.zenoh_config import zenoh_config
 from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT
@@ -104,7 +105,11 @@ log = get_logger("run")
 
 
 @click.command()
-@click.option("--config", type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML).")
+@click.option(
+    "--config",
+    type=click.Path(path_type=Path),
+    help="The rig's configuration (TOML); without one, a terminal is asked whether a simulated rig will do.",
+)
 @click.option("--listen", "-l", multiple=True, help="Listen here instead of the configured endpoints; may be repeated.")
 @click.option("--connect", "-e", multiple=True, help="Connect here too; may be repeated.")
 @click.option("--bus", help="Serve this line only, as the rig RIG_BUS: one process for each line.")
@@ -125,7 +130,7 @@ log = get_logger("run")
     help="Log nothing below this.",
 )
 def command(
-    config: Path,
+    config: Path | None,
     listen: tuple[str, ...],
     connect: tuple[str, ...],
     bus: str | None,
@@ -141,9 +146,12 @@ def command(
     Options, the log level among them, keep their values.
     """
     configure_logging(json=log_json, level=log_level)
+    file = config or _simulated()
+    if config is None and console is None and find_spec("starlette"):
+        console = parse_listen_address(CONSOLE_ADDRESS)
 
     def load() -> RigConfig:
-        rig = load_config(config)
+        rig = load_config(file)
         if bus:
             rig = single_line(rig, bus)
         require_plan(rig)
@@ -159,6 +167,25 @@ def command(
         asyncio.Runner(loop_factory=loop_factory(uvloop=rig.daemon.uvloop)) as runner,
     ):
         runner.run(serve(rig, load, console))
+
+
+def _simulated() -> Path:
+    """Return the configuration of the simulated rig, if that is agreed to at the terminal.
+
+    Raises:
+        click.UsageError: it is not, or there is no terminal; says what to type.
+    """
+    simulated = example("simulated.toml")
+    if sys.stdin.isatty() and sys.stdout.isatty():
+        click.echo(
+            "No configuration is given (--config). A rig of four simulated drives needs none, and moves nothing."
+        )
+        if click.confirm("Run it?", default=True):
+            return simulated
+    raise click.UsageError(
+        f"name the configuration of a rig: --config rig.toml. {shlex.quote(str(simulated))} is that of a simulated one;"
+        " `ldcnd scan PORT --write rig.toml` begins that of your drives"
+    )
 
 
 async def serve(rig: RigConfig, load: Callable[[], RigConfig], console: ListenAddress | None = None) -> None:

@@ -47,6 +47,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
     type=FILE,
     help="Serve the commissioning page for this configuration of a rig: it writes the file, and its steps move axes.",
 )
+@click.option("--link", is_flag=True, help="Print another link of the console that runs on the port of --listen.")
 @click.option("--json", "as_json", is_flag=True, help="Print the link as a line of JSON.")
 @click.option(
     "--log-level",
@@ -66,19 +67,24 @@ def console(
     token_file: Path | None,
     *,
     commission: Path | None,
+    link: bool,
     as_json: bool,
     log_level: str,
 ) -> None:
-    """Show rigs in a browser until SIGTERM or SIGINT; prints the link that opens it. SIGUSR1 prints another one.
+    """Show rigs in a browser until SIGTERM or SIGINT; prints the link that opens it; --link prints another.
 
     It stops axes, it is not an emergency stop. With --commission every browser that is let in can also search a port
     for drives, write the configuration, and run the steps of `ldcnd commission` and `ldcnd tune`.
     """
-    require("markdown_it", "starlette", "uvicorn", "websockets")
-    from ldcnd.console.rigs import Endpoint  # noqa: PLC0415 - its packages are optional
-    from ldcnd.console.server import serve  # noqa: PLC0415
+    require("markdown_it", "segno", "starlette", "uvicorn", "websockets")
+    from ldcnd.console.link_socket import ask_for_link  # noqa: PLC0415 - its packages are optional
+    from ldcnd.console.rigs import Endpoint  # noqa: PLC0415
+    from ldcnd.console.server import serve, show_link  # noqa: PLC0415
     from ldcnd.console.settings import ConsoleSettings, read_token  # noqa: PLC0415
 
+    if link:
+        show_link(asyncio.run(ask_for_link(listen.port)), as_json=as_json)
+        return
     configure_logging(level=log_level)
     endpoints = connect or (() if config else (DEFAULT_ENDPOINT,))
     settings = ConsoleSettings(

@@ -4,11 +4,14 @@ import asyncio
 import json
 import signal
 import socket
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from urllib.parse import urlsplit
 
 import click
+import segno
 import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -24,6 +27,7 @@ from ldcnd.console.control import control_routes
 from ldcnd.console.feed import Feed
 from ldcnd.console.gate import RequestGate
 from ldcnd.console.latest_values import LatestValues
+from ldcnd.console.link_socket import GivenLink, giving_links
 from ldcnd.console.pages import Pages
 from ldcnd.console.reading import STATIC, reading_routes
 from ldcnd.console.replies import LinkReply
@@ -78,7 +82,7 @@ def build_app(
 
 
 async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = None) -> None:
-    """Serve until SIGTERM, SIGINT or the end of the terminal; SIGUSR1 prints another link.
+    """Serve until SIGTERM, SIGINT or the end of the terminal; SIGUSR1 prints another link, and so does `--link`.
 
     Args:
         settings: of the console.
@@ -99,15 +103,22 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
     def new_link() -> str:
         return f"{settings.scheme}://{settings.shown_host}:{port}/?link={visitors.new_link()}"
 
-    async with Feed(values, time.time_ns) as feed, asyncio.TaskGroup() as group:
+    def give_link() -> GivenLink:
+        return GivenLink(link=new_link(), minutes=None if settings.token else LINK_S / 60)
+
+    async with (
+        Feed(values, time.time_ns) as feed,
+        giving_links(port, give_link),
+        asyncio.TaskGroup() as group,
+    ):
         server = _Server(_config(build_app(settings, rigs, feed, visitors, new_link, commissioning), settings))
         for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
             loop.add_signal_handler(number, server.end)
-        loop.add_signal_handler(signal.SIGUSR1, lambda: _print(new_link(), settings))
+        loop.add_signal_handler(signal.SIGUSR1, lambda: show_link(give_link(), as_json=settings.as_json))
         watching = [
             group.create_task(rigs.run(endpoint), name=f"endpoint {endpoint.name}") for endpoint in settings.endpoints
         ]
-        _print(new_link(), settings)
+        show_link(give_link(), as_json=settings.as_json)
         await server.serve(sockets=[listening])
         for task in watching:
             task.cancel()
@@ -196,10 +207,14 @@ def _listen(address: ListenAddress) -> socket.socket:
     return listening
 
 
-def _print(link: str, settings: ConsoleSettings) -> None:
-    if settings.as_json:
-        click.echo(json.dumps({"link": link}))
-    elif settings.token:
-        click.echo(f"console: {link}")
-    else:
-        click.echo(f"console: {link}\nThe link lets one browser in, within {LINK_S / 60:g} minutes.")
+def show_link(given: GivenLink, *, as_json: bool) -> None:
+    """Print a link, for a phone as a picture too, where it leads anywhere from there."""
+    if as_json:
+        click.echo(json.dumps({"link": given.link}))
+        return
+    click.echo(f"console: {given.link}")
+    if given.minutes:
+        click.echo(f"The link lets one browser in, within {given.minutes:g} minutes.")
+    loopback = (urlsplit(given.link).hostname or "").startswith(("localhost", "127.", "::1"))
+    if not loopback and sys.stdout.isatty() and "utf" in (sys.stdout.encoding or "").lower():
+        segno.make(given.link).terminal(compact=True)

@@ -5,8 +5,10 @@ import datetime as dt
 import signal
 import socket
 import ssl
+import sys
 from asyncio.subprocess import PIPE
 from contextlib import AsyncExitStack, asynccontextmanager
+from urllib.parse import urlsplit
 
 import msgpack
 import pytest
@@ -82,6 +84,28 @@ async def test_a_page_that_never_reads_delays_nobody_and_the_console_ends_withou
     assert stopped.document["rigs"]["sim"]["confirmed"] == ["x"]
     assert code == 0
     assert not capfd.readouterr().err
+
+
+async def test_another_link_is_given_without_stopping_anything():
+    async with console("-e", f"tcp/127.0.0.1:{free_port()}") as running:
+        port = urlsplit(running.link).port
+        asked = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "ldcnd", "console", "--link", "--listen", f"127.0.0.1:{port}", stdout=PIPE
+        )
+        printed, _ = await asked.communicate()
+        link = printed.decode().splitlines()[0].removeprefix("console: ")
+        browser = await running.stranger.enter(link)
+        page = await browser.get("/")
+        nowhere = await asyncio.create_subprocess_exec(
+            sys.executable, "-m", "ldcnd", "console", "--link", "--listen", f"127.0.0.1:{free_port()}", stderr=PIPE
+        )
+        _, refused = await nowhere.communicate()
+
+    assert asked.returncode == 0
+    assert link != running.link
+    assert page.status == 200
+    assert nowhere.returncode != 0
+    assert b"ldcnd console" in refused
 
 
 async def test_the_web_server_refuses_what_the_gate_refuses():

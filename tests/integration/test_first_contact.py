@@ -6,6 +6,7 @@ import re
 import signal
 import sys
 from asyncio.subprocess import PIPE, STDOUT
+from contextlib import suppress
 from urllib.parse import urlsplit
 
 import pytest
@@ -83,3 +84,44 @@ async def test_make_run_says_what_to_type_and_the_first_program_moves(tmp_path):
     assert "<polyline" in toured.decode()
     assert "above the limit" in toured.decode()
     assert float(printed.split()[0]) == pytest.approx(5, abs=0.05)
+
+
+async def test_run_without_a_configuration_offers_the_simulated_rig():
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    ours, theirs = os.openpty()
+    run = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "ldcnd", "run", "--listen", endpoint, "--console", "127.0.0.1:0"),
+        stdin=theirs,
+        stdout=theirs,
+        stderr=theirs,
+        start_new_session=True,
+    )
+    os.close(theirs)
+    said = ""
+    try:
+        async with asyncio.timeout(UP_S):
+            for wanted, answer in (("Run it?", b"y\n"), ("Ctrl-C here ends it", b"")):
+                while wanted not in said:
+                    said += (await asyncio.to_thread(os.read, ours, 4096)).decode(errors="replace")
+                os.write(ours, answer)
+            run.send_signal(signal.SIGTERM)
+            await asyncio.gather(run.wait(), asyncio.to_thread(_drain, ours))
+    finally:
+        if run.returncode is None:
+            run.kill()
+        os.close(ours)
+    assert "Rig sim is up" in said
+
+
+def _drain(terminal):
+    with suppress(OSError):  # Linux ends a terminal without a process so
+        while os.read(terminal, 4096):
+            pass
+
+
+async def test_run_without_a_configuration_and_a_terminal_says_what_to_type():
+    run = await asyncio.create_subprocess_exec(sys.executable, "-m", "ldcnd", "run", stdout=PIPE, stderr=STDOUT)
+    said, _ = await run.communicate()
+    assert run.returncode == 2
+    assert b"--config rig.toml" in said
+    assert b"simulated.toml" in said
