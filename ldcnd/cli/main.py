@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 import click
 
-from ldcnd.cli.names import COMMANDS, EXAMPLES, GROUPS, OPTIONS_TYPED, example_of
+from ldcnd.cli.names import COMMANDS, EXAMPLES, GROUPS, OPTIONS_TYPED, RENAMED, example_of
 from ldcnd.cli.output import DONE, EXIT_CODES, exit_code, print_under_any_encoding
 from ldcnd.contract.errors import LdcndError
 
@@ -79,6 +79,8 @@ class CommandGroup(click.Group):
         if " ".join(elsewhere) in EXAMPLES and elsewhere != [*here, name]:
             given = [word.replace(_MINUS, "-", 1) if word.startswith(_MINUS) else word for word in rest]
             return f"There is no `ldcnd {' '.join([*here, name])}`: type `ldcnd {shlex.join([*elsewhere, *given])}`."
+        if not here and name in RENAMED:
+            return f"There is no `ldcnd {name}` any more: type `ldcnd {shlex.join([RENAMED[name], *rest])}`."
         near = get_close_matches(name, self.list_commands(ctx), 1)
         meant = f" Did you mean {near[0]!r}?" if near else ""
         return f"No such command {name!r}.{meant}"

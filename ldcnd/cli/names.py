@@ -38,7 +38,7 @@ GROUPS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         "top": ("ldcnd.cli.top", "Show every axis and line of a rig, what is wrong first."),
         "why": ("ldcnd.cli.looking:why", "Tell why an axis cannot move, and what would clear that."),
         "fault": ("ldcnd.cli.looking:fault", "Explain a fault or an error code: what to check, how to clear it."),
-        "events": ("ldcnd.cli.looking:events", "Show who moved what, when, with which result."),
+        "log": ("ldcnd.cli.log:log", "Show what happened: who moved what, faults, losses, in one order."),
         "fleet": ("ldcnd.cli.looking:fleet", "Show every rig, axis, version and health that can be reached."),
         "bus": ("ldcnd.cli.bus", "Show the lines of a running daemon, and what was on them."),
         "trace": ("ldcnd.cli.trace", "Record an axis against time, show the result, draw it."),
@@ -123,7 +123,7 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "top": "",
     "why": "x",
     "fault": "not_referenced",
-    "events": "--axis x --follow",
+    "log": "--since 10m --axis x",
     "fleet": "--watch 2",
     "bus": "list",
     "bus convert": "line0.capture --format words",
@@ -178,6 +178,9 @@ EXAMPLES: Final[Mapping[str, str]] = {
 }
 """One example of each command, as it is typed behind its name."""
 
+RENAMED: Final[Mapping[str, str]] = {"events": "log"}
+"""Commands that had another name."""
+
 
 def example_of(path: str) -> str | None:
     """Return the line of the help that shows a command at work; None for one without an example.
@@ -202,7 +205,7 @@ TYPED = {
     "restart_eeprom_count": "params restart-count {axis}",
     "list_parameters": "params list {axis}",
     "acquire": "lease hold --axis {axis} -- COMMAND",
-    "events": "events",
+    "events": "log",
 }
 """How a command that a remedy names is typed; what is missing is its verb, behind `axis` if the program has it not."""
 OPTIONS_TYPED: ContextVar[str] = ContextVar("options that name daemon and rig", default="")

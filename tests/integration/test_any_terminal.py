@@ -32,7 +32,7 @@ COMMANDS = [
     "axis gains x --kp 100 --kd 1000 --ki 0 --el 4000",
     "move x 300000",
     "why x",
-    "events",
+    "log",
     "stop",
     "reset",
 ]

@@ -141,7 +141,7 @@ CASES = {
         "jog x 1 --for 0.2",
         then="halt x",
     ),
-    "unknown command": Case("ldcnd events", (), "OUTCOME x", "events", then="events"),
+    "unknown command": Case("ldcnd log", (), "OUTCOME x", "log", then="log"),
 }
 
 
@@ -284,7 +284,7 @@ NOT_RUN = {
     "ldcnd trace abort AXIS": "a daemon that is lost during a trace",
     "ldcnd trace abort AXIS again": "a drive that does not leave its trace",
     "ldcnd axis clear-counter AXIS COUNTER again": "a drive that does not leave its counter mode",
-    "ldcnd events; give every command an id of its own": "thousands of commands",
+    "ldcnd log; give every command an id of its own": "thousands of commands",
     "ldcnd halt AXIS first: at standstill the counter is set back": "hours of motion",
     "ldcnd move AXIS DISTANCE --relative, a small distance: it sets the counter back": "hours of motion",
     "ldcnd halt AXIS and wait: at standstill the gains are loaded again": "a drive taken over in motion",

@@ -32,7 +32,7 @@ async def test_what_a_drive_can_do_can_be_typed(tmp_path):
             "axis monitors x",
             "bus list --rig sum",
             "trace channels x",
-            "events --axis x --count 3",
+            "log --axis x --count 3",
             "stop",
         ]
         typed_at_rest = ["reset", "power off"]

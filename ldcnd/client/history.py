@@ -1,0 +1,119 @@
+"""What happened on a rig, in one order: commands, who had control, faults, and what drives did by themselves."""
+
+from enum import StrEnum
+
+from ldcnd.client.events import latest_events
+from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.events import (
+    ALARM_HISTORY,
+    DRIVE_CHANGED,
+    INTERLOCK,
+    REFERENCE,
+    UNSETTLED,
+    CommandEvent,
+)
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import PastFault
+
+CONTROL = frozenset({"acquire", "renew", "release", "override_interlock"})
+BY_ITSELF = frozenset({ALARM_HISTORY, DRIVE_CHANGED, INTERLOCK, REFERENCE, UNSETTLED})
+MOST_EVENTS = 1000
+
+
+class HistoryKind(StrEnum):
+    """What kind of thing happened."""
+
+    COMMAND = "command"
+    """A command got further."""
+    CONTROL = "control"
+    """Control was taken, lost or refused, or an interlock was overridden."""
+    FAULT = "fault"
+    """A fault was seen."""
+    DRIVE = "drive"
+    """A drive did something that no command of the daemon explains."""
+
+
+class HistoryRow(Frozen):
+    """One thing that happened."""
+
+    t: int
+    """Instant, UTC in ns since 1970."""
+    kind: HistoryKind
+    """What kind of thing it was."""
+    axis: str
+    """The axis, or the I/O module."""
+    what: str
+    """The verb of the command, or the code of the fault."""
+    how: str
+    """How far a command has got; empty for what is no command."""
+    who: str
+    """The client as it calls itself, with its login; empty where there was none."""
+    why: str
+    """The reason, or what the fault means."""
+    code: str | None = None
+    """The error code of what was refused or failed."""
+    position: float | None = None
+    """Where a motion ended, in axis units."""
+    command_id: str | None = None
+    """The command."""
+    line: str | None = None
+    """The line of the axis: `ldcnd bus wire-log` shows its packets of that moment, as long as they are kept."""
+
+
+def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
+    """Return an event as a row."""
+    kind = HistoryKind.COMMAND
+    if event.verb in CONTROL:
+        kind = HistoryKind.CONTROL
+    elif event.verb in BY_ITSELF:
+        kind = HistoryKind.DRIVE
+    login = f" ({event.login})" if event.login else ""
+    return HistoryRow(
+        t=event.t,
+        kind=kind,
+        axis=event.axis,
+        what=event.verb,
+        how="" if kind is HistoryKind.DRIVE else event.status.value,
+        who=f"{event.client or ''}{login}".strip(),
+        why=event.reason or "",
+        code=event.code,
+        position=event.position,
+        command_id=event.command_id,
+        line=line,
+    )
+
+
+def _row_of_fault(axis: AxisInfo, fault: PastFault) -> HistoryRow:
+    return HistoryRow(
+        t=fault.since,
+        kind=HistoryKind.FAULT,
+        axis=axis.axis,
+        what=fault.code,
+        how="",
+        who="",
+        why=fault.text,
+        code=fault.code,
+        line=axis.bus,
+    )
+
+
+async def history(client: RigClient, axis: str | None = None, since_ns: int = 0, count: int = 50) -> list[HistoryRow]:
+    """Return the latest things that happened, oldest first, as far as the daemon remembers them.
+
+    Args:
+        client: of the rig.
+        axis: only of this axis; of all when missing.
+        since_ns: none before this instant, UTC in ns since 1970.
+        count: the most that are wanted.
+    """
+    axes = {info.axis: info for info in await client.axes()}
+    faults = {name: sample.active for name, sample in (await client.faults()).items()}
+    last = {event.command_id: event for event in await latest_events(client, MOST_EVENTS, axis)}  # how each has ended
+    rows = [row_of(event, axes[event.axis].bus if event.axis in axes else None) for event in last.values()]
+    for name, info in axes.items():
+        if axis in (None, name):
+            seen = {(fault.code, fault.since): fault for fault in (*info.past_faults, *faults.get(name, ()))}
+            rows += [_row_of_fault(info, fault) for fault in seen.values()]
+    rows = sorted((row for row in rows if row.t >= since_ns), key=lambda row: row.t)
+    return rows[-count:]
