@@ -125,7 +125,8 @@ async def test_the_outputs_of_a_line_that_another_host_left_are_not_touched():
         await asyncio.sleep(3.0)
 
         assert (io.outputs, io.latch) == (0x008, 0x008)
-        assert taken(rig)
+        assert not rig.line.problem
+        assert not taken(rig)
 
 
 async def test_a_drive_that_was_out_of_reach_is_identified_before_it_takes_a_command_again():
