@@ -8,7 +8,7 @@ lines they are.
 import asyncio
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 from ldcnd.axis.axis import AxisService
@@ -58,7 +58,11 @@ class BoundRule:
         config: of it.
         axis: what it binds; None for an output.
         holders: axes whose lease an override needs.
+        kinds: what it forbids.
         requires: its requirements.
+        modules: whose lines it requires; empty where it requires something of an axis, too.
+        version: of the lines, at which its requirements held.
+        until_s: until when they do, in loop time, if that version stays.
         override: the one in force.
         reacted: the motion under way is being ended because of it.
     """
@@ -66,7 +70,11 @@ class BoundRule:
     config: InterlockConfig
     axis: AxisService | None
     holders: tuple[str, ...]
-    requires: tuple[Obstacle, ...] = field(default=())
+    kinds: tuple[InterlockKind, ...]
+    requires: tuple[Obstacle, ...]
+    modules: tuple[ModuleService, ...]
+    version: int = -1
+    until_s: float = 0.0
     override: Override | None = None
     reacted: bool = False
 
@@ -81,6 +89,32 @@ class BoundRule:
         )
 
 
+@dataclass(slots=True)
+class AxisRules:
+    """The rules that bind one axis.
+
+    Attributes:
+        axis: which.
+        rules: of it.
+        version: of the lines, at which all of them held.
+        until_s: until when they do, in loop time, if that version stays.
+    """
+
+    axis: AxisService
+    rules: tuple[BoundRule, ...]
+    version: int = -1
+    until_s: float = 0.0
+
+    def hold(self, version: int, now_s: float) -> bool:
+        """Tell whether all of them are proven to hold, by lines that have not changed since."""
+        if self.version == version and self.until_s >= now_s:
+            return True
+        if any(rule.version != version or rule.until_s < now_s for rule in self.rules):
+            return False
+        self.version, self.until_s = version, min(rule.until_s for rule in self.rules)
+        return True
+
+
 class Interlocks:
     """The rules of one rig."""
 
@@ -93,22 +127,37 @@ class Interlocks:
         self._now_s = asyncio.get_running_loop().time
         self._modules = {name: module for module in rig.modules.values() for name in module.names}
         self._rules = {config.name: self._rule(config) for config in rules}
-        self._watched = [rule for rule in self._rules.values() if rule.axis and rule.config.reaction != "none"]
-        self._period_s = min((rule.config.within_ms / 1e3 / LOOKS for rule in self._watched), default=math.inf)
+        self._of_axes: list[AxisRules] = []
         self._changed = asyncio.Event()
+        self._version = 0
         for name, axis in rig.axes.items():
-            if own := [rule for rule in self._rules.values() if rule.axis is axis]:
-                axis.interlock(partial(self._violations_of_axis, f"axis {name}", own))
+            if own := tuple(rule for rule in self._rules.values() if rule.axis is axis):
+                self._of_axes.append(bound := AxisRules(axis, own))
+                axis.interlock(partial(self._violations_of_axis, f"axis {name}", bound))
+        periods_s = [rule.config.within_ms / 1e3 / LOOKS for each in self._of_axes for rule in each.rules]
+        self._period_s = min(periods_s, default=math.inf)
         for module in rig.modules.values():
             module.check = self._check_outputs
-            module.changed = self._changed.set
+            module.changed = self._note_change
             module.note = partial(self._note, module.name)
 
     def _rule(self, config: InterlockConfig) -> BoundRule:
         age_s = config.within_ms / 1e3 * (1 - 1 / LOOKS)
         axis = dict(self._rig.axes).get(config.of)
         holders = (config.of,) if axis else self._modules[config.of].axes
-        return BoundRule(config, axis, holders, tuple(self._requirement(each, age_s) for each in config.requires))
+        requires = tuple(self._requirement(each, age_s) for each in config.requires)
+        modules = [
+            self._rig.modules[each.module] if each.module else self._modules[each.input or each.output or ""]
+            for each in config.requires
+            if each.axis is None
+        ]
+        alone = len(modules) == len(requires)
+        kinds = config.kinds(output=axis is None)
+        return BoundRule(config, axis, holders, kinds, requires, tuple(dict.fromkeys(modules)) if alone else ())
+
+    def _note_change(self) -> None:
+        self._version += 1
+        self._changed.set()
 
     def _note(self, about: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
         self._events.note(about, verb, status, reason, code=code)
@@ -120,6 +169,9 @@ class Interlocks:
         for requirement in rule.requires:
             if text := requirement():
                 return text
+        if rule.modules:
+            age_s = rule.config.within_ms / 1e3 * (1 - 1 / LOOKS)
+            rule.version, rule.until_s = self._version, min(each.read_at_s for each in rule.modules) + age_s
         return ""
 
     # -- what must hold ----------------------------------------------------------------------------------------------
@@ -139,7 +191,7 @@ class Interlocks:
     def _obstacle_of_line(self, module: ModuleService, name: str, what: str, wanted: bool, age_s: float) -> str:  # noqa: FBT001
         if self._now_s() - module.read_at_s > age_s:
             return f"{what} {name} is not known: module {module.name} does not answer"
-        value = module.value(name)
+        value = module.values[name]
         if value is wanted:
             return ""
         words = ("true", "false") if what == "input" else ("high", "low")
@@ -172,13 +224,14 @@ class Interlocks:
     # -- asked -------------------------------------------------------------------------------------------------------
 
     def _violations_of_axis(
-        self, what: str, rules: list[BoundRule], kind: InterlockKind, speed: float
+        self, what: str, own: AxisRules, kind: InterlockKind, speed: float
     ) -> Iterator[InterlockViolated]:
         """Yield what forbids a motion of an axis at a speed, or to open or close its loop."""
-        for rule in rules:
+        if own.hold(self._version, self._now_s()):
+            return
+        for rule in own.rules:
             above = rule.config.above
-            binds = kind in rule.config.kinds(output=False) and (above is None or speed > above)
-            if binds and (text := self._obstacle(rule)):
+            if kind in rule.kinds and (above is None or speed > above) and (text := self._obstacle(rule)):
                 yield rule.violation(what, text)
 
     def _check_outputs(self, levels: Mapping[str, bool | None]) -> None:
@@ -188,7 +241,7 @@ class Interlocks:
                 continue
             level = levels[rule.config.of]
             kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW
-            if kind in (None, *rule.config.kinds(output=True)) and (text := self._obstacle(rule)):
+            if kind in (None, *rule.kinds) and (text := self._obstacle(rule)):
                 raise rule.violation(f"output {rule.config.of}", text)
 
     # -- watched -----------------------------------------------------------------------------------------------------
@@ -208,26 +261,24 @@ class Interlocks:
                 for rule in self._rules.values():
                     if rule.override:
                         self._goes_on(rule, rule.override)
-                for rule in self._watched:
-                    self._look(rule, group)
+                for own in self._of_axes:
+                    self._look(own, group)
 
-    def _look(self, rule: BoundRule, group: asyncio.TaskGroup) -> None:
-        axis = rule.axis
-        if axis is None:
-            return
+    def _look(self, own: AxisRules, group: asyncio.TaskGroup) -> None:
+        """End the motion of an axis where one of its rules does not hold; each rule reacts once for a motion."""
+        axis = own.axis
         status = axis.tracker.status
         # a drive that is out of reach takes nothing; it is looked at when it answers again
         moves = status.energised and status.link is not LinkState.DOWN
-        if not (moves and (status.rest.rests is False or _commanded(status)) and self._binds(rule, axis, status)):
-            rule.reacted = False
-            return
-        text = self._obstacle(rule)
-        if not text:
-            rule.reacted = False
-            return
-        if rule.reacted:
-            return
-        rule.reacted = True
+        moves = moves and (status.rest.rests is False or _commanded(status))
+        moves = moves and not own.hold(self._version, self._now_s())
+        for rule in own.rules:
+            text = self._obstacle(rule) if moves and self._binds(rule, axis, status) else ""
+            if text and not rule.reacted:
+                self._react(axis, rule, text, group)
+            rule.reacted = bool(text)
+
+    def _react(self, axis: AxisService, rule: BoundRule, text: str, group: asyncio.TaskGroup) -> None:
         name, reaction = axis.config.name, LossPolicy(rule.config.reaction)
         log.warning("interlock violated", axis=name, interlock=rule.config.name, reason=text, reaction=reaction.value)
         error = rule.violation(f"axis {name}", text)
@@ -236,8 +287,10 @@ class Interlocks:
         group.create_task(axis.stops.bring_to_rest(STOP_MODES[reaction]), name=f"interlock {rule.config.name}")
 
     def _binds(self, rule: BoundRule, axis: AxisService, status: AxisStatus) -> bool:
-        """Tell whether a rule binds the motion under way; one without a command is of any kind."""
-        kinds, command = rule.config.kinds(output=False), status.command
+        """Tell whether a rule is to end the motion under way; one without a command is of any kind."""
+        if rule.config.reaction == "none":
+            return False
+        kinds, command = rule.kinds, status.command
         if command is None or status.state is AxisState.STOPPING:
             if not any(kind in MOTIONS for kind in kinds):
                 return False

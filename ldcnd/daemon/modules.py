@@ -65,9 +65,9 @@ class NamedInput:
         self._since_s = 0.0
         self._unsettled_since_s: float | None = None
 
-    def take(self, level: bool, at_s: float) -> bool:  # noqa: FBT001 - a level
-        """Take the level of a reading; return whether the value has changed."""
-        level, before = level is not self._inverted, self.value
+    def take(self, level: bool, at_s: float) -> bool | None:  # noqa: FBT001 - a level
+        """Take the level of a reading; return the value."""
+        level = level is not self._inverted
         if level is not self._level:
             self._level, self._since_s = level, at_s
         if at_s - self._since_s >= self._debounce_s:
@@ -76,7 +76,7 @@ class NamedInput:
             self._unsettled_since_s = at_s
         elif at_s - self._unsettled_since_s > self._unsettled_s:
             self.value = None
-        return self.value is not before
+        return self.value
 
 
 class ModuleService:
@@ -86,8 +86,9 @@ class ModuleService:
         name: as configured.
         axes: on its line, whose leases cover it.
         read_at_s: when the latest reading was requested, in loop time; minus infinity while it is out of reach.
+        values: of the named inputs, and the levels of the outputs; None while one is not known.
         check: raises what forbids to write outputs, each true for high, false for low and None to let go of it.
-        changed: called when an input or what is known of an output has changed.
+        changed: called when one of the values has changed.
         note: takes an event of the module: verb, status, reason and code.
     """
 
@@ -111,6 +112,7 @@ class ModuleService:
         self._names = {config.line: name for name, config in outputs.items()}
         self._lines = {name: each.line for name, each in inputs.items()}
         self._lines |= {name: each.line for name, each in outputs.items()}
+        self.values: dict[str, bool | None] = dict.fromkeys(self._lines)
         self._differs = dict.fromkeys(outputs, 0)
         self._unread_until_s: dict[str, float] = {}  # outputs of which only what is requested from then on tells
         self._reading: IoReading | None = None
@@ -130,18 +132,16 @@ class ModuleService:
         """Names of its inputs and outputs."""
         return tuple(self._lines)
 
-    def value(self, name: str) -> bool | None:
-        """Return the value of a named input, or the level of a named output; None when it is not known.
-
-        The level of an output is that of its pin; while it is written or not driven, and while the pin shows another
-        level than was written, it is not known.
-        """
-        if each := self._inputs.get(name):
-            return each.value
-        if self._reading is None or name in self._unread_until_s or self._differs[name] >= DIFFERS_AFTER:
+    def _level(self, name: str, line: int, reading: IoReading) -> bool | None:
+        """Return the level of an output: that of its pin, if it is driven and the pin shows what was written."""
+        if self._differ(name, line, reading) or name in self._unread_until_s:
             return None
-        line, outputs = self._lines[name], self._reading.outputs
-        return None if outputs is not None and line not in outputs else self._reading.levels[line - 1]
+        return None if reading.outputs is not None and line not in reading.outputs else reading.levels[line - 1]
+
+    def _take(self, values: dict[str, bool | None]) -> None:
+        if values != self.values:
+            self.values = values
+            self.changed()
 
     def _observed(self, reading: IoReading, timing: Timing) -> None:
         if not self._driver.proof.holds:
@@ -152,13 +152,12 @@ class ModuleService:
         for name in [name for name, until_s in self._unread_until_s.items() if timing.sent_at_s >= until_s]:
             del self._unread_until_s[name]
         self._misses, self._reading, self.read_at_s = 0, reading, timing.sent_at_s
-        changed = False
-        for each in self._inputs.values():
-            changed |= each.take(reading.levels[each.line - 1], timing.true_from_s)
+        values = {
+            name: each.take(reading.levels[each.line - 1], timing.true_from_s) for name, each in self._inputs.items()
+        }
         for name, config in self._outputs.items():
-            changed |= self._compare(name, config.line, reading)
-        if changed:
-            self.changed()
+            values[name] = self._level(name, config.line, reading)
+        self._take(values)
         t, t_error_ns = self._clock.stamp(timing)
         self._topic.publish(
             {
@@ -168,19 +167,19 @@ class ModuleService:
                 "quality": Quality.GOOD,
                 **dict(reading),
                 "volts": tuple(value / FULL_SCALE_COUNTS * FULL_SCALE_V for value in reading.adc),
-                "named": {name: self.value(name) for name in self._lines if not name.isdigit()},
+                "named": {name: value for name, value in values.items() if not name.isdigit()},
             }
         )
 
-    def _compare(self, name: str, line: int, reading: IoReading) -> bool:
-        """Compare the pin of an output with what was written; return whether it begins to differ or ends to."""
+    def _differ(self, name: str, line: int, reading: IoReading) -> bool:
+        """Compare the pin of an output with what was written; return whether they have differed for long enough."""
         written, before = self._driver.written(line), self._differs[name]
         if written is None or written is reading.levels[line - 1]:
             self._differs[name] = 0
-            return before >= DIFFERS_AFTER
+            return False
         self._differs[name] = min(before + 1, DIFFERS_AFTER)
         if before != DIFFERS_AFTER - 1:
-            return False
+            return before == DIFFERS_AFTER
         reason = f"output {name} was set {_word(written)} and its pin shows {_word(not written)}: check what it drives"
         log.error("output differs", module=self.name, output=name, reason=reason)
         self.note("output_differs", CommandStatus.FAILED, reason, None)
@@ -197,7 +196,7 @@ class ModuleService:
         self._reading, self.read_at_s = None, -math.inf
         for each in self._inputs.values():
             each.forget()
-        self.changed()
+        self._take(dict.fromkeys(self._lines))
 
     # -- commands ----------------------------------------------------------------------------------------------------
 
@@ -244,6 +243,7 @@ class ModuleService:
             self._check(condition)
             # first of all: motions ask for these outputs, as this asks for motions, and never do both pass
             self._unread_until_s |= dict.fromkeys(asked, math.inf)
+            self._take(self.values | dict.fromkeys(asked))
             try:
                 permitted()
                 with only_while(until_begun(permitted)):

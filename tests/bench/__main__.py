@@ -18,6 +18,7 @@ from tests.bench import (
     client_sample,
     console,
     counts,
+    interlock_cost,
     round_trip,
     saturated_command,
     scaling,
@@ -62,6 +63,7 @@ PARTS = (
     "jumping-clock",
     "client",
     "counts",
+    "interlocks",
 )
 
 
@@ -126,6 +128,7 @@ def _parts(folder: Path, rounds: int, virtual_s: float, before: Path | None) -> 
         partial(virtual_time.rows, virtual_s),
         client_sample.rows,
         partial(counts.rows, ROOT, before),
+        interlock_cost.rows,
     )
     return dict(zip(PARTS, found, strict=True))
 

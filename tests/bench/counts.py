@@ -92,7 +92,7 @@ def _is_daemons(code: CodeType) -> bool:
 
 
 @contextmanager
-def _counted() -> Iterator[Count]:
+def counted() -> Iterator[Count]:
     """Count calls, bytecodes and turns of the running loop; a hundred times slower than without."""
     count = Count()
 
@@ -126,7 +126,7 @@ def _counted() -> Iterator[Count]:
 
 async def _costs(what: str, work: Callable[[], Awaitable[float]]) -> dict[str, float]:
     """Return what each costs of what `work` does and counts; memory is looked at when it is done again."""
-    with _counted() as count:
+    with counted() as count:
         times = await work()
     gc.collect()
     blocks = sys.getallocatedblocks()
