@@ -31,8 +31,9 @@ log = get_logger("interlocks")
 
 HUNTING = 0.1
 """Share of its speed by which a servo may be faster than its profile, between two readings."""
-Obstacle = Callable[[], str]
-"""Returns in words why a requirement does not hold, or is not known to; empty when it does."""
+Obstacle = Callable[[bool], str]
+"""Returns in words why a requirement does not hold, or is not known to; empty when it does. Takes whether a motion is
+only watched: an output that is being written counts with its last reading then, as long as that is not too old."""
 
 
 @dataclass(slots=True)
@@ -162,14 +163,14 @@ class Interlocks:
     def _note(self, about: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
         self._events.note(about, verb, status, reason, code=code)
 
-    def _obstacle(self, rule: BoundRule) -> str:
+    def _obstacle(self, rule: BoundRule, *, watched: bool = False) -> str:
         """Return why a rule forbids what it binds; empty when it does not."""
         if rule.override is not None and self._goes_on(rule, rule.override):
             return ""
         for requirement in rule.requires:
-            if text := requirement():
+            if text := requirement(watched):
                 return text
-        if rule.modules:
+        if rule.modules and not any(module.before for module in rule.modules):
             age_s = rule.config.within_ms / 1e3 * (1 - 1 / LOOKS)
             rule.version, rule.until_s = self._version, min(each.read_at_s for each in rule.modules) + age_s
         return ""
@@ -185,19 +186,30 @@ class Interlocks:
         assert name is not None  # noqa: S101 - a requirement names one of the four
         return partial(self._obstacle_of_line, self._modules[name], name, what, each.value, age_s)
 
-    def _obstacle_of_module(self, module: ModuleService, age_s: float) -> str:
+    def _obstacle_of_module(self, module: ModuleService, age_s: float, _watched: bool) -> str:  # noqa: FBT001
         return "" if self._now_s() - module.read_at_s <= age_s else f"module {module.name} does not answer"
 
-    def _obstacle_of_line(self, module: ModuleService, name: str, what: str, wanted: bool, age_s: float) -> str:  # noqa: FBT001
+    def _obstacle_of_line(
+        self,
+        module: ModuleService,
+        name: str,
+        what: str,
+        wanted: bool,  # noqa: FBT001 - of a configuration
+        age_s: float,
+        watched: bool,  # noqa: FBT001 - see `Obstacle`
+    ) -> str:
         if self._now_s() - module.read_at_s > age_s:
             return f"{what} {name} is not known: module {module.name} does not answer"
         value = module.values[name]
+        if watched and value is None and name in module.before:
+            before, read_at_s = module.before[name]
+            value = before if self._now_s() - read_at_s <= age_s else None
         if value is wanted:
             return ""
         words = ("true", "false") if what == "input" else ("high", "low")
         return f"{what} {name} is not known" if value is None else f"{what} {name} is {words[wanted]}"
 
-    def _obstacle_of_axis(self, axis: AxisService, each: Requirement, age_s: float) -> str:
+    def _obstacle_of_axis(self, axis: AxisService, each: Requirement, age_s: float, _watched: bool) -> str:  # noqa: FBT001
         tracker, name = axis.tracker, axis.config.name
         status, reading = tracker.status, tracker.reading
         if (
@@ -273,7 +285,7 @@ class Interlocks:
         moves = moves and (status.rest.rests is False or _commanded(status))
         moves = moves and not own.hold(self._version, self._now_s())
         for rule in own.rules:
-            text = self._obstacle(rule) if moves and self._binds(rule, axis, status) else ""
+            text = self._obstacle(rule, watched=True) if moves and self._binds(rule, axis, status) else ""
             if text and not rule.reacted:
                 self._react(axis, rule, text, group)
             rule.reacted = bool(text)

@@ -87,6 +87,7 @@ class ModuleService:
         axes: on its line, whose leases cover it.
         read_at_s: when the latest reading was requested, in loop time; minus infinity while it is out of reach.
         values: of the named inputs, and the levels of the outputs; None while one is not known.
+        before: of outputs that are being written the value that they had, and when that was read, in loop time.
         check: raises what forbids to write outputs, each true for high, false for low and None to let go of it.
         changed: called when one of the values has changed.
         note: takes an event of the module: verb, status, reason and code.
@@ -113,6 +114,7 @@ class ModuleService:
         self._lines = {name: each.line for name, each in inputs.items()}
         self._lines |= {name: each.line for name, each in outputs.items()}
         self.values: dict[str, bool | None] = dict.fromkeys(self._lines)
+        self.before: dict[str, tuple[bool | None, float]] = {}
         self._differs = dict.fromkeys(outputs, 0)
         self._unread_until_s: dict[str, float] = {}  # outputs of which only what is requested from then on tells
         self._reading: IoReading | None = None
@@ -133,10 +135,13 @@ class ModuleService:
         return tuple(self._lines)
 
     def _level(self, name: str, line: int, reading: IoReading) -> bool | None:
-        """Return the level of an output: that of its pin, if it is driven and the pin shows what was written."""
-        if self._differ(name, line, reading) or name in self._unread_until_s:
+        """Return the level of an output: that of its pin, if it is known to be driven and the pin shows that.
+
+        The pin of a line that floats is pulled up: high is no proof that it is driven.
+        """
+        if self._differ(name, line, reading) or name in self._unread_until_s or self._driver.written(line) is None:
             return None
-        return None if reading.outputs is not None and line not in reading.outputs else reading.levels[line - 1]
+        return reading.levels[line - 1]
 
     def _take(self, values: dict[str, bool | None]) -> None:
         if values != self.values:
@@ -150,7 +155,7 @@ class ModuleService:
         if self._reading is None or self._driver.restarted:
             self._returned()
         for name in [name for name, until_s in self._unread_until_s.items() if timing.sent_at_s >= until_s]:
-            del self._unread_until_s[name]
+            del self._unread_until_s[name], self.before[name]
         self._misses, self._reading, self.read_at_s = 0, reading, timing.sent_at_s
         values = {
             name: each.take(reading.levels[each.line - 1], timing.true_from_s) for name, each in self._inputs.items()
@@ -241,11 +246,17 @@ class ModuleService:
 
         async with self._writes:
             self._check(condition)
+            values = self.values
             # first of all: motions ask for these outputs, as this asks for motions, and never do both pass
-            self._unread_until_s |= dict.fromkeys(asked, math.inf)
-            self._take(self.values | dict.fromkeys(asked))
+            self._take(values | dict.fromkeys(asked))
             try:
                 permitted()
+            except LdcndError:
+                self._take(values)
+                raise
+            self._unread_until_s |= dict.fromkeys(asked, math.inf)
+            self.before = {name: (values[name], self.read_at_s) for name in asked} | self.before
+            try:
                 with only_while(until_begun(permitted)):
                     return await self._driver.set_outputs(levels, inputs, pwm)
             finally:

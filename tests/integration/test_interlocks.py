@@ -1,6 +1,7 @@
 """Interlocks: what motions, power and outputs require: asked, watched while a motion lasts, overridden for a time."""
 
 import asyncio
+import contextlib
 
 import pytest
 from pydantic import ValidationError
@@ -256,6 +257,22 @@ async def test_a_motion_is_ended_within_the_bound_when_the_module_falls_silent()
         assert rig.speed() == 0
 
 
+@pytest.mark.parametrize(
+    ("request_", "refused_"), [(UNLOCKED, True), (LOCKED, False), (SetIo(module="cabinet", pwm1=0.5), False)]
+)
+async def test_to_write_an_output_ends_no_motion_that_requires_it_as_it_stays(request_, refused_):
+    async with running_machine(machine(DOOR_SHUT, DOOR_OPENS)) as rig:
+        await spinning(rig)
+        for _ in range(10):
+            with contextlib.nullcontext() if not refused_ else pytest.raises(InterlockViolated):
+                await rig.client.ask(request_)
+            await asyncio.sleep(0.01)
+        await asyncio.sleep(0.5)
+
+        assert rig.speed() == pytest.approx(5.0, rel=0.05)
+        assert not await events(rig, "interlock")
+
+
 # -- power -------------------------------------------------------------------------------------------------------------
 
 HANGING = {"name": "brake", "of": "table", "kind": ["power_off"], "requires": [{"output": "lock"}]}
@@ -399,8 +416,9 @@ async def test_a_machine_that_another_host_has_left_in_mid_spin_is_taken_over_an
     rotor.group = table.group = 0x85
     latch = io.latch
 
-    async with running_machine(machine(DOOR_SHUT, DOOR_OPENS, start="adopt"), chain) as rig:
-        await rig.named(lock=True, door_closed=True)
+    by_contacts = DOOR_SHUT | {"requires": [{"input": "door_closed"}, {"input": "door_open", "value": False}]}
+    async with running_machine(machine(by_contacts, DOOR_OPENS, start="adopt"), chain) as rig:
+        await rig.named(lock=None, door_closed=True)
         await asyncio.sleep(3.0)
         assert rig.speed() == pytest.approx(5.0, rel=0.05)
         assert (rig.io.latch, rig.io.outputs) == (latch, 1 << 9)

@@ -47,8 +47,8 @@ WITHIN_S = 0.4
 LOST_S = 0.2
 """Time that lost replies may cost the packet that starts or stops the rotor, and the judge's own period."""
 RAMP_S = FASTEST / ACCELERATION
-HUNTING = 0.25
-"""Revolutions a second by which the shaft, behind its servo, may be faster than its profile."""
+HUNTING = 1.0
+"""Revolutions a second by which the shaft may be faster than its profile for a moment: it sticks, and breaks free."""
 INPUTS = {
     "door_closed": {"line": CLOSED, "debounce_ms": 30},
     "door_open": {"line": OPEN, "debounce_ms": 30},
