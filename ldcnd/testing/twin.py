@@ -81,7 +81,12 @@ def config_of_twin(config: RigConfig, state: RigState) -> RigConfig:
             f" {', '.join(sorted(state.axes))}",
             remedy="give the configuration with which the daemon was started",
         )
-    units = {axis.name: axis.address for bus in config.bus for axis in bus.axis if axis.name in state.parameters}
+    units = {
+        (bus.simulated, axis.address): axis.name
+        for bus in config.bus
+        for axis in bus.axis
+        if axis.name in state.parameters
+    }
     return config.model_copy(
         update={
             "bus": tuple(
@@ -89,7 +94,11 @@ def config_of_twin(config: RigConfig, state: RigState) -> RigConfig:
                 for bus in config.bus
             ),
             "sim": tuple(
-                line.model_copy(update={"unit": tuple(_unit(unit, units, state) for unit in line.unit)})
+                line.model_copy(
+                    update={
+                        "unit": tuple(_unit(unit, units.get((line.name, unit.number)), state) for unit in line.unit)
+                    }
+                )
                 if isinstance(line, SimulatedSmartStepLineConfig)
                 else line
                 for line in config.sim
@@ -106,8 +115,7 @@ def _axis(axis: object, info: AxisInfo) -> object:
     return axis.model_copy(update={"gains": axis.gains.model_copy(update=known)})
 
 
-def _unit(unit: SimulatedUnitConfig, addresses: Mapping[str, int], state: RigState) -> SimulatedUnitConfig:
-    name = next((name for name, address in addresses.items() if address == unit.number), None)
+def _unit(unit: SimulatedUnitConfig, name: str | None, state: RigState) -> SimulatedUnitConfig:
     if name is None:
         return unit
     values = state.parameters[name].values
