@@ -54,7 +54,7 @@ from ldcnd.contract.commands import (
     Verb,
     kind_of,
 )
-from ldcnd.contract.errors import LdcndError, NotSupported, OutcomeUnknown, WrongState
+from ldcnd.contract.errors import InterlockViolated, LdcndError, NotSupported, OutcomeUnknown, WrongState
 from ldcnd.contract.events import REFERENCE, CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.axis_config import AxisConfig
@@ -246,7 +246,7 @@ class AxisService:
         permit = permit or self.permit(self._next_command_id(), command.verb)
         if self.stops.possible and (mode := takes_energy_out(command)):
             if isinstance(command, Power):
-                await self._ask_to_open_loop()
+                await self._ask_to_open_loop(permit)
             return await self._take_energy_out(permit, command, mode)
         self._check_takes(command.verb)
         if not self._queue.free:
@@ -274,17 +274,17 @@ class AxisService:
         """How fast the latest motion may have the drive turn, counts a second."""
         return self._gate.counts_per_s
 
-    async def _ask_to_open_loop(self) -> None:
+    async def _ask_to_open_loop(self, permit: Permit) -> None:
         """Bring an axis to rest that an interlock keeps from being switched off: a load would fall; nothing else does.
 
         Raises:
             InterlockViolated: it holds its position.
         """
-        if not self.tracker.status.energised:
-            return
-        for violation in self._gate.violations(InterlockKind.POWER_OFF, 0.0):
+        try:
+            permit.ask_to_open_loop()
+        except InterlockViolated:
             await self.stops.bring_to_rest(StopMode.SMOOTH)
-            raise violation
+            raise
 
     def _violations(self, verb: Verb, speed: float | None) -> list[tuple[LdcndError, bool]]:
         """Return what interlocks forbid a command with; at the speed of moves that name none when that is left out."""

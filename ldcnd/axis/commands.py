@@ -285,6 +285,7 @@ class AxisCommands:
             fault.stops for fault in tracker.status.active_faults
         )
         if stopped or not tracker.status.energised:
+            permit.ask_to_open_loop()
             await self._driver.reset()
             self._drop_procedure()
             tracker.take(LoopSwitched(on=False, now_s=self._motion.clock.now_s()))

@@ -150,6 +150,16 @@ class Permit:
         """Take how fast the next motion may become: interlocks may bind only fast ones."""
         self._counts_per_s = abs(motion.velocity_counts_per_s) if isinstance(motion, CountsMotion) else math.inf
 
+    def ask_to_open_loop(self) -> None:
+        """Raise while an interlock forbids to switch a motor off that has voltage: its load would fall.
+
+        Raises:
+            InterlockViolated: names the rule.
+        """
+        if self._gate.tracker.status.energised:
+            for violation in self._gate.violations(InterlockKind.POWER_OFF, 0.0):
+                raise violation
+
     # -- what can move -----------------------------------------------------------------------------------------------
 
     async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:

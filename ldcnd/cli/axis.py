@@ -66,6 +66,7 @@ WAIT, LEAVE = (click.option(name, is_flag=True, help=text) for name, text in WAI
     type=click.Choice([direction.value for direction in Direction]),
     help="Which way to turn, on an axis with a modulo; the shortest when missing.",
 )
+@click.option("--for", "for_s", type=Finite(0, 86_400, min_open=True), help="Duration at the velocity, seconds.")
 @click.option(
     "--buffer-mode",
     type=click.Choice([mode.value for mode in BufferMode]),
@@ -83,6 +84,7 @@ def move(
     acceleration: float | None,
     direction: str | None,
     buffer_mode: str,
+    for_s: float | None,
     *,
     relative: bool,
     at_velocity: bool,
@@ -96,10 +98,12 @@ def move(
     request: MoveVelocity | MoveRelative | MoveAbsolute
     if direction and (relative or at_velocity):
         raise click.UsageError("--direction goes with a position")
+    if for_s is not None and not at_velocity:
+        raise click.UsageError("--for goes with a velocity")
     if at_velocity:
         if velocity is not None:
             raise click.UsageError("with --at-velocity, VALUE is the velocity; leave --velocity out")
-        request = of_options(MoveVelocity, velocity=value, **given)
+        request = of_options(MoveVelocity, velocity=value, duration_s=for_s, **given)
     elif relative:
         request = of_options(MoveRelative, distance=value, velocity=velocity, **given)
     else:

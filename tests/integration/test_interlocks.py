@@ -14,6 +14,7 @@ from ldcnd.contract.commands import (
     MoveVelocity,
     Power,
     Preview,
+    Reset,
     SetPosition,
     Stop,
     Why,
@@ -296,6 +297,17 @@ async def test_a_hanging_load_is_held_until_its_brake_is_set_and_stops_are_never
         reply = await rig.client.stop()
 
         assert set(reply.confirmed) == {"rotor", "table"}
+
+
+async def test_a_reset_does_not_drop_a_load_that_its_loop_holds():
+    unsettled = {"settle": {"window": 1e-9, "time_s": 0.01, "timeout_s": 0.05, "unsettled": "fault"}}
+    async with running_machine(machine(HANGING, axis=unsettled)) as rig:
+        await power(rig)
+        await rig.client.command("table", MoveRelative(distance=0.1))
+        await rig.until("table", lambda state: state.state is AxisState.ERROR_STOP)
+        await refused(rig, "table", Reset(), "interlock brake")
+        await locked(rig)
+        await rig.client.command("table", Reset())
 
 
 @pytest.mark.promise("interlock-never-a-stop")
