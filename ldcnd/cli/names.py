@@ -135,7 +135,6 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "bus wire-log": "line0 --seconds 2 --format words",
     "trace": "take x -c position --samples 200 --out x.csv",
     "trace abort": "x",
-    "trace channels": "x",
     "trace last": "x --out x.csv",
     "trace plot": "x.csv -o x.png",
     "trace show": "x.csv",

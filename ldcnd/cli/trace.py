@@ -94,7 +94,7 @@ def command() -> None:
 
 @command.command()
 @click.argument("axis", type=AXIS)
-@click.option("--channel", "-c", "channels", multiple=True, required=True, help="What to record; may be repeated.")
+@click.option("--channel", "-c", "channels", multiple=True, help="What to record; may be repeated.")
 @click.option("--interval", callback=_interval, default=FASTEST, help=f"Seconds between samples [{FASTEST}].")
 @click.option("--samples", type=WholeNumber(2, MOST_SAMPLES), default=500, help="How many samples [500].")
 @click.option("--pre", type=WholeNumber(0), default=0, help="Number of them before the trigger [0].")
@@ -117,7 +117,11 @@ def take(
     timeout: float,
     out: Path | None,
 ) -> None:
-    """Record channels of AXIS; `ldcnd trace channels` shows what it has. Ctrl-C and SIGTERM end the trace."""
+    """Record channels of AXIS; without any, show which it has. Ctrl-C and SIGTERM end the trace."""
+    if not channels:
+        info = target.run(lambda client: axis_of(client, axis))
+        target.show(info, *info.trace_channels)
+        return
     request = of_options(
         TakeTrace,
         channels=channels,
@@ -156,15 +160,6 @@ def _aborted(reply: TraceAbortReply, _axis: AxisInfo | None) -> Shown:
 
 
 command.add_command(derived_question("abort", AbortTrace, shows=_aborted))
-
-
-@command.command()
-@click.argument("axis", type=AXIS)
-@with_target
-def channels(target: Target, axis: str) -> None:
-    """Show what a trace of AXIS can record."""
-    info = target.run(lambda client: axis_of(client, axis))
-    target.show(info, *info.trace_channels)
 
 
 @command.command()

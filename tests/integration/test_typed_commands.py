@@ -31,7 +31,7 @@ async def test_what_a_drive_can_do_can_be_typed(tmp_path):
             "move X 1",
             "axis monitors x",
             "bus list --rig sum",
-            "trace channels x",
+            "trace take x",
             "log --axis x --count 3",
             "stop",
         ]
@@ -66,7 +66,7 @@ async def test_what_a_drive_can_do_can_be_typed(tmp_path):
     assert "ldcnd reset z" in went["why z"].printed
     assert went["move X 1"].errors.startswith("there is no axis 'X'; did you mean 'x'?")
     assert went["bus list --rig sum"].errors.startswith("no rig 'sum' answers; did you mean 'sim'?")
-    assert "position" in went["trace channels x"].printed.splitlines()
+    assert "position" in went["trace take x"].printed.splitlines()
     assert went["stop"].printed == "sim: stopped and latched: x, y, z, c\n"
     assert went["power off"].printed.count("power done") == 4
     assert not state.enabled
