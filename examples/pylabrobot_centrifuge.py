@@ -1,0 +1,190 @@
+"""The centrifuge of `config/centrifuge.toml` as a backend of PyLabRobot, which `pip install pylabrobot` gets.
+
+`pylabrobot_centrifuge.py [ENDPOINT]` runs a cycle. The interlocks of the rig hold whatever this program does.
+"""
+
+import asyncio
+import math
+import sys
+from collections.abc import Mapping
+from contextlib import AsyncExitStack
+from typing import Any
+
+from pylabrobot.centrifuge import Centrifuge
+from pylabrobot.centrifuge.backend import CentrifugeBackend
+
+import ldcnd
+from ldcnd.contract.samples import IoSample, Moving, StateSample
+
+EARTH_M_S2 = 9.80665
+_SENSORS = ("pin_in", "locked", "door_closed", "door_open", "balanced")
+
+
+def revolutions_of(g: float, radius_m: float) -> float:
+    """Return the revolutions a second at which g times the acceleration of gravity acts at a radius."""
+    return math.sqrt(g * EARTH_M_S2 / radius_m) / math.tau
+
+
+class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no types
+    """A rotor, a door, its lock and the pin that holds the rotor at a bucket."""
+
+    def __init__(
+        self, endpoint: str | None = None, *, radius_m: float = 0.1, bucket1: float = 0.1, bucket2: float = 0.6
+    ) -> None:
+        """Describe it.
+
+        Args:
+            endpoint: of the daemon; the local one when missing.
+            radius_m: of the rotor, at the middle of the buckets.
+            bucket1: where the first bucket is at the door, in revolutions from the index.
+            bucket2: likewise.
+        """
+        super().__init__()
+        self.endpoint, self.radius_m, self.bucket1, self.bucket2 = endpoint, radius_m, bucket1, bucket2
+        self._open = AsyncExitStack()
+
+    async def setup(self) -> None:
+        """Take control, shut the door, find the index. A rotor that spins is brought to rest first."""
+        try:
+            self._rig = await self._open.enter_async_context(ldcnd.connect(self.endpoint))
+            control = self._rig.control("rotor", client="PyLabRobot", lease_s=2.0)
+            self._rotor = await self._open.enter_async_context(control)
+            await self._rest()
+            await self._shut()
+            await self._rotor.power(on=True)
+            await (await self._rotor.home()).done()
+        except BaseException:
+            await self._open.aclose()
+            raise
+
+    async def stop(self) -> None:
+        """Bring the rotor to rest, open its loop, let go of it."""
+        try:
+            await self._rest()
+            await self._rotor.power(on=False)
+            await self._until({}, at_rest=True)
+        finally:
+            await self._open.aclose()
+
+    async def open_door(self) -> None:
+        """Unlock and open it."""
+        await self.unlock_door()
+        await self._set(high="door", until={"door_open": True})
+
+    async def close_door(self) -> None:
+        """Close it; it stays unlocked."""
+        if (await self._named())["door_closed"] is not True:
+            await self._set(high="unlock", until={"locked": False})
+        await self._set(low="door", until={"door_closed": True})
+
+    async def lock_door(self) -> None:
+        """Lock it."""
+        if (await self._named())["door_closed"] is not True:
+            raise RuntimeError("the door is not closed")
+        await self._set(low="unlock", until={"locked": True})
+
+    async def unlock_door(self) -> None:
+        """Unlock it; refused while the rotor turns."""
+        await self._set(high="unlock", until={"locked": False})
+
+    async def lock_bucket(self) -> None:
+        """Hold the rotor by its pin."""
+        await self._set(high="pin", until={"pin_in": True})
+
+    async def unlock_bucket(self) -> None:
+        """Let go of the rotor."""
+        await self._set(low="pin", until={"pin_in": False})
+
+    async def go_to_bucket1(self) -> None:
+        """Bring the first bucket to the door, and open it."""
+        await self._go(self.bucket1)
+
+    async def go_to_bucket2(self) -> None:
+        """Bring the second bucket to the door, and open it."""
+        await self._go(self.bucket2)
+
+    async def spin(self, g: float = 500, duration: float = 60, acceleration: float = 0.8) -> None:
+        """Spin behind a locked door for a time at speed; the drive itself ends it with a ramp.
+
+        Args:
+            g: at the radius of the buckets.
+            duration: seconds at speed.
+            acceleration: 0 to 1 of the limit of the axis.
+
+        Raises:
+            LdcndError: refused, or ended by an interlock: the door, the pin, the imbalance switch.
+        """
+        (info,) = [each for each in await self._rig.describe() if each.axis == "rotor"]
+        await self._shut()
+        motion = await self._rotor.move_velocity(
+            revolutions_of(g, self.radius_m),
+            acceleration=acceleration * (info.limits.acceleration or 1.0),
+            duration_s=duration,
+        )
+        try:
+            await motion.done()
+        finally:
+            await self._rest()
+
+    def serialize(self) -> dict[str, Any]:
+        """Return what makes the same backend again."""
+        names = ("endpoint", "radius_m", "bucket1", "bucket2")
+        return {"type": type(self).__name__} | {name: getattr(self, name) for name in names}
+
+    # -- how it is done ----------------------------------------------------------------------------------------------
+
+    async def _shut(self) -> None:
+        await self.unlock_bucket()
+        await self.close_door()
+        await self.lock_door()
+
+    async def _go(self, place: float) -> None:
+        await self._shut()
+        await (await self._rotor.move_absolute(place)).done()
+        await self.open_door()
+
+    async def _set(self, *, high: str | None = None, low: str | None = None, until: Mapping[str, bool]) -> None:
+        await self._rig.set_io("cabinet", high=[high] if high else [], low=[low] if low else [])
+        await self._until(until)
+
+    async def _named(self) -> Mapping[str, bool | None]:
+        sample = await self._rig.latest("cabinet", "io")
+        return sample.named if isinstance(sample, IoSample) else dict.fromkeys(_SENSORS)
+
+    async def _rest(self) -> None:
+        await (await self._rotor.halt()).done()
+        await self._until({}, at_rest=True, within_s=120.0)
+
+    async def _until(self, named: Mapping[str, bool], *, at_rest: bool = False, within_s: float = 10.0) -> None:
+        """Wait until inputs have these values, and the rotor stands if it has to."""
+        seen: Mapping[str, bool | None] = {}
+        try:
+            async with asyncio.timeout(within_s), self._rig.samples() as samples:
+                while True:
+                    seen, state = await self._named(), await self._rig.latest("rotor", "state")
+                    stands = isinstance(state, StateSample) and state.moving is Moving.NO
+                    if (stands or not at_rest) and all(seen[name] is value for name, value in named.items()):
+                        return
+                    await anext(samples)
+        except TimeoutError:
+            wanted = dict(named) or "standstill"
+            raise RuntimeError(f"{wanted} did not come within {within_s:g} s: {dict(seen)}") from None
+
+
+async def main(endpoint: str | None = None) -> None:
+    """Load, spin at 100 g for ten seconds, unload."""
+    centrifuge = Centrifuge(backend=LdcndCentrifuge(endpoint), name="centrifuge", size_x=300, size_y=300, size_z=300)
+    await centrifuge.setup()
+    try:
+        await centrifuge.go_to_bucket1()
+        await centrifuge.close_door()
+        await centrifuge.spin(g=100, duration=10)
+        await centrifuge.go_to_bucket2()
+        await centrifuge.close_door()
+        print("done")
+    finally:
+        await centrifuge.stop()
+
+
+if __name__ == "__main__":
+    asyncio.run(main(*sys.argv[1:]))
