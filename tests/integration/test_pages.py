@@ -11,6 +11,7 @@ from tests.support.page_reader import PageReader
 from tests.support.pages import ROOT, blocks_of, command_lines, pages, require_command_line
 
 FIRST_RIG = "docs/tutorials/first-rig.md"
+CENTRIFUGE = "docs/tutorials/centrifuge.md"
 MONITOR = "docs/how-to/monitor-a-rig.md"
 EPICS = "docs/how-to/use-epics.md"
 SECOP = "docs/how-to/use-secop.md"
@@ -24,7 +25,7 @@ OPERATING = tuple(
     f"docs/how-to/{name}.md"
     for name in ("commission-a-first-drive", "jog", "home", "tune", "move-a-group", "speed-and-approach")
 )
-FOLLOWED = {FIRST_RIG, *NEXT, *BY_THEMSELVES, *OPERATING}
+FOLLOWED = {FIRST_RIG, CENTRIFUGE, *NEXT, *BY_THEMSELVES, *OPERATING}
 """Pages whose blocks are run here, all of them but those in `NOT_RUN`."""
 ELSEWHERE = {
     "deploy/INSTALL.md": "test_every_command_of_the_guide_works",
@@ -201,3 +202,16 @@ async def test_a_first_drive_is_commissioned_jogged_homed_tuned_and_moved_in_a_g
 async def test_a_how_to_can_be_followed(page: str, tmp_path) -> None:
     async with PageReader(tmp_path) as reader:
         await reader.follow(ROOT / page, NOT_RUN)
+
+
+@pytest.mark.system
+@pytest.mark.real_time
+@pytest.mark.timeout(120)
+async def test_a_centrifuge_is_spun_and_opened_as_far_as_its_rules_allow(tmp_path) -> None:
+    async with PageReader(tmp_path) as reader:
+        text = (ROOT / "config" / "centrifuge.toml").read_text()
+        (tmp_path / "centrifuge.toml").write_text(text.replace("7447", reader.port))
+        await reader.follow(ROOT / CENTRIFUGE, NOT_RUN)
+
+    assert "interlock lock_opens: axis rotor" in reader.printed
+    assert "interlock door_shut: " in reader.printed

@@ -27,13 +27,14 @@ class PageReader:
 
     Attributes:
         printed: what the commands have said, for the message of a test that fails.
+        port: at which the daemon listens instead of that of the pages.
     """
 
     def __init__(self, folder: Path) -> None:
         self.printed = ""
         self.folder = folder
-        self._port = str(free_port())
-        self._endpoint = f"tcp/127.0.0.1:{self._port}"
+        self.port = str(free_port())
+        self._endpoint = f"tcp/127.0.0.1:{self.port}"
         path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
         self._environment = {**os.environ, "PATH": path, "LDCND_CONNECT": self._endpoint, "PYTHONUNBUFFERED": "1"}
         self._running: list[Process] = []
@@ -68,7 +69,7 @@ class PageReader:
         await self._leave_running(f"ldcnd run --config {config}", self._answers, f"the daemon on {config}")
 
     async def _do(self, block: Block) -> None:
-        text = block.text.replace(PORT_OF_THE_PAGES, self._port)
+        text = block.text.replace(PORT_OF_THE_PAGES, self.port)
         if name := FILE_NAME.match(text):
             (self.folder / name[1]).write_text(text, encoding="utf-8")
         if block.language != "sh":
