@@ -55,6 +55,7 @@ from ldcnd.axis.faults import (
 )
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, shows_velocity
 from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, CommandEnd, Completion, OpenStop
+from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState
 from ldcnd.drives.driver import Fault
@@ -237,7 +238,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
     if before is None:
         last_error = None
     elif before.command_id != command.command_id:
-        status = _end(status, CommandStatus.ABORTED, f"aborted by {command.verb}")
+        status = _abort(status, command.verb)
         # what takes a motion over goes on with it as another command's
         last_error = status.last_error if command.state is AxisState.STOPPING else None
     return replace(
@@ -289,7 +290,7 @@ def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:
 def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
     on = event.on
     return replace(
-        _end(status, CommandStatus.ABORTED, "aborted by power"),
+        _abort(status, Verb.POWER),
         state=_state_at_rest(status, enabled=on),
         enabled=on,
         effective_from_s=event.now_s,
@@ -442,6 +443,12 @@ def _came_to_rest(status: AxisStatus) -> bool:
 
 def _fail(status: AxisStatus, reason: str, *, settled: bool | None = None) -> AxisStatus:
     return _end(_with(status, state=AxisState.ERROR_STOP), CommandStatus.FAILED, reason, settled=settled)
+
+
+def _abort(status: AxisStatus, by: Verb) -> AxisStatus:
+    """Return the status of a command that another one ends, with the reason where something is wrong, too."""
+    why = f": {status.failure}" if status.failure else ""
+    return _end(status, CommandStatus.ABORTED, f"aborted by {by}{why}")
 
 
 def _finished(status: AxisStatus, error: str | None = None, *, settled: bool | None = None) -> AxisStatus:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from ldcnd.axis.axis import AxisService
+from ldcnd.axis.events import CommandFailing
 from ldcnd.axis.rest import REST_COUNTS
 from ldcnd.axis.status import MOTION_STATES, AxisStatus
 from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
@@ -296,6 +297,7 @@ class Interlocks:
         error = rule.violation(f"axis {name}", text)
         reason = f"{error.message}; reaction: {reaction.value}"
         self._events.note(name, INTERLOCK, CommandStatus.ABORTED, reason, code=error.code.value)
+        axis.tracker.take(CommandFailing(error.message))  # whoever waits for the motion is told why it ends
         group.create_task(axis.stops.bring_to_rest(STOP_MODES[reaction]), name=f"interlock {rule.config.name}")
 
     def _binds(self, rule: BoundRule, axis: AxisService, status: AxisStatus) -> bool:

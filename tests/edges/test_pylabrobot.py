@@ -86,7 +86,7 @@ def test_a_rotor_out_of_balance_ends_its_spin_and_the_next_one_runs():
     async def unbalanced(centrifuge, looker):
         now_s = asyncio.get_running_loop().time
         looker.drive.set_condition(FaultCondition.UNBALANCED, present=True, at_s=now_s())
-        with pytest.raises(LdcndError, match="aborted"):
+        with pytest.raises(LdcndError, match="interlock balance"):
             await centrifuge.spin(g=1000, duration=20, acceleration=1.0)
         await looker.rig.at_rest("rotor")
         looker.drive.set_condition(FaultCondition.UNBALANCED, present=False, at_s=now_s())

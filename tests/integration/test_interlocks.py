@@ -227,6 +227,8 @@ async def test_a_motion_is_ended_when_a_requirement_is_lost(reaction):
         assert state.state is (AxisState.DISABLED if reaction == "power_off" else AxisState.STANDSTILL)
         (said,) = await events(rig, "interlock")
         assert said == f"axis rotor: interlock door_shut: input door_closed is false; reaction: {reaction}"
+        (*_, ended) = await events(rig, "move_velocity")
+        assert ended.endswith(": axis rotor: interlock door_shut: input door_closed is false"), ended
 
 
 async def test_a_motion_goes_on_where_the_rule_has_no_reaction():
