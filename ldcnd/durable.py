@@ -97,7 +97,7 @@ def remove(path: Path) -> None:
 
 def _give_the_rights_of(path: Path, opened: int) -> None:
     """Give an open file owner and mode of one that it will replace, if there is one."""
-    with contextlib.suppress(FileNotFoundError):
+    with contextlib.suppress(FileNotFoundError, AttributeError):  # Windows has neither owners nor modes
         was = path.stat()
         with contextlib.suppress(PermissionError):  # of another user: only the mode can be kept
             os.fchown(opened, was.st_uid, was.st_gid)
@@ -105,7 +105,9 @@ def _give_the_rights_of(path: Path, opened: int) -> None:
 
 
 def _sync(directory: Path) -> None:
-    """Have the names in a directory written to the disk."""
+    """Have the names in a directory written to the disk; Windows opens no directories."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
     opened = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(opened)

@@ -1,5 +1,8 @@
-"""Parts that are not installed everywhere: the wings of ldcnd, and packages of others that an extra brings."""
+"""Parts that are not everywhere: the wings of ldcnd, packages of others that an extra brings, signals of POSIX."""
 
+import asyncio
+import signal
+from collections.abc import Callable
 from importlib.util import find_spec
 
 from ldcnd.contract.errors import ConfigError
@@ -46,3 +49,17 @@ def missing_wing(error: ModuleNotFoundError) -> ConfigError | None:
     if root != "ldcnd" or not wing:
         return None
     return ConfigError(f"this needs {error.name}, a part of ldcnd that is not installed", remedy="install all of ldcnd")
+
+
+ENDS = ("SIGTERM", "SIGINT", "SIGHUP")
+"""Signals that end a program: of a person, of a service manager, of a terminal that was closed."""
+
+
+def on_signals(call: Callable[[], None], *names: str) -> None:
+    """Call something on the running loop at these signals, instead of being killed; Windows has not all of them."""
+    loop = asyncio.get_running_loop()
+    for number in (getattr(signal, name) for name in names if hasattr(signal, name)):
+        try:
+            loop.add_signal_handler(number, call)
+        except NotImplementedError:
+            signal.signal(number, lambda *_: loop.call_soon_threadsafe(call))

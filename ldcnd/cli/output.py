@@ -5,8 +5,6 @@ import io
 import os
 import signal
 import sys
-import termios
-import tty
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import contextmanager, suppress
 
@@ -14,7 +12,7 @@ import click
 
 from ldcnd.cli.names import typed
 from ldcnd.contract.errors import ConfigError, LdcndError, SessionError
-from ldcnd.parts import missing_wing
+from ldcnd.parts import ENDS, missing_wing, on_signals
 from ldcnd.printable import printable
 
 DONE = 0
@@ -114,14 +112,13 @@ TERMINAL_DESCRIPTORS = (0, 1, 2)
 
 def end_as_interrupted() -> None:
     """Let SIGTERM and the end of the terminal end a command as Ctrl-C does: what it has under way is ended first."""
-    for number in (signal.SIGTERM, signal.SIGHUP):
+    for number in (getattr(signal, name) for name in ENDS if name != "SIGINT" and hasattr(signal, name)):
         signal.signal(number, lambda *_: signal.raise_signal(signal.SIGINT))
 
 
 def on_end(told: Callable[[], None]) -> None:
     """Call `told` at SIGTERM, SIGINT and the end of the terminal, on the running loop, instead of being killed."""
-    for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-        asyncio.get_running_loop().add_signal_handler(number, told)
+    on_signals(told, *ENDS)
 
 
 class Terminal:
@@ -137,9 +134,9 @@ class Terminal:
 
 
 def _is_terminal(descriptor: int) -> bool:
-    with suppress(OSError, termios.error):
+    with suppress(OSError):
         if os.isatty(descriptor):
-            termios.tcgetattr(descriptor)  # one that was hung up is still called a terminal
+            os.get_terminal_size(descriptor)  # one that was hung up is still called a terminal
             return True
     return False
 
@@ -152,7 +149,18 @@ NEXT_REPEAT_S = 0.25
 
 @contextmanager
 def keys() -> Iterator["asyncio.Queue[str]"]:
-    """Yield the keys that are pressed, one by one, as they come."""
+    """Yield the keys that are pressed, one by one, as they come.
+
+    Raises:
+        ConfigError: this system has no terminals of POSIX.
+    """
+    try:
+        import termios  # noqa: PLC0415 - a part of POSIX
+        import tty  # noqa: PLC0415 - likewise
+    except ModuleNotFoundError:
+        raise ConfigError(
+            "keys that are held are read on POSIX systems only", remedy="say how long to run at most with --for SECONDS"
+        ) from None
     pressed: asyncio.Queue[str] = asyncio.Queue()
     loop, terminal = asyncio.get_running_loop(), sys.stdin.fileno()
     before = termios.tcgetattr(terminal)

@@ -18,7 +18,6 @@ from ldcnd.sim.family import PacketCutter, ServedLine
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.known import SIMULATED
 from ldcnd.sim.line_config import FaultPlanConfig
-from ldcnd.sim.pty import serve_pty
 from ldcnd.version import version
 
 
@@ -35,6 +34,9 @@ def _serve(
     def faults(seed: int) -> FaultPlan:
         plan = read_toml(fault_plan, FaultPlanConfig).fault if fault_plan else ()
         return FaultPlan(tuple(fault.spec(0.0) for fault in plan), seed)
+
+    # the options of a line are shown everywhere; terminals are a part of POSIX
+    from ldcnd.sim.pty import serve_pty  # noqa: PLC0415
 
     family, line = _served(options, faults)
 

@@ -79,6 +79,8 @@ class TerminalPerson(Person):
             descriptor = sys.stdin.fileno()
         except io.UnsupportedOperation:
             return sys.stdin.readline()
+        if sys.platform == "win32":  # its loops watch sockets only
+            return await asyncio.to_thread(sys.stdin.readline)
         if not _can_wait(descriptor):
             return sys.stdin.readline()
         while b"\n" not in self._typed:

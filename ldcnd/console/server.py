@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import signal
 import socket
 import sys
 import time
@@ -36,6 +35,7 @@ from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import LINK_S, Visitors
 from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
+from ldcnd.parts import ENDS, on_signals
 
 END_TIME_S = 1.0
 """Time for open pages to close when the console ends, seconds; then their connections are aborted."""
@@ -112,9 +112,8 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
         asyncio.TaskGroup() as group,
     ):
         server = _Server(_config(build_app(settings, rigs, feed, visitors, new_link, commissioning), settings))
-        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            loop.add_signal_handler(number, server.end)
-        loop.add_signal_handler(signal.SIGUSR1, lambda: show_link(give_link(), as_json=settings.as_json))
+        on_signals(server.end, *ENDS)
+        on_signals(lambda: show_link(give_link(), as_json=settings.as_json), "SIGUSR1")
         watching = [
             group.create_task(rigs.run(endpoint), name=f"endpoint {endpoint.name}") for endpoint in settings.endpoints
         ]

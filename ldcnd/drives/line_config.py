@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field, SerializeAsAny, ValidationInfo, fiel
 from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.toml import Name, refuse_duplicates
-from ldcnd.line.line_discipline import Rs485Config
+from ldcnd.line.transport import Rs485Config
 
 SIMULATED = "sim:"
 """A port of this kind names a simulated line instead of a device."""

@@ -5,7 +5,6 @@ include/uapi/linux/serial.h (struct serial_icounter_struct).
 """
 
 import contextlib
-import fcntl
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,6 +118,8 @@ def ports(dev: Path = Path("/dev"), by_id: Path = BY_ID) -> list[str]:
 
 def line_errors(descriptor: int) -> LineErrors | None:
     """Return what the driver of an open port has counted; None where it counts nothing."""
+    import fcntl  # noqa: PLC0415 - a part of POSIX, and clients import this module for its classes
+
     with contextlib.suppress(OSError):
         counts = ICOUNTS.unpack(fcntl.ioctl(descriptor, TIOCGICOUNT, bytes(ICOUNTS.size)))
         return LineErrors(counts[_FRAME], counts[_OVERRUN], counts[_PARITY], counts[_BREAK], counts[_BUFFER_OVERRUN])

@@ -11,9 +11,14 @@ import struct
 import termios
 from collections.abc import Sequence
 
-from pydantic import Field
-
-from ldcnd.contract.frozen import Frozen
+from ldcnd.line.transport import (
+    ENABLED,
+    RTS_AFTER_SEND,
+    RTS_ON_SEND,
+    RX_DURING_TX,
+    TERMINATE_BUS,
+    Rs485Config,
+)
 
 TCGETS2 = 0x802C542A
 """Reads `struct termios2`, whose speeds also hold rates without a constant of their own."""
@@ -21,11 +26,6 @@ TERMIOS2 = struct.Struct("4I20B2I")
 TIOCGRS485 = 0x542E
 TIOCSRS485 = 0x542F
 SERIAL_RS485 = struct.Struct("3I5I")
-
-ENABLED, RTS_ON_SEND, RTS_AFTER_SEND, RX_DURING_TX, TERMINATE_BUS = 1, 2, 4, 16, 32
-"""Flags of `struct serial_rs485`."""
-LONGEST_RTS_DELAY_MS = 100
-"""The kernel's serial core shortens longer ones."""
 
 STANDARD_BAUDS = (9600, 19_200, 38_400, 57_600, 115_200, 230_400)
 RATE_TOLERANCE = 0.02
@@ -57,28 +57,6 @@ def nearest(asked: int, available: Sequence[int]) -> str:
     below = [baud for baud in available if baud < asked]
     above = [baud for baud in available if baud > asked]
     return " and ".join(str(baud) for baud in (*below[-1:], *above[:1])) or "none"
-
-
-class Rs485Config(Frozen):
-    """Direction control of an RS-485 transmitter by the kernel, which switches RTS around each packet."""
-
-    rts_on_send: bool = True
-    """RTS is on while sending and off otherwise; false for ports that are wired the other way round."""
-    before_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
-    """Time from switching the transmitter on to the first bit, in ms."""
-    after_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
-    """Time from the last bit to switching the transmitter off, in ms."""
-    receive_own: bool = False
-    """The receiver stays on while sending: on two wires the host then receives its own bytes, see `echo`."""
-    terminate: bool = False
-    """Switch on the terminating resistor of a port that has one."""
-
-    @property
-    def flags(self) -> int:
-        """As in `struct serial_rs485`."""
-        flags = ENABLED | (RTS_ON_SEND if self.rts_on_send else RTS_AFTER_SEND)
-        flags |= RX_DURING_TX if self.receive_own else 0
-        return flags | (TERMINATE_BUS if self.terminate else 0)
 
 
 def switch_direction(descriptor: int, wanted: Rs485Config) -> str:

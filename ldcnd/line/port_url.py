@@ -3,10 +3,8 @@
 from urllib.parse import urlsplit
 
 from ldcnd.contract.errors import ConfigError
-from ldcnd.line.line_discipline import Rs485Config
-from ldcnd.line.serial_port import Framing, SerialSettings, open_serial_port
 from ldcnd.line.tcp_port import open_tcp_port
-from ldcnd.line.transport import Opener
+from ldcnd.line.transport import Framing, Opener, Rs485Config
 
 SOCKET = "socket://"
 
@@ -27,6 +25,9 @@ def port_opener(
         ConfigError: the port is neither.
     """
     if port.startswith("/"):
+        # clients read configurations too, also where there are no terminals of POSIX
+        from ldcnd.line.serial_port import SerialSettings, open_serial_port  # noqa: PLC0415
+
         settings = SerialSettings(port, baud, framing, working_baud=working_baud, rs485=rs485)
         return lambda: open_serial_port(settings)
     host, number = _socket_address(port)

@@ -17,7 +17,6 @@ import fcntl
 import os
 import termios
 from dataclasses import dataclass
-from typing import Literal
 
 import serial
 import serial_asyncio
@@ -28,14 +27,13 @@ from ldcnd.line.adapter import LineErrors, line_errors
 from ldcnd.line.line_discipline import (
     STANDARD_BAUDS,
     PortFault,
-    Rs485Config,
     actual_baud,
     makes,
     nearest,
     switch_direction,
 )
 from ldcnd.line.terminal_link import why_not_served
-from ldcnd.line.transport import Incoming, Receiver, Transport
+from ldcnd.line.transport import Framing, Incoming, Receiver, Rs485Config, Transport
 
 OPEN_TIME_S = 5.0
 DRAIN_TIME_S = 1.0
@@ -53,8 +51,6 @@ CONTROL_CHARACTERS = 6
 
 SETTINGS_BYTES = 64
 """More than `struct termios` has anywhere."""
-
-Framing = Literal["8n1", "7e1"]
 
 
 @dataclass(frozen=True, slots=True)

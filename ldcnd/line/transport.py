@@ -7,12 +7,43 @@ Not a stream: bytes are pushed to one receiver as they arrive, so that a reply c
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable
-from typing import Protocol
+from typing import Literal, Protocol
 
+from pydantic import Field
 from typing_extensions import override
 
 from ldcnd.contract.errors import TransportLost
+from ldcnd.contract.frozen import Frozen
 from ldcnd.line.adapter import LineErrors
+
+ENABLED, RTS_ON_SEND, RTS_AFTER_SEND, RX_DURING_TX, TERMINATE_BUS = 1, 2, 4, 16, 32
+"""Flags of `struct serial_rs485`."""
+LONGEST_RTS_DELAY_MS = 100
+"""The kernel's serial core shortens longer ones."""
+
+Framing = Literal["8n1", "7e1"]
+
+
+class Rs485Config(Frozen):
+    """Direction control of an RS-485 transmitter by the kernel, which switches RTS around each packet."""
+
+    rts_on_send: bool = True
+    """RTS is on while sending and off otherwise; false for ports that are wired the other way round."""
+    before_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
+    """Time from switching the transmitter on to the first bit, in ms."""
+    after_ms: int = Field(default=0, ge=0, le=LONGEST_RTS_DELAY_MS)
+    """Time from the last bit to switching the transmitter off, in ms."""
+    receive_own: bool = False
+    """The receiver stays on while sending: on two wires the host then receives its own bytes, see `echo`."""
+    terminate: bool = False
+    """Switch on the terminating resistor of a port that has one."""
+
+    @property
+    def flags(self) -> int:
+        """As in `struct serial_rs485`."""
+        flags = ENABLED | (RTS_ON_SEND if self.rts_on_send else RTS_AFTER_SEND)
+        flags |= RX_DURING_TX if self.receive_own else 0
+        return flags | (TERMINATE_BUS if self.terminate else 0)
 
 
 class Receiver(Protocol):

@@ -39,6 +39,8 @@ async def senders_wait() -> None:
 
 def _let_senders_wait() -> bool:
     """Tell whether there were any."""
+    if not hasattr(os, "sched_setscheduler"):  # no Linux
+        return True
     found = False
     for thread in THREADS.iterdir():
         with contextlib.suppress(OSError):  # it has ended, or may not be changed

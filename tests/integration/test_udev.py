@@ -75,6 +75,9 @@ L: device=../../../ttyUSB0
 
 FTDI = Adapter("ftdi_sio", "0403", "6001", "FT4ABCDE")
 CP210X = Adapter("cp210x", "10c4", "ea60", "0001")
+EXAR = Adapter("xr_serial", "04e2", "1411", "0002")
+TI = Adapter("ti_usb_3410_5052", "0451", "3410", "0003")
+MOXA = Adapter("mxuport", "110a", "1250", "0004")
 CH340 = Adapter("ch341", "1a86", "7523", None)
 MODEM = Adapter("option", "12d1", "1506", "MODEM1")
 
@@ -126,7 +129,16 @@ def test_other_chips_are_left_as_they_are(machine: Machine, adapter: Adapter):
     assert "latency_timer" not in report
 
 
-@pytest.mark.parametrize(("adapter", "link"), [(FTDI, "/dev/ldcn-FT4ABCDE-00"), (CP210X, "/dev/ldcn-0001-00")])
+@pytest.mark.parametrize(
+    ("adapter", "link"),
+    [
+        (FTDI, "/dev/ldcn-FT4ABCDE-00"),
+        (CP210X, "/dev/ldcn-0001-00"),
+        (EXAR, "/dev/ldcn-0002-00"),
+        (TI, "/dev/ldcn-0003-00"),
+        (MOXA, "/dev/ldcn-0004-00"),
+    ],
+)
 def test_adapter_has_a_name_that_stays_and_modem_manager_leaves_it_alone(machine: Machine, adapter: Adapter, link: str):
     found = properties(tried(machine, adapter, f"{PORT}/tty/ttyUSB0"))
 

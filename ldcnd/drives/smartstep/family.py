@@ -26,7 +26,7 @@ from ldcnd.drives.smartstep.profiles import Echo, Framing, SmartStepProfile
 from ldcnd.drives.smartstep.transfer import check_values, listed
 from ldcnd.drives.transcript import Describe
 from ldcnd.line.port_url import port_opener
-from ldcnd.line.serial_port import Framing as SerialFraming
+from ldcnd.line.transport import Framing as SerialFraming
 from ldcnd.line.transport import Opener
 
 LEDGER_FILE = "eeprom-writes.json"
