@@ -18,6 +18,7 @@ from prometheus_client.registry import Collector
 from ldcnd.contract.condition import Place, assess
 from ldcnd.contract.health import BusHealth, DaemonHealth
 from ldcnd.contract.samples import FaultSample, LinkState, ShadowSample, StateSample
+from ldcnd.version import version
 
 SHORTEST_LATENCY_S = 64e-6
 """Upper limit of the first bucket of a `LaneHealth`; each further one has twice the limit of the one before."""
@@ -71,6 +72,9 @@ class HealthCollector(Collector):
         up = GaugeMetricFamily("ldcnd_daemon_up", "1 while the daemon reports", labels=["rig"])
         up.add_metric([self._rig], 1.0 if daemon else 0.0)
         yield up
+        build = GaugeMetricFamily("ldcnd_build_info", "1, with the version of this exporter", labels=["rig", "version"])
+        build.add_metric([self._rig, version()], 1.0)
+        yield build
         yield from self._of_daemon(daemon)
         yield from self._of_buses(buses)
         yield from self._of_lanes(buses)

@@ -10,6 +10,7 @@ from prometheus_client import CollectorRegistry
 
 from ldcnd.client.health import health_reports
 from ldcnd.lab.metrics import HealthCollector
+from ldcnd.version import version
 from tests.support.process import LDCND, ROOT, daemon
 from tests.support.rig import running_rig
 
@@ -24,6 +25,7 @@ async def test_a_daemon_s_reports_become_metrics():
             await asyncio.sleep(3.5)
 
         assert registry.get_sample_value("ldcnd_daemon_up", {"rig": "sim"}) == 1
+        assert registry.get_sample_value("ldcnd_build_info", {"rig": "sim", "version": version()}) == 1
         rate = registry.get_sample_value("ldcnd_axis_rate_hertz", {"rig": "sim", "bus": "line0", "axis": "x"})
         wanted = registry.get_sample_value("ldcnd_axis_rate_wanted_hertz", {"rig": "sim", "bus": "line0", "axis": "x"})
         assert rate == pytest.approx(wanted, rel=0.05)
