@@ -33,8 +33,10 @@ def socket_of(port: int) -> Path:
     """Return where the console that listens on a port gives links.
 
     Raises:
-        ConfigError: the folder for it belongs to somebody else.
+        ConfigError: the folder for it belongs to another user, or this machine has no such sockets.
     """
+    if not hasattr(asyncio, "open_unix_connection"):
+        raise ConfigError("consoles give no further links on this machine", remedy="start the console again")
     given = next((Path(os.environ[name].split(":")[0]) for name in RUNTIME_FOLDERS if os.environ.get(name)), None)
     folder = given or Path(tempfile.gettempdir()) / f"ldcnd-{os.getuid()}"
     folder.mkdir(mode=PRIVATE, parents=True, exist_ok=True)
