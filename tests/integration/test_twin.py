@@ -118,6 +118,7 @@ def test_a_report_says_where_the_run_differed():
     assert "stops" in told
 
 
+@pytest.mark.system
 @pytest.mark.real_time
 def test_a_twin_is_served_to_programs_that_know_nothing_of_it(tmp_path):
     rig_file = tmp_path / "rig.toml"
