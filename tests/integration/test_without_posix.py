@@ -77,6 +77,7 @@ async def test_all_but_the_ports_can_be_imported():
     assert (code, json.loads(printed or "null")) == (0, {}), errors
 
 
+@pytest.mark.system
 async def test_a_rig_is_looked_at_moved_and_stopped():
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
         for words in (["list"], ["power", "on", "x"], ["move", "x", "0.1", "--wait"], ["stop"]):
