@@ -54,7 +54,7 @@ SETTLED_S = 0.1
 TURN_S = 0.0005
 QUIET_HZ = 0.01
 """Of all polls while a command is followed, so that none of them mixes with it."""
-WINGS = ("sim", "console", "lab", "ops", "bench", "testing")
+WINGS = ("sim", "console", "lab", "ops", "bench", "testing", "ports")
 """Folders that are no part of the core."""
 LEAST_SHARED, SHARE = 4, 0.6
 """How many fields two twins have in common at least, and which share of the smaller one's these are."""
