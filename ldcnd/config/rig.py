@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, SerializeAsAny, model_validator
 
 from ldcnd.config.interlocks import InterlockConfig, check_interlocks
+from ldcnd.config.ports import PortConfig, check_ports
 from ldcnd.config.simulated import SimulatedLine, simulator
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
@@ -111,6 +112,8 @@ class RigConfig(Frozen):
     """The lines."""
     interlock: tuple[InterlockConfig, ...] = Field(default=(), max_length=100)
     """What motions and outputs require of the machine; software, and no safety function."""
+    port: tuple[PortConfig, ...] = Field(default=(), max_length=20)
+    """Terminals on which existing host software shares a line."""
     sim: tuple[SimulatedLine, ...] = ()
     """Simulated lines, used by ports of the form sim:NAME."""
 
@@ -126,6 +129,8 @@ class RigConfig(Frozen):
         named += [name for bus in self.bus for name in (*bus.inputs, *bus.outputs)]
         refuse_duplicates("axis", [axis.name for bus in self.bus for axis in bus.axis] + named)
         check_interlocks(self.interlock, self.bus)
+        refuse_duplicates("port", [port.name for port in self.port])
+        check_ports(self.port, self.bus)
         refuse_duplicates("sim", [line.name for line in self.sim])
         ports = [bus.port for bus in self.bus]
         refuse_duplicates("port", ports)

@@ -4,6 +4,7 @@ import secrets
 import time
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -12,9 +13,11 @@ from ldcnd.axis.clock import Clock
 from ldcnd.axis.kept import KeptFiles
 from ldcnd.axis.latches import LatchKeeper
 from ldcnd.config.plan import demand_of
+from ldcnd.config.ports import ports
 from ldcnd.config.rig import RigConfig
 from ldcnd.config.simulated import simulator
 from ldcnd.contract.codec import Encoding
+from ldcnd.contract.commands import AxisCommand, CommandReply
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.keys import Keys
 from ldcnd.daemon.daemon import Daemon
@@ -125,9 +128,41 @@ def build_daemon(
     dispatcher = Dispatcher(rig, authority, ledger, events, clock, instance, config.interlock)
 
     heartbeat = Heartbeat(config.heartbeat, rig) if config.heartbeat else None
-    return Daemon(
-        config, session, rig, dispatcher, publisher, clock, instance, latches, stops=stops, heartbeat=heartbeat
+    guests = tuple(
+        partial(ports().serve, port, line.bus, tuple(line.network.axes.values()), _GuestHost(line, dispatcher))
+        for port in config.port
+        for line in (rig.lines[port.bus],)
     )
+    return Daemon(
+        config,
+        session,
+        rig,
+        dispatcher,
+        publisher,
+        clock,
+        instance,
+        latches,
+        stops=stops,
+        heartbeat=heartbeat,
+        guests=guests,
+    )
+
+
+class _GuestHost:
+    """What the daemon does for the guest of a port: see `ldcnd.config.ports.GuestHost`."""
+
+    def __init__(self, line: BusService, dispatcher: Dispatcher) -> None:
+        self._line, self._dispatcher = line, dispatcher
+
+    def is_up(self) -> bool:
+        return self._line.report is not None
+
+    async def carry_out(self, axis: str, command: AxisCommand[CommandReply]) -> object:
+        return await self._dispatcher.answer(axis, command)
+
+    def refuse(self, axis: str, what: str, client: str) -> None:
+        reason = f"{what}: the port {client} has access = read; the guest has its answer, nothing was done"
+        self._dispatcher.events.note(axis, "guest", CommandStatus.REFUSED, reason, client=client)
 
 
 def _build_bus(

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Coroutine
+from collections.abc import Awaitable, Callable, Coroutine
 from functools import partial
 from typing import Any
 
@@ -61,8 +61,10 @@ class Daemon:
         *,
         stops: EarlyStops | None = None,
         heartbeat: Heartbeat | None = None,
+        guests: tuple[Callable[[], Awaitable[None]], ...] = (),
     ) -> None:
         self.rig = rig
+        self._guests = guests
         self._stops = stops
         self._latches = latches
         self._dispatcher = dispatcher
@@ -164,6 +166,7 @@ class Daemon:
                     serving.append(group.create_task(self._guarded(self._heartbeat.run()), name="heartbeat"))
                 if self.captures:
                     serving.append(group.create_task(self._guarded(self.captures.run()), name="captures"))
+                serving += [group.create_task(_served(guest), name="guest") for guest in self._guests]
                 self._serving.set()
                 log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._run.instance)
                 await self._ending.wait()
@@ -299,6 +302,10 @@ class Daemon:
             axes=tuple(self.rig.axes),
             buses=tuple(bus.bus.settings.name for bus in self.rig.buses),
         )
+
+
+async def _served(guest: Callable[[], Awaitable[None]]) -> None:
+    await guest()
 
 
 def _capture_watch(daemon: Daemon, run: Run) -> CaptureWatch | None:

@@ -1,11 +1,13 @@
 """A module as a guest sees it: addresses, groups, rate and status mask are the guest's, the readings are the drive's.
 
 The guest talks to a chain of these instead of to the line. What only arranges (Hard Reset, Set Address, Set Baud Rate,
-Define Status) is obeyed here, as `SimulatedModule` does, and never reaches the line. Nothing here can send to the line:
-a command that could change a drive is handed to `refuse` and not done.
+Define Status) is obeyed here, as `SimulatedModule` does, and never reaches the line. Nothing here sends: readings are
+asked for with `ask`, and a command that could concern a drive is handed to `command`.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Protocol
 
 from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem, StatusPacket, encode_status
 from ldcnd.drives.ldcn.profiles import Profile
@@ -13,24 +15,29 @@ from ldcnd.drives.ldcn.received import ReceivedCommand
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 
-Read = Callable[[StatusItem], StatusPacket | None]
-"""Returns what the drive has last sent if it has all of these items and is recent enough, otherwise None."""
+
+class Answer(Protocol):
+    """A reply that waits for its reading."""
+
+    def wanted(self) -> bool:
+        """Tell whether the host still waits: a module drops its reply as soon as the host sends."""
+
+    def give(self, reading: StatusPacket, at_s: float) -> None:
+        """Begin the reply at that instant, if it is still wanted."""
 
 
-class ReadOnlyModule(SimulatedModule):
-    """A servo module that answers with the drive's readings and executes nothing.
-
-    Without a recent reading it is silent, as a module is that does not reply: no value is invented.
-
-    Attributes:
-        unread: how many replies were left out because there was no recent reading.
-    """
+class GuestModule(SimulatedModule):
+    """A servo module that answers with the drive's readings; without one it is silent: no value is invented."""
 
     def __init__(
-        self, profile: Profile, settings: ModuleSettings, read: Read, refuse: Callable[[ReceivedCommand], None]
+        self,
+        profile: Profile,
+        settings: ModuleSettings,
+        ask: Callable[[StatusItem, Answer], None],
+        command: Callable[[ReceivedCommand], None],
     ) -> None:
-        self._read, self._refuse = read, refuse
-        self.unread = 0
+        self._ask, self._command = ask, command
+        self._asked: _Answer | None = None
         super().__init__(profile, settings)
 
     def restart(self) -> None:
@@ -40,17 +47,41 @@ class ReadOnlyModule(SimulatedModule):
         """The drive counts its own servo cycles."""
 
     def execute(self, command: ReceivedCommand) -> None:
-        """Refuse what could change the drive."""
-        self._refuse(command)
+        """Hand on what could concern the drive."""
+        self._command(command)
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
-        """Return the packet that the drive could send now, with the guest's own checksum error alone in its bit."""
-        reading = self._read(items)
-        if reading is None:
-            self.unread += 1
-            return b""
-        data = bytearray(encode_status(self.profile, items, reading))
-        flag = int(StatusFlag.CHECKSUM_ERROR)
-        data[0] = data[0] & ~flag | (flag if checksum_error else 0)
-        data[-1] = sum(data[:-1]) & 0xFF
-        return bytes(data)
+        """Ask for the reading that the reply needs; the reply follows with it."""
+        self._asked = _Answer(self, items, damaged=checksum_error)
+        self._ask(items, self._asked)
+        return b""
+
+    def answers(self, answer: "_Answer") -> bool:
+        """Tell whether this is the reply that the host waits for."""
+        return self._asked is answer
+
+    def reply(self, data: bytes, at_s: float) -> None:
+        """Begin a reply at that instant."""
+        self._asked = None
+        self._reply, self.next_event_s = data, at_s
+
+    def _fall_silent(self) -> None:
+        self._asked = None
+        super()._fall_silent()
+
+
+class _Answer:
+    """A reply of one module."""
+
+    def __init__(self, module: GuestModule, items: StatusItem, *, damaged: bool) -> None:
+        self._module, self._items, self._damaged = module, items, damaged
+
+    def wanted(self) -> bool:
+        return self._module.answers(self)
+
+    def give(self, reading: StatusPacket, at_s: float) -> None:
+        if not self.wanted():
+            return
+        flag = StatusFlag.CHECKSUM_ERROR  # the guest's own, not that of the daemon's packet
+        flags = StatusFlag(reading.flags & ~flag | (flag if self._damaged else 0))
+        self._module.reply(encode_status(self._module.profile, self._items, replace(reading, flags=flags)), at_s)

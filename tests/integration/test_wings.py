@@ -15,7 +15,8 @@ STANDING = {
     "console": (),
     "lab": ("bluesky", "cli.top"),
     "ops": ("cli.pki",),
-    "sim": ("bench.tuning", "cli.sim", "cli.twin", "testing"),
+    "ports": (),
+    "sim": ("bench.tuning", "cli.sim", "cli.twin", "ports", "testing"),
     "testing": ("cli.twin",),
 }
 """By wing: what stands on it and goes with it, beside what the folder has."""

@@ -1,4 +1,4 @@
-"""A guest's own chain: what arranges is answered as on the bare line, what could change a drive is not done."""
+"""A guest's own chain: what arranges is answered as on the bare line, what could concern a drive is handed on."""
 
 from ldcnd.drives.ldcn.packet import (
     CommandCode,
@@ -10,99 +10,83 @@ from ldcnd.drives.ldcn.packet import (
 )
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.received import ReceivedCommand
-from ldcnd.ports.guest_module import ReadOnlyModule
+from ldcnd.ports.guest_module import Answer, GuestModule
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 
-SETTINGS = ModuleSettings(reset_dead_s=0.0)
-READING = StatusPacket(
-    StatusFlag(0x09), position=-70_000, adc=3, velocity=0, home=12, device_id=0, version=10, position_error=0, bit7=0
-)
+READING = StatusPacket(StatusFlag(0x09), position=-70_000)
 ADDRESS_1 = Packet(0, CommandCode.SET_ADDRESS, bytes((1, 0xFF)))
 
 
-class Guest:
-    """A host program on a chain of two drives that are at rest."""
+class Program:
+    """A host program on a chain of two drives that are at rest; readings come at once unless they are held back."""
 
-    def __init__(self, reading: StatusPacket | None = READING) -> None:
-        self.refused: list[ReceivedCommand] = []
-        self.asked: list[StatusItem] = []
-
-        def read(items: StatusItem) -> StatusPacket | None:
-            self.asked.append(items)
-            return reading
-
-        self.chain = Chain([ReadOnlyModule(PIC_SERVO_SC, SETTINGS, read, self.refused.append) for _ in range(2)])
+    def __init__(self) -> None:
+        self.commands: list[ReceivedCommand] = []
+        settings = ModuleSettings(reset_dead_s=0.0)
+        self.asked: list[Answer] = []
+        self.chain = Chain([GuestModule(PIC_SERVO_SC, settings, self._ask, self.commands.append) for _ in range(2)])
         self.now_s = 0.0
+
+    def _ask(self, _items: StatusItem, answer: Answer) -> None:
+        self.asked.append(answer)
 
     def send(self, *packets: Packet) -> list[str]:
         return [self.send_bytes(encode_packet(packet)) for packet in packets]
 
-    def send_bytes(self, data: bytes) -> str:
+    def send_bytes(self, data: bytes, *, read: bool = True) -> str:
         self.chain.write(self.now_s, data)
+        self.now_s += 0.05
+        self.chain.advance(self.now_s)
+        if not read:
+            return ""
+        for answer in self.asked:
+            answer.give(READING, self.now_s)
+        self.asked.clear()
         self.now_s += 0.05
         return b"".join(piece for _, piece in self.chain.advance(self.now_s)).hex()
 
 
 def test_addresses_resets_and_rates_of_a_guest_are_its_own() -> None:
-    guest = Guest()
+    program = Program()
 
-    assert guest.send(ADDRESS_1, Packet(0, CommandCode.SET_ADDRESS, bytes((2, 0xFF)))) == ["0909", "0909"]
-    assert guest.send(Packet(0xFF, CommandCode.SET_BAUD_RATE, bytes((0x14,)))) == [""]
-    guest.chain.baud = 57_600
-    assert guest.send(Packet(2, CommandCode.NO_OPERATION)) == ["0909"]
-    assert guest.send(Packet(0xFF, CommandCode.HARD_RESET)) == [""]
-    assert guest.send(Packet(1, CommandCode.NO_OPERATION)) == [""]
-    guest.chain.baud = 19_200
-    assert guest.send(ADDRESS_1) == ["0909"]
-    assert guest.refused == []
+    assert program.send(ADDRESS_1, Packet(0, CommandCode.SET_ADDRESS, bytes((2, 0xFF)))) == ["0909", "0909"]
+    assert program.send(Packet(0xFF, CommandCode.SET_BAUD_RATE, bytes((0x14,)))) == [""]
+    program.chain.baud = 57_600
+    assert program.send(Packet(2, CommandCode.NO_OPERATION)) == ["0909"]
+    assert program.send(Packet(0xFF, CommandCode.HARD_RESET)) == [""]
+    assert program.send(Packet(1, CommandCode.NO_OPERATION)) == [""]
+    program.chain.baud = 19_200
+    assert program.send(ADDRESS_1) == ["0909"]
+    assert program.commands == []
 
 
 def test_a_guest_reads_by_its_own_status_mask() -> None:
-    guest = Guest()
-    position = (-70_000).to_bytes(4, "little", signed=True)
-    packet = b"\x09" + position
+    program = Program()
+    packet = b"\x09" + (-70_000).to_bytes(4, "little", signed=True)
     expected = (packet + bytes([sum(packet) & 0xFF])).hex()
 
-    guest.send(ADDRESS_1)
+    program.send(ADDRESS_1)
 
-    assert guest.send(Packet(1, CommandCode.DEFINE_STATUS, b"\x01"), Packet(1, CommandCode.NO_OPERATION)) == [
-        expected,
-        expected,
-    ]
-    assert guest.asked[-2:] == [StatusItem.POSITION] * 2
+    define, read = Packet(1, CommandCode.DEFINE_STATUS, b"\x01"), Packet(1, CommandCode.NO_OPERATION)
+    assert program.send(define, read) == [expected, expected]
 
 
-def test_what_could_change_a_drive_is_answered_and_not_done() -> None:
-    guest = Guest()
-    guest.send(ADDRESS_1)
-    changes = (
-        Packet(1, CommandCode.RESET_POSITION),
-        Packet(1, CommandCode.LOAD_TRAJECTORY, bytes((0x91, 0x10, 0, 0, 0))),
-        Packet(1, CommandCode.START_MOTION),
-        Packet(1, CommandCode.SET_GAIN, bytes(14)),
-        Packet(1, CommandCode.STOP_MOTOR, b"\x01"),
-        Packet(1, CommandCode.IO_CONTROL, b"\x00"),
-        Packet(1, CommandCode.SET_HOMING_MODE, b"\x02"),
-        Packet(1, CommandCode.CLEAR_STICKY_BITS),
-        Packet(1, CommandCode.SAVE_CURRENT_POSITION_AS_HOME),
-    )
-
-    assert guest.send(*changes) == ["0909"] * len(changes)
-    assert len(guest.refused) == len(changes)
-
-
-def test_a_damaged_packet_is_reported_and_neither_done_nor_refused() -> None:
-    guest = Guest()
-    guest.send(ADDRESS_1)
+def test_a_damaged_packet_is_reported_and_not_handed_on() -> None:
+    program = Program()
+    program.send(ADDRESS_1)
     damaged = encode_packet(Packet(1, CommandCode.START_MOTION))[:-1] + b"\x00"
 
-    assert guest.send_bytes(damaged) == "0b0b"
-    assert guest.refused == []
-    assert guest.send(Packet(1, CommandCode.NO_OPERATION)) == ["0909"]
+    assert program.send_bytes(damaged) == "0b0b"
+    assert program.commands == []
+    assert program.send(Packet(1, CommandCode.NO_OPERATION)) == ["0909"]
 
 
-def test_a_drive_without_a_recent_reading_is_silent() -> None:
-    guest = Guest(reading=None)
+def test_a_reading_that_comes_late_answers_no_later_request() -> None:
+    program = Program()
+    program.send(ADDRESS_1)
+    ask = encode_packet(Packet(1, CommandCode.NO_OPERATION))
 
-    assert guest.send(ADDRESS_1, Packet(1, CommandCode.NO_OPERATION)) == ["", ""]
+    program.send_bytes(ask, read=False)
+
+    assert program.send_bytes(ask) == "0909"

@@ -1,0 +1,87 @@
+"""The door to ports for guests: existing host software that shares a line; a rig without `[[port]]` runs without it."""
+
+from collections.abc import Awaitable, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Literal, Protocol
+
+from pydantic import Field
+
+from ldcnd.contract.commands import AxisCommand, CommandReply
+from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.frozen import Frozen
+from ldcnd.drives.driver import Drive
+from ldcnd.drives.line_config import BusConfig
+from ldcnd.drives.toml import Name
+from ldcnd.line.bus import Bus
+
+PORTS = "ldcnd.ports"
+
+
+class PortConfig(Frozen):
+    """A terminal on which a program that knows nothing of ldcnd uses a line of LDCN drives."""
+
+    name: Name
+    """The guest's name in events."""
+    bus: Name
+    """The line; the guest finds its axes in the order of their addresses."""
+    link: Path
+    """The link to the terminal that the program opens."""
+    access: Literal["read"] = "read"
+    """What the guest may do: with "read" it reads, stops and switches motors off; all else is answered and not done."""
+    mode: str = Field(default="0600", pattern=r"^0[0-7]{3}$")
+    """Permissions of the terminal, octal."""
+
+
+class GuestHost(Protocol):
+    """What a daemon does for a guest."""
+
+    def is_up(self) -> bool:
+        """Tell whether every module of the line has its address, so that a guest's reading disturbs nothing."""
+
+    def carry_out(self, axis: str, command: AxisCommand[CommandReply]) -> Awaitable[object]:
+        """Carry out a command as of any client."""
+
+    def refuse(self, axis: str, what: str, client: str) -> None:
+        """Enter what was refused to a guest among the events."""
+
+
+class Ports(Protocol):
+    """What the wing does for a configuration and for a daemon: the functions of `ldcnd.ports.known`."""
+
+    def check(self, port: PortConfig, line: BusConfig) -> None:
+        """Refuse a port that the line cannot have; raises ValueError."""
+
+    def serve(self, port: PortConfig, bus: Bus, drives: Sequence[Drive], host: GuestHost) -> Awaitable[None]:
+        """Serve a guest until cancelled; a failure ends its port and nothing else."""
+
+
+def ports() -> Ports:
+    """Load the wing.
+
+    Raises:
+        ConfigError: it is not installed.
+    """
+    try:
+        known: Ports = import_module(f"{PORTS}.known")
+    except ModuleNotFoundError as error:
+        if error.name not in {PORTS, f"{PORTS}.known"}:
+            raise
+        raise ConfigError(
+            f"[[port]] needs {PORTS}, which is not installed", remedy="install all of ldcnd, or delete [[port]]"
+        ) from error
+    return known
+
+
+def check_ports(configured: Sequence[PortConfig], lines: Sequence[BusConfig]) -> None:
+    """Refuse ports of lines that are not there or cannot have one; raises ValueError."""
+    if not configured:
+        return
+    by_name = {line.name: line for line in lines}
+    for port in configured:
+        if port.bus not in by_name:
+            raise ValueError(f"port {port.name}: there is no bus {port.bus!r}; there are: {', '.join(by_name)}")
+        try:
+            ports().check(port, by_name[port.bus])
+        except ConfigError as error:  # one complaint among others about the file
+            raise ValueError(f"{error.message}; {error.remedy}") from error

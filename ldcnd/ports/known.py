@@ -1,0 +1,200 @@
+"""Ports of guests: a chain of their own behind a terminal, and what of it reaches the line."""
+
+import asyncio
+import os
+import tty
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from ldcnd.config.ports import GuestHost, PortConfig
+from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Power
+from ldcnd.contract.errors import LdcndError
+from ldcnd.drives.driver import Drive
+from ldcnd.drives.ldcn.commands import Node, read_status
+from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket
+from ldcnd.drives.ldcn.received import PlainCommand, ReceivedCommand, StopMotor
+from ldcnd.drives.ldcn.servo import LdcnAxis
+from ldcnd.drives.line_config import BusConfig
+from ldcnd.line.bus import Bus
+from ldcnd.line.line_discipline import actual_baud
+from ldcnd.line.terminal_link import TerminalLink
+from ldcnd.log import get_logger
+from ldcnd.ports.guest_module import Answer, GuestModule
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.quirks import ModuleSettings
+
+log = get_logger("ports")
+
+PAUSE_PER_EXCHANGE = 3.0
+"""A guest's exchange is followed by a pause of so many times its length: others keep three quarters of the line."""
+SAME_REFUSAL_S = 1.0
+"""The same refusal of an axis is one event in this time: old programs repeat themselves."""
+READ_BYTES = 4096
+
+
+def check(port: PortConfig, line: BusConfig) -> None:
+    """Refuse a port of another family; raises ValueError."""
+    if line.family != "ldcn":
+        raise ValueError(
+            f"port {port.name}: bus {line.name} is of the family {line.family}; only ldcn lines have ports"
+        )
+
+
+@dataclass(slots=True)
+class _Axis:
+    """An axis as a guest reaches it, with what it has set going."""
+
+    name: str
+    node: Node
+    under_way: "dict[type, asyncio.Task[None]]" = field(default_factory=dict)
+    again: set[type] = field(default_factory=set)
+
+
+class Guest:
+    """A guest on one line: takes its bytes, returns what the modules answer.
+
+    Attributes:
+        chain: as the guest sees the line.
+    """
+
+    def __init__(self, name: str, bus: Bus, drives: Sequence[Drive], host: GuestHost, group: asyncio.TaskGroup) -> None:
+        self._name, self._bus, self._host, self._group = name, bus, host, group
+        self._loop = asyncio.get_running_loop()
+        self._line, self._free_at_s = asyncio.Lock(), 0.0
+        self._refused: dict[tuple[str, str], float] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self.receive: Callable[[bytes], None] = lambda _: None
+        modules = []
+        for drive in sorted(
+            (each for each in drives if isinstance(each, LdcnAxis)), key=lambda each: each.spec.address
+        ):
+            axis = _Axis(drive.spec.name, Node(drive.spec.address, drive.profile))
+            settings = ModuleSettings(reset_dead_s=0.0)  # programs take a terminal for drained at once
+            ask, command = partial(self._ask, axis), partial(self._command, axis)
+            modules.append(GuestModule(drive.profile, settings, ask, command))
+        self.chain = Chain(modules)
+
+    def send(self, data: bytes) -> None:
+        """Take bytes of the guest."""
+        self.chain.write(self._loop.time(), data)
+        self._advance()
+
+    def _advance(self) -> None:
+        """Do what is due on the guest's chain, and come back for what is due next."""
+        if self._timer:
+            self._timer.cancel()
+        due = b"".join(piece for _, piece in self.chain.advance(self._loop.time()))
+        next_s = self.chain.next_event_s()
+        self._timer = self._loop.call_at(next_s, self._advance) if next_s is not None else None
+        if due:
+            self.receive(due)
+
+    def _ask(self, axis: _Axis, items: StatusItem, answer: Answer) -> None:
+        self._group.create_task(self._read(axis, items, answer), name=f"guest {self._name} reads {axis.name}")
+
+    async def _read(self, axis: _Axis, items: StatusItem, answer: Answer) -> None:
+        """Answer with a reading of the drive, made after what the guest has set going there before."""
+        if axis.under_way:
+            await asyncio.wait(tuple(axis.under_way.values()))
+        async with self._line:
+            await asyncio.sleep(self._free_at_s - self._loop.time())
+            if not answer.wanted() or not self._host.is_up():
+                return
+            began_s = self._loop.time()
+            try:
+                reading: StatusPacket = await self._bus.execute(read_status(axis.node, items))
+            except LdcndError as error:
+                log.debug("not read", guest=self._name, axis=axis.name, reason=error.message)
+                return
+            finally:
+                now_s = self._loop.time()
+                self._free_at_s = now_s + PAUSE_PER_EXCHANGE * (now_s - began_s)
+        answer.give(reading, self._loop.time())
+        self._advance()
+
+    def _command(self, axis: _Axis, command: ReceivedCommand) -> None:
+        """Take energy out at once; refuse everything else."""
+        relief = _relief(command, self._name)
+        if relief is None:
+            self._refuse(axis.name, command)
+            return
+        kind = type(relief)
+        if kind in axis.under_way:
+            axis.again.add(kind)  # one more behind it, however many come: each is followed by one that begins later
+            return
+        task = self._group.create_task(self._carry_out(axis, relief), name=f"guest {self._name} stops {axis.name}")
+        axis.under_way[kind] = task
+        task.add_done_callback(lambda _: axis.under_way.pop(kind))
+
+    async def _carry_out(self, axis: _Axis, command: AxisCommand[CommandReply]) -> None:
+        again = True
+        while again:
+            with suppress(LdcndError):  # the daemon has entered it among the events
+                await self._host.carry_out(axis.name, command)
+            again = type(command) in axis.again
+            axis.again.discard(type(command))
+
+    def _refuse(self, axis: str, command: ReceivedCommand) -> None:
+        what = command.command.name.lower() if isinstance(command, PlainCommand) else type(command).__name__
+        now_s = self._loop.time()
+        if now_s - self._refused.get((axis, what), -SAME_REFUSAL_S) >= SAME_REFUSAL_S:
+            self._refused[axis, what] = now_s
+            self._host.refuse(axis, what, self._name)
+
+
+def _relief(command: ReceivedCommand, client: str) -> AxisCommand[CommandReply] | None:
+    """Return what takes the energy out that a guest's Stop Motor takes out; None for what does more or something else.
+
+    Without its amplifier bit it switches the power driver off whatever else it says; going to a position is motion.
+    """
+    if not isinstance(command, StopMotor):
+        return None
+    if command.control & StopControl.MOTOR_OFF or not command.control & StopControl.AMP_ENABLE:
+        return Power(on=False, client=client)
+    if command.control & (StopControl.ABRUPT | StopControl.SMOOTH):
+        return Halt(client=client)
+    return None
+
+
+async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], host: GuestHost) -> None:
+    """Serve a guest on a terminal until cancelled; a failure ends its port and nothing else."""
+    try:
+        async with asyncio.TaskGroup() as group:
+            with ExitStack() as stack:
+                _open(port, Guest(port.name, bus, drives, host, group), stack)
+                await asyncio.Event().wait()
+    except Exception:
+        log.exception("port ended", guest=port.name, bus=port.bus)
+
+
+def _open(port: PortConfig, guest: Guest, stack: ExitStack) -> None:
+    """Put a terminal in front of a guest's chain, until the stack closes."""
+    loop = asyncio.get_running_loop()
+    master, slave = os.openpty()
+    stack.callback(os.close, master)
+    stack.callback(os.close, slave)  # our end stays open, so that a program may come and go
+    tty.setraw(slave)
+    os.set_blocking(master, False)
+    path = Path(os.ttyname(slave))
+    path.chmod(int(port.mode, 8))
+    link = TerminalLink(port.link, path)
+    stack.callback(link.close)
+
+    def to_guest(data: bytes) -> None:
+        with suppress(BlockingIOError):  # the program does not read: a real line does not wait either
+            os.write(master, data)
+
+    def from_guest() -> None:
+        with suppress(BlockingIOError):
+            data = os.read(master, READ_BYTES)
+            guest.chain.baud = actual_baud(master) or guest.chain.baud
+            guest.send(data)
+
+    guest.receive = to_guest
+    loop.add_reader(master, from_guest)
+    stack.callback(loop.remove_reader, master)
+    log.info("port", guest=port.name, bus=port.bus, link=str(port.link), terminal=str(path), access=port.access)
