@@ -16,7 +16,7 @@ from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 
 
-class Answer(Protocol):
+class PendingReply(Protocol):
     """A reply that waits for its reading."""
 
     def wanted(self) -> bool:
@@ -33,11 +33,11 @@ class GuestModule(SimulatedModule):
         self,
         profile: Profile,
         settings: ModuleSettings,
-        ask: Callable[[StatusItem, Answer], None],
+        ask: Callable[[StatusItem, PendingReply], None],
         command: Callable[[ReceivedCommand], None],
     ) -> None:
         self._ask, self._command = ask, command
-        self._asked: _Answer | None = None
+        self._asked: _StatusReply | None = None
         super().__init__(profile, settings)
 
     def restart(self) -> None:
@@ -52,11 +52,11 @@ class GuestModule(SimulatedModule):
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
         """Ask for the reading that the reply needs; the reply follows with it."""
-        self._asked = _Answer(self, items, damaged=checksum_error)
+        self._asked = _StatusReply(self, items, damaged=checksum_error)
         self._ask(items, self._asked)
         return b""
 
-    def answers(self, answer: "_Answer") -> bool:
+    def answers(self, answer: "_StatusReply") -> bool:
         """Tell whether this is the reply that the host waits for."""
         return self._asked is answer
 
@@ -70,7 +70,7 @@ class GuestModule(SimulatedModule):
         super()._fall_silent()
 
 
-class _Answer:
+class _StatusReply:
     """A reply of one module."""
 
     def __init__(self, module: GuestModule, items: StatusItem, *, damaged: bool) -> None:

@@ -23,7 +23,7 @@ from ldcnd.line.bus import Bus
 from ldcnd.line.line_discipline import actual_baud
 from ldcnd.line.terminal_link import TerminalLink
 from ldcnd.log import get_logger
-from ldcnd.ports.guest_module import Answer, GuestModule
+from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 
@@ -45,7 +45,7 @@ def check(port: PortConfig, line: BusConfig) -> None:
 
 
 @dataclass(slots=True)
-class _Axis:
+class _GuestAxis:
     """An axis as a guest reaches it, with what it has set going."""
 
     name: str
@@ -72,7 +72,7 @@ class Guest:
         for drive in sorted(
             (each for each in drives if isinstance(each, LdcnAxis)), key=lambda each: each.spec.address
         ):
-            axis = _Axis(drive.spec.name, Node(drive.spec.address, drive.profile))
+            axis = _GuestAxis(drive.spec.name, Node(drive.spec.address, drive.profile))
             settings = ModuleSettings(reset_dead_s=0.0)  # programs take a terminal for drained at once
             ask, command = partial(self._ask, axis), partial(self._command, axis)
             modules.append(GuestModule(drive.profile, settings, ask, command))
@@ -93,11 +93,11 @@ class Guest:
         if due:
             self.receive(due)
 
-    def _ask(self, axis: _Axis, items: StatusItem, answer: Answer) -> None:
+    def _ask(self, axis: _GuestAxis, items: StatusItem, answer: PendingReply) -> None:
         self._group.create_task(self._read(axis, items, answer), name=f"guest {self._name} reads {axis.name}")
 
-    async def _read(self, axis: _Axis, items: StatusItem, answer: Answer) -> None:
-        """Answer with a reading of the drive, made after what the guest has set going there before."""
+    async def _read(self, axis: _GuestAxis, items: StatusItem, answer: PendingReply) -> None:
+        """PendingReply with a reading of the drive, made after what the guest has set going there before."""
         if axis.under_way:
             await asyncio.wait(tuple(axis.under_way.values()))
         async with self._line:
@@ -116,7 +116,7 @@ class Guest:
         answer.give(reading, self._loop.time())
         self._advance()
 
-    def _command(self, axis: _Axis, command: ReceivedCommand) -> None:
+    def _command(self, axis: _GuestAxis, command: ReceivedCommand) -> None:
         """Take energy out at once; refuse everything else."""
         relief = _relief(command, self._name)
         if relief is None:
@@ -130,7 +130,7 @@ class Guest:
         axis.under_way[kind] = task
         task.add_done_callback(lambda _: axis.under_way.pop(kind))
 
-    async def _carry_out(self, axis: _Axis, command: AxisCommand[CommandReply]) -> None:
+    async def _carry_out(self, axis: _GuestAxis, command: AxisCommand[CommandReply]) -> None:
         again = True
         while again:
             with suppress(LdcndError):  # the daemon has entered it among the events

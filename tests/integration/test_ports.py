@@ -32,8 +32,8 @@ CHANGES = (
 )
 
 
-def with_port(link: Path) -> RigConfig:
-    document = machine().model_dump(mode="json", exclude_defaults=True)
+def with_port(link: Path, **axis: object) -> RigConfig:
+    document = machine(axis=axis).model_dump(mode="json", exclude_defaults=True)
     return RigConfig.model_validate(document | {"port": [{"name": "old", "bus": "line", "link": str(link)}]})
 
 
@@ -64,8 +64,8 @@ class Program:
 
 
 @asynccontextmanager
-async def guest(tmp_path: Path) -> AsyncIterator[tuple[Machine, Program]]:
-    async with running_machine(with_port(tmp_path / "port")) as rig:
+async def guest(tmp_path: Path, **axis: object) -> AsyncIterator[tuple[Machine, Program]]:
+    async with running_machine(with_port(tmp_path / "port", **axis)) as rig:
         descriptor = os.open(tmp_path / "port", os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
         settings = termios.tcgetattr(descriptor)
         settings[4] = settings[5] = termios.B19200
@@ -80,6 +80,18 @@ def registers(rig: Machine) -> list[tuple[object, ...]]:
     """Return what the simulated drives hold that a guest could change."""
     drives = [each for each in rig.chain.modules if isinstance(each, SimulatedDrive)]
     return [(each.address, each.group, each.leader, each.baud, each.items) for each in drives]
+
+
+def count_packets(rig: Machine) -> list[int]:
+    """Count what is sent on the line from now on."""
+    counted, write = [0], rig.chain.write
+
+    def count(now_s: float, data: bytes) -> None:
+        counted[0] += 1
+        write(now_s, data)
+
+    rig.chain.write = count
+    return counted
 
 
 async def turning(rig: Machine) -> None:
@@ -134,3 +146,19 @@ def test_a_port_of_a_line_that_is_not_there_is_refused():
     document = machine().model_dump(mode="json", exclude_defaults=True)
     with pytest.raises(ValueError, match="port old: there is no bus 'other'; there are: line"):
         RigConfig.model_validate(document | {"port": [{"name": "old", "bus": "other", "link": "x"}]})
+
+
+async def test_a_guest_that_reads_as_fast_as_it_can_leaves_polls_their_rate(tmp_path):
+    async with guest(tmp_path, rates={"position": 400, "velocity": 400, "adc": 0, "state": 20}) as (rig, program):
+        loop = asyncio.get_running_loop()
+        packets = count_packets(rig)
+        await asyncio.sleep(2.0)
+        alone = packets[0]
+        await program.begin()
+        packets[0] = 0
+        replies, until_s = 0, loop.time() + 2.0
+        while loop.time() < until_s:
+            replies += bool(await program.send(Packet(1, NO_OPERATION)))
+
+        assert replies > 20
+        assert packets[0] - replies >= 0.7 * alone

@@ -10,7 +10,7 @@ from ldcnd.drives.ldcn.packet import (
 )
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.received import ReceivedCommand
-from ldcnd.ports.guest_module import Answer, GuestModule
+from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 
@@ -24,11 +24,11 @@ class Program:
     def __init__(self) -> None:
         self.commands: list[ReceivedCommand] = []
         settings = ModuleSettings(reset_dead_s=0.0)
-        self.asked: list[Answer] = []
+        self.asked: list[PendingReply] = []
         self.chain = Chain([GuestModule(PIC_SERVO_SC, settings, self._ask, self.commands.append) for _ in range(2)])
         self.now_s = 0.0
 
-    def _ask(self, _items: StatusItem, answer: Answer) -> None:
+    def _ask(self, _items: StatusItem, answer: PendingReply) -> None:
         self.asked.append(answer)
 
     def send(self, *packets: Packet) -> list[str]:
