@@ -13,6 +13,7 @@ import pytest
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import MoveVelocity, Power
 from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.samples import LinkState
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
@@ -240,3 +241,27 @@ async def test_replies_have_the_form_that_they_have_on_the_bare_line(tmp_path):
             reply = await program.send(packet, 0.1)
             await asyncio.sleep(0.02)
             assert len(reply) // 2 == len(expected), packet
+
+
+async def test_a_port_that_cannot_be_made_leaves_the_daemon_as_it_is(tmp_path):
+    async with running_machine(with_port(tmp_path / "no" / "such" / "folder")) as rig:
+        await turning(rig)
+
+
+async def test_while_the_line_is_lost_a_guest_hears_nothing_and_afterwards_it_reads_again(tmp_path):
+    async with guest(tmp_path) as (rig, program):
+        await program.begin()
+        now_s = asyncio.get_running_loop().time()
+        rig.chain.unplug(now_s)
+        await asyncio.sleep(0.1)
+        assert await program.send(Packet(1, NO_OPERATION), 0.3) == ""
+
+        rig.chain.replug()
+        await rig.until("rotor", lambda state: state.link is LinkState.UP)
+        assert await program.send(Packet(1, NO_OPERATION))
+
+
+async def test_the_link_is_gone_with_the_daemon(tmp_path):
+    async with guest(tmp_path):
+        assert (tmp_path / "port").is_symlink()
+    assert not (tmp_path / "port").is_symlink()
