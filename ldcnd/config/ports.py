@@ -12,6 +12,7 @@ from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.line_config import BusConfig
+from ldcnd.drives.network import IoDriver
 from ldcnd.drives.toml import Name
 from ldcnd.line.bus import Bus
 
@@ -24,7 +25,7 @@ class PortConfig(Frozen):
     name: Name
     """The guest's name in events."""
     bus: Name
-    """The line; the guest finds its axes in the order of their addresses."""
+    """The line; the guest finds its axes and named PIC-I/O modules in the order of their addresses."""
     link: Path
     """The link to the terminal that the program opens."""
     access: Literal["read"] = "read"
@@ -52,7 +53,9 @@ class Ports(Protocol):
     def check(self, port: PortConfig, line: BusConfig) -> None:
         """Refuse a port that the line cannot have; raises ValueError."""
 
-    def serve(self, port: PortConfig, bus: Bus, drives: Sequence[Drive], host: GuestHost) -> Awaitable[None]:
+    def serve(
+        self, port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequence[IoDriver], host: GuestHost
+    ) -> Awaitable[None]:
         """Serve a guest until cancelled; a failure ends its port and nothing else."""
 
 

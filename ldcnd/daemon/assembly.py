@@ -129,7 +129,14 @@ def build_daemon(
 
     heartbeat = Heartbeat(config.heartbeat, rig) if config.heartbeat else None
     guests = tuple(
-        partial(ports().serve, port, line.bus, tuple(line.network.axes.values()), _GuestHost(line, dispatcher))
+        partial(
+            ports().serve,
+            port,
+            line.bus,
+            tuple(line.network.axes.values()),
+            tuple(line.network.io.values()),
+            _GuestHost(line, dispatcher),
+        )
         for port in config.port
         for line in (rig.lines[port.bus],)
     )

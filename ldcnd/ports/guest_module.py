@@ -6,14 +6,16 @@ asked for with `ask`, and a command that could concern a drive is handed to `com
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Protocol
 
-from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem, StatusPacket, encode_status
+from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem
 from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.drives.ldcn.received import ReceivedCommand
 from ldcnd.sim.ldcn.module import SimulatedModule
 from ldcnd.sim.ldcn.quirks import ModuleSettings
+
+CHECKSUM_ERROR = int(StatusFlag.CHECKSUM_ERROR)
+"""The same bit in the status byte of every module (PIC-SERVO manual, 5.3)."""
 
 
 class PendingReply(Protocol):
@@ -22,12 +24,12 @@ class PendingReply(Protocol):
     def wanted(self) -> bool:
         """Tell whether the host still waits: a module drops its reply as soon as the host sends."""
 
-    def give(self, reading: StatusPacket, at_s: float) -> None:
-        """Begin the reply at that instant, if it is still wanted."""
+    def give(self, status: bytes, at_s: float) -> None:
+        """Begin the reply at that instant with the drive's status packet, if it is still wanted."""
 
 
 class GuestModule(SimulatedModule):
-    """A servo module that answers with the drive's readings; without one it is silent: no value is invented."""
+    """A module that answers with readings of the one on the line; without one it is silent: no value is invented."""
 
     def __init__(
         self,
@@ -52,7 +54,7 @@ class GuestModule(SimulatedModule):
 
     def status(self, items: StatusItem, *, checksum_error: bool) -> bytes:
         """Ask for the reading that the reply needs; the reply follows with it."""
-        self._asked = _StatusReply(self, items, damaged=checksum_error)
+        self._asked = _StatusReply(self, damaged=checksum_error)
         self._ask(items, self._asked)
         return b""
 
@@ -73,15 +75,15 @@ class GuestModule(SimulatedModule):
 class _StatusReply:
     """A reply of one module."""
 
-    def __init__(self, module: GuestModule, items: StatusItem, *, damaged: bool) -> None:
-        self._module, self._items, self._damaged = module, items, damaged
+    def __init__(self, module: GuestModule, *, damaged: bool) -> None:
+        self._module, self._damaged = module, damaged
 
     def wanted(self) -> bool:
         return self._module.answers(self)
 
-    def give(self, reading: StatusPacket, at_s: float) -> None:
+    def give(self, status: bytes, at_s: float) -> None:
         if not self.wanted():
             return
-        flag = StatusFlag.CHECKSUM_ERROR  # the guest's own, not that of the daemon's packet
-        flags = StatusFlag(reading.flags & ~flag | (flag if self._damaged else 0))
-        self._module.reply(encode_status(self._module.profile, self._items, replace(reading, flags=flags)), at_s)
+        flag = CHECKSUM_ERROR if self._damaged else 0  # the guest's own, not that of the daemon's packet
+        body = bytes((status[0] & ~CHECKSUM_ERROR | flag,)) + status[1:-1]
+        self._module.reply(body + bytes((sum(body) & 0xFF,)), at_s)

@@ -5,9 +5,10 @@ import os
 import tty
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from ldcnd.config.ports import GuestHost, PortConfig
 from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Power
@@ -15,11 +16,16 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.ldcn.commands import Node, read_status
 from ldcnd.drives.ldcn.controls import StopControl
-from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket
-from ldcnd.drives.ldcn.received import PlainCommand, ReceivedCommand, StopMotor
+from ldcnd.drives.ldcn.io_module import IoModule
+from ldcnd.drives.ldcn.packet import StatusItem
+from ldcnd.drives.ldcn.pic_io import IoItem, IoNode, IoStatus, read_io_status
+from ldcnd.drives.ldcn.profiles import PIC_IO, Profile
+from ldcnd.drives.ldcn.received import PlainCommand, ReceivedCommand, StopMotor, UndescribedCommand
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.drives.line_config import BusConfig
+from ldcnd.drives.network import IoDriver
 from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange
 from ldcnd.line.line_discipline import actual_baud
 from ldcnd.line.terminal_link import TerminalLink
 from ldcnd.log import get_logger
@@ -46,10 +52,15 @@ def check(port: PortConfig, line: BusConfig) -> None:
 
 @dataclass(slots=True)
 class _GuestAxis:
-    """An axis as a guest reaches it, with what it has set going."""
+    """An axis or another module as a guest reaches it, with what it has set going.
+
+    Attributes:
+        stops: whether it is an axis, which a guest may stop.
+    """
 
     name: str
-    node: Node
+    read: Callable[[StatusItem], Exchange[Any]]
+    stops: bool
     under_way: "dict[type, asyncio.Task[None]]" = field(default_factory=dict)
     again: set[type] = field(default_factory=set)
 
@@ -61,22 +72,36 @@ class Guest:
         chain: as the guest sees the line.
     """
 
-    def __init__(self, name: str, bus: Bus, drives: Sequence[Drive], host: GuestHost, group: asyncio.TaskGroup) -> None:
+    def __init__(
+        self,
+        name: str,
+        bus: Bus,
+        drives: Sequence[Drive],
+        ios: Sequence[IoDriver],
+        host: GuestHost,
+        group: asyncio.TaskGroup,
+    ) -> None:
         self._name, self._bus, self._host, self._group = name, bus, host, group
         self._loop = asyncio.get_running_loop()
         self._line, self._free_at_s = asyncio.Lock(), 0.0
         self._refused: dict[tuple[str, str], float] = {}
         self._timer: asyncio.TimerHandle | None = None
         self.receive: Callable[[bytes], None] = lambda _: None
-        modules = []
-        for drive in sorted(
-            (each for each in drives if isinstance(each, LdcnAxis)), key=lambda each: each.spec.address
-        ):
-            axis = _GuestAxis(drive.spec.name, Node(drive.spec.address, drive.profile))
-            settings = ModuleSettings(reset_dead_s=0.0)  # programs take a terminal for drained at once
-            ask, command = partial(self._ask, axis), partial(self._command, axis)
-            modules.append(GuestModule(drive.profile, settings, ask, command))
-        self.chain = Chain(modules)
+        settings = ModuleSettings(reset_dead_s=0.0)  # programs take a terminal for drained at once
+        modules: dict[int, GuestModule] = {}
+
+        def add(address: int, profile: Profile, reached: _GuestAxis) -> None:
+            ask, command = partial(self._ask, reached), partial(self._command, reached)
+            modules[address] = GuestModule(profile, settings, ask, command)
+
+        for drive in drives:
+            if isinstance(drive, LdcnAxis):
+                node = Node(drive.spec.address, drive.profile)
+                add(node.address, drive.profile, _GuestAxis(drive.spec.name, partial(read_status, node), stops=True))
+        for io in ios:
+            if isinstance(io, IoModule):
+                add(io.node, PIC_IO, _GuestAxis(io.name, partial(_read_io, io.node), stops=False))
+        self.chain = Chain([modules[address] for address in sorted(modules)])
 
     def send(self, data: bytes) -> None:
         """Take bytes of the guest."""
@@ -106,19 +131,19 @@ class Guest:
                 return
             began_s = self._loop.time()
             try:
-                reading: StatusPacket = await self._bus.execute(read_status(axis.node, items))
+                status = await self._bus.execute(_as_sent(axis.read(items)))
             except LdcndError as error:
                 log.debug("not read", guest=self._name, axis=axis.name, reason=error.message)
                 return
             finally:
                 now_s = self._loop.time()
                 self._free_at_s = now_s + PAUSE_PER_EXCHANGE * (now_s - began_s)
-        answer.give(reading, self._loop.time())
+        answer.give(status, self._loop.time())
         self._advance()
 
     def _command(self, axis: _GuestAxis, command: ReceivedCommand) -> None:
         """Take energy out at once; refuse everything else."""
-        relief = _relief(command, self._name)
+        relief = _relief(command, self._name) if axis.stops else None
         if relief is None:
             self._refuse(axis.name, command)
             return
@@ -139,11 +164,26 @@ class Guest:
             axis.again.discard(type(command))
 
     def _refuse(self, axis: str, command: ReceivedCommand) -> None:
-        what = command.command.name.lower() if isinstance(command, PlainCommand) else type(command).__name__
+        match command:
+            case PlainCommand(code):
+                what = code.name.lower()
+            case UndescribedCommand(code):
+                what = f"command {int(code)}"
+            case _:
+                what = type(command).__name__
         now_s = self._loop.time()
         if now_s - self._refused.get((axis, what), -SAME_REFUSAL_S) >= SAME_REFUSAL_S:
             self._refused[axis, what] = now_s
             self._host.refuse(axis, what, self._name)
+
+
+def _read_io(address: int, items: StatusItem) -> Exchange[IoStatus]:
+    return read_io_status(IoNode(address), IoItem(int(items)))
+
+
+def _as_sent(exchange: Exchange[Any]) -> Exchange[bytes]:
+    """Return an exchange that returns the reply as it was sent: intact, and not decoded."""
+    return replace(exchange, decode=bytes)
 
 
 def _relief(command: ReceivedCommand, client: str) -> AxisCommand[CommandReply] | None:
@@ -160,12 +200,12 @@ def _relief(command: ReceivedCommand, client: str) -> AxisCommand[CommandReply] 
     return None
 
 
-async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], host: GuestHost) -> None:
+async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequence[IoDriver], host: GuestHost) -> None:
     """Serve a guest on a terminal until cancelled; a failure ends its port and nothing else."""
     try:
         async with asyncio.TaskGroup() as group:
             with ExitStack() as stack:
-                _open(port, Guest(port.name, bus, drives, host, group), stack)
+                _open(port, Guest(port.name, bus, drives, ios, host, group), stack)
                 await asyncio.Event().wait()
     except Exception:
         log.exception("port ended", guest=port.name, bus=port.bus)

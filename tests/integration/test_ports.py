@@ -81,7 +81,7 @@ class Program:
     async def begin(self) -> None:
         """Do as every program does: reset the line and give addresses."""
         await self.send(Packet(0xFF, CommandCode.HARD_RESET), 0.05)
-        for address in (1, 2):
+        for address in (1, 2, 3):
             assert await self.send(Packet(0, SET_ADDRESS, bytes((address, 0xFF))))
 
 
@@ -203,7 +203,7 @@ async def test_whatever_a_guest_sends_the_line_is_not_rearranged_and_nothing_mov
                 if command is STOP:
                     continue  # it may stop any axis: see above
                 data = chance.randbytes(chance.choice((0, 1, 2, 5, 14, 15)))
-                packet = bytearray(encode_packet(Packet(chance.choice((0, 1, 2, 3, 0x80, 0xFF)), command, data)))
+                packet = bytearray(encode_packet(Packet(chance.choice((0, 1, 2, 3, 4, 0x80, 0xFF)), command, data)))
                 if chance.random() < 0.2:
                     packet[chance.randrange(len(packet))] ^= 1 << chance.randrange(8)
                 if chance.random() < 0.1:
@@ -221,11 +221,12 @@ async def test_whatever_a_guest_sends_the_line_is_not_rearranged_and_nothing_mov
 
 async def test_replies_have_the_form_that_they_have_on_the_bare_line(tmp_path):
     loop = asyncio.get_running_loop()
-    bare = build_chain(ChainSpec((ModuleSpec("pic-servo-sc"), ModuleSpec("pic-servo-sc"))))
+    bare = build_chain(ChainSpec((ModuleSpec("pic-servo-sc"), ModuleSpec("pic-servo-sc"), ModuleSpec("pic-io"))))
     arrange = (
         Packet(0xFF, CommandCode.HARD_RESET),
         Packet(0, SET_ADDRESS, b"\x01\xff"),
         Packet(0, SET_ADDRESS, b"\x02\xff"),
+        Packet(0, SET_ADDRESS, b"\x03\xff"),
         Packet(2, SET_ADDRESS, b"\x02\x81"),
         Packet(1, SET_ADDRESS, b"\x01\x01"),
     )

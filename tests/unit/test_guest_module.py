@@ -7,6 +7,7 @@ from ldcnd.drives.ldcn.packet import (
     StatusItem,
     StatusPacket,
     encode_packet,
+    encode_status,
 )
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.received import ReceivedCommand
@@ -24,12 +25,12 @@ class Program:
     def __init__(self) -> None:
         self.commands: list[ReceivedCommand] = []
         settings = ModuleSettings(reset_dead_s=0.0)
-        self.asked: list[PendingReply] = []
+        self.asked: list[tuple[PendingReply, StatusItem]] = []
         self.chain = Chain([GuestModule(PIC_SERVO_SC, settings, self._ask, self.commands.append) for _ in range(2)])
         self.now_s = 0.0
 
-    def _ask(self, _items: StatusItem, answer: PendingReply) -> None:
-        self.asked.append(answer)
+    def _ask(self, items: StatusItem, answer: PendingReply) -> None:
+        self.asked.append((answer, items))
 
     def send(self, *packets: Packet) -> list[str]:
         return [self.send_bytes(encode_packet(packet)) for packet in packets]
@@ -40,8 +41,8 @@ class Program:
         self.chain.advance(self.now_s)
         if not read:
             return ""
-        for answer in self.asked:
-            answer.give(READING, self.now_s)
+        for answer, answer_items in self.asked:
+            answer.give(encode_status(PIC_SERVO_SC, answer_items, READING), self.now_s)
         self.asked.clear()
         self.now_s += 0.05
         return b"".join(piece for _, piece in self.chain.advance(self.now_s)).hex()
