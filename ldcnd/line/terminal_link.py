@@ -57,7 +57,7 @@ class TerminalLink:
                 fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
             time.sleep(LOOK_S)
-        raise OSError(f"another `ldcnd sim` serves {self._link}")
+        raise OSError(f"another program serves {self._link}")
 
 
 def why_not_served(path: str) -> str:

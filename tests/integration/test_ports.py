@@ -185,11 +185,10 @@ async def test_a_guest_that_reads_as_fast_as_it_can_leaves_polls_their_rate(tmp_
         assert len(sent) - replies >= 0.85 * alone
 
 
-RANDOM_HISTORIES = 300
-
-
-@pytest.mark.parametrize("seed", range(3))
-async def test_whatever_a_guest_sends_the_line_is_not_rearranged_and_nothing_moves_by_it(tmp_path, seed):
+@pytest.mark.parametrize(
+    ("seed", "bursts"), [*((seed, 100) for seed in range(3)), pytest.param(3, 20_000, marks=pytest.mark.soak)]
+)
+async def test_whatever_a_guest_sends_the_line_is_not_rearranged_and_nothing_moves_by_it(tmp_path, seed, bursts):
     """A random guest beside a client that moves another axis: valid packets, damaged ones, rubbish, resets, rates."""
     chance = random.Random(seed)
     async with guest(tmp_path) as (rig, program):
@@ -197,7 +196,7 @@ async def test_whatever_a_guest_sends_the_line_is_not_rearranged_and_nothing_mov
         await rig.client.ask(MoveVelocity(velocity=2.0), "table")
         before, sent = registers(rig), record_packets(rig)
         await program.begin()
-        for _ in range(RANDOM_HISTORIES // 3):
+        for _ in range(bursts):
             for _ in range(chance.randrange(1, 5)):
                 command = chance.choice(list(CommandCode))
                 if command is STOP:
