@@ -2,7 +2,6 @@
 
 import asyncio
 import os
-import tty
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
@@ -26,8 +25,6 @@ from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.network import IoDriver
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
-from ldcnd.line.line_discipline import actual_baud
-from ldcnd.line.terminal_link import TerminalLink
 from ldcnd.log import get_logger
 from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.sim.chain import Chain
@@ -213,6 +210,12 @@ async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequen
 
 def _open(port: PortConfig, guest: Guest, stack: ExitStack) -> None:
     """Put a terminal in front of a guest's chain, until the stack closes."""
+    # a configuration with a port can be read where there are no terminals
+    import tty  # noqa: PLC0415
+
+    from ldcnd.line.line_discipline import actual_baud  # noqa: PLC0415
+    from ldcnd.line.terminal_link import TerminalLink  # noqa: PLC0415
+
     loop = asyncio.get_running_loop()
     master, slave = os.openpty()
     stack.callback(os.close, master)
