@@ -224,7 +224,7 @@ async def test_what_needs_attention_is_said_once_and_links_keep_the_axis(house):
         await latched.get_by_role("link", name="sim · y").click()
 
         await expect(desk.page.get_by_role("list", name="Inputs")).to_contain_text(
-            re.compile(r"forward limit\s*(high|low|unknown)")
+            re.compile(r"forward limit\s*(high|low|unknown|not shown while disabled)")
         )
         await desk.page.get_by_role("link", name="Scope", exact=True).last.click()
         for quantity in ("position", "velocity", "following error"):
