@@ -114,9 +114,13 @@ class RigWatch:
             except TimeoutError:
                 self._why_due.update(self.axes)
             self._why_wanted.clear()
-            due, self._why_due = self._why_due & self.axes, set()
-            for axis in due if self._values.watchers and self.connected else ():
-                await self._ask_why(axis)
+            due = self._why_due & self.axes
+            if self._values.watchers and self.connected:
+                self._why_due = set()
+                for axis in due:
+                    await self._ask_why(axis)
+            elif due:
+                self._why_wanted.set()  # kept for the next page: it would be shown what forbade them before
             await asyncio.sleep(ASK_WHY_EACH_S)
 
     async def _ask_why(self, axis: str) -> None:
