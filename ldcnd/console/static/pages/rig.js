@@ -8,7 +8,7 @@ import { problems } from "../parts/problems.js";
 import { Mark } from "../parts/state.js";
 import { ask } from "../session/api.js";
 import { command, controls, release, take } from "../session/control.js";
-import { obstacle } from "../session/obstacles.js";
+import { isUseless, obstacle } from "../session/obstacles.js";
 import { axesOf, changed, endpoints, useRigs } from "../session/rigs.js";
 import { AxesOf, refused, ShortAction } from "./rig_axes.js";
 import { GroupMoves } from "./rig_groups.js";
@@ -133,7 +133,8 @@ function RigCommands({ rig }) {
   const force = others.length > 0 && from === held;
   const ready = (act) => axes.filter((axis) => obstacle(axis, act) === null);
   const each = (act, verb, body) => async () => {
-    const asked = ready(act);
+    // what forbade it before this page had control may not be told anew yet: the daemon refuses what it must
+    const asked = axes.filter((axis) => obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth && !isUseless(axis, act)));
     for (const axis of axes) axis.refusal = null;
     const outcomes = await Promise.allSettled(asked.map((axis) => command(axis, verb, body)));
     outcomes.forEach(({ reason }, at) => {

@@ -39,6 +39,11 @@ export function obstacle(axis, act, joins = false) {
   return cause ? inWords(cause) : null;
 }
 
+/** Whether an act would change nothing on an axis as it is. */
+export function isUseless(axis, act) {
+  return Boolean(USELESS[act]?.(axis));
+}
+
 function inWords(cause) {
   return `${cause.text}${cause.remedy ? `: ${inPageTerms(cause)}` : ""}.`;
 }
