@@ -8,21 +8,27 @@ from pydantic import Field
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import decode_received
+from ldcnd.contract.commands import Verb
+from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import CommandEvent, CommandStatus
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.parameters import ReadParameter
 from ldcnd.contract.samples import PositionSample, TelemetryItem
 from ldcnd.net.session import Publication, SampleKind
 
 EVENT = "event"
 STOPS = ("stop", "quick_stop", "halt")
-WRITES = ("write_parameter",)
+ANY_PARAMETER = "Pn100"
+"""Every SmartStep has it; with it the daemon tells how often the drive's EEPROM was written."""
 DURATION_SHARE = 0.02
 """Difference of durations that is worth saying, as a share."""
 TRAVEL_SHARE = 0.05
 """The same of how near an axis came to a limit, as a share of its travel."""
 FOLLOWING_FACTOR = 2.0
 """The same of the worst following error, as a ratio: a twin has another mechanics."""
+FOLLOWING_SHARE = 1e-4
+"""What a closed loop hunts beside that, as a share of the travel."""
 
 
 class AxisRun(Frozen):
@@ -34,14 +40,14 @@ class AxisRun(Frozen):
     """Motions that began."""
     way: float = Field(ge=0)
     """Way that it has gone, back and forth."""
-    lowest: float
-    """Lowest position that was seen."""
-    highest: float
-    """Highest position that was seen."""
+    lowest: float | None
+    """Lowest position that was seen; null when none was."""
+    highest: float | None
+    """Highest position that was seen; null when none was."""
     to_min: float | None
-    """Closest approach to the lower software limit; null without one, negative beyond it."""
+    """Closest approach to the lower software limit; null without one or when unknown, negative beyond it."""
     to_max: float | None
-    """Closest approach to the upper software limit; null without one, negative beyond it."""
+    """Closest approach to the upper software limit; null without one or when unknown, negative beyond it."""
     travel: float | None
     """From one software limit to the other; null where one is missing."""
     following_error: float = Field(ge=0)
@@ -63,14 +69,15 @@ class RunReport(Frozen):
     """Commands that were refused, in their order: axis, verb and code."""
     failures: tuple[str, ...]
     """Commands that failed or were aborted, in their order: axis, verb and code or reason."""
-    eeprom_writes: int = Field(ge=0)
-    """Parameters that were written."""
+    eeprom_writes: int | None = Field(ge=0)
+    """Writes to the EEPROMs of drives; null where the daemon keeps no count of them."""
     bus_use: dict[str, float]
     """Mean share of the time for which bytes were on the wire, by line."""
 
     def lines(self) -> Iterator[str]:
         """Yield the report as it is read, one line a fact."""
-        yield f"rig {self.rig}: {self.duration_s:.2f} s, {self.stops} stops, {self.eeprom_writes} EEPROM writes"
+        writes = _told(self.eeprom_writes)
+        yield f"rig {self.rig}: {self.duration_s:.2f} s, {self.stops} stops, {writes} EEPROM writes"
         for name, axis in self.axes.items():
             near = [
                 f"{distance:.6g} {axis.unit} from its {end} limit"
@@ -78,8 +85,8 @@ class RunReport(Frozen):
                 if distance is not None
             ]
             yield (
-                f"axis {name}: {axis.motions} motions, {axis.way:.6g} {axis.unit} of way, from {axis.lowest:.6g} to"
-                f" {axis.highest:.6g}, following error up to {axis.following_error:.3g}"
+                f"axis {name}: {axis.motions} motions, {axis.way:.6g} {axis.unit} of way, from {_told(axis.lowest)}"
+                f" to {_told(axis.highest)}, following error up to {axis.following_error:.3g}"
                 + (f"; at the nearest {' and '.join(near)}" if near else "")
             )
         yield from (f"refused: {text}" for text in self.refusals)
@@ -97,7 +104,7 @@ class RunReport(Frozen):
                 yield f"{what}: {', '.join(rehearsed) or 'none'} rehearsed, {', '.join(found) or 'none'} in the run"
         if self.stops != real.stops:
             yield f"stops: {self.stops} rehearsed, {real.stops} in the run"
-        if self.eeprom_writes != real.eeprom_writes:
+        if None not in (self.eeprom_writes, real.eeprom_writes) and self.eeprom_writes != real.eeprom_writes:
             yield f"EEPROM writes: {self.eeprom_writes} rehearsed, {real.eeprom_writes} in the run"
         for name in [*self.axes, *(name for name in real.axes if name not in self.axes)]:
             if name not in self.axes or name not in real.axes:
@@ -109,18 +116,26 @@ class RunReport(Frozen):
 def _differing(name: str, rehearsed: AxisRun, real: AxisRun) -> Iterator[str]:
     if rehearsed.motions != real.motions:
         yield f"axis {name}: {rehearsed.motions} motions rehearsed, {real.motions} in the run"
-    span = rehearsed.travel or max(rehearsed.highest - rehearsed.lowest, real.highest - real.lowest)
+    places = (rehearsed.lowest, rehearsed.highest, real.lowest, real.highest)
+    known = [place for place in places if place is not None]
+    span = rehearsed.travel or (max(known) - min(known) if known else 0.0)
     for what, planned, found in (
         ("lowest place", rehearsed.lowest, real.lowest),
         ("highest place", rehearsed.highest, real.highest),
     ):
-        if abs(planned - found) > TRAVEL_SHARE * span:
-            yield f"axis {name}: {what} {planned:.6g} {rehearsed.unit} rehearsed, {found:.6g} in the run"
-    if real.following_error > FOLLOWING_FACTOR * rehearsed.following_error + TRAVEL_SHARE * span:
+        one_is_unknown = (planned is None) is not (found is None)
+        if one_is_unknown or (planned is not None and found is not None and abs(planned - found) > TRAVEL_SHARE * span):
+            yield (f"axis {name}: {what} {_told(planned)} {rehearsed.unit} rehearsed, {_told(found)} in the run")
+    less, more = sorted((rehearsed.following_error, real.following_error))
+    if more > FOLLOWING_FACTOR * less + FOLLOWING_SHARE * span:
         yield (
             f"axis {name}: following error up to {rehearsed.following_error:.3g} {rehearsed.unit} rehearsed,"
             f" {real.following_error:.3g} in the run"
         )
+
+
+def _told(value: float | None) -> str:
+    return "unknown" if value is None else f"{value:.6g}"
 
 
 @dataclass(slots=True)
@@ -155,7 +170,7 @@ class RunWatch:
         self._seen = {axis.axis: _Seen() for axis in axes}
         self._first_ns: int | None = None
         self._last_ns = 0
-        self._stops = self._writes = 0
+        self._stops = 0
         self._refusals: list[str] = []
         self._failures: list[str] = []
 
@@ -178,14 +193,13 @@ class RunWatch:
         if event.status is CommandStatus.EXECUTING:
             seen.motions.add(event.command_id)
         self._stops += event.verb in STOPS and event.status is CommandStatus.DONE
-        self._writes += event.verb in WRITES and event.status is CommandStatus.DONE
         said = f"{event.axis} {event.verb}: {event.code or event.reason}"
         if event.status is CommandStatus.REFUSED:
             self._refusals.append(said)
         elif event.status in (CommandStatus.FAILED, CommandStatus.ABORTED):
             self._failures.append(said)
 
-    def report(self, bus_use: dict[str, float]) -> RunReport:
+    def report(self, bus_use: dict[str, float], eeprom_writes: int | None) -> RunReport:
         """Return what was seen."""
         return RunReport(
             rig=self._rig,
@@ -194,22 +208,22 @@ class RunWatch:
             stops=self._stops,
             refusals=tuple(self._refusals),
             failures=tuple(self._failures),
-            eeprom_writes=self._writes,
+            eeprom_writes=eeprom_writes,
             bus_use=bus_use,
         )
 
     def _of_axis(self, name: str, seen: _Seen) -> AxisRun:
         info = self._axes[name]
         low, high = info.limits.position_min, info.limits.position_max
-        lowest, highest = seen.lowest or 0.0, seen.highest or 0.0
+        lowest, highest = seen.lowest, seen.highest
         return AxisRun(
             unit=info.unit if info.modulo is None else "count",
             motions=len(seen.motions),
             way=seen.way,
             lowest=lowest,
             highest=highest,
-            to_min=None if low is None else lowest - low,
-            to_max=None if high is None else high - highest,
+            to_min=None if low is None or lowest is None else lowest - low,
+            to_max=None if high is None or highest is None else high - highest,
             travel=None if low is None or high is None else high - low,
             following_error=seen.following_error,
         )
@@ -217,7 +231,8 @@ class RunWatch:
 
 async def watch_run(client: RigClient, ended: Awaitable[object]) -> RunReport:
     """Watch a rig until something has ended, and return the report of it."""
-    watch, loop = RunWatch(client.rig, await client.axes()), asyncio.get_running_loop()
+    axes, loop = await client.axes(), asyncio.get_running_loop()
+    watch, written = RunWatch(client.rig, axes), await _eeprom_writes(client, axes)
     before, began_s = {bus.bus: bus.wire_busy_s for bus in await client.buses()}, loop.time()
     async with client.published(watch.take):
         for sample in await client.last_published():  # where the axes stand at the beginning
@@ -226,4 +241,21 @@ async def watch_run(client: RigClient, ended: Awaitable[object]) -> RunReport:
         await ended
     passed_s = max(loop.time() - began_s, 1e-9)
     busy_s = {bus.bus: max(0.0, bus.wire_busy_s - before.get(bus.bus, 0.0)) for bus in await client.buses()}
-    return watch.report({name: busy / passed_s for name, busy in busy_s.items()})
+    now_written = await _eeprom_writes(client, axes)
+    writes = None if written is None or now_written is None else max(0, now_written - written)
+    return watch.report({name: busy / passed_s for name, busy in busy_s.items()}, writes)
+
+
+async def _eeprom_writes(client: RigClient, axes: list[AxisInfo]) -> int | None:
+    """Return how often the EEPROMs of all drives were written so far; None where that is not counted."""
+    total = 0
+    for axis in axes:
+        if Verb.READ_PARAMETER in axis.capabilities:
+            try:
+                count = (await client.ask(ReadParameter(parameter=ANY_PARAMETER), axis.axis)).value.eeprom_total
+            except LdcndError:
+                return None
+            if count is None:
+                return None
+            total += count
+    return total

@@ -107,6 +107,31 @@ def test_a_twin_has_the_parameters_of_the_rig_in_both_memories():
     assert values["Pn100"][1] == 70
 
 
+async def ram_written():
+    async with simulated_rig(MIXED) as rig:
+
+        async def program(client):
+            async with client.control("feed", client="night") as feed:
+                await feed.write_parameter("Pn102", 41)
+
+        return await seen(rig, program)
+
+
+def test_a_write_to_ram_is_no_write_to_eeprom_and_what_is_not_counted_is_unknown():
+    report = run(ram_written())
+    assert report.eeprom_writes is None
+    assert "unknown EEPROM writes" in next(report.lines())
+
+
+def test_a_following_error_ten_times_as_large_is_said_either_way():
+    _, one = run(real_run((0, 0)))
+    x = one.axes["x"]
+    worse = x.model_copy(update={"following_error": 10 * x.following_error})
+    other = one.model_copy(update={"axes": {**one.axes, "x": worse}})
+    assert ["following error" in text for text in one.differences(other)] == [True]
+    assert ["following error" in text for text in other.differences(one)] == [True]
+
+
 def test_a_report_says_where_the_run_differed():
     _, rehearsed = run(real_run((0, 0)))
     other = rehearsed.model_copy(
