@@ -2,7 +2,9 @@
 
 import asyncio
 import signal
+import sys
 import threading
+import traceback
 from pathlib import Path
 
 import click
@@ -13,14 +15,31 @@ from ldcnd.cli.typed import NewFile
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import ConfigError
 from ldcnd.log import configure_logging
-from ldcnd.testing.run_report import RunReport, watch_run
+from ldcnd.parts import require
+from ldcnd.sim.plant import PlantConfig
+from ldcnd.testing.rig import run, simulated_rig
+from ldcnd.testing.run_report import RunReport, rehearse, watch_run
 from ldcnd.testing.served import CONNECT, served_rig
-from ldcnd.testing.twin import read_state
+from ldcnd.testing.twin import RigState, read_state
 
 
 @click.command()
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False), required=False)
+@click.argument("arguments", nargs=-1)
 @click.option("--at", "endpoint", help="Where the twin listens, such as tcp/127.0.0.1:7600; a free port when missing.")
+@click.option(
+    "--fast",
+    "program",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    help="Run this Python program with ARGUMENTS at the pace of its waits instead: a night in minutes.",
+)
+@click.option(
+    "--plant",
+    "plants",
+    type=click.Path(path_type=Path, dir_okay=False),
+    multiple=True,
+    help="What `ldcnd tune AXIS --json` has printed: its machine is on the shaft of that axis. May be repeated.",
+)
 @click.option("--report", type=NewFile(), help="Write what the run has done to this file, for --diff.")
 @click.option(
     "--diff",
@@ -28,11 +47,21 @@ from ldcnd.testing.twin import read_state
     help="Watch the rig itself instead, and say where its run differed from this report.",
 )
 @with_target
-def twin(target: Target, file: Path | None, endpoint: str | None, report: Path | None, diff: Path | None) -> None:
+def twin(
+    target: Target,
+    file: Path | None,
+    arguments: tuple[str, ...],
+    endpoint: str | None,
+    program: Path | None,
+    plants: tuple[Path, ...],
+    report: Path | None,
+    diff: Path | None,
+) -> None:
     """Serve a simulated rig that stands as the running one does, until SIGTERM or SIGINT, and report what came of it.
 
     FILE is the configuration of the rig. Nothing of the rig changes: it is only read. Programs run on the twin
-    unchanged when LDCND_CONNECT names its endpoint, which is printed first.
+    unchanged when LDCND_CONNECT names its endpoint, which is printed first. With --fast, the program is one of
+    `ldcnd.open` or `ldcnd.connect`; its clock, `time.sleep` and `asyncio.run` are those of the twin.
     """
     if diff:
         rehearsed = _read(diff)
@@ -40,8 +69,18 @@ def twin(target: Target, file: Path | None, endpoint: str | None, report: Path |
         return
     if file is None:
         raise click.UsageError("name the configuration of the rig, or a report with --diff")
-    state = target.run(read_state)
+    if arguments and not program:
+        raise click.UsageError(f"{arguments[0]} is for a program: name that with --fast")
+    machines = _plants(plants)
+    state = target.run(lambda client: read_state(client, machines))
     configure_logging(level="error")
+    if program:
+        done, failure = run(_fast(file, state, program, arguments))
+        _show(target, done, report, None)
+        if failure:
+            traceback.print_exception(failure)
+            sys.exit(1)
+        return
     ended = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: ended.set())
@@ -49,6 +88,22 @@ def twin(target: Target, file: Path | None, endpoint: str | None, report: Path |
         show_lines(f"export {CONNECT}={served.endpoint}", "# the twin stands where the rig does; SIGINT ends it")
         done = served.watch(lambda: asyncio.to_thread(ended.wait))
     _show(target, done, report, None)
+
+
+def _plants(files: tuple[Path, ...]) -> dict[str, PlantConfig]:
+    if not files:
+        return {}
+    require("numpy")
+    from ldcnd.bench.tuning.watching import machine_of, read_report  # noqa: PLC0415 - needs an optional package
+
+    return {report.axis: machine_of(report) for report in map(read_report, files)}
+
+
+async def _fast(
+    file: Path, state: RigState, program: Path, arguments: tuple[str, ...]
+) -> tuple[RunReport, Exception | None]:
+    async with simulated_rig(file, state=state) as rig:
+        return await rehearse(rig, program, arguments)
 
 
 async def _watched(client: RigClient) -> RunReport:

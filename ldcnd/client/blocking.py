@@ -14,7 +14,7 @@ from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, overload
 
 from ldcnd.client import axis as asynchronous
 from ldcnd.client import motion, rig
-from ldcnd.client.loop_thread import LoopThread, loop_thread
+from ldcnd.client.loop_thread import LENT, LoopThread, loop_thread
 from ldcnd.client.notebook import table
 from ldcnd.contract.events import CommandEvent
 from ldcnd.contract.meta import AxisInfo
@@ -318,7 +318,11 @@ class Opened(AbstractContextManager[ResultT, None]):
     def open(self) -> ResultT:
         """Begin; the caller closes it."""
         value = self.__enter__()
-        atexit.register(self.close)
+        lent = LENT.get()  # the loop of a rehearsal ends long before the interpreter does
+        if lent:
+            lent.close_later(self.close)
+        else:
+            atexit.register(self.close)
         return value
 
     def close(self) -> None:

@@ -4,7 +4,7 @@ import asyncio
 import concurrent.futures
 import threading
 from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
-from contextlib import AbstractAsyncContextManager, contextmanager
+from contextlib import AbstractAsyncContextManager, ExitStack, contextmanager
 from contextvars import ContextVar
 from typing import Any, TypeVar, TypeVarTuple
 
@@ -17,6 +17,7 @@ class LoopThread:
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
         self._loop = loop
+        self._left_open = ExitStack()
 
     # Any: what a coroutine yields and is sent concerns the loop only
     def start(self, work: Coroutine[Any, Any, ResultT]) -> concurrent.futures.Future[ResultT]:
@@ -40,6 +41,14 @@ class LoopThread:
     def wait(self, *futures: concurrent.futures.Future[Any]) -> None:
         """Wait until one of them is done."""
         concurrent.futures.wait(futures, return_when=concurrent.futures.FIRST_COMPLETED)
+
+    def close_later(self, close: Callable[[], object]) -> None:
+        """Call something when the program ends to which this loop is lent."""
+        self._left_open.callback(close)
+
+    def close(self) -> None:
+        """Close what the program has left open."""
+        self._left_open.close()
 
     @contextmanager
     def inside(self, context: AbstractAsyncContextManager[ResultT]) -> Iterator[ResultT]:

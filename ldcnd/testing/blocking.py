@@ -1,16 +1,20 @@
 """Programs without an event loop on the jumping clock: in a thread, whose waits jump with the clock of the rig.
 
 The clock stands while the thread computes and goes on while it waits for the client or in `time.sleep`, so that such a
-program is as repeatable as one of asyncio. What it waits for by other means takes real time, and none on the rig.
+program is as repeatable as one of asyncio. What it gives to `asyncio.run` runs on the rig's own loop. What it waits for
+by other means takes real time, and none on the rig.
 """
 
 import asyncio
 import concurrent.futures
 import contextvars
+import runpy
+import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, ParamSpec, SupportsIndex, TypeVar, cast
 
 from typing_extensions import override
@@ -20,6 +24,10 @@ from ldcnd.testing.jumping_loop import JumpingLoop
 
 P = ParamSpec("P")
 ResultT = TypeVar("ResultT")
+
+
+class ProgramFailed(Exception):
+    """A rehearsed program has ended with a status that says so."""
 
 
 class PacedLoop(LoopThread):
@@ -52,7 +60,7 @@ class PacedLoop(LoopThread):
         return self._clock.time()
 
 
-_sleep, _monotonic, _time = time.sleep, time.monotonic, time.time
+_sleep, _monotonic, _time, _run = time.sleep, time.monotonic, time.time, asyncio.run
 _guests: dict[int, tuple[PacedLoop, Callable[[], float]]] = {}
 """By the thread of a program: its loop, and the wall clock of its rig."""
 _changing = threading.Lock()
@@ -76,17 +84,29 @@ def _time_here() -> float:
     return guest[1]() if guest else _time()
 
 
+# Any: as asyncio declares it
+def _run_here(
+    main: Coroutine[Any, Any, ResultT], *, debug: bool | None = None, loop_factory: Callable[[], Any] | None = None
+) -> ResultT:
+    guest = _guests.get(threading.get_ident())
+    if guest:
+        return guest[0].run(main)
+    with asyncio.Runner(debug=debug, loop_factory=loop_factory) as runner:
+        return runner.run(main)
+
+
 def _enter(guest: tuple[PacedLoop, Callable[[], float]]) -> None:
     with _changing:
         _guests[threading.get_ident()] = guest
         time.sleep, time.monotonic, time.time = _sleep_here, _monotonic_here, _time_here
+        asyncio.run = _run_here
 
 
 def _leave() -> None:
     with _changing:
         del _guests[threading.get_ident()]
         if not _guests:
-            time.sleep, time.monotonic, time.time = _sleep, _monotonic, _time
+            time.sleep, time.monotonic, time.time, asyncio.run = _sleep, _monotonic, _time, _run
 
 
 async def run_in_thread(
@@ -117,6 +137,7 @@ async def run_in_thread(
         except BaseException as error:  # noqa: BLE001 - it is raised where the program is waited for
             outcome = partial(ended.set_exception, error)
         finally:
+            paced.close()
             _leave()
         paced.call(end, outcome)
 
@@ -124,3 +145,25 @@ async def run_in_thread(
     # a daemon: a program that waits for what never comes does not keep pytest from ending
     threading.Thread(target=live, name="blocking program", daemon=True).start()
     return await ended
+
+
+def run_file(file: Path, arguments: Sequence[str]) -> None:
+    """Run a Python program as `python FILE ARGUMENTS` does, in this process.
+
+    Args:
+        file: of the program.
+        arguments: of its command line.
+
+    Raises:
+        ProgramFailed: it exited with another status than 0; other exceptions of it pass.
+    """
+    before, sys.argv = sys.argv, [str(file), *arguments]
+    sys.path.insert(0, str(file.parent))  # its neighbours are there, as for Python itself
+    try:
+        runpy.run_path(str(file), run_name="__main__")
+    except SystemExit as error:  # asyncio would end the whole process
+        if error.code not in (None, 0):
+            raise ProgramFailed(f"{file} exited with {error.code}") from error
+    finally:
+        sys.argv = before
+        sys.path.remove(str(file.parent))

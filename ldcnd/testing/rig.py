@@ -30,7 +30,7 @@ from ldcnd.testing.lines import simulated_config
 from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 from ldcnd.testing.timeline import Timeline
 from ldcnd.testing.truth import Machine, Truth
-from ldcnd.testing.twin import RigState, config_of_twin, place, restore
+from ldcnd.testing.twin import RigState, config_of_twin, place, recall, restore
 
 P = ParamSpec("P")
 ResultT = TypeVar("ResultT")
@@ -267,8 +267,11 @@ class SimulatedRig:
             return await asyncio.to_thread(program, *args, **kwargs)
         return await run_in_thread(self._loop, lambda: self._now_ns() / 1e9, program, *args, **kwargs)
 
-    async def start_daemon(self) -> None:
+    async def start_daemon(self, state: RigState | None = None) -> None:
         """Start a daemon on the same lines, and wait until they are up.
+
+        Args:
+            state: of the rig whose latches and references it begins with; none, when missing.
 
         Raises:
             TimeoutError: they do not come up within a minute of the rig's clock.
@@ -277,13 +280,15 @@ class SimulatedRig:
         self.timeline.note(f"daemon {self._runs} starts")
         made: asyncio.Future[Daemon] = self._loop.create_future()
         self._life = _Life()
-        self._serving = asyncio.create_task(self._serve(self._life, made), name=f"daemon {self._runs}")
+        self._serving = asyncio.create_task(self._serve(self._life, made, state), name=f"daemon {self._runs}")
         up = asyncio.create_task(self._up(made), name="lines up")
         await asyncio.wait((self._serving, up), return_when=asyncio.FIRST_COMPLETED)
         if not up.done():
             up.cancel()
             await self._serving
         await up
+        if state:
+            restore(self.daemon, self.machine, state)
 
     async def _up(self, made: "asyncio.Future[Daemon]") -> None:
         async with asyncio.timeout(UP_WITHIN_S):
@@ -309,7 +314,7 @@ class SimulatedRig:
                 await self._serving
         self._serving = self._daemon = None
 
-    async def _serve(self, life: _Life, made: "asyncio.Future[Daemon]") -> None:
+    async def _serve(self, life: _Life, made: "asyncio.Future[Daemon]", state: RigState | None) -> None:
         config = self.config
         openers = {
             bus.name: life.opener(opener_of(bus, config.sim, self.lines[bus.name])) for bus in config.bus
@@ -318,6 +323,8 @@ class SimulatedRig:
             self._daemon = build_daemon(
                 config, session, self._now_ns, f"run{self._runs}", openers, lambda: f"lease-{self._loop.time():.9f}"
             )
+            if state:
+                recall(self._daemon, state, self._now_ns())
             made.set_result(self._daemon)
             await self._daemon.run()
 
@@ -401,10 +408,8 @@ async def simulated_rig(
         stack.callback(setattr, loop, "network", None)
         if state:
             place(rig.machine, state)
-        await rig.start_daemon()
+        await rig.start_daemon(state)
         await rig.join(session)
-        if state:
-            await restore(rig.client, state)
         yield rig
 
 

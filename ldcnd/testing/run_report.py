@@ -1,8 +1,10 @@
 """What a run has done to a rig: watched from outside, alike on a twin and on the rig itself, so that both compare."""
 
 import asyncio
-from collections.abc import Awaitable, Iterator
+import contextlib
+from collections.abc import Awaitable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from pydantic import Field
 
@@ -16,6 +18,8 @@ from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import ReadParameter
 from ldcnd.contract.samples import PositionSample, TelemetryItem
 from ldcnd.net.session import Publication, SampleKind
+from ldcnd.testing.blocking import run_file
+from ldcnd.testing.rig import SimulatedRig
 
 EVENT = "event"
 STOPS = ("stop", "quick_stop", "halt")
@@ -122,6 +126,8 @@ def _differing(name: str, rehearsed: AxisRun, real: AxisRun) -> Iterator[str]:
     for what, planned, found in (
         ("lowest place", rehearsed.lowest, real.lowest),
         ("highest place", rehearsed.highest, real.highest),
+        ("distance to the lower limit", rehearsed.to_min, real.to_min),
+        ("distance to the upper limit", rehearsed.to_max, real.to_max),
     ):
         one_is_unknown = (planned is None) is not (found is None)
         if one_is_unknown or (planned is not None and found is not None and abs(planned - found) > TRAVEL_SHARE * span):
@@ -173,6 +179,12 @@ class RunWatch:
         self._stops = 0
         self._refusals: list[str] = []
         self._failures: list[str] = []
+
+    def begin(self, last: Sequence[Publication]) -> None:
+        """Take where the axes stand at the beginning."""
+        for sample in last:
+            if sample.key.endswith(f"/{TelemetryItem.POSITION}"):
+                self.take(sample)
 
     def take(self, sample: Publication) -> None:
         """Take what was published."""
@@ -229,15 +241,36 @@ class RunWatch:
         )
 
 
+async def rehearse(rig: SimulatedRig, file: Path, arguments: Sequence[str]) -> tuple[RunReport, Exception | None]:
+    """Run a Python program on a simulated rig at the pace of its clock; return the report and what the program raised.
+
+    Args:
+        rig: on the jumping clock.
+        file: of the program, which finds the rig by `ldcnd.open` and `ldcnd.connect` without an endpoint.
+        arguments: of its command line.
+    """
+    failure: Exception | None = None
+
+    async def program() -> None:
+        nonlocal failure
+        try:
+            await rig.run_blocking(run_file, file, arguments)
+        except Exception as error:  # noqa: BLE001 - a program that fails has a report, too
+            failure = error
+        with contextlib.suppress(TimeoutError):  # it has left something running, and the report says how far it came
+            await rig.at_rest()
+
+    running = asyncio.create_task(program(), name="program")
+    return await watch_run(rig.client.client, running), failure
+
+
 async def watch_run(client: RigClient, ended: Awaitable[object]) -> RunReport:
     """Watch a rig until something has ended, and return the report of it."""
     axes, loop = await client.axes(), asyncio.get_running_loop()
     watch, written = RunWatch(client.rig, axes), await _eeprom_writes(client, axes)
     before, began_s = {bus.bus: bus.wire_busy_s for bus in await client.buses()}, loop.time()
     async with client.published(watch.take):
-        for sample in await client.last_published():  # where the axes stand at the beginning
-            if sample.key.endswith(f"/{TelemetryItem.POSITION}"):
-                watch.take(sample)
+        watch.begin(await client.last_published())
         await ended
     passed_s = max(loop.time() - began_s, 1e-9)
     busy_s = {bus.bus: max(0.0, bus.wire_busy_s - before.get(bus.bus, 0.0)) for bus in await client.buses()}

@@ -18,7 +18,7 @@ from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.testing.lines import simulated_config
 from ldcnd.testing.rig import SimulatedRig, lines_of, loaded
 from ldcnd.testing.run_report import RunReport, watch_run
-from ldcnd.testing.twin import RigState, config_of_twin, place, restore
+from ldcnd.testing.twin import RigState, config_of_twin, place
 
 ResultT = TypeVar("ResultT")
 
@@ -121,11 +121,9 @@ async def _serving(config: RigConfig, endpoint: str, state: RigState | None) -> 
         stack.push_async_callback(rig.close)
         if state:
             place(rig.machine, state)
-        await rig.start_daemon()
+        await rig.start_daemon(state)
         client = ZenohSettings(mode="client", connect=(endpoint,))
         await rig.join(await stack.enter_async_context(open_zenoh_session(client)))
-        if state:
-            await restore(rig.client, state)
         yield rig
 
 

@@ -5,29 +5,26 @@ not: the mechanics on a shaft are those of the configuration's gains, or of an i
 only an order of magnitude; temperatures and supplies are none.
 """
 
-import asyncio
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from ldcnd.client.rig import Rig
+from ldcnd.axis.events import LatchRecalled, PlaceKnown
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import ParameterDump, ReadAllParameters
-from ldcnd.contract.samples import PositionSample, StateSample
+from ldcnd.contract.samples import AxisState, FaultSample, PositionSample, StateSample
+from ldcnd.daemon.daemon import Daemon
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.config import LdcnAxisConfig
 from ldcnd.drives.smartstep.addresses import RAM_OFFSET
+from ldcnd.drives.smartstep.drive import fault_of
+from ldcnd.drives.smartstep.monitors import ALARMS
 from ldcnd.sim.plant import PlantConfig
 from ldcnd.sim.smartstep.simulation import SimulatedSmartStepLineConfig, SimulatedUnitConfig
 from ldcnd.testing.truth import Machine
-
-LEASE_CLIENT = "twin"
-SEEN_WITHIN_S = 10.0
-SEEN_COUNTS = 20.0
-"""So far from where it was said to stand an axis is shown at most: what a closed loop hunts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +35,7 @@ class RigState:
         axes: descriptions, by name.
         states: by name; an axis that has not published any is missing.
         positions: likewise.
+        faults: likewise.
         parameters: of the drives that have them, by name.
         plants: identified machines, by name.
     """
@@ -45,6 +43,7 @@ class RigState:
     axes: Mapping[str, AxisInfo]
     states: Mapping[str, StateSample]
     positions: Mapping[str, PositionSample]
+    faults: Mapping[str, FaultSample]
     parameters: Mapping[str, ParameterDump] = field(default_factory=dict)
     plants: Mapping[str, PlantConfig] = field(default_factory=dict)
 
@@ -61,7 +60,9 @@ async def read_state(client: RigClient, plants: Mapping[str, PlantConfig] | None
     for name, axis in axes.items():
         if Verb.READ_ALL_PARAMETERS in axis.capabilities:
             parameters[name] = await client.ask(ReadAllParameters(), name)
-    return RigState(axes, await client.states(), await client.positions(), parameters, plants or {})
+    return RigState(
+        axes, await client.states(), await client.positions(), await client.faults(), parameters, plants or {}
+    )
 
 
 def config_of_twin(config: RigConfig, state: RigState) -> RigConfig:
@@ -80,6 +81,12 @@ def config_of_twin(config: RigConfig, state: RigState) -> RigConfig:
             f"the configuration has the axes {', '.join(sorted(configured))}, the rig that runs"
             f" {', '.join(sorted(state.axes))}",
             remedy="give the configuration with which the daemon was started",
+        )
+    if unknown := state.plants.keys() - configured:
+        raise ConfigError(
+            f"a machine was identified for axis {min(unknown)}, and the rig has {', '.join(sorted(configured))}",
+            value=min(unknown),
+            remedy="name reports of this rig",
         )
     units = {
         (bus.simulated, axis.address): axis.name
@@ -130,6 +137,7 @@ def place(machine_of: Callable[[str], Machine], state: RigState) -> None:
     for name, position in state.positions.items():
         machine = machine_of(name)
         if not isinstance(machine.config, LdcnAxisConfig):
+            _place_unit(machine, position, state.faults.get(name))
             continue
         module = machine.servo
         if plant := state.plants.get(name):
@@ -137,6 +145,15 @@ def place(machine_of: Callable[[str], Machine], state: RigState) -> None:
             module.shaft.become(module.shaft.plant.model_copy(update=plant.model_dump(exclude_unset=True) | kept))
         turns = (position.turns or 0) * (state.axes[name].modulo or 0.0)
         module.shaft.position_counts = (position.value + turns) * machine.config.signed_counts_per_unit
+
+
+def _place_unit(machine: Machine, position: PositionSample, faults: FaultSample | None) -> None:
+    drive = machine.unit.drive
+    drive.motor.position = position.counts
+    present = {fault.code for fault in faults.active} if faults else set()
+    for alarm in ALARMS:
+        if fault_of(alarm).code in present:
+            drive.provoke(alarm.code, drive.motor.at_s)
 
 
 def _load_parameters(machine_of: Callable[[str], Machine], state: RigState) -> None:
@@ -148,21 +165,32 @@ def _load_parameters(machine_of: Callable[[str], Machine], state: RigState) -> N
                 memory.write(RAM_OFFSET + int(value.parameter.removeprefix("Pn"), 16), value.active)
 
 
-async def restore(rig: Rig, state: RigState) -> None:
-    """Give the axes of a twin the references and latches of the rig; nothing moves.
+def recall(daemon: Daemon, state: RigState, now_ns: int) -> None:
+    """Begin with what forbids axes of the rig to move, as after a restart of its daemon; before that of the twin runs.
 
-    Raises:
-        LdcndError: the daemon of the twin refused it.
-        TimeoutError: it does not show an axis where it stands.
+    Args:
+        daemon: of the twin.
+        state: of the rig.
+        now_ns: the time on the twin, UTC in ns since 1970.
+    """
+    for name, there in state.states.items():
+        in_error = there.state is AxisState.ERROR_STOP
+        if there.stop_latched or in_error:
+            faults = state.faults.get(name)
+            first = faults.first.past if in_error and faults and faults.first else None
+            daemon.rig.axes[name].tracker.take(LatchRecalled(there.stop_latched, None, in_error, first, now_ns))
+
+
+def restore(daemon: Daemon, machine_of: Callable[[str], Machine], state: RigState) -> None:
+    """Give the axes of a twin, whose lines are up, the references of the rig; no command is needed for it.
+
+    Args:
+        daemon: of the twin.
+        machine_of: returns the simulated drive of an axis.
+        state: of the rig.
     """
     for name, there in state.states.items():
         position = state.positions.get(name)
         if there.referenced and position is not None and Verb.SET_POSITION in state.axes[name].capabilities:
-            async with rig.control(name, client=LEASE_CLIENT) as axis:
-                await axis.set_position(position.value)
-                tolerance = SEEN_COUNTS / (state.axes[name].counts_per_unit or 1.0)
-                async with asyncio.timeout(SEEN_WITHIN_S):
-                    while abs(axis.position.value - position.value) > tolerance:
-                        await axis.news(None)
-        if there.stop_latched:
-            await rig.client.stop(name)
+            tracker, counts = daemon.rig.axes[name].tracker, machine_of(name).servo.loop.position
+            tracker.take(PlaceKnown(tracker.status.scale.with_position(counts, position.value), resting=True))

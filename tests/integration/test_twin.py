@@ -15,7 +15,7 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.parameters import ReadAllParameters
 from ldcnd.sim.plant import PlantConfig
 from ldcnd.testing import run, served_rig, simulated_rig
-from ldcnd.testing.run_report import RunReport, watch_run
+from ldcnd.testing.run_report import RunReport, rehearse, watch_run
 from ldcnd.testing.twin import read_state
 from tests.support.rig import SIMULATED
 
@@ -107,6 +107,102 @@ def test_a_twin_has_the_parameters_of_the_rig_in_both_memories():
     assert values["Pn100"][1] == 70
 
 
+async def in_trouble():
+    """Return what a twin shows of a rig with a jammed axis, a stopped one, and a SmartStep in alarm somewhere."""
+    async with simulated_rig(MIXED) as rig:
+        rig.faults.jam("x")
+        async with rig.client.control("x", client="day") as x:
+            await x.power(on=True)
+            with pytest.raises(LdcndError):
+                await (await x.move_relative(20)).done()
+        feed = rig.machine("feed").unit.drive
+        feed.set_run(asyncio.get_running_loop().time(), on=True)
+        feed.set_pulse_rate(5000, asyncio.get_running_loop().time())
+        await asyncio.sleep(1)
+        feed.set_pulse_rate(0, asyncio.get_running_loop().time())
+        feed.provoke(0x0070, asyncio.get_running_loop().time())
+        await asyncio.sleep(5)
+        state = await read_state(rig.client.client)
+    async with simulated_rig(MIXED, state=state) as twin:
+        await asyncio.sleep(5)
+        return state, await read_state(twin.client.client), str(twin.timeline).splitlines()
+
+
+def test_a_twin_begins_with_error_stop_and_alarms_and_nothing_is_commanded_for_it():
+    real, twin, events = run(in_trouble())
+    assert real.states["x"].state == twin.states["x"].state == "error_stop"
+    assert twin.faults["x"].first.code == real.faults["x"].first.code
+    assert real.positions["feed"].counts == pytest.approx(twin.positions["feed"].counts, abs=2)
+    assert real.positions["feed"].counts > 1000
+    assert [fault.code for fault in twin.faults["feed"].active] == [fault.code for fault in real.faults["feed"].active]
+    assert not [line for line in events if "lost" in line or "released" in line]
+
+
+BLOCKING = """
+import sys, time
+import ldcnd
+
+rig = ldcnd.open()
+with rig.control("x", client="night") as x:
+    x.power(on=True)
+    began = time.monotonic()
+    x.move_absolute(float(sys.argv[1])).done()
+    time.sleep(60)
+    assert time.monotonic() - began > 60
+    if len(sys.argv) > 2:
+        sys.exit("the sample is empty")
+"""
+ASYNC = """
+import asyncio, sys
+import ldcnd
+
+async def main():
+    async with ldcnd.connect() as rig, rig.control("x", client="night") as x:
+        await x.power(on=True)
+        await (await x.move_absolute(float(sys.argv[1]))).done()
+        await asyncio.sleep(60)
+
+asyncio.run(main())
+"""
+
+
+async def minute(file, *arguments):
+    async with simulated_rig(SIMULATED) as rig:
+        return await rehearse(rig, file, arguments)
+
+
+@pytest.mark.parametrize("source", [BLOCKING, ASYNC], ids=["blocking", "asyncio"])
+def test_a_program_of_a_minute_is_rehearsed_at_the_pace_of_its_waits(tmp_path, source):
+    file = tmp_path / "night.py"
+    file.write_text(source)
+    report, failure = run(minute(file, "7.5"))
+    assert failure is None
+    assert report.axes["x"].highest == pytest.approx(7.5, abs=0.05)
+
+
+def test_a_program_that_fails_has_a_report_too(tmp_path):
+    file = tmp_path / "night.py"
+    file.write_text(BLOCKING)
+    report, failure = run(minute(file, "7.5", "empty"))
+    assert "the sample is empty" in str(failure)
+    assert report.axes["x"].motions == 1
+
+
+async def heavier():
+    async with simulated_rig(SIMULATED) as rig:
+        state = await read_state(rig.client.client, {"x": PlantConfig(inertia_kg_m2=9e-5)})
+    async with simulated_rig(SIMULATED, state=state) as twin:
+        plant = twin.machine("x").servo.shaft.plant
+        return plant.inertia_kg_m2, twin.machine("y").servo.shaft.plant.inertia_kg_m2, plant.forward_limit_counts
+
+
+def test_an_identified_machine_is_on_the_shaft_of_its_axis_and_the_travel_stays():
+    x, y, limit = run(heavier())
+    assert x == 9e-5
+    assert y != x
+    assert limit < 1_000_000
+
+
 async def ram_written():
     async with simulated_rig(MIXED) as rig:
 
@@ -178,3 +274,28 @@ def test_a_twin_is_served_to_programs_that_know_nothing_of_it(tmp_path):
     assert "axis x: " in told
     report = RunReport.model_validate(json.loads((tmp_path / "night.json").read_text()))
     assert report.axes["x"].highest == pytest.approx(5.0, abs=0.05)
+
+
+@pytest.mark.system
+@pytest.mark.real_time
+def test_a_program_is_rehearsed_fast_from_the_rig_that_runs(tmp_path):
+    rig_file, night = tmp_path / "rig.toml", tmp_path / "night.py"
+    rig_file.write_text(SIMULATED.read_text())
+    night.write_text(BLOCKING)
+    with served_rig(rig_file) as real, ldcnd.connect_blocking(real.endpoint) as rig:
+        with rig.control("x", client="day") as x:
+            x.power(on=True)
+            x.move_absolute(4.0, velocity=20).done()
+
+        def twin(*arguments):
+            command = [sys.executable, "-m", "ldcnd", "twin", str(rig_file), "--fast", str(night), "--", *arguments]
+            return subprocess.run(  # noqa: S603
+                command, env=real.environment, capture_output=True, text=True, timeout=60, check=False
+            )
+
+        good, bad = twin("5.5"), twin("5.5", "empty")
+        assert real.ask(lambda there: there.truth("x").position) == pytest.approx(4.0, abs=0.02)
+    assert (good.returncode, bad.returncode) == (0, 1)
+    assert "axis x: 1 motions" in good.stdout
+    assert "the sample is empty" in bad.stderr
+    assert "axis x: 1 motions" in bad.stdout

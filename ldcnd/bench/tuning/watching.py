@@ -20,6 +20,7 @@ from ldcnd.contract.samples import FigureRange, PositionSample, Quality, ShadowF
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import PROFILES, Profile
 from ldcnd.log import get_logger
+from ldcnd.sim.plant import MotorPlant
 
 log = get_logger("shadow")
 
@@ -80,6 +81,11 @@ def read_report(path: Path) -> TuningReport:
             f"{path}: not a report of `ldcnd tune --json`", remedy="make one: ldcnd tune AXIS --json > AXIS.json"
         ) from error
     return report
+
+
+def machine_of(report: TuningReport) -> MotorPlant:
+    """Return the simulated machine that behaves as the one that was identified."""
+    return _plant_of(report).motor()
 
 
 def _plant_of(report: TuningReport) -> Plant:
