@@ -4,6 +4,7 @@ Callbacks run on the event loop, one after the other, and must not block. What a
 bounded: a subscription keeps its newest samples, a queryable refuses what is too much.
 """
 
+import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping
 from enum import StrEnum
@@ -18,6 +19,8 @@ UNDELIVERED_SAMPLES = 64
 QUERY_TIMEOUT_S = 2.0
 """Default time that a client waits for the answers to a query, seconds."""
 
+REHEARSALS: set[asyncio.AbstractEventLoop] = set()
+"""Loops of this process on which a program is rehearsed: while there is one, no other loop reaches a real network."""
 NO_PARAMETERS: Mapping[str, str] = MappingProxyType({})
 
 

@@ -20,7 +20,7 @@ import zenoh
 from zenoh.handlers import Callback, RingChannel
 
 from ldcnd.contract.codec import Encoding, encode, error_reply
-from ldcnd.contract.errors import SessionError, ValueOutOfRange
+from ldcnd.contract.errors import NotSupported, SessionError, ValueOutOfRange
 from ldcnd.log import LogLimit, get_lazy_logger
 from ldcnd.net import zenoh_failures
 from ldcnd.net.hand_over import (
@@ -40,6 +40,7 @@ from ldcnd.net.hand_over import (
 from ldcnd.net.login_probe import refusals
 from ldcnd.net.reads import ReadIntake, Reads
 from ldcnd.net.session import (
+    REHEARSALS,
     NO_PARAMETERS,
     QUERY_TIMEOUT_S,
     UNDELIVERED_SAMPLES,
@@ -89,6 +90,7 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
     """Join the network for as long as the context lasts; a loop that brings a network of its own has none other.
 
     Raises:
+        NotSupported: a program is rehearsed in this process, on another loop: this one would reach a real rig.
         ConfigError: Zenoh does not accept a setting or the configuration file.
         SessionError: an endpoint cannot be used; says which and what to do.
     """
@@ -96,6 +98,11 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
         async with own() as session:
             yield session
             return
+    if REHEARSALS:
+        raise NotSupported(
+            "a program is rehearsed in this process, and this would reach a real network",
+            remedy="in a rehearsal, use `rig.client`, or run a program that blocks by `await rig.run_blocking(program)`",
+        )
     config = zenoh_config(settings)
     listen, connect = endpoints(config, "listen"), endpoints(config, "connect")
     if listen:

@@ -246,11 +246,16 @@ class Chain:
 
     def advance(self, now_s: float) -> list[tuple[float, bytes]]:
         """Let time pass; return the bytes that reached the host, each piece with the instant of its end."""
+        self.pass_until(now_s)
+        return self._received(now_s)
+
+    def pass_until(self, now_s: float) -> None:
+        """Let time pass; what reaches the host meanwhile is returned by the next `advance`."""
         while True:
             byte_at_s = self._requests[0].next_at_s if self._requests else NEVER_S
             inner_at_s = self._next_inner_event_s()
             if byte_at_s > now_s < inner_at_s:
-                return self._received(now_s)
+                return
             if inner_at_s <= byte_at_s:
                 self._wake(inner_at_s)
             elif not (self._requests[0].ends_at_s <= now_s < inner_at_s and self._spread_request(self._requests[0])):

@@ -10,15 +10,15 @@ With pytest the fixtures `ldcnd_rig` and, in real time for other processes, `ldc
 ldcnd is installed; without it, `run`, `simulated_rig` and `served_rig` do the same.
 """
 
-from ldcnd.testing.faults import RigFault, RigFaults
-from ldcnd.testing.jumping_loop import JumpingLoop
+from ldcnd.testing.faults import FaultSpan, FaultStart, RigFault, RigFaults
 from ldcnd.testing.lines import simulated_config
 from ldcnd.testing.rig import SimulatedRig, run, simulated_rig
 from ldcnd.testing.served import ServedRig, served_rig
 from ldcnd.testing.truth import Truth
 
 __all__ = [
-    "JumpingLoop",
+    "FaultSpan",
+    "FaultStart",
     "RigFault",
     "RigFaults",
     "ServedRig",

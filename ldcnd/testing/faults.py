@@ -119,6 +119,12 @@ class RigFaults:
     ) -> None:
         self._machine_of, self._lines, self._look = machine_of, lines, look
         self._loop, self._processes, self._note = loop, processes, note
+        self._made_so_far: list[RigFault] = []
+
+    @property
+    def to_come(self) -> tuple[RigFault, ...]:
+        """What has neither begun nor been taken back."""
+        return tuple(fault for fault in self._made_so_far if not fault.begun and not fault.over)
 
     # -- the machine -------------------------------------------------------------------------------------------------
 
@@ -359,6 +365,7 @@ class RigFaults:
             after_s: when it begins.
             for_s: how long it lasts.
         """
+        _check_share("noise", probability)
         wrong = tuple(
             LineFault(kind, probability) for kind in (FaultKind.REQUEST_BIT_FLIPPED, FaultKind.REPLY_BIT_FLIPPED)
         )
@@ -371,6 +378,7 @@ class RigFaults:
 
     def lost_replies(self, probability: float, line: str | None = None, **start: Unpack[FaultSpan]) -> RigFault:
         """Lose whole replies, each with this probability."""
+        _check_share("lost replies", probability)
         wrong = (LineFault(FaultKind.REPLY_LOST, probability),)
         return self._wires(f"replies lost, {probability:g}", line, wrong, start)
 
@@ -436,6 +444,8 @@ class RigFaults:
 
     def _switch(self, axis: str, name: str, what: str, start: FaultStart, *, closed: bool) -> RigFault:  # fmt: skip
         servo = self._machine_of(axis).servo
+        if not hasattr(servo.shaft, what):
+            raise ValueOutOfRange(f"{name}: a limit switch is forward or reverse", value=name)
 
         def put(value: bool | None) -> Change:  # noqa: FBT001 - the level, or that it works
             def change(at_s: float) -> None:
@@ -467,9 +477,10 @@ class RigFaults:
         return name, self._lines[name]
 
     def _on(self, axis: str, name: str, begin: Change, end: Change, start: FaultStart) -> RigFault:
-        fault = self._made(f"{axis}: {name}", begin, end)
+        _check_names(name, start, FaultStart)
         if sum(key in start for key in ("after_s", "at", "when")) > 1:
-            raise ValueOutOfRange(f"{fault.name}: it begins after_s, at or when; give one of them", value=len(start))
+            raise ValueOutOfRange(f"{axis}: {name}: it begins after_s, at or when; give one of them", value=len(start))
+        fault = self._made(f"{axis}: {name}", begin, end)
         when = start.get("when")
         if (place := start.get("at")) is not None:
             when = _passing(self._look(axis).position, place)
@@ -487,6 +498,7 @@ class RigFaults:
         return fault
 
     def _of_rig(self, name: str, begin: Change, end: Change, start: FaultSpan) -> RigFault:
+        _check_names(name, start, FaultSpan)
         fault = self._made(name, begin, end)
         self._begin(fault, start)
         return fault
@@ -500,7 +512,9 @@ class RigFaults:
             self._note(f"{name} ends")
             end(at_s)
 
-        return RigFault(name, begun, ended, self._loop.time)
+        fault = RigFault(name, begun, ended, self._loop.time)
+        self._made_so_far.append(fault)
+        return fault
 
     def _begin(self, fault: RigFault, start: FaultSpan) -> None:
         if "after_s" in start:
@@ -512,6 +526,17 @@ class RigFaults:
         fault.begin()
         if "for_s" in start:
             self._loop.call_later(start["for_s"], fault.end)
+
+
+def _check_names(name: str, start: Mapping[str, object], known: type[FaultSpan]) -> None:
+    unknown = start.keys() - known.__optional_keys__
+    if unknown:
+        raise TypeError(f"{name}: there is no {min(unknown)!r}; there are {', '.join(sorted(known.__optional_keys__))}")
+
+
+def _check_share(name: str, share: float) -> None:
+    if not 0.0 <= share <= 1.0:
+        raise ValueOutOfRange(f"{name}: a probability is 0 to 1, not {share:g}", value=share)
 
 
 def _passing(before: float, place: float) -> Callable[[Truth], bool]:

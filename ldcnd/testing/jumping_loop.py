@@ -10,14 +10,14 @@ import heapq
 import math
 import selectors
 from bisect import bisect_left
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
-from contextlib import AbstractAsyncContextManager
+from contextlib import AbstractAsyncContextManager, contextmanager
 from contextvars import Context
 from itertools import count
 from typing import Any
 
-from ldcnd.net.session import Session
+from ldcnd.net.session import REHEARSALS, Session
 
 NS_PER_S = 1e9
 NEXT_TO_S = 1e-10
@@ -95,9 +95,12 @@ class JumpingLoop(asyncio.SelectorEventLoop):
 
     Attributes:
         network: opens a session of the network that programs on this loop join instead of any other; None for theirs.
+        ends_at_s: what runs until its clock shows this is ended by an error; None without such a bound.
     """
 
     network: Callable[[], AbstractAsyncContextManager[Session]] | None = None
+
+    ends_at_s: float | None = None
 
     def __init__(self, starts_at_s: float = 0.0, awake_at_s: Sequence[float] = ()) -> None:
         self._jumping = _JumpingSelector(starts_at_s, awake_at_s)
@@ -128,6 +131,17 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         """Let the clock stand for so many more threads, or for fewer; called on the loop's own thread."""
         self._jumping.held += threads
 
+    @contextmanager
+    def rehearsing(self, network: Callable[[], AbstractAsyncContextManager[Session]]) -> Iterator[None]:
+        """Let programs on this loop join a network, and those on no other loop of this process join any."""
+        self.network = network
+        REHEARSALS.add(self)
+        try:
+            yield
+        finally:
+            REHEARSALS.discard(self)
+            self.network = None
+
     def hold_up(self, duration_s: float) -> None:
         """Let time pass as if the callback that runs now had taken so long."""
         self._jumping.now_s = _whole_s(self._jumping.now_s + duration_s)
@@ -141,6 +155,9 @@ class JumpingLoop(asyncio.SelectorEventLoop):
     def _process_events(self, event_list: list[tuple[selectors.SelectorKey, int]]) -> None:
         """Take what has come since the loop looked last, before it looks at its timers."""
         super()._process_events(event_list)  # type: ignore[misc] # known to asyncio's loops, not to their types
+        if self.ends_at_s is not None and self.time() > self.ends_at_s:
+            self.ends_at_s = None  # what is left to be done may take its time
+            raise TimeoutError("what was rehearsed has not ended: it waits for what never comes, or runs without an end")
         arrivals = self._jumping.arrivals
         while arrivals and arrivals[0][0] <= self.time():
             _, _, arrival = heapq.heappop(arrivals)

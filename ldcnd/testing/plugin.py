@@ -6,6 +6,7 @@ Loaded by pytest wherever ldcnd is installed, so it imports nothing of ldcnd bef
 import asyncio
 import inspect
 import tempfile
+import warnings
 from collections.abc import AsyncIterator, Callable, Generator, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,11 +19,17 @@ if TYPE_CHECKING:
 
 RIG = "ldcnd_rig"
 EXAMPLE = "simulated.toml"
+WITHIN_S = 3600.0
+"""A test that takes longer on the rig's clock fails, unless its marker says otherwise; it is less than a minute here."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Name the marker."""
-    config.addinivalue_line("markers", "ldcnd_rig(file, seed=None): the configuration on which `ldcnd_rig` rehearses")
+    config.addinivalue_line(
+        "markers",
+        f"ldcnd_rig(file, seed=None, within_s={WITHIN_S:g}): the configuration on which `ldcnd_rig` rehearses, the seed of"
+        " what is drawn, and how long the test may take on the rig's clock",
+    )
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -79,19 +86,30 @@ async def _rig(request: pytest.FixtureRequest) -> "AsyncIterator[SimulatedRig]":
         )
     from ldcnd.testing.rig import simulated_rig  # noqa: PLC0415 - see above
 
-    file, seed = _asked_for(request)
-    async with simulated_rig(file, seed=seed) as rig:
+    file, seed, within_s = _asked_for(request)
+    async with simulated_rig(file, seed=seed, within_s=within_s) as rig:
         request.node.stash[RIG_OF_TEST] = rig
         yield rig
+        for fault in rig.faults.to_come:
+            warnings.warn(f"{fault} never began: the test did not meet what it is about", stacklevel=2)
 
 
-def _asked_for(request: pytest.FixtureRequest) -> tuple[Path, int | None]:
-    """Return the configuration and the seed of the marker of a test."""
+def _asked_for(request: pytest.FixtureRequest) -> tuple[Path, int | None, float]:
+    """Return the configuration, the seed and the longest time of the marker of a test."""
     from ldcnd.config.rig import example  # noqa: PLC0415 - see above
 
+    def asked(file: Path | str | None = None, *, seed: int | None = None, within_s: float = WITHIN_S) -> None:
+        nonlocal answer
+        answer = request.path.parent / file if file else example(EXAMPLE), seed, within_s
+
+    answer: tuple[Path, int | None, float] = (example(EXAMPLE), None, WITHIN_S)
     marker = request.node.get_closest_marker(RIG)
-    file = request.path.parent / marker.args[0] if marker and marker.args else example(EXAMPLE)
-    return file, marker.kwargs.get("seed") if marker else None
+    if marker:
+        try:
+            asked(*marker.args, **marker.kwargs)
+        except TypeError as error:
+            pytest.fail(f"@pytest.mark.ldcnd_rig: {str(error).partition(') ')[2]}", pytrace=False)
+    return answer
 
 
 ldcnd_rig = _async_fixture(_rig)
@@ -102,7 +120,7 @@ def ldcnd_served_rig(request: pytest.FixtureRequest) -> "Iterator[ServedRig]":
     """Serve the rig of the marker `ldcnd_rig` in real time, for programs in other processes."""
     from ldcnd.testing.served import served_rig  # noqa: PLC0415 - see above
 
-    file, seed = _asked_for(request)
+    file, seed, _ = _asked_for(request)
     with served_rig(file, seed=seed) as rig:
         request.node.stash[RIG_OF_TEST] = rig.ask(lambda served: served)
         yield rig

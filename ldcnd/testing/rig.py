@@ -4,11 +4,13 @@ import asyncio
 import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar
 
 from typing_extensions import override
 
+from ldcnd.axis.status import AxisStatus
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
@@ -214,8 +216,8 @@ class SimulatedRig:
             UnknownAxis: there is no such axis.
         """
         machine, daemon = self.machine(axis), self._daemon
-        place_of = daemon.rig.axes[axis].tracker.status.scale.position if daemon else None
-        return machine.look(self._loop.time(), place_of)
+        status = daemon.rig.axes[axis].tracker.status if daemon else None
+        return machine.look(self._loop.time(), status.scale.position if status and status.referenced else None)
 
     def packets(self, count: int = 12) -> str:
         """Return the last packets of each line, in words; those of a daemon that was killed are gone with it."""
@@ -323,10 +325,16 @@ class SimulatedRig:
             self._daemon = build_daemon(
                 config, session, self._now_ns, f"run{self._runs}", openers, lambda: f"lease-{self._loop.time():.9f}"
             )
+            for name, axis in self._daemon.rig.axes.items():
+                axis.tracker.watch(partial(self._refer, name), "scale", "referenced")
             if state:
                 recall(self._daemon, state, self._now_ns())
             made.set_result(self._daemon)
             await self._daemon.run()
+
+    def _refer(self, axis: str, _: AxisStatus, status: AxisStatus) -> None:
+        if status.referenced:
+            self.machine(axis).refer(status.scale, self._loop.time())
 
     def _overheard(self, sample: Publication) -> None:
         self.timeline.take(sample)
@@ -372,7 +380,11 @@ class SimulatedRig:
 
 @asynccontextmanager
 async def simulated_rig(
-    config: RigConfig | Path | str, *, seed: int | None = None, state: RigState | None = None
+    config: RigConfig | Path | str,
+    *,
+    seed: int | None = None,
+    state: RigState | None = None,
+    within_s: float | None = None,
 ) -> AsyncIterator[SimulatedRig]:
     """Rehearse on a rig until the context ends; its lines are up when the context begins.
 
@@ -383,10 +395,12 @@ async def simulated_rig(
         seed: of everything that is drawn; the same seed gives the same bytes on the line.
         state: of the rig that it stands for, see `ldcnd.testing.twin`; where drives stand after their first power-up,
             when missing.
+        within_s: longest time on the rig's clock; what is rehearsed is ended then. Without a bound when missing.
 
     Raises:
         ConfigError: the file is none of a rig, or of another rig than the state.
         NotSupported: the program does not run on the jumping clock.
+        TimeoutError: it took longer; raised where the program is run.
     """
     loop = asyncio.get_running_loop()
     if not isinstance(loop, JumpingLoop):
@@ -404,12 +418,13 @@ async def simulated_rig(
     async with AsyncExitStack() as stack:
         stack.push_async_callback(session.close)
         stack.push_async_callback(rig.close)
-        loop.network = broker.session
-        stack.callback(setattr, loop, "network", None)
+        stack.enter_context(loop.rehearsing(broker.session))
         if state:
             place(rig.machine, state)
         await rig.start_daemon(state)
         await rig.join(session)
+        loop.ends_at_s = loop.time() + within_s if within_s else None
+        stack.callback(setattr, loop, "ends_at_s", None)
         yield rig
 
 

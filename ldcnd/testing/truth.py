@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.errors import NotSupported
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.smartstep.parameters import PARAMETERS
@@ -21,7 +22,9 @@ class Truth:
     """One axis as it is at an instant.
 
     Attributes:
-        position: of the encoder, in axis units: what a daemon that knew everything would publish.
+        position: of the encoder, in axis units: what a daemon that knew everything would publish. Where no daemon
+            knows the place of the axis, by the reference that it had last; without any, from where its drive was first
+            switched on.
         counts: of the encoder, from where the axis stood when its drive was switched on first.
         load_position: of the load, in axis units: behind the encoder by what the coupling has slipped.
         velocity: in axis units a second, positive forward.
@@ -52,6 +55,7 @@ class Machine:
         line: the name of the line.
         place: of the drive on the line, from 1 on.
         slipped_counts: how far the load is behind the encoder.
+        origin_counts: of the shaft, where the axis is at 0 by its last reference.
     """
 
     def __init__(self, config: AxisConfig, line: str, chain: Chain, place: int) -> None:
@@ -61,6 +65,7 @@ class Machine:
         self.line = line
         self.place = place
         self.slipped_counts = 0.0
+        self.origin_counts = 0.0
 
     @property
     def module(self) -> Module:
@@ -91,14 +96,20 @@ class Machine:
             raise NotSupported(f"axis {self.axis}: a simulated {self.config.model} is no SmartStep")
         return next(unit for unit in module.cable.units if unit.drive.unit == self.config.address)
 
+    def refer(self, scale: AxisScale, now_s: float) -> None:
+        """Take the coordinates of an axis whose place is known: they outlive its daemon."""
+        if isinstance(self.module, SimulatedDrive):
+            self.module.catch_up(now_s)
+            self.origin_counts = self.module.shaft.position_counts - self.module.loop.position + scale.origin_counts
+
     def look(self, now_s: float, place_of: Callable[[float], float] | None) -> Truth:
         """Return what is so at an instant of the line's clock.
 
         Args:
             now_s: the instant.
-            place_of: turns the drive's counter into a published position; None where no daemon knows the axis.
+            place_of: turns the drive's counter into a published position; None where no daemon knows the place.
         """
-        self.chain.advance(now_s)
+        self.chain.pass_until(now_s)  # bytes on their way are the daemon's, in real time too
         module = self.module
         if isinstance(module, SimulatedDrive):
             module.catch_up(now_s)
@@ -107,7 +118,7 @@ class Machine:
 
     def _of_servo(self, drive: SimulatedDrive, place_of: Callable[[float], float] | None) -> Truth:
         loop, shaft, scale = drive.loop, drive.shaft, self.config.signed_counts_per_unit
-        position = place_of(loop.position) if place_of else shaft.position_counts / scale
+        position = place_of(loop.position) if place_of else (shaft.position_counts - self.origin_counts) / scale
         speed = shaft.velocity_counts / drive.profile.servo_cycle_s
         energised = drive.stage.drives and (loop.servo_on or loop.pwm != 0)
         gains = loop.gains

@@ -1,5 +1,6 @@
 """Programs that move machines, tried on a rig in the process of a test."""
 
+import asyncio
 import os
 import shutil
 import subprocess
@@ -11,7 +12,7 @@ import pytest
 
 import ldcnd
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
-from ldcnd.testing import run, simulated_rig
+from ldcnd.testing import run, served_rig, simulated_rig
 from tests.support.pages import ROOT, blocks_of
 from tests.support.rig import SIMULATED
 
@@ -176,6 +177,74 @@ async def test_a_fault_begins_in_one_way(ldcnd_rig, start):
         ldcnd_rig.faults.jam("x", **start)
 
 
+@pytest.mark.parametrize("mistyped", ["at_s", "att", "after"])
+async def test_a_mistyped_start_of_a_fault_is_refused(ldcnd_rig, mistyped):
+    with pytest.raises(TypeError, match=f"no '{mistyped}'; there are after_s, at, for_s, when"):
+        ldcnd_rig.faults.jam("x", **{mistyped: 1.0})
+
+
+async def test_a_switch_or_a_probability_that_there_is_not_is_refused(ldcnd_rig):
+    with pytest.raises(ValueOutOfRange, match="forward or reverse"):
+        ldcnd_rig.faults.limit_closed("x", "fwd")
+    with pytest.raises(ValueOutOfRange, match="0 to 1, not 50"):
+        ldcnd_rig.faults.lost_replies(50)
+
+
+async def test_the_truth_of_an_axis_keeps_its_coordinates_when_its_daemon_does_not(ldcnd_rig):
+    await scan(ldcnd_rig.client, (7.5,))
+    await ldcnd_rig.kill_daemon()
+    assert ldcnd_rig.truth("x").position == pytest.approx(7.5, abs=0.02)
+    await ldcnd_rig.start_daemon()
+    assert ldcnd_rig.truth("x").position == pytest.approx(7.5, abs=0.02)
+
+
+def blocking_program():
+    with ldcnd.connect_blocking() as rig, rig.control("x", client="scan") as x:
+        x.power(on=True)
+
+
+async def test_a_program_that_is_not_given_to_the_rehearsal_reaches_no_real_rig(ldcnd_rig):
+    """As when the test calls it without `run_blocking`: by default it would find whichever daemon runs here."""
+    for call in (blocking_program, lambda: asyncio.to_thread(blocking_program)):
+        with pytest.raises(NotSupported, match="a program is rehearsed in this process"):
+            result = call()
+            await result
+    assert not ldcnd_rig.truth("x").energised
+
+
+UNHAPPY = """
+import asyncio
+import pytest
+
+@pytest.mark.ldcnd_rig(within_s=60)
+async def test_waits_for_ever(ldcnd_rig):
+    await asyncio.Event().wait()
+
+@pytest.mark.ldcnd_rig(seeed=3)
+async def test_mistyped(ldcnd_rig):
+    pass
+
+async def test_meets_nothing(ldcnd_rig):
+    ldcnd_rig.faults.jam("x", at=50)
+
+async def test_goes_on(ldcnd_rig):
+    assert ldcnd_rig.now_s < 60
+"""
+
+
+def test_a_test_that_never_ends_fails_with_what_happened_and_a_fault_that_never_came_is_said(tmp_path):
+    (tmp_path / "test_unhappy.py").write_text(UNHAPPY)
+    done = subprocess.run(  # noqa: S603
+        [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", tmp_path, "-c", os.devnull, "."],
+        cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert "1 failed, 2 passed, 1 warning, 1 error" in done.stdout, done.stdout
+    assert "it waits for what never comes" in done.stdout
+    assert "daemon 1 starts" in done.stdout
+    assert "unexpected keyword argument 'seeed'" in done.stdout
+    assert "x: jam: to come> never began" in done.stdout
+
+
 @pytest.mark.real_time
 async def test_no_rehearsal_on_the_wall_clock():
     with pytest.raises(NotSupported, match="jumping clock") as found:
@@ -272,3 +341,24 @@ def test_whoever_has_nothing_but_the_wheel_can_rehearse(tmp_path):
     shutil.copy(Path(__file__).with_name("test_named_faults.py"), lab)
     told = in_folder(lab, "-m", "pytest", "-q", "-p", "no:cacheprovider", python=python)
     assert "32 passed" in told, told
+
+
+@pytest.mark.system
+@pytest.mark.real_time
+def test_what_is_asked_of_a_served_rig_takes_no_reply_from_its_daemon(tmp_path):
+    """A fault that begins at a place is looked for two thousand times a second, and so is the truth of an axis."""
+
+    def counted(there):
+        return there.daemon.rig.buses[0].bus.statistics
+
+    with served_rig(SIMULATED) as served, ldcnd.connect_blocking(served.endpoint) as rig:
+        jam = served.ask(lambda there: there.faults.jam("x", at=7.5))
+        exchanges, timeouts = served.ask(lambda there: (counted(there).exchanges, counted(there).timeouts))
+        served.until(lambda there: counted(there).exchanges > exchanges + 150)
+        assert served.ask(lambda there: counted(there).timeouts) == timeouts
+        with rig.control("x", client="scan") as x:
+            x.power(on=True)
+            with pytest.raises(ldcnd.DriveFault):
+                x.move_absolute(10.0, velocity=20).done()
+        assert jam.begun
+        assert served.ask(lambda there: there.truth("x").position) == pytest.approx(7.5, abs=0.5)
