@@ -44,7 +44,7 @@ from ldcnd.testing.twin import RigState, read_state
 @click.option(
     "--diff",
     type=click.Path(path_type=Path, dir_okay=False, exists=True),
-    help="Watch the rig itself instead, and say where its run differed from this report.",
+    help="Watch the rig itself instead, and say where its run differed from this report; exits with 1 if it did.",
 )
 @with_target
 def twin(
@@ -65,8 +65,8 @@ def twin(
     """
     if diff:
         rehearsed = _read(diff)
-        _show(target, target.run(_watched), report, rehearsed)
-        return
+        differs = _show(target, target.run(_watched), report, rehearsed)
+        sys.exit(1 if differs else 0)
     if file is None:
         raise click.UsageError("name the configuration of the rig, or a report with --diff")
     if arguments and not program:
@@ -122,10 +122,13 @@ def _read(file: Path) -> RunReport:
         ) from error
 
 
-def _show(target: Target, done: RunReport, file: Path | None, rehearsed: RunReport | None) -> None:
+def _show(target: Target, done: RunReport, file: Path | None, rehearsed: RunReport | None) -> bool:
+    """Print and write what a run has done; tell whether it differed from what was rehearsed."""
     if file:
         file.write_text(done.model_dump_json(indent=2) + "\n", encoding="utf-8")
     lines = list(done.lines())
+    differences = list(rehearsed.differences(done)) if rehearsed else []
     if rehearsed:
-        lines += list(rehearsed.differences(done)) or ["as it was rehearsed"]
+        lines += differences or ["as it was rehearsed"]
     target.show(done, *lines)
+    return bool(differences)

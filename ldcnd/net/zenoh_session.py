@@ -40,9 +40,9 @@ from ldcnd.net.hand_over import (
 from ldcnd.net.login_probe import refusals
 from ldcnd.net.reads import ReadIntake, Reads
 from ldcnd.net.session import (
-    REHEARSALS,
     NO_PARAMETERS,
     QUERY_TIMEOUT_S,
+    REHEARSALS,
     UNDELIVERED_SAMPLES,
     Declaration,
     OnSample,
@@ -101,7 +101,7 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
     if REHEARSALS:
         raise NotSupported(
             "a program is rehearsed in this process, and this would reach a real network",
-            remedy="in a rehearsal, use `rig.client`, or run a program that blocks by `await rig.run_blocking(program)`",
+            remedy="use `rig.client` of the rehearsal, or run a program that blocks by `await rig.run_blocking(program)`",
         )
     config = zenoh_config(settings)
     listen, connect = endpoints(config, "listen"), endpoints(config, "connect")

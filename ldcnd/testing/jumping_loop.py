@@ -157,7 +157,9 @@ class JumpingLoop(asyncio.SelectorEventLoop):
         super()._process_events(event_list)  # type: ignore[misc] # known to asyncio's loops, not to their types
         if self.ends_at_s is not None and self.time() > self.ends_at_s:
             self.ends_at_s = None  # what is left to be done may take its time
-            raise TimeoutError("what was rehearsed has not ended: it waits for what never comes, or runs without an end")
+            raise TimeoutError(
+                "what was rehearsed has not ended: it waits for what never comes, or runs without an end"
+            )
         arrivals = self._jumping.arrivals
         while arrivals and arrivals[0][0] <= self.time():
             _, _, arrival = heapq.heappop(arrivals)

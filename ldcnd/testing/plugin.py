@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 RIG = "ldcnd_rig"
 EXAMPLE = "simulated.toml"
 WITHIN_S = 3600.0
-"""A test that takes longer on the rig's clock fails, unless its marker says otherwise; it is less than a minute here."""
+"""A test that takes longer on the rig's clock fails, unless its marker says otherwise; that is under a minute here."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Name the marker."""
     config.addinivalue_line(
         "markers",
-        f"ldcnd_rig(file, seed=None, within_s={WITHIN_S:g}): the configuration on which `ldcnd_rig` rehearses, the seed of"
-        " what is drawn, and how long the test may take on the rig's clock",
+        f"ldcnd_rig(file, seed=None, within_s={WITHIN_S:g}): the configuration on which `ldcnd_rig` rehearses, the"
+        " seed of what is drawn, and how long the test may take on the rig's clock",
     )
 
 
@@ -135,6 +135,7 @@ def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestR
     report = yield
     rig = item.stash.get(RIG_OF_TEST, None)
     if rig is not None and report.when == "call" and report.failed:
+        rig.settle()
         lines = [str(rig.timeline), rig.packets()]
         name = "".join(letter if letter.isalnum() else "_" for letter in item.name)
         picture = rig.timeline.draw(Path(tempfile.mkdtemp(prefix="ldcnd-")) / f"{name}.png")

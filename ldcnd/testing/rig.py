@@ -40,6 +40,8 @@ ResultT = TypeVar("ResultT")
 BEGINS_NS = 1_700_000_000_000_000_000
 """The wall clock at the beginning of every rehearsal, UTC in ns since 1970: what is repeated is the same to the bit."""
 UP_WITHIN_S = 60.0
+SETTLES_S = 0.05
+"""How late events are published at most, and more, in seconds of the jumping clock."""
 LOOK_S = 0.01
 """How often a condition is looked at, in seconds of the jumping clock."""
 
@@ -234,6 +236,11 @@ class SimulatedRig:
                 for record in packets[-count:]
             ]
         return "\n".join(told)
+
+    def settle(self) -> None:
+        """Let what has happened come to the timeline, once nothing runs on the loop any more."""
+        if isinstance(self._loop, JumpingLoop) and not self._loop.is_running() and not self._loop.is_closed():
+            self._loop.run_until_complete(asyncio.sleep(SETTLES_S))
 
     async def until(self, condition: Callable[[], bool], within_s: float = 60.0) -> None:
         """Wait until something is so; it is asked every 10 ms of the rig's clock.

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import math
 from collections.abc import Awaitable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +13,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import decode_received
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import LdcndError
-from ldcnd.contract.events import CommandEvent, CommandStatus
+from ldcnd.contract.events import CommandEvent, CommandStatus, ReadEvents
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import ReadParameter
@@ -27,8 +28,11 @@ ANY_PARAMETER = "Pn100"
 """Every SmartStep has it; with it the daemon tells how often the drive's EEPROM was written."""
 DURATION_SHARE = 0.02
 """Difference of durations that is worth saying, as a share."""
-TRAVEL_SHARE = 0.05
-"""The same of how near an axis came to a limit, as a share of its travel."""
+PLACE_SHARE = 0.005
+"""The same of a place where an axis was, as a share of the way between its lowest and its highest place."""
+HUNTED_COUNTS = 20.0
+MOST_ENDS = 5000
+"""Most ends of motions that a report keeps for one axis."""
 FOLLOWING_FACTOR = 2.0
 """The same of the worst following error, as a ratio: a twin has another mechanics."""
 FOLLOWING_SHARE = 1e-4
@@ -56,6 +60,10 @@ class AxisRun(Frozen):
     """From one software limit to the other; null where one is missing."""
     following_error: float = Field(ge=0)
     """Largest following error that was seen."""
+    hunts: float = Field(default=0.0, ge=0)
+    """What a closed loop hunts around its place."""
+    ends: tuple[float, ...] = ()
+    """Where its motions ended, in their order; the first 5000."""
 
 
 class RunReport(Frozen):
@@ -122,16 +130,25 @@ def _differing(name: str, rehearsed: AxisRun, real: AxisRun) -> Iterator[str]:
         yield f"axis {name}: {rehearsed.motions} motions rehearsed, {real.motions} in the run"
     places = (rehearsed.lowest, rehearsed.highest, real.lowest, real.highest)
     known = [place for place in places if place is not None]
-    span = rehearsed.travel or (max(known) - min(known) if known else 0.0)
-    for what, planned, found in (
+    span = max(known) - min(known) if known else 0.0
+    near = PLACE_SHARE * span + max(rehearsed.hunts, real.hunts)
+    for number, (planned, found) in enumerate(zip(rehearsed.ends, real.ends, strict=False), 1):
+        if abs(planned - found) > near:
+            yield (
+                f"axis {name}: motion {number} ended at {planned:.6g} {rehearsed.unit} rehearsed,"
+                f" {found:.6g} in the run"
+            )
+            break
+    passed = near + rehearsed.following_error + real.following_error  # an axis that is late overshoots
+    for what, there, here in (
         ("lowest place", rehearsed.lowest, real.lowest),
         ("highest place", rehearsed.highest, real.highest),
         ("distance to the lower limit", rehearsed.to_min, real.to_min),
         ("distance to the upper limit", rehearsed.to_max, real.to_max),
     ):
-        one_is_unknown = (planned is None) is not (found is None)
-        if one_is_unknown or (planned is not None and found is not None and abs(planned - found) > TRAVEL_SHARE * span):
-            yield (f"axis {name}: {what} {_told(planned)} {rehearsed.unit} rehearsed, {_told(found)} in the run")
+        one_is_unknown = (there is None) is not (here is None)
+        if one_is_unknown or (there is not None and here is not None and abs(there - here) > passed):
+            yield (f"axis {name}: {what} {_told(there)} {rehearsed.unit} rehearsed, {_told(here)} in the run")
     less, more = sorted((rehearsed.following_error, real.following_error))
     if more > FOLLOWING_FACTOR * less + FOLLOWING_SHARE * span:
         yield (
@@ -154,6 +171,7 @@ class _Seen:
     following_error: float = 0.0
     before: float | None = None
     motions: set[str] = field(default_factory=set)
+    ends: list[float] = field(default_factory=list)
     commanded: bool = False
 
     def take(self, position: PositionSample) -> None:
@@ -204,6 +222,8 @@ class RunWatch:
         seen.commanded = True
         if event.status is CommandStatus.EXECUTING:
             seen.motions.add(event.command_id)
+        if event.status is CommandStatus.DONE and event.command_id in seen.motions and event.position is not None:
+            seen.ends.append(event.position)
         self._stops += event.verb in STOPS and event.status is CommandStatus.DONE
         said = f"{event.axis} {event.verb}: {event.code or event.reason}"
         if event.status is CommandStatus.REFUSED:
@@ -238,6 +258,8 @@ class RunWatch:
             to_max=None if high is None or highest is None else high - highest,
             travel=None if low is None or high is None else high - low,
             following_error=seen.following_error,
+            hunts=HUNTED_COUNTS / (info.counts_per_unit or math.inf),
+            ends=tuple(seen.ends[:MOST_ENDS]),
         )
 
 
@@ -272,6 +294,7 @@ async def watch_run(client: RigClient, ended: Awaitable[object]) -> RunReport:
     async with client.published(watch.take):
         watch.begin(await client.last_published())
         await ended
+        await client.ask(ReadEvents(count=1))  # publishes at once what is published a few milliseconds late otherwise
     passed_s = max(loop.time() - began_s, 1e-9)
     busy_s = {bus.bus: max(0.0, bus.wire_busy_s - before.get(bus.bus, 0.0)) for bus in await client.buses()}
     now_written = await _eeprom_writes(client, axes)

@@ -16,7 +16,7 @@ from ldcnd.contract.samples import FaultSample, PositionSample, StateSample, Tel
 from ldcnd.net.session import Publication, SampleKind
 
 KEPT = 2000
-SHOWN = 30
+SHOWN = 100
 EVENT = "event"
 
 
@@ -61,7 +61,8 @@ class Timeline:
             self._positions.setdefault(axis, deque(maxlen=KEPT)).append((self._now_s(), position.value))
         elif item == TelemetryItem.STATE:
             state = decode_received(StateSample, sample.payload, sample.encoding)
-            self._changed(axis, "state", f"is {state.state} and moves: {state.moving}")
+            target = "" if state.target is None else f", target {state.target:.6g}"
+            self._changed(axis, "state", f"is {state.state} and moves: {state.moving}{target}")
         elif item == TelemetryItem.FAULT:
             fault = decode_received(FaultSample, sample.payload, sample.encoding)
             names = ", ".join(each.code for each in fault.active) or "none"
@@ -69,7 +70,8 @@ class Timeline:
         elif item == EVENT:
             event = decode_received(CommandEvent, sample.payload, sample.encoding)
             why = f": {event.reason}" if event.reason else ""
-            moment = Moment(self._seconds(event.t), f"{event.axis} {event.verb} {event.status}{why}")
+            where = "" if event.position is None else f" at {event.position:.6g}"
+            moment = Moment(self._seconds(event.t), f"{event.axis} {event.verb} {event.status}{where}{why}")
             self._moments.append(moment)
 
     def _seconds(self, at_ns: int) -> float:
@@ -81,8 +83,10 @@ class Timeline:
             self.note(f"{axis} {text}")
 
     def __str__(self) -> str:
-        """Return the last lines."""
-        return "\n".join(map(str, self.moments[-SHOWN:]))
+        """Return the last lines, and how many are left off before them."""
+        moments = self.moments
+        left = [f"({len(moments) - SHOWN} earlier lines)"] if len(moments) > SHOWN else []
+        return "\n".join([*left, *map(str, moments[-SHOWN:])])
 
     def draw(self, file: Path) -> Path | None:
         """Draw the positions over time; return the file, or None where matplotlib is not installed."""

@@ -228,6 +228,17 @@ def test_a_following_error_ten_times_as_large_is_said_either_way():
     assert ["following error" in text for text in other.differences(one)] == [True]
 
 
+def test_a_place_in_between_that_differs_by_a_small_share_of_the_travel_is_said():
+    _, one = run(real_run((0, 0)))
+    x = one.axes["x"]
+    assert x.ends == pytest.approx([*(-60 + 7.5 * number for number in range(20)), 12.5], abs=0.02)
+    ends = (*x.ends[:5], x.ends[5] + 1.0, *x.ends[6:])
+    other = one.model_copy(update={"axes": {**one.axes, "x": x.model_copy(update={"ends": ends})}})
+    assert list(one.differences(other)) == [
+        f"axis x: motion 6 ended at {ends[5] - 1:.6g} mm rehearsed, {ends[5]:.6g} in the run"
+    ]
+
+
 def test_a_report_says_where_the_run_differed():
     _, rehearsed = run(real_run((0, 0)))
     other = rehearsed.model_copy(
