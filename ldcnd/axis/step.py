@@ -145,8 +145,8 @@ def _take_profile_end(
         return _finished(status, settled=settled)
     status = replace(status, own=_own_and(status, NOT_SETTLED))
     status = _with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
-    off = settling.target_counts - reading.position_counts
-    return _fail(status, f"{command.verb} did not settle: {off} counts off", settled=False)
+    off = (settling.target_counts - reading.position_counts) / status.scale.counts_per_unit
+    return _fail(status, f"{command.verb} did not settle: {off:.4g} {status.scale.unit} off", settled=False)
 
 
 def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:

@@ -106,6 +106,8 @@ class NewFile(click.Path):
         path = Path(os.fsdecode(super().convert(value, param, ctx)))
         if path.is_file() and not (ctx and ctx.meta.get(_FORCE)):
             self.fail(f"{path} is there already; give another name, or --force to write over it", param, ctx)
+        if not path.parent.is_dir():
+            self.fail(f"there is no folder {path.parent} to write {path.name} to", param, ctx)
         return path
 
 

@@ -233,16 +233,21 @@ class Axis(AxisVerbs):
     async def under_way(self) -> Motion | None:
         """Return the last motion that was begun here if it has not ended; None also where that cannot be known."""
         last = self._last
-        if last is None or last.ended is not None or (self.control and self.control.lost):
+        if last is None or last.over or (self.control and self.control.lost):
             return None
         with contextlib.suppress(LdcndError):
             return None if (await self.outcome(last.command_id)).status in FINAL else last
         return None
 
     async def halt_unfinished(self) -> None:
-        """Halt if a motion that was begun here may not have ended."""
-        if self._last and self._last.ended is None:
-            await self.halt_now()
+        """Halt if a motion that was begun here may not have ended: after its end, the next is perhaps another's."""
+        if self._last is None or self._last.over:
+            return
+        with contextlib.suppress(LdcndError, TimeoutError):
+            async with asyncio.timeout(HALT_S):
+                if (await self.outcome(self._last.command_id)).status in FINAL:
+                    return
+        await self.halt_now()
 
     def begun(self, reply: CommandReply, asked: float | None = None) -> Motion:
         """Return the motion that a command has begun; `asked` is the requested target, in axis units."""

@@ -20,6 +20,7 @@ RENEWALS_PER_LEASE = 4
 """Number of consecutive renewals that may be lost before a lease ends."""
 LEASE_VARIABLE = "LDCND_LEASE"
 """Variable of the environment in which `ldcnd lease hold` gives its lease to the program that it runs."""
+ACQUIRE_AGAIN = Remedy("{}", step("acquire", "acquire it again"))
 LONGEST_NAME = 64
 """Longest name of a client, characters."""
 
@@ -63,7 +64,32 @@ class Control:
             LeaseExpired: the lease was lost.
             LdcndError: as the daemon refused it.
         """
-        return await self._client.command(axis, self.stamped(command, axis), timeout_s)
+        try:
+            return await self._client.command(axis, self.stamped(command, axis), timeout_s)
+        except LeaseUnknown as error:
+            raise self._ended(error) from error
+
+    async def check(self) -> None:
+        """Query the daemon whether control is still here; without an answer it is taken to be.
+
+        Raises:
+            LeaseExpired: control was lost.
+        """
+        with contextlib.suppress(OutcomeUnknown, SessionError):
+            await self._renew()
+
+    async def _renew(self) -> None:
+        try:
+            await self._client.ask(Renew(lease=self.lease.lease), timeout_s=self.lease.lease_s)
+        except (LeaseExpired, LeaseUnknown) as error:
+            raise self._ended(error) from error
+
+    def _ended(self, error: LeaseExpired | LeaseUnknown) -> LeaseExpired:
+        """Keep why control was lost: a daemon that does not know the lease which it gave is another one."""
+        if isinstance(error, LeaseUnknown):
+            error = LeaseExpired("the daemon was restarted, and control ended with it", remedy=ACQUIRE_AGAIN)
+        self.lost = error
+        return error
 
     def stamped(self, request: RequestT, axis: str) -> RequestT:
         """Return a request for an axis under the lease, with the next sequence number unless others count as well.
@@ -79,7 +105,7 @@ class Control:
             raise LeaseExpired(
                 f"control was lost: {self.lost.message}",
                 axis=axis,
-                remedy=Remedy("{}", step("acquire", "acquire it again")),
+                remedy=ACQUIRE_AGAIN,
             )
         sequence = None if self.inherited else next(self._sequence)
         return request.model_copy(update={"lease": self.lease.lease, "sequence": sequence})
@@ -92,9 +118,9 @@ class Control:
             await asyncio.sleep(lease_s / RENEWALS_PER_LEASE)
             asked_at_s = loop.time()
             try:
-                await self._client.ask(Renew(lease=self.lease.lease), timeout_s=lease_s)
-            except (LeaseExpired, LeaseUnknown) as error:
-                self.lost = error
+                await self._renew()
+            except LeaseExpired:
+                break
             except LdcndError as error:
                 if loop.time() >= until_s:  # until then an answer may have been lost; the next renewal is due soon
                     self.lost = LeaseExpired(f"it could not be renewed for {lease_s:g} s: {error.message}")

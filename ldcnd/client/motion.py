@@ -163,11 +163,13 @@ class Motion:
     Attributes:
         reply: the request as the drive's registers have it: target, velocity, duration.
         ended: the state after it; None until `done` has returned.
+        over: it has ended in any way, as far as this program knows.
     """
 
     reply: CommandReply
     _axis: "Axis"
     ended: State | None = field(default=None, init=False)
+    over: bool = field(default=False, init=False)
 
     @property
     def command_id(self) -> str:
@@ -193,7 +195,11 @@ class Motion:
             await self._axis.halt_now()
             raise
         if outcome.status is not CommandStatus.DONE:
+            self.over = True
+            if self._axis.control and outcome.status in (CommandStatus.ABORTED, CommandStatus.REFUSED):
+                await self._axis.control.check()  # what took control away has ended it, too
             raise failure(outcome)
+        self.over = True
         await self._arrival()
         self.ended = replace(
             self._axis.state,

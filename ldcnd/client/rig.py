@@ -158,10 +158,12 @@ class Rig:
     ) -> AbstractAsyncContextManager[Axis] | AbstractAsyncContextManager[tuple[Axis, ...]]:
         """Control axes until the context ends: no other client moves them, and they halt when this program disappears.
 
-        Yields the axis, or a tuple when several are named. When control is lost, `LeaseExpired` is raised where the
-        program waits. An exception that leaves the context halts the axes whose motions have not ended. At its other
-        ends these do what their `loss.client` says, and the warning `UnfinishedMotion` names them. Inside
-        `ldcnd lease hold -- PROGRAM` the program shares the control that is held for it.
+        Yields the axis, or a tuple when several are named. When control is lost, calls and motions of the axis raise
+        `LeaseExpired`; whatever else the program waits for inside is cancelled, as by `asyncio.timeout`, and the
+        context raises `LeaseExpired`: clean up in `finally`. An exception that leaves the context halts the axes whose
+        motions have not ended. At its other ends these do what their `loss.client` says, and the warning
+        `UnfinishedMotion` names them. Inside `ldcnd lease hold -- PROGRAM` the program shares the control that is held
+        for it.
 
         Args:
             axes: what to control; a group stands for its members.

@@ -8,7 +8,6 @@ less, given back - an axis that moves then does what its `loss.client` says. `Au
 
 import asyncio
 import secrets
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
@@ -38,6 +37,7 @@ from ldcnd.log import LogLimit, get_logger
 
 log = get_logger("loss")
 
+NOT_RENEWED = "ended because it was not renewed"
 REMEMBERED = 256
 """Maximum number of ended leases kept, to distinguish a stale command from an invented lease."""
 STOP_MODES = {
@@ -92,7 +92,7 @@ class Authority:
         self.required = required
         self._axes = frozenset(axes)
         self._leases: dict[str, Lease] = {}
-        self._ended: deque[str] = deque(maxlen=REMEMBERED)
+        self._ended: dict[str, str] = {}  # how the latest that are over have ended, by token
         self._successors: dict[str, str] = {}  # of leases that their own holder has replaced, by token
 
     def holder(self, axis: str) -> Lease | None:
@@ -117,7 +117,11 @@ class Authority:
         """
         wanted = frozenset(axes) or self._axes
         if unknown := sorted(wanted - self._axes):
-            raise UnknownAxis(f"there is no axis {unknown[0]!r}", axis=unknown[0], value=unknown[0])
+            raise UnknownAxis(
+                f"there is no axis {unknown[0]!r}; there are {', '.join(sorted(self._axes))}",
+                axis=unknown[0],
+                value=unknown[0],
+            )
         self.expire(now_s)
         displaced = [lease for lease in self._leases.values() if lease.axes & wanted]
         foreign = [lease for lease in displaced if lease.client != client]
@@ -129,8 +133,8 @@ class Authority:
                 value=foreign[0].client,
                 remedy=Remedy("wait until it is released, or {}", step("acquire", "acquire it with force", force=True)),
             )
-        for lease in displaced:
-            self._end(lease)
+        for old in displaced:
+            self._end(old, f"was taken by {client}" if old.client != client else "was replaced by its own client")
         lease = Lease(self._next_token(), client, wanted, duration_s, now_s + duration_s)
         self._leases[lease.token] = lease
         self._successors.update((old.token, lease.token) for old in displaced if old.client == client)
@@ -153,14 +157,14 @@ class Authority:
             LeaseExpired, LeaseUnknown: it does not hold any more, or never did.
         """
         lease = self._living(token, now_s)
-        self._end(lease)
+        self._end(lease, "was released")
         return lease
 
     def expire(self, now_s: float) -> list[Lease]:
         """End the leases that were not renewed in time, and return them."""
         over = [lease for lease in self._leases.values() if lease.ends_at_s <= now_s]
         for lease in over:
-            self._end(lease)
+            self._end(lease, NOT_RENEWED)
         return over
 
     def admit(self, axis: str, token: str | None, sequence: int | None, now_s: float) -> str | None:
@@ -239,7 +243,7 @@ class Authority:
             return lease
         if lease or token in self._ended:
             raise LeaseExpired(
-                "the lease has ended: what was sent under it is stale",
+                f"control {self._ended.get(token, NOT_RENEWED)}: what was sent under that lease is stale",
                 value=token,
                 remedy=Remedy("{}", step("acquire", "acquire a new one")),
             )
@@ -247,11 +251,13 @@ class Authority:
             "there was never such a lease", value=token, remedy=Remedy("{}", step("acquire", "acquire one first"))
         )
 
-    def _end(self, lease: Lease) -> None:
+    def _end(self, lease: Lease, how: str) -> None:
         del self._leases[lease.token]
         if len(self._ended) == REMEMBERED:
-            self._successors.pop(self._ended[0], None)
-        self._ended.append(lease.token)
+            oldest = next(iter(self._ended))
+            self._successors.pop(oldest, None)
+            del self._ended[oldest]
+        self._ended[lease.token] = how
 
 
 class LeaseWatch:

@@ -101,7 +101,7 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
     if REHEARSALS:
         raise NotSupported(
             "a program is rehearsed in this process, and this would reach a real network",
-            remedy="use `rig.client` of the rehearsal, or run a program that blocks by `await rig.run_blocking(program)`",
+            remedy="use `rig.client` there, or run a program that blocks by `await rig.run_blocking(program)`",
         )
     config = zenoh_config(settings)
     listen, connect = endpoints(config, "listen"), endpoints(config, "connect")

@@ -10,11 +10,15 @@ With pytest the fixtures `ldcnd_rig` and, in real time for other processes, `ldc
 ldcnd is installed; without it, `run`, `simulated_rig` and `served_rig` do the same.
 """
 
-from ldcnd.testing.faults import FaultSpan, FaultStart, RigFault, RigFaults
-from ldcnd.testing.lines import simulated_config
-from ldcnd.testing.rig import SimulatedRig, run, simulated_rig
-from ldcnd.testing.served import ServedRig, served_rig
-from ldcnd.testing.truth import Truth
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ldcnd.testing.faults import FaultSpan, FaultStart, RigFault, RigFaults
+    from ldcnd.testing.lines import simulated_config
+    from ldcnd.testing.rig import SimulatedRig, run, simulated_rig
+    from ldcnd.testing.served import ServedRig, served_rig
+    from ldcnd.testing.truth import Truth
 
 __all__ = [
     "FaultSpan",
@@ -29,3 +33,14 @@ __all__ = [
     "simulated_config",
     "simulated_rig",
 ]
+MODULES = ("faults", "lines", "rig", "served", "truth")
+
+
+def __getattr__(name: str) -> object:
+    """Load what is named here on first use: pytest loads this package wherever ldcnd is installed."""
+    if name in __all__:
+        for module in MODULES:
+            found = getattr(import_module(f"{__name__}.{module}"), name, None)
+            if found is not None:
+                return found
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

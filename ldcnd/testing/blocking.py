@@ -12,7 +12,9 @@ import runpy
 import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, ParamSpec, SupportsIndex, TypeVar, cast
@@ -60,53 +62,77 @@ class PacedLoop(LoopThread):
         return self._clock.time()
 
 
+@dataclass(frozen=True, slots=True)
+class RigClock:
+    """What `time` shows in a thread whose program is rehearsed.
+
+    Attributes:
+        monotonic: seconds of the rig's clock.
+        wall: seconds since 1970 on the rig.
+        sleep: lets so many seconds pass.
+        loop: on which `asyncio.run` runs what it gets; None where a loop runs already.
+    """
+
+    monotonic: Callable[[], float]
+    wall: Callable[[], float]
+    sleep: Callable[[float], object]
+    loop: PacedLoop | None = None
+
+
 _sleep, _monotonic, _time, _run = time.sleep, time.monotonic, time.time, asyncio.run
-_guests: dict[int, tuple[PacedLoop, Callable[[], float]]] = {}
-"""By the thread of a program: its loop, and the wall clock of its rig."""
+_clocks: dict[int, RigClock] = {}
+"""Of the threads whose programs are rehearsed now."""
 _changing = threading.Lock()
 
 
 def _sleep_here(seconds: float | SupportsIndex) -> None:
-    guest = _guests.get(threading.get_ident())
-    if guest is None:
+    clock = _clocks.get(threading.get_ident())
+    if clock is None:
         _sleep(seconds)
     else:
-        guest[0].run(asyncio.sleep(float(seconds)))
+        clock.sleep(float(seconds))
 
 
 def _monotonic_here() -> float:
-    guest = _guests.get(threading.get_ident())
-    return guest[0].now_s() if guest else _monotonic()
+    clock = _clocks.get(threading.get_ident())
+    return clock.monotonic() if clock else _monotonic()
 
 
 def _time_here() -> float:
-    guest = _guests.get(threading.get_ident())
-    return guest[1]() if guest else _time()
+    clock = _clocks.get(threading.get_ident())
+    return clock.wall() if clock else _time()
 
 
 # Any: as asyncio declares it
 def _run_here(
     main: Coroutine[Any, Any, ResultT], *, debug: bool | None = None, loop_factory: Callable[[], Any] | None = None
 ) -> ResultT:
-    guest = _guests.get(threading.get_ident())
-    if guest:
-        return guest[0].run(main)
+    clock = _clocks.get(threading.get_ident())
+    if clock and clock.loop:
+        return clock.loop.run(main)
     with asyncio.Runner(debug=debug, loop_factory=loop_factory) as runner:
         return runner.run(main)
 
 
-def _enter(guest: tuple[PacedLoop, Callable[[], float]]) -> None:
+@contextmanager
+def on_clock(clock: RigClock) -> Iterator[None]:
+    """Show the clock of a rig in this thread: `time.time`, `time.monotonic`, `time.sleep`; others keep theirs."""
+    me = threading.get_ident()
     with _changing:
-        _guests[threading.get_ident()] = guest
+        before = _clocks.get(me)
+        _clocks[me] = clock
         time.sleep, time.monotonic, time.time = _sleep_here, _monotonic_here, _time_here
         asyncio.run = _run_here
-
-
-def _leave() -> None:
-    with _changing:
-        del _guests[threading.get_ident()]
-        if not _guests:
-            time.sleep, time.monotonic, time.time, asyncio.run = _sleep, _monotonic, _time, _run
+    try:
+        yield
+    finally:
+        with _changing:
+            if before:
+                _clocks[me] = before
+            else:
+                del _clocks[me]
+            if not _clocks:
+                time.sleep, time.monotonic, time.time, asyncio.run = _sleep, _monotonic, _time, _run
 
 
 async def run_in_thread(
@@ -131,14 +157,13 @@ async def run_in_thread(
             outcome()
 
     def live() -> None:
-        _enter((paced, wall_s))
-        try:
-            outcome = partial(ended.set_result, context.run(program, *args, **kwargs))
-        except BaseException as error:  # noqa: BLE001 - it is raised where the program is waited for
-            outcome = partial(ended.set_exception, error)
-        finally:
-            paced.close()
-            _leave()
+        with on_clock(RigClock(paced.now_s, wall_s, lambda seconds: paced.run(asyncio.sleep(seconds)), paced)):
+            try:
+                outcome = partial(ended.set_result, context.run(program, *args, **kwargs))
+            except BaseException as error:  # noqa: BLE001 - it is raised where the program is waited for
+                outcome = partial(ended.set_exception, error)
+            finally:
+                paced.close()
         paced.call(end, outcome)
 
     loop.hold(+1)

@@ -25,7 +25,7 @@ from ldcnd.net.hand_over import Answer
 from ldcnd.net.session import NO_PARAMETERS, QUERY_TIMEOUT_S, OnSample, Publication, Session
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.known import SIMULATED, opener_of
-from ldcnd.testing.blocking import run_in_thread
+from ldcnd.testing.blocking import RigClock, on_clock, run_in_thread
 from ldcnd.testing.faults import Change, Processes, RigFaults
 from ldcnd.testing.jumping_loop import JumpingLoop
 from ldcnd.testing.lines import simulated_config
@@ -217,9 +217,7 @@ class SimulatedRig:
         Raises:
             UnknownAxis: there is no such axis.
         """
-        machine, daemon = self.machine(axis), self._daemon
-        status = daemon.rig.axes[axis].tracker.status if daemon else None
-        return machine.look(self._loop.time(), status.scale.position if status and status.referenced else None)
+        return self.machine(axis).look(self._loop.time())
 
     def packets(self, count: int = 12) -> str:
         """Return the last packets of each line, in words; those of a daemon that was killed are gone with it."""
@@ -274,7 +272,7 @@ class SimulatedRig:
         """
         if not isinstance(self._loop, JumpingLoop):
             return await asyncio.to_thread(program, *args, **kwargs)
-        return await run_in_thread(self._loop, lambda: self._now_ns() / 1e9, program, *args, **kwargs)
+        return await run_in_thread(self._loop, self.wall_s, program, *args, **kwargs)
 
     async def start_daemon(self, state: RigState | None = None) -> None:
         """Start a daemon on the same lines, and wait until they are up.
@@ -291,11 +289,13 @@ class SimulatedRig:
         self._life = _Life()
         self._serving = asyncio.create_task(self._serve(self._life, made, state), name=f"daemon {self._runs}")
         up = asyncio.create_task(self._up(made), name="lines up")
-        await asyncio.wait((self._serving, up), return_when=asyncio.FIRST_COMPLETED)
-        if not up.done():
+        try:
+            await asyncio.wait((self._serving, up), return_when=asyncio.FIRST_COMPLETED)
+            if not up.done():
+                await self._serving
+            await up
+        finally:
             up.cancel()
-            await self._serving
-        await up
         if state:
             restore(self.daemon, self.machine, state)
 
@@ -345,6 +345,10 @@ class SimulatedRig:
 
     def _overheard(self, sample: Publication) -> None:
         self.timeline.take(sample)
+
+    def wall_s(self) -> float:
+        """Return what the wall clock of the rig shows, in seconds since 1970."""
+        return self._now_ns() / 1e9
 
     def _now_ns(self) -> int:
         return self._begins_ns + round(self.now_s * 1e9)
@@ -426,6 +430,7 @@ async def simulated_rig(
         stack.push_async_callback(session.close)
         stack.push_async_callback(rig.close)
         stack.enter_context(loop.rehearsing(broker.session))
+        stack.enter_context(on_clock(RigClock(loop.time, rig.wall_s, loop.hold_up)))
         if state:
             place(rig.machine, state)
         await rig.start_daemon(state)

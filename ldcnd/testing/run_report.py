@@ -58,8 +58,8 @@ class AxisRun(Frozen):
     """Closest approach to the upper software limit; null without one or when unknown, negative beyond it."""
     travel: float | None
     """From one software limit to the other; null where one is missing."""
-    following_error: float = Field(ge=0)
-    """Largest following error that was seen."""
+    following_error: float | None = Field(ge=0)
+    """Largest following error that was seen; null of a drive that reports none."""
     hunts: float = Field(default=0.0, ge=0)
     """What a closed loop hunts around its place."""
     ends: tuple[float, ...] = ()
@@ -89,7 +89,7 @@ class RunReport(Frozen):
     def lines(self) -> Iterator[str]:
         """Yield the report as it is read, one line a fact."""
         writes = _told(self.eeprom_writes)
-        yield f"rig {self.rig}: {self.duration_s:.2f} s, {self.stops} stops, {writes} EEPROM writes"
+        yield f"rig {self.rig}: {self.duration_s:.2f} s, {self.stops} stops and halts, {writes} EEPROM writes"
         for name, axis in self.axes.items():
             near = [
                 f"{distance:.6g} {axis.unit} from its {end} limit"
@@ -98,7 +98,7 @@ class RunReport(Frozen):
             ]
             yield (
                 f"axis {name}: {axis.motions} motions, {axis.way:.6g} {axis.unit} of way, from {_told(axis.lowest)}"
-                f" to {_told(axis.highest)}, following error up to {axis.following_error:.3g}"
+                f" to {_told(axis.highest)}, following error up to {_told(axis.following_error)}"
                 + (f"; at the nearest {' and '.join(near)}" if near else "")
             )
         yield from (f"refused: {text}" for text in self.refusals)
@@ -115,7 +115,7 @@ class RunReport(Frozen):
             if rehearsed != found:
                 yield f"{what}: {', '.join(rehearsed) or 'none'} rehearsed, {', '.join(found) or 'none'} in the run"
         if self.stops != real.stops:
-            yield f"stops: {self.stops} rehearsed, {real.stops} in the run"
+            yield f"stops and halts: {self.stops} rehearsed, {real.stops} in the run"
         if None not in (self.eeprom_writes, real.eeprom_writes) and self.eeprom_writes != real.eeprom_writes:
             yield f"EEPROM writes: {self.eeprom_writes} rehearsed, {real.eeprom_writes} in the run"
         for name in [*self.axes, *(name for name in real.axes if name not in self.axes)]:
@@ -130,6 +130,7 @@ def _differing(name: str, rehearsed: AxisRun, real: AxisRun) -> Iterator[str]:
         yield f"axis {name}: {rehearsed.motions} motions rehearsed, {real.motions} in the run"
     places = (rehearsed.lowest, rehearsed.highest, real.lowest, real.highest)
     known = [place for place in places if place is not None]
+    late = rehearsed.following_error or 0.0, real.following_error or 0.0
     span = max(known) - min(known) if known else 0.0
     near = PLACE_SHARE * span + max(rehearsed.hunts, real.hunts)
     for number, (planned, found) in enumerate(zip(rehearsed.ends, real.ends, strict=False), 1):
@@ -139,7 +140,7 @@ def _differing(name: str, rehearsed: AxisRun, real: AxisRun) -> Iterator[str]:
                 f" {found:.6g} in the run"
             )
             break
-    passed = near + rehearsed.following_error + real.following_error  # an axis that is late overshoots
+    passed = near + sum(late)  # an axis that is late overshoots
     for what, there, here in (
         ("lowest place", rehearsed.lowest, real.lowest),
         ("highest place", rehearsed.highest, real.highest),
@@ -149,11 +150,11 @@ def _differing(name: str, rehearsed: AxisRun, real: AxisRun) -> Iterator[str]:
         one_is_unknown = (there is None) is not (here is None)
         if one_is_unknown or (there is not None and here is not None and abs(there - here) > passed):
             yield (f"axis {name}: {what} {_told(there)} {rehearsed.unit} rehearsed, {_told(here)} in the run")
-    less, more = sorted((rehearsed.following_error, real.following_error))
+    less, more = sorted(late)
     if more > FOLLOWING_FACTOR * less + FOLLOWING_SHARE * span:
         yield (
-            f"axis {name}: following error up to {rehearsed.following_error:.3g} {rehearsed.unit} rehearsed,"
-            f" {real.following_error:.3g} in the run"
+            f"axis {name}: following error up to {_told(rehearsed.following_error)} {rehearsed.unit} rehearsed,"
+            f" {_told(real.following_error)} in the run"
         )
 
 
@@ -168,7 +169,7 @@ class _Seen:
     way: float = 0.0
     lowest: float | None = None
     highest: float | None = None
-    following_error: float = 0.0
+    following_error: float | None = None
     before: float | None = None
     motions: set[str] = field(default_factory=set)
     ends: list[float] = field(default_factory=list)
@@ -182,7 +183,7 @@ class _Seen:
         self.lowest = value if self.lowest is None else min(self.lowest, value)
         self.highest = value if self.highest is None else max(self.highest, value)
         if self.commanded and position.following_error is not None:
-            self.following_error = max(self.following_error, abs(position.following_error))
+            self.following_error = max(self.following_error or 0.0, abs(position.following_error))
 
 
 class RunWatch:

@@ -71,7 +71,8 @@ class Timeline:
             event = decode_received(CommandEvent, sample.payload, sample.encoding)
             why = f": {event.reason}" if event.reason else ""
             where = "" if event.position is None else f" at {event.position:.6g}"
-            moment = Moment(self._seconds(event.t), f"{event.axis} {event.verb} {event.status}{where}{why}")
+            who = f" by {event.client}" if event.client else ""
+            moment = Moment(self._seconds(event.t), f"{event.axis} {event.verb} {event.status}{who}{where}{why}")
             self._moments.append(moment)
 
     def _seconds(self, at_ns: int) -> float:

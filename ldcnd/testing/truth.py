@@ -1,6 +1,6 @@
 """What is really so on a simulated rig, whatever the daemon says: where shafts are, how they move, what drives hold."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ldcnd.axis.scale import AxisScale
@@ -22,9 +22,8 @@ class Truth:
     """One axis as it is at an instant.
 
     Attributes:
-        position: of the encoder, in axis units: what a daemon that knew everything would publish. Where no daemon
-            knows the place of the axis, by the reference that it had last; without any, from where its drive was first
-            switched on.
+        position: of the shaft, in axis units: what a daemon that knew everything would publish, by the reference that
+            the axis had last, and without any from where its drive was first switched on.
         counts: of the encoder, from where the axis stood when its drive was switched on first.
         load_position: of the load, in axis units: behind the encoder by what the coupling has slipped.
         velocity: in axis units a second, positive forward.
@@ -102,23 +101,18 @@ class Machine:
             self.module.catch_up(now_s)
             self.origin_counts = self.module.shaft.position_counts - self.module.loop.position + scale.origin_counts
 
-    def look(self, now_s: float, place_of: Callable[[float], float] | None) -> Truth:
-        """Return what is so at an instant of the line's clock.
-
-        Args:
-            now_s: the instant.
-            place_of: turns the drive's counter into a published position; None where no daemon knows the place.
-        """
+    def look(self, now_s: float) -> Truth:
+        """Return what is so at an instant of the line's clock."""
         self.chain.pass_until(now_s)  # bytes on their way are the daemon's, in real time too
         module = self.module
         if isinstance(module, SimulatedDrive):
             module.catch_up(now_s)
-            return self._of_servo(module, place_of)
+            return self._of_servo(module)
         return self._of_smartstep(self.unit.drive, now_s)
 
-    def _of_servo(self, drive: SimulatedDrive, place_of: Callable[[float], float] | None) -> Truth:
+    def _of_servo(self, drive: SimulatedDrive) -> Truth:
         loop, shaft, scale = drive.loop, drive.shaft, self.config.signed_counts_per_unit
-        position = place_of(loop.position) if place_of else (shaft.position_counts - self.origin_counts) / scale
+        position = (shaft.position_counts - self.origin_counts) / scale
         speed = shaft.velocity_counts / drive.profile.servo_cycle_s
         energised = drive.stage.drives and (loop.servo_on or loop.pwm != 0)
         gains = loop.gains

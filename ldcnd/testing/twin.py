@@ -82,6 +82,17 @@ def config_of_twin(config: RigConfig, state: RigState) -> RigConfig:
             f" {', '.join(sorted(state.axes))}",
             remedy="give the configuration with which the daemon was started",
         )
+    for bus in config.bus:
+        for axis in bus.axis:
+            given, there = (axis.unit, axis.signed_counts_per_unit), state.axes[axis.name]
+            found = there.unit, there.counts_per_unit
+            if given != found:
+                raise ConfigError(
+                    f"axis {axis.name}: the configuration has {given[1]:g} counts per {given[0]}, the rig that runs"
+                    f" {found[1]:g} per {found[0]}",
+                    axis=axis.name,
+                    remedy="give the configuration with which the daemon was started",
+                )
     if unknown := state.plants.keys() - configured:
         raise ConfigError(
             f"a machine was identified for axis {min(unknown)}, and the rig has {', '.join(sorted(configured))}",
