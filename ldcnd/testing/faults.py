@@ -477,7 +477,7 @@ class RigFaults:
         return name, self._lines[name]
 
     def _on(self, axis: str, name: str, begin: Change, end: Change, start: FaultStart) -> RigFault:
-        _check_names(name, start, FaultStart)
+        _check_names(name, start, FaultStart.__optional_keys__)
         if sum(key in start for key in ("after_s", "at", "when")) > 1:
             raise ValueOutOfRange(f"{axis}: {name}: it begins after_s, at or when; give one of them", value=len(start))
         fault = self._made(f"{axis}: {name}", begin, end)
@@ -498,7 +498,7 @@ class RigFaults:
         return fault
 
     def _of_rig(self, name: str, begin: Change, end: Change, start: FaultSpan) -> RigFault:
-        _check_names(name, start, FaultSpan)
+        _check_names(name, start, FaultSpan.__optional_keys__)
         fault = self._made(name, begin, end)
         self._begin(fault, start)
         return fault
@@ -528,10 +528,10 @@ class RigFaults:
             self._loop.call_later(start["for_s"], fault.end)
 
 
-def _check_names(name: str, start: Mapping[str, object], known: type[FaultSpan]) -> None:
-    unknown = start.keys() - known.__optional_keys__
+def _check_names(name: str, start: Mapping[str, object], known: frozenset[str]) -> None:
+    unknown = start.keys() - known
     if unknown:
-        raise TypeError(f"{name}: there is no {min(unknown)!r}; there are {', '.join(sorted(known.__optional_keys__))}")
+        raise TypeError(f"{name}: there is no {min(unknown)!r}; there are {', '.join(sorted(known))}")
 
 
 def _check_share(name: str, share: float) -> None:

@@ -98,18 +98,16 @@ def _asked_for(request: pytest.FixtureRequest) -> tuple[Path, int | None, float]
     """Return the configuration, the seed and the longest time of the marker of a test."""
     from ldcnd.config.rig import example  # noqa: PLC0415 - see above
 
-    def asked(file: Path | str | None = None, *, seed: int | None = None, within_s: float = WITHIN_S) -> None:
-        nonlocal answer
-        answer = request.path.parent / file if file else example(EXAMPLE), seed, within_s
+    def asked(
+        file: Path | str | None = None, *, seed: int | None = None, within_s: float = WITHIN_S
+    ) -> tuple[Path, int | None, float]:
+        return request.path.parent / file if file else example(EXAMPLE), seed, within_s
 
-    answer: tuple[Path, int | None, float] = (example(EXAMPLE), None, WITHIN_S)
     marker = request.node.get_closest_marker(RIG)
-    if marker:
-        try:
-            asked(*marker.args, **marker.kwargs)
-        except TypeError as error:
-            pytest.fail(f"@pytest.mark.ldcnd_rig: {str(error).partition(') ')[2]}", pytrace=False)
-    return answer
+    try:
+        return asked(*marker.args, **marker.kwargs) if marker else asked()
+    except TypeError as error:
+        pytest.fail(f"@pytest.mark.ldcnd_rig: {str(error).partition(') ')[2]}", pytrace=False)
 
 
 ldcnd_rig = _async_fixture(_rig)
