@@ -10,8 +10,8 @@ from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.sending import Shown, derived_question
 from ldcnd.cli.typed import Finite, NewFile, force_option
+from ldcnd.client.events import fetch_wire_log
 from ldcnd.client.rig_client import RigClient
-from ldcnd.client.wire_log import FetchedWireLog, fetch_wire_log
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, read_whole
 from ldcnd.contract.rig_commands import (
@@ -21,12 +21,12 @@ from ldcnd.contract.rig_commands import (
     SetIoTimer,
     Snapshot,
     SnapshotReply,
+    WireLogReply,
 )
 from ldcnd.daemon.capture import config_of
 from ldcnd.drives.known import FAMILIES
-from ldcnd.drives.transcript import Describe
 from ldcnd.line.capture import Capture, CaptureHeader, capture_lines, parse_capture
-from ldcnd.line.flight_recorder import WireEvent, WireRecord, parse_records
+from ldcnd.line.flight_recorder import Describe, WireEvent, WireRecord, parse_records
 
 TEXT, WORDS, PCAPNG = FORMATS = ("text", "words", "pcapng")
 
@@ -163,8 +163,8 @@ def wire_log(target: Target, bus: str, seconds: float, form: str | None, out: Pa
     """
     log, header, describe = target.run(lambda client: _fetch(client, bus, seconds))
     _render(Capture(header, parse_records(log.lines)), describe, form, out, as_json=target.as_json)
-    if log.lost:
-        click.echo(f"{log.lost} records were overwritten while they were fetched", err=True)
+    if lost := log.next_record - log.first_record - len(log.lines):
+        click.echo(f"{lost} records were overwritten while they were fetched", err=True)
 
 
 @command.command("convert")
@@ -201,7 +201,7 @@ def _render(capture: Capture, describe: Describe, form: str | None, out: Path | 
         click.echo(text)
 
 
-async def _fetch(client: RigClient, bus: str, seconds: float) -> tuple[FetchedWireLog, CaptureHeader, Describe]:
+async def _fetch(client: RigClient, bus: str, seconds: float) -> tuple[WireLogReply, CaptureHeader, Describe]:
     log = await fetch_wire_log(client, bus, seconds)
     daemon = await client.daemon()
     line = next(line for line in await client.buses() if line.bus == bus)
@@ -212,9 +212,9 @@ async def _fetch(client: RigClient, bus: str, seconds: float) -> tuple[FetchedWi
         port=line.port,
         baud=line.baud,
         instance=daemon.instance,
-        zero_ns=log.zero_ns,
-        started_s=log.started_s,
-        until_s=log.now_s,
+        zero_ns=log.zero,
+        started_s=log.started,
+        until_s=log.now,
         first_record=log.first_record,
     )
     models = {axis.address: axis.model for axis in await client.axes() if axis.bus == bus}

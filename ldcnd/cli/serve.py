@@ -13,7 +13,7 @@ import click
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.output import on_end
 from ldcnd.cli.typed import CONSOLE_ADDRESS, WholeNumber, address_option, parsed_address
-from ldcnd.client.health import health_reports
+from ldcnd.client.overview import health_reports
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.errors import ConfigError, UnknownAxis

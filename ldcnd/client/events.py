@@ -1,6 +1,7 @@
-"""The events of a rig without gaps: what the network drops is fetched from the daemon's memory.
+"""What a daemon remembers, page by page: events without gaps, and the records of a line.
 
-An event has a number, so a gap is seen when the next one comes, and at the latest at the next query of the daemon.
+What the network drops of events is fetched from the daemon's memory. An event has a number, so a gap is seen when the
+next one comes, and at the latest at the next query of the daemon.
 """
 
 import asyncio
@@ -13,6 +14,7 @@ from ldcnd.contract.codec import decode_received
 from ldcnd.contract.errors import OutcomeUnknown, SessionError
 from ldcnd.contract.events import CommandEvent, EventList, ReadEvents
 from ldcnd.contract.keys import EVENT
+from ldcnd.contract.rig_commands import ReadWireLog, WireLogReply
 from ldcnd.net.session import Publication, SampleKind
 
 CHECK_PERIOD_S = 2.0
@@ -153,3 +155,19 @@ async def latest_events(client: RigClient, count: int, axis: str | None = None) 
         events += page.events
         at = page.next_number
     return events[-count:]
+
+
+async def fetch_wire_log(client: RigClient, bus: str, seconds: float) -> WireLogReply:
+    """Fetch the last seconds of a line up to now as one reply; what happens while its pages travel is left out.
+
+    Records that were overwritten meanwhile are missing: then there are fewer lines than numbers.
+
+    Raises:
+        LdcndError: as the daemon refused it, of the same class.
+    """
+    first = page = await client.ask(ReadWireLog(bus=bus, seconds=seconds))
+    end, lines = first.end_record, list(first.lines)
+    while page.next_record < end:
+        page = await client.ask(ReadWireLog(bus=bus, seconds=seconds, from_record=page.next_record))
+        lines += page.lines[: max(0, end - page.first_record)]
+    return first.model_copy(update={"lines": tuple(lines), "next_record": end})

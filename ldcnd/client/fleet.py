@@ -2,7 +2,7 @@
 
 import asyncio
 
-from ldcnd.client.health import last_bus_health, last_health
+from ldcnd.client.overview import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient, daemons, find_rigs
 from ldcnd.contract.condition import Condition, assess, line_troubles
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown

@@ -13,8 +13,8 @@ from ldcnd.drives.cost import LineTiming
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.line_plan import Poll, Urgent, in_time
 from ldcnd.drives.network import Network
-from ldcnd.drives.transcript import Describe
 from ldcnd.line.bus import Bus
+from ldcnd.line.flight_recorder import Describe
 from ldcnd.line.settings import BusSettings, ServoCycle
 from ldcnd.line.transport import Opener
 

@@ -8,7 +8,7 @@ text instead of bytes. A line that is empty or starts with a number sign is a co
 from array import array
 from bisect import bisect_left
 from collections import deque
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from itertools import accumulate, islice
@@ -297,3 +297,22 @@ class BusStatistics:
     def counters(self) -> dict[str, int]:
         """Return what is published of the line; slotted here, because every exchange counts."""
         return {name: getattr(self, name) for name in LineCounters.model_fields}
+
+
+Describe = Callable[[WireRecord], str]
+"""Puts a record into words; empty where there are none."""
+
+
+class Parts:
+    """Puts replies of a recorded line together that were delivered in pieces."""
+
+    def __init__(self) -> None:
+        self._before = b""
+
+    def whole(self, record: WireRecord) -> bytes:
+        """Return the record's bytes behind those of the parts before it; of a part alone, nothing."""
+        before, self._before = self._before, b""
+        if record.event is WireEvent.PART:
+            self._before = before + record.data
+            return b""
+        return before + record.data if record.event is WireEvent.RECEIVED else record.data

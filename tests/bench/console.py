@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 
 from websockets.asyncio.client import ClientConnection
 
-from ldcnd.client.health import health_reports
+from ldcnd.client.overview import health_reports
 from ldcnd.contract.health import BusHealth
 from tests.bench.processes import LINE_CPU, SUBJECT_CPU, free_endpoint, process
 from tests.bench.report import Row

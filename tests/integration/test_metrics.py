@@ -8,7 +8,7 @@ from asyncio.subprocess import PIPE
 import pytest
 from prometheus_client import CollectorRegistry
 
-from ldcnd.client.health import health_reports
+from ldcnd.client.overview import health_reports
 from ldcnd.lab.metrics import HealthCollector
 from ldcnd.version import version
 from tests.support.process import LDCND, ROOT, daemon

@@ -10,7 +10,7 @@ import zenoh
 from mcap.reader import make_reader
 
 from ldcnd.client.events import follow_events
-from ldcnd.client.health import health_reports
+from ldcnd.client.overview import health_reports
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config

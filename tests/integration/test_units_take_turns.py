@@ -10,7 +10,7 @@ import pytest
 from ldcnd.contract.samples import MonitorName
 from ldcnd.drives.cost import Cost
 from ldcnd.drives.line_plan import LinePlan, Poll, Urgent, plan_line
-from ldcnd.drives.smartstep.costs import words_of
+from ldcnd.drives.smartstep.family import words_of
 from ldcnd.drives.smartstep.monitors import OUTPUT_SIGNALS, SPEED_FEEDBACK, WORDS
 from ldcnd.drives.smartstep.poller import Basic, Item, Listeners, UnitPoller
 from ldcnd.drives.smartstep.profiles import SMARTSTEP

@@ -35,10 +35,9 @@ from ldcnd.drives.family import Demand, Family, OpenLine, UnopenedLine, bus_sett
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.line_plan import Poll, Urgent
 from ldcnd.drives.network import BringUpReport, Network
-from ldcnd.drives.transcript import Describe
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
-from ldcnd.line.flight_recorder import WireRecord
+from ldcnd.line.flight_recorder import Describe, WireRecord
 from ldcnd.line.port_url import port_opener
 from ldcnd.line.transport import Opener
 

@@ -12,7 +12,7 @@ from ldcnd.drives.ldcn.commands import Node
 from ldcnd.drives.ldcn.family import price_list
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S, actual_baud, baud_divisor
-from ldcnd.drives.smartstep.costs import price_list as smartstep_price_list
+from ldcnd.drives.smartstep.family import price_list as smartstep_price_list
 from ldcnd.drives.smartstep.parameters import PN000
 from ldcnd.line.exchange import Exchange
 from ldcnd.line.settings import LINGER_S

@@ -14,9 +14,8 @@ from ldcnd.contract.health import Finding
 from ldcnd.drives.family import UnopenedLine
 from ldcnd.drives.smartstep.commands import FLUSH
 from ldcnd.drives.smartstep.config import SmartStepBusConfig
-from ldcnd.drives.smartstep.costs import BAUD
 from ldcnd.drives.smartstep.drive import SmartStepAxis
-from ldcnd.drives.smartstep.family import SMARTSTEP, open_smartstep_line
+from ldcnd.drives.smartstep.family import BAUD, SMARTSTEP, open_smartstep_line
 from ldcnd.drives.smartstep.network import smartstep_opener
 from ldcnd.drives.smartstep.profiles import Framing, SmartStepProfile
 from ldcnd.line.bus import Bus

@@ -33,8 +33,8 @@ from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory
 from ldcnd.drives.ldcn.transcript import LdcnTranscript
 from ldcnd.drives.line_plan import Poll, Urgent
 from ldcnd.drives.response_times import PeriodicTask
-from ldcnd.drives.transcript import Describe
 from ldcnd.line.exchange import Exchange
+from ldcnd.line.flight_recorder import Describe
 from ldcnd.line.port_url import SOCKET, port_opener
 from ldcnd.line.settings import ServoCycle
 from ldcnd.line.transport import Opener

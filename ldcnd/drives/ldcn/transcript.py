@@ -17,8 +17,7 @@ from ldcnd.drives.ldcn.packet import (
 from ldcnd.drives.ldcn.pic_io import IoItem, IoStatus, decode_io_status
 from ldcnd.drives.ldcn.profiles import LS_182AP, DeviceKind, Profile, identify
 from ldcnd.drives.ldcn.received import DefineStatus, HardReset, PlainCommand, ReadStatus, interpret_bytes
-from ldcnd.drives.transcript import Parts
-from ldcnd.line.flight_recorder import WireEvent, WireRecord
+from ldcnd.line.flight_recorder import Parts, WireEvent, WireRecord
 
 
 class LdcnTranscript:

@@ -1,34 +1,48 @@
-"""The family of SmartSteps: from the configuration of a line to its bus and its plan."""
+"""The family of SmartSteps: from the configuration of a line to its bus and its plan.
+
+An exchange is 14 characters each way at 9600 baud, and a wait of which only the maximum is known.
+Source: manual 2.1 "Basic specifications", 2.2.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 from typing_extensions import override
 
-from ldcnd.drives.cost import Cost, LineTiming, cost_of
+from ldcnd.contract.samples import MonitorName, TelemetryItem
+from ldcnd.drives.cost import Cost, LineTiming, PriceList, cost_of
 from ldcnd.drives.driver import AxisSpec
 from ldcnd.drives.family import Demand, Family, HasParameterFiles, OpenLine, UnopenedLine, bus_settings
 from ldcnd.drives.line_plan import Poll, Urgent
+from ldcnd.drives.smartstep import commands
+from ldcnd.drives.smartstep.addresses import TRACE_1_AREA, OperatingMode, TraceRegister
 from ldcnd.drives.smartstep.config import SmartStepAxisConfig, SmartStepBusConfig
-from ldcnd.drives.smartstep.costs import BAUD, price_list, words_of
 from ldcnd.drives.smartstep.drive import UnitSpec
 from ldcnd.drives.smartstep.ledger import EepromLedger
-from ldcnd.drives.smartstep.monitors import HISTORY_LENGTH
+from ldcnd.drives.smartstep.monitors import COUNTERS, HISTORY_LENGTH
 from ldcnd.drives.smartstep.network import smartstep_line, smartstep_opener
 from ldcnd.drives.smartstep.packet import SmartStepTranscript
 from ldcnd.drives.smartstep.parameter_store import EepromRules
 from ldcnd.drives.smartstep.parameters import PARAMETERS, digit_texts
-from ldcnd.drives.smartstep.poller import Basic, Item
+from ldcnd.drives.smartstep.poller import BASIC_WORDS, Basic, Item
 from ldcnd.drives.smartstep.profiles import SMARTSTEP as PROFILE
 from ldcnd.drives.smartstep.profiles import Echo, Framing, SmartStepProfile
 from ldcnd.drives.smartstep.transfer import check_values, listed
-from ldcnd.drives.transcript import Describe
+from ldcnd.line.exchange import Exchange
+from ldcnd.line.flight_recorder import Describe
 from ldcnd.line.port_url import port_opener
 from ldcnd.line.transport import Framing as SerialFraming
 from ldcnd.line.transport import Opener
 
+BAUD = 9600
+COUNTER_WORDS = 3
+"""High half, low half, high half again."""
+ANY_UNIT = 1
+"""The price is the same for every unit."""
 LEDGER_FILE = "eeprom-writes.json"
 ALARM_HISTORY_HZ = HISTORY_LENGTH / 60
 """One word a turn: an alarm that came and went between two readings of the state is found within a minute."""
@@ -158,10 +172,10 @@ def _polls(bus: SmartStepBusConfig, timing: LineTiming) -> list[Poll]:
 def _urgent(bus: SmartStepBusConfig, timing: LineTiming) -> Urgent:
     """Return what goes before polls: the exchanges of commissioning and traces; nothing on this line stops a motor."""
     prices = [price_list(_planned(axis)) for axis in bus.axis]
-    commands = [cost_of(exchange, timing) for price in prices for exchange in price.commands.values()]
+    costs = [cost_of(exchange, timing) for price in prices for exchange in price.commands.values()]
     flush_s = len(prices[0].flush) * timing.bits_per_byte / timing.host_baud
     return Urgent(
-        command_s=max(command.longest_s for command in commands),
+        command_s=max(cost.longest_s for cost in costs),
         stop_s=0.0,
         recovery_s=flush_s + prices[0].settle_s,
         margin_s=bus.margin_ms / 1000,
@@ -180,3 +194,37 @@ def _times(words: int, cost: Cost) -> Cost:
         overhead_s=words * cost.overhead_s,
         ends_early=False,
     )
+
+
+def price_list(profile: SmartStepProfile = PROFILE) -> PriceList:
+    """Return the exchanges of a drive; a reading is one word, for any item."""
+    chunk = commands.string_reference(ANY_UNIT, TRACE_1_AREA[0], profile.trace_chunk_bytes, profile)
+    exchanges: dict[str, Exchange[Any]] = {
+        "read word": commands.reference(ANY_UNIT, 0),
+        "write trace register": commands.write_trace_register(ANY_UNIT, next(iter(TraceRegister)), 0),
+        "set operating mode": commands.set_operating_mode(ANY_UNIT, OperatingMode.NORMAL),
+        "probe": commands.probe(ANY_UNIT),
+        f"read string of {profile.trace_chunk_bytes} bytes": chunk,
+    }
+    return PriceList(
+        node_baud=float(BAUD),
+        reading=partial(_reading, profile),
+        commands=MappingProxyType(
+            {name: commands.with_response_time(exchange, profile) for name, exchange in exchanges.items()}
+        ),
+        probe=commands.with_response_time(commands.probe(ANY_UNIT), profile),
+        stop=None,
+        flush=commands.FLUSH,
+        settle_s=profile.quiet_s,
+    )
+
+
+def words_of(item: Item) -> int:
+    """Return how many words an item is; a counter near a carry takes more."""
+    if isinstance(item, MonitorName):
+        return COUNTER_WORDS if item in COUNTERS else 1
+    return len(BASIC_WORDS[item]) if item in BASIC_WORDS else COUNTER_WORDS
+
+
+def _reading(profile: SmartStepProfile, _items: frozenset[TelemetryItem]) -> Exchange[Any]:
+    return commands.with_response_time(commands.reference(ANY_UNIT, 0), profile)

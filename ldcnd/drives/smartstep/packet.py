@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from ldcnd.contract.errors import BadReply, ValueOutOfRange
-from ldcnd.drives.transcript import Parts
-from ldcnd.line.flight_recorder import WireEvent, WireRecord
+from ldcnd.line.flight_recorder import Parts, WireEvent, WireRecord
 
 PACKET_CHARACTERS = 14
 START = b"W"

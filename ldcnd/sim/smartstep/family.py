@@ -9,7 +9,7 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import ConfigError
 from ldcnd.drives.smartstep.config import SmartStepBusConfig
-from ldcnd.drives.smartstep.costs import BAUD
+from ldcnd.drives.smartstep.family import BAUD
 from ldcnd.drives.smartstep.network import smartstep_opener
 from ldcnd.drives.smartstep.packet import HIGHEST_UNIT, CommandCutter
 from ldcnd.drives.smartstep.profiles import Echo
