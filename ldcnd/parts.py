@@ -1,6 +1,7 @@
 """Parts that are not everywhere: the wings of ldcnd, packages of others that an extra brings, signals of POSIX."""
 
 import asyncio
+import importlib.metadata
 import signal
 from collections.abc import Callable
 from importlib.util import find_spec
@@ -12,6 +13,7 @@ EXTRAS = {
     "cryptography": ("cryptography", "ops"),
     "frappy": ("frappy-core", "secop"),
     "foxglove": ("foxglove-sdk", "foxglove"),
+    "gpiod": ("gpiod", "gpio"),
     "markdown_it": ("markdown-it-py", "console"),
     "matplotlib": ("matplotlib", "plot"),
     "mcap": ("mcap", "lab"),
@@ -19,13 +21,21 @@ EXTRAS = {
     "p4p": ("p4p", "epics-pva"),
     "prometheus_client": ("prometheus-client", "lab"),
     "pyarrow": ("pyarrow", "parquet"),
+    "pytest_asyncio": ("pytest-asyncio", "testing"),
     "segno": ("segno", "console"),
     "starlette": ("starlette", "console"),
     "textual": ("textual", "tui"),
     "uvicorn": ("uvicorn", "console"),
+    "uvloop": ("uvloop", "fast"),
     "websockets": ("websockets", "console"),
 }
 """By the name of its module: a package, and the extra of ldcnd that brings it."""
+DEBIAN = {
+    "ldcnd": ("console", "fast", "gpio", "journal", "lab", "ops", "tui"),
+    "ldcnd-tuning": ("bench", "plot"),
+    "ldcnd-bridges": ("bluesky", "epics", "epics-pva", "foxglove", "parquet", "secop"),
+}
+"""Debian packages, each upon those before it, with the extras that it brings."""
 
 
 def require(*modules: str) -> None:
@@ -39,8 +49,22 @@ def require(*modules: str) -> None:
     """
     for module in modules:
         if find_spec(module) is None:
-            package, extra = EXTRAS[module]
-            raise ConfigError(f"{package} is not installed", remedy=f"pip install 'ldcnd[{extra}]'")
+            raise missing(module)
+
+
+def missing(module: str) -> ConfigError:
+    """Return what to say when an optional package is not there: how to get it depends on how ldcnd came here.
+
+    Args:
+        module: of `EXTRAS`.
+    """
+    package, extra = EXTRAS[module]
+    remedy = f"pip install 'ldcnd[{extra}]'"
+    # who has installed it is recorded beside it (Python packaging user guide, "Recording installed projects")
+    if (importlib.metadata.distribution("ldcnd").read_text("INSTALLER") or "").strip() == "debian":
+        debian = next((name for name, extras in DEBIAN.items() if extra in extras), None)
+        remedy = f"apt install {debian}, or dpkg -i its file" if debian else f"use an ldcnd of pip, with its {extra}"
+    return ConfigError(f"{package} is not installed", remedy=remedy)
 
 
 def missing_wing(error: ModuleNotFoundError) -> ConfigError | None:

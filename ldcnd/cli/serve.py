@@ -17,7 +17,7 @@ from ldcnd.client.overview import health_reports
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.errors import ConfigError, UnknownAxis
-from ldcnd.contract.samples import FaultSample, ShadowSample, StateSample, TelemetryItem
+from ldcnd.contract.samples import FaultSample, PositionSample, ShadowSample, StateSample, TelemetryItem
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import configure_logging
 from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, ZenohSettings, endpoint_of
@@ -143,6 +143,7 @@ async def _serve_metrics(client: RigClient, address: ListenAddress) -> None:
             client.samples(item=TelemetryItem.SHADOW) as shadows,
             client.samples(item=TelemetryItem.STATE) as states,
             client.samples(item=TelemetryItem.FAULT) as faults,
+            client.samples(item=TelemetryItem.POSITION) as positions,
             metrics_server(registry, address.host, address.port) as port,
             asyncio.TaskGroup() as group,
         ):
@@ -151,7 +152,8 @@ async def _serve_metrics(client: RigClient, address: ListenAddress) -> None:
             for axis, fault in (await client.faults()).items():
                 collector.take_state(axis, fault)
             following = [
-                group.create_task(_follow(samples, collector), name="samples") for samples in (shadows, states, faults)
+                group.create_task(_follow(samples, collector), name="samples")
+                for samples in (shadows, states, faults, positions)
             ]
             click.echo(f"metrics on http://{address.in_url}:{port}/metrics")
             await ending.wait()
@@ -168,6 +170,8 @@ async def _follow(samples: Samples, collector: "HealthCollector") -> None:
             collector.take_shadow(axis, sample)
         elif isinstance(sample, StateSample | FaultSample):
             collector.take_state(axis, sample)
+        elif isinstance(sample, PositionSample):
+            collector.take_position(axis, sample)
 
 
 EPICS_ADDRESS = "127.0.0.1:5064"

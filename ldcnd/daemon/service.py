@@ -28,6 +28,7 @@ from ldcnd.daemon.reload import Reloader
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.systemd import Notifier
 from ldcnd.log import get_logger
+from ldcnd.parts import missing
 
 log = get_logger("service")
 
@@ -43,7 +44,7 @@ def loop_factory(*, uvloop: bool) -> LoopFactory:
         try:
             import uvloop as fast  # noqa: PLC0415 - an optional package
         except ImportError:
-            log.warning("no uvloop", remedy="install ldcnd[fast], or set uvloop = false")
+            log.warning("no uvloop", remedy=f"{missing('uvloop').remedy}, or set uvloop = false")
         else:
             return _finely_timed(fast.Loop)
     return asyncio.new_event_loop

@@ -17,7 +17,15 @@ from prometheus_client.registry import Collector
 
 from ldcnd.contract.condition import Place, assess
 from ldcnd.contract.health import BusHealth, DaemonHealth
-from ldcnd.contract.samples import FaultSample, LinkState, ShadowSample, StateSample
+from ldcnd.contract.samples import (
+    AxisState,
+    FaultSample,
+    LinkState,
+    PositionSample,
+    Quality,
+    ShadowSample,
+    StateSample,
+)
 from ldcnd.version import version
 
 SHORTEST_LATENCY_S = 64e-6
@@ -45,6 +53,8 @@ class HealthCollector(Collector):
         self._shadows: dict[str, tuple[float, ShadowSample]] = {}
         self._states: dict[str, tuple[float, StateSample]] = {}
         self._faults: dict[str, FaultSample] = {}
+        self._positions: dict[str, PositionSample] = {}
+        self._counts: dict[str, int] = {}
 
     def take(self, report: DaemonHealth | BusHealth) -> None:
         """Replace the report that came before."""
@@ -63,6 +73,13 @@ class HealthCollector(Collector):
             self._states = {**self._states, axis: (self._now_s(), sample)}
         else:
             self._faults = {**self._faults, axis: sample}
+
+    def take_position(self, axis: str, sample: PositionSample) -> None:
+        """Add what an axis has travelled since the sample before, without a gap or a doubtful value between them."""
+        before = self._positions.get(axis, sample)
+        if sample.quality is before.quality is Quality.GOOD and sample.seq - before.seq <= 1:
+            self._counts = {**self._counts, axis: self._counts.get(axis, 0) + abs(sample.counts - before.counts)}
+        self._positions[axis] = sample
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics; those of reports that have stopped coming are left out."""
@@ -162,6 +179,12 @@ class HealthCollector(Collector):
         control = GaugeMetricFamily(
             "ldcnd_axis_control", "1 with who controls or moves an axis as a label", labels=[*labels, "control"]
         )
+        state_is = GaugeMetricFamily("ldcnd_axis_state", "1 for the state of an axis", labels=[*labels, "state"])
+        referenced = GaugeMetricFamily("ldcnd_axis_referenced", "1 while its position is valid", labels=labels)
+        latched = GaugeMetricFamily("ldcnd_axis_stop_latched", "1 from a stop until reset", labels=labels)
+        pending = GaugeMetricFamily(
+            "ldcnd_axis_stop_pending", "1 while a stop is not confirmed by the drive", labels=labels
+        )
         down = {axis.axis for bus in buses if not bus.up for axis in bus.axes}
         since_s = self._now_s() - FRESH_S
         for axis, (at_s, state) in self._states.items():
@@ -173,7 +196,20 @@ class HealthCollector(Collector):
                 condition.add_metric([self._rig, axis, note], 1.0)
             if now.control:
                 control.add_metric([self._rig, axis, now.control], 1.0)
-        yield from (known, severity, condition, control)
+            if silence or axis in down:
+                continue  # the last state of an axis that is not heard is not its state
+            for each in AxisState:
+                state_is.add_metric([self._rig, axis, each.value], float(state.state is each))
+            if state.has_reference:
+                referenced.add_metric([self._rig, axis], float(state.referenced))
+            latched.add_metric([self._rig, axis], float(state.stop_latched))
+            pending.add_metric([self._rig, axis], float(state.stop_pending))
+        travelled = CounterMetricFamily(
+            "ldcnd_axis_travelled_counts", "Encoder counts travelled since this exporter began", labels=labels
+        )
+        for axis, counts in self._counts.items():
+            travelled.add_metric([self._rig, axis], counts)
+        yield from (known, severity, condition, control, state_is, referenced, latched, pending, travelled)
 
     def _of_shadows(self) -> Iterator[Metric]:
         labels = ["rig", "axis", "figure"]

@@ -8,6 +8,7 @@ import serial
 from typing_extensions import override
 
 from ldcnd.contract.errors import ConfigError
+from ldcnd.parts import missing
 
 
 class Output(ABC):
@@ -95,9 +96,8 @@ class GpioLine(Output):
             import gpiod  # noqa: PLC0415 - an optional package
             from gpiod.line import Direction, Value  # noqa: PLC0415 - as above
         except ImportError:
-            raise ConfigError(
-                f"heartbeat.gpio: {name} needs the bindings of libgpiod", value=name, remedy="pip install ldcnd[gpio]"
-            ) from None
+            why = missing("gpiod")
+            raise ConfigError(f"heartbeat.gpio: {name}: {why.message}", value=name, remedy=why.remedy) from None
         chip, _, number = name.partition(":")
         self._levels = (Value.INACTIVE, Value.ACTIVE)
         self._number = int(number)

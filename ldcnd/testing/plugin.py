@@ -69,10 +69,12 @@ def _async_fixture(function: Callable[..., AsyncIterator[Any]]) -> Any:  # noqa:
     except ModuleNotFoundError:
 
         @pytest.fixture(name=RIG)
-        def missing() -> None:
-            pytest.fail("the fixture ldcnd_rig needs pytest-asyncio 1.4 or later: pip install 'ldcnd[testing]'")
+        def unavailable() -> None:
+            from ldcnd.parts import missing  # noqa: PLC0415 - see above
 
-        return missing
+            pytest.fail(f"the fixture ldcnd_rig needs pytest-asyncio 1.4 or later: {missing('pytest_asyncio').remedy}")
+
+        return unavailable
     return pytest_asyncio.fixture(name=RIG)(function)
 
 

@@ -223,7 +223,7 @@ def test_a_missing_library_is_named(monkeypatch):
 
     monkeypatch.setitem(sys.modules, "gpiod", None)
 
-    with pytest.raises(ConfigError, match="gpiochip0:17 needs the bindings of libgpiod"):
+    with pytest.raises(ConfigError, match="gpiochip0:17: gpiod is not installed"):
         open_output(HeartbeatConfig(gpio="gpiochip0:17"))
 
 

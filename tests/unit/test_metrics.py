@@ -2,14 +2,26 @@
 
 import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import promql_parser
 import pytest
+import yaml
 from prometheus_client import CollectorRegistry, generate_latest
 
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth, StopWaitHealth
-from ldcnd.contract.samples import LinkState, Quality, ShadowFigure, ShadowSample
+from ldcnd.contract.samples import (
+    AxisState,
+    LinkState,
+    Moving,
+    PositionSample,
+    Quality,
+    ShadowFigure,
+    ShadowSample,
+    StateSample,
+)
 from ldcnd.lab.metrics import SHADOW_FRESH_S, HealthCollector
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
@@ -59,12 +71,29 @@ SHADOW = ShadowSample(
 )
 
 
+LATCHED = StateSample(
+    t=0, t_error_ns=0, seq=0, quality=Quality.GOOD, state=AxisState.STANDSTILL, enabled=True, referenced=False,
+    moving=Moving.NO, link=LinkState.UP, stop_latched=True, command=None,
+)  # fmt: skip
+
+
+def position(seq: int, counts: int, quality: Quality = Quality.GOOD) -> PositionSample:
+    return PositionSample(
+        t=seq, t_error_ns=0, seq=seq, quality=quality, value=counts, unit="count", counts=counts, following_error=None
+    )
+
+
 @pytest.fixture
 def registry(clock) -> CollectorRegistry:
     collector = HealthCollector("sim", clock)
     collector.take(DAEMON)
     collector.take(BUS)
     collector.take_shadow("x", SHADOW)
+    collector.take_state("x", LATCHED)
+    for seq, counts in enumerate((0, 40, 10)):
+        collector.take_position("x", position(seq, counts))
+    collector.take_position("x", position(5, 1000))  # over a gap
+    collector.take_position("x", position(6, 0, Quality.BAD))  # and a value that is none
     registry = CollectorRegistry()
     registry.register(collector)
     return registry
@@ -100,6 +129,12 @@ def registry(clock) -> CollectorRegistry:
         ("ldcnd_axis_sample_age_seconds", {"bus": "line0", "axis": "y"}, None),
         ("ldcnd_axis_rate_hertz", {"bus": "line0", "axis": "x"}, 19.5),
         ("ldcnd_axis_faults", {"bus": "line0", "axis": "x"}, 2.0),
+        ("ldcnd_axis_state", {"axis": "x", "state": "standstill"}, 1.0),
+        ("ldcnd_axis_state", {"axis": "x", "state": "disabled"}, 0.0),
+        ("ldcnd_axis_referenced", {"axis": "x"}, 0.0),
+        ("ldcnd_axis_stop_latched", {"axis": "x"}, 1.0),
+        ("ldcnd_axis_stop_pending", {"axis": "x"}, 0.0),
+        ("ldcnd_axis_travelled_counts_total", {"axis": "x"}, 70.0),
         ("ldcnd_shadow_value", {"axis": "x", "figure": "friction"}, 3.2),
         ("ldcnd_shadow_usual", {"axis": "x", "figure": "friction"}, 2.0),
         ("ldcnd_shadow_high", {"axis": "x", "figure": "friction"}, 2.5),
@@ -116,7 +151,12 @@ def test_reports_that_stop_coming_are_not_shown_as_if_they_were_true(registry, c
 
     samples = [line for line in generate_latest(registry).decode().splitlines() if not line.startswith("#")]
 
-    assert [line for line in samples if not line.startswith("ldcnd_build_info")] == ['ldcnd_daemon_up{rig="sim"} 0.0']
+    assert [line for line in samples if not line.startswith(("ldcnd_build_info", "ldcnd_axis_travelled"))] == [
+        'ldcnd_daemon_up{rig="sim"} 0.0',
+        'ldcnd_axis_place_known{axis="x",rig="sim"} 0.0',
+        'ldcnd_axis_severity{axis="x",rig="sim"} 3.0',
+        'ldcnd_axis_condition{axis="x",condition="daemon silent",rig="sim"} 1.0',
+    ]
 
 
 @pytest.mark.parametrize("name", ["alerts.yml", "dashboard.json"])
@@ -159,6 +199,47 @@ def test_every_expression_is_promql_and_selects_by_labels_that_exist(registry, n
     assert len(found) >= len(expressions(name)) > 8
     for metric, used in found:
         assert used <= labels[metric], metric
+
+
+@pytest.mark.system
+@pytest.mark.skipif(not shutil.which("promtool"), reason="no promtool: apt-get install prometheus")
+def test_alerts_fire_when_they_should(tmp_path):
+    def series(name: str, values: str, **labels: str) -> dict[str, str]:
+        given = ",".join(f'{label}="{value}"' for label, value in {"rig": "sim", "axis": "x", **labels}.items())
+        return {"series": f"{name}{{{given}}}", "values": values}
+
+    def fires(alert: str, at: str, *, expected: bool) -> dict[str, object]:
+        labels = {"rig": "sim", "axis": "x"}
+        found = [{"exp_labels": labels | {"severity": "critical" if "Reference" in alert else "warning"}}]
+        return {"eval_time": at, "alertname": alert, "exp_alerts": found if expected else []}
+
+    rules = tmp_path / "alerts.yml"
+    rules.write_text(re.sub(r"(?m)^ +annotations: .*\n", "", (GRAFANA / "alerts.yml").read_text()))
+    tests = [
+        {
+            "interval": "10s",
+            "input_series": [
+                series("ldcnd_axis_referenced", "1x30 0x30"),
+                series("ldcnd_axis_stop_latched", "0x10 1x100"),
+                series("ldcnd_axis_travelled_counts_total", "0x30 0+500x30"),
+                series("ldcnd_axis_state", "1x60", state="disabled"),
+                series("ldcnd_axis_state", "0x60", state="error_stop"),
+            ],
+            "alert_rule_test": [
+                fires("LdcndReferenceLost", "4m", expected=False),
+                fires("LdcndReferenceLost", "7m", expected=True),
+                fires("LdcndStopLatched", "5m", expected=False),
+                fires("LdcndStopLatched", "15m", expected=True),
+                fires("LdcndMovesWithoutPower", "4m", expected=False),
+                fires("LdcndMovesWithoutPower", "8m", expected=True),
+            ],
+        }
+    ]
+    (tmp_path / "tests.yml").write_text(yaml.safe_dump({"rule_files": ["alerts.yml"], "tests": tests}))
+
+    for command in (["check", "rules", str(GRAFANA / "alerts.yml")], ["test", "rules", str(tmp_path / "tests.yml")]):
+        done = subprocess.run(["promtool", *command], capture_output=True, text=True, timeout=30, check=False)  # noqa: S603, S607
+        assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_every_alert_has_a_severity_and_a_summary():
