@@ -5,6 +5,7 @@ import contextlib
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from contextlib import AbstractAsyncContextManager, AsyncExitStack, asynccontextmanager
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, ParamSpec, Protocol, TypeVar
 
@@ -182,6 +183,7 @@ class SimulatedRig:
         self._life = _Life()
         self._serving: asyncio.Task[None] | None = None
         self._runs = 0
+        self._leases = count(1)  # the clock may stand between two of them
         self._errands: set[asyncio.Task[None]] = set()
         self._machines = {
             axis.name: Machine(axis, bus.name, lines[bus.name], place)
@@ -330,7 +332,7 @@ class SimulatedRig:
         }  # fmt: skip
         async with self.network.session(overhear=self._overheard) as session:
             self._daemon = build_daemon(
-                config, session, self._now_ns, f"run{self._runs}", openers, lambda: f"lease-{self._loop.time():.9f}"
+                config, session, self._now_ns, f"run{self._runs}", openers, lambda: f"lease-{self._runs}-{next(self._leases)}"
             )
             for name, axis in self._daemon.rig.axes.items():
                 axis.tracker.watch(partial(self._refer, name), "scale", "referenced")
