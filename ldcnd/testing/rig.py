@@ -332,7 +332,12 @@ class SimulatedRig:
         }  # fmt: skip
         async with self.network.session(overhear=self._overheard) as session:
             self._daemon = build_daemon(
-                config, session, self._now_ns, f"run{self._runs}", openers, lambda: f"lease-{self._runs}-{next(self._leases)}"
+                config,
+                session,
+                self._now_ns,
+                f"run{self._runs}",
+                openers,
+                lambda: f"lease-{self._runs}-{next(self._leases)}",
             )
             for name, axis in self._daemon.rig.axes.items():
                 axis.tracker.watch(partial(self._refer, name), "scale", "referenced")
