@@ -23,7 +23,7 @@ from ldcnd.drives.known import FAMILIES
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.line.transport import Opener, Receiver, Transport
 from ldcnd.net.hand_over import Answer
-from ldcnd.net.session import NO_PARAMETERS, QUERY_TIMEOUT_S, OnSample, Publication, Session
+from ldcnd.net.session import NO_PARAMETERS, QUERY_TIMEOUT_S, OnSample, Session
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.known import SIMULATED, opener_of
 from ldcnd.testing.blocking import RigClock, on_clock, run_in_thread
@@ -189,6 +189,7 @@ class SimulatedRig:
             axis.name: Machine(axis, bus.name, lines[bus.name], place)
             for bus in config.bus
             for axis in bus.axis
+            if bus.name in lines
             for place in [sorted(bus.models).index(axis.address) + 1]
         }
         processes = Processes(
@@ -326,23 +327,20 @@ class SimulatedRig:
         self._serving = self._daemon = None
 
     async def _serve(self, life: _Life, made: "asyncio.Future[Daemon]", state: RigState | None) -> None:
-        config = self.config
+        config, run = self.config, f"run{self._runs}"
         openers = {
-            bus.name: life.opener(opener_of(bus, config.sim, self.lines[bus.name])) for bus in config.bus
-        }  # fmt: skip
-        async with self.network.session(overhear=self._overheard) as session:
+            bus.name: life.opener(opener_of(bus, config.sim, self.lines[bus.name]))
+            for bus in config.bus
+            if bus.name in self.lines
+        }
+        async with self.network.session(overhear=self.timeline.take) as session:
             self._daemon = build_daemon(
-                config,
-                session,
-                self._now_ns,
-                f"run{self._runs}",
-                openers,
-                lambda: f"lease-{self._runs}-{next(self._leases)}",
+                config, session, self.now_ns, run, openers, lambda: f"lease-{self._runs}-{next(self._leases)}"
             )
             for name, axis in self._daemon.rig.axes.items():
                 axis.tracker.watch(partial(self._refer, name), "scale", "referenced")
             if state:
-                recall(self._daemon, state, self._now_ns())
+                recall(self._daemon, state, self.now_ns())
             made.set_result(self._daemon)
             await self._daemon.run()
 
@@ -350,14 +348,12 @@ class SimulatedRig:
         if status.referenced:
             self.machine(axis).refer(status.scale, self._loop.time())
 
-    def _overheard(self, sample: Publication) -> None:
-        self.timeline.take(sample)
-
     def wall_s(self) -> float:
         """Return what the wall clock of the rig shows, in seconds since 1970."""
-        return self._now_ns() / 1e9
+        return self.now_ns() / 1e9
 
-    def _now_ns(self) -> int:
+    def now_ns(self) -> int:
+        """Return the same in ns."""
         return self._begins_ns + round(self.now_s * 1e9)
 
     def machine(self, axis: str) -> Machine:

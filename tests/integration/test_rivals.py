@@ -240,8 +240,8 @@ async def test_a_daemon_that_ends_hides_no_halt_and_no_stop_of_the_one_that_has_
             await other.serve(keys.daemon, lambda query: query.reply(*told), complete=True)
             client = RigClient(running.session, "sim")
             assert (await client.daemon()).instance == "rival"
-        await running.client.command("x", MoveVelocity(velocity=5.0, instance="test"))
-        halted = await client.command("x", Halt(instance="test"))
+        await running.client.command("x", MoveVelocity(velocity=5.0, instance="run1"))
+        halted = await client.command("x", Halt(instance="run1"))
         stopped = await client.stop()
 
     assert halted.status == "accepted"

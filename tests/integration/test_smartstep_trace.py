@@ -252,14 +252,14 @@ async def test_setting_during_a_trace_is_busy_tracing_and_commands_for_others_go
         with pytest.raises(BusyTracing, match="e=9"):
             await client.command("feed", write)
         reply = await client.command("spool", write)
-        with pytest.raises(BusyTracing, match="trace test-1 is waiting"):
+        with pytest.raises(BusyTracing, match="trace run1-1 is waiting"):
             await arm_trace(client, "feed", trace_request())
         aborted = await client.command("feed", AbortTrace(), 10)
         after = await client.command("feed", write)
         header = await trace_header(client, "feed")
 
     assert (reply.written, after.written) == (True, True)
-    assert (aborted.trace_id, header.phase, header.chunks) == ("test-1", TracePhase.ABORTED, 0)
+    assert (aborted.trace_id, header.phase, header.chunks) == ("run1-1", TracePhase.ABORTED, 0)
 
 
 @pytest.mark.parametrize(

@@ -7,18 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
+from typing_extensions import override
+
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import CommandReply
 from ldcnd.contract.events import CommandStatus, ReadEvents
 from ldcnd.contract.samples import StateSample
-from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.line.transport import Opener
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.known import opener_of
 from ldcnd.sim.ldcn.simulation import SimulatedLdcnLineConfig
 from ldcnd.testing.memory_session import MemoryBroker, MemorySession
+from ldcnd.testing.rig import SimulatedRig, lines_of
 
 EPOCH_NS = 1_700_000_000_000_000_000
 SIMULATED = Path(__file__).parents[2] / "config" / "simulated.toml"
@@ -52,6 +54,21 @@ class RunningRig:
         return last.code if last.status in (CommandStatus.REFUSED, CommandStatus.ABORTED) else None
 
 
+class _Rig(SimulatedRig):
+    """A rig whose daemon may have a clock that is wrong."""
+
+    def __init__(
+        self, config: RigConfig, broker: MemoryBroker, lines: Mapping[str, Chain], off_s: Callable[[], float]
+    ) -> None:
+        zero_ns = EPOCH_NS + round(asyncio.get_running_loop().time() * 1e9)
+        super().__init__(config, broker, lines, zero_ns, (lambda _: None, lambda _: None))
+        self._off_s = off_s
+
+    @override
+    def now_ns(self) -> int:
+        return super().now_ns() + round(self._off_s() * 1e9)
+
+
 @asynccontextmanager
 async def running_rig(
     config: RigConfig | None = None,
@@ -69,23 +86,16 @@ async def running_rig(
         clock_off_s: returns by how much the machine's clock is wrong; time itself goes on.
     """
     config = config or load_config(SIMULATED)
-    loop = asyncio.get_running_loop()
     broker = broker or MemoryBroker()
-
-    def now_ns() -> int:
-        return EPOCH_NS + round((loop.time() + clock_off_s()) * 1e9)
-
-    async with broker.session() as session, broker.session() as client_session:
-        daemon = build_daemon(config, session, now_ns, "test", openers_of(config, chains))
-        async with asyncio.TaskGroup() as group:
-            running = group.create_task(daemon.run(), name="daemon")
-            try:
-                async with asyncio.timeout(60):
-                    await daemon.wait_up()
-                yield RunningRig(daemon, RigClient(client_session, config.rig), client_session, broker)
-            finally:
-                daemon.end()
-                await running
+    made = {bus.name: chains[bus.simulated] for bus in config.bus if bus.simulated in chains}
+    unmade = config.model_copy(update={"bus": tuple(bus for bus in config.bus if bus.name not in made)})
+    rig = _Rig(config, broker, {**lines_of(unmade), **made}, clock_off_s)
+    async with broker.session() as session:
+        try:
+            await rig.start_daemon()
+            yield RunningRig(rig.daemon, RigClient(session, config.rig), session, broker)
+        finally:
+            await rig.close()
 
 
 def openers_of(config: RigConfig, chains: Mapping[str, Chain]) -> dict[str, Opener]:
