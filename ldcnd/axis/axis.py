@@ -9,6 +9,7 @@ import contextlib
 import math
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
+from typing import Literal
 
 from ldcnd.axis import guards
 from ldcnd.axis.clock import Clock
@@ -427,22 +428,25 @@ class AxisService:
         """Publish who controls the axis from now on; None when no client does."""
         self.telemetry.publish_state(self.tracker.take(ControlChanged(client)), self._clock.now_ns())
 
-    async def set_speed_share(self, share: float) -> tuple[bool, bool]:
-        """Take another speed override, 0 to 1; return whether what moves goes on at another speed, or was halted.
+    async def set_speed_share(self, share: float) -> Literal["changed", "unchanged", "halted"] | None:
+        """Take another speed override, 0 to 1; return what becomes of the motion under way, None without one.
 
         Raises:
             LdcndError: a motion under way could not be changed; those that begin have the new one all the same.
         """
+        before = self.tracker.status.speed_share
         self.telemetry.publish_state(self.tracker.take(SpeedOverridden(share)), self._clock.now_ns())
         if share <= 0:
             if not self.at_work or self.tracker.status.state is AxisState.DISABLED:
-                return False, False
+                return None
             await self.stops.bring_to_rest(StopMode.SMOOTH)
-            return False, True
+            return "halted"
         async with self._queue.at_work:
             changed = await self._commands.change_speed()
         self._queue.wake()
-        return changed, False
+        if changed:
+            return "changed"
+        return "unchanged" if share != before and self.tracker.status.command is not None else None
 
     def begin_hold(self, command_id: str, request: Jog) -> Hold:
         """Remember who holds a jog, from its command on."""

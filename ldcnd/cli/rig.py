@@ -106,7 +106,9 @@ def speed(sender: Sender, percent: float | None) -> None:
     async def work(client: RigClient) -> None:
         reply = await client.ask(request)
         changed = [f"{axis}: goes on at another speed" for axis in reply.changed]
-        told = [f"speed override {rounded(reply.percent)} %", *changed, *(f"{axis}: halted" for axis in reply.halted)]
+        kept = [f"{axis}: goes on at the speed with which it began" for axis in reply.unchanged]
+        halted = [f"{axis}: halted" for axis in reply.halted]
+        told = [f"speed override {rounded(reply.percent)} %", *changed, *kept, *halted]
         sender.target.show(reply, *(f"{whose(client.rig)}{line}" for line in told))
 
     sender.target.run(work)

@@ -151,6 +151,8 @@ class SpeedOverrideReply(Frozen):
     """Speed override, in percent of each commanded velocity."""
     changed: tuple[str, ...]
     """Axes whose motion under way goes on at another velocity."""
+    unchanged: tuple[str, ...] = ()
+    """Axes whose motion under way goes on at the velocity with which it began."""
     halted: tuple[str, ...]
     """Axes that were commanded to halt, because it is 0."""
 

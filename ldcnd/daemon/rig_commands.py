@@ -242,24 +242,24 @@ class RigCommands:
             for name in self._rig.axes:
                 self._admit(name, self._own(name, command.leases))
         log.info("speed override", percent=command.percent, client=command.client)
-        changed, halted = [], []
+        became: dict[str, list[str]] = {"changed": [], "unchanged": [], "halted": []}
 
         async def change(axis: AxisService) -> None:
             name = axis.config.name
             try:
-                other_speed, at_rest = await axis.set_speed_share(share)
+                motion = await axis.set_speed_share(share)
             except LdcndError as error:
                 log.warning("motion goes on at its speed", axis=name, reason=error.message)
-                return
-            if other_speed:
-                changed.append(name)
-            if at_rest:
-                halted.append(name)
+                motion = "unchanged"
+            if motion:
+                became[motion].append(name)
 
         async with asyncio.TaskGroup() as group:
             for axis in axes:
                 group.create_task(change(axis), name=f"speed override {axis.config.name}")
-        return SpeedOverrideReply(percent=command.percent, changed=tuple(sorted(changed)), halted=tuple(sorted(halted)))
+        return SpeedOverrideReply(
+            percent=command.percent, **{motion: tuple(sorted(names)) for motion, names in became.items()}
+        )
 
     async def _move_together(
         self, command: MoveTogether | WalkPath, login: str | None

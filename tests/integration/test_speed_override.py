@@ -70,6 +70,7 @@ async def test_a_move_under_way_changes_its_speed_where_the_drive_takes_it_and_e
 
         assert measured == pytest.approx(goes_on_at, abs=0.2)
         assert said.changed == ((AXIS,) if dialect is SC else ())
+        assert said.unchanged == (() if dialect is SC else (AXIS,))
         assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
         assert rig.position_mm == pytest.approx(15.0, abs=0.02)
 

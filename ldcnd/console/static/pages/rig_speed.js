@@ -1,6 +1,6 @@
 /** The speed override of a rig: a share of every velocity; anyone may lower it, raising it needs control. */
 
-import { html } from "../html.js";
+import { html, useState } from "../html.js";
 import { Action } from "../parts/controls.js";
 import { number } from "../parts/format.js";
 import { setSpeedOverride } from "../session/control.js";
@@ -20,9 +20,13 @@ export function slowed(rig) {
 
 export function SpeedOverride({ rig }) {
   const shown = overrideOf(rig);
+  const [kept, setKept] = useState([]); // what the last answer said: commands that go on at the speed of their beginning
   if (shown === undefined) return null;
+  const onDone = (reply) => setKept(reply.unchanged.map((name) => [name, rig.axes.get(name)?.state?.command?.command_id]));
+  const going = kept.filter(([name, id]) => id && rig.axes.get(name)?.state?.command?.command_id === id);
   return html`<div class="speed" role="group" aria-label=${`Speed override of ${rig.name}`}>
     <span role="status">Speed <b>${number(shown, 0)} %</b></span>
-    ${SHARES.map((share) => html`<${Action} key=${share} act=${() => setSpeedOverride(rig, share)}>${share} %<//>`)}
+    ${SHARES.map((share) => html`<${Action} key=${share} act=${() => setSpeedOverride(rig, share)} onDone=${onDone}>${share} %<//>`)}
+    ${going.length > 0 && html`<small role="status">${going.map(([name]) => name).join(", ")}: goes on at the speed with which it began</small>`}
   </div>`;
 }
