@@ -123,7 +123,7 @@ async def test_a_stop_is_in_the_headline_until_reset_whoever_has_stopped(house):
         await playwright.expect(stops.filter(has_text="sim")).to_have_count(0)
 
         await house.sim.rig.stop("y")  # another person
-        await playwright.expect(stops).to_contain_text("stopped and latched: y")
+        await playwright.expect(stops.filter(has_text="sim")).to_contain_text("stopped and latched: y")
         await house.sim.rig.command("y", Reset())
         await playwright.expect(stops.filter(has_text="sim")).to_have_count(0)
 

@@ -99,6 +99,26 @@ async def test_a_jog_runs_while_the_button_or_an_arrow_key_is_held(house):
         await house.sim.reaches("x", before + 1, within=0.05)
 
 
+async def test_why_a_jog_was_refused_is_not_said_of_another_axis(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        jog = desk.panel("Jog")
+        await jog.get_by_label("Speed mm/s").fill("9000")
+        forward = jog.get_by_role("button", name="Hold to run +")
+        await expect(forward).to_be_enabled()
+        await forward.focus()
+        await desk.page.keyboard.down("ArrowRight")
+        await expect(jog).to_contain_text("is above the limit")
+        await desk.page.keyboard.up("ArrowRight")
+        await desk.page.evaluate("() => { location.hash = '#/axis/sim/y'; }")
+        await expect(desk.panel("Jog").get_by_role("group", name="Jog y")).to_be_visible()
+        await expect(desk.page.locator("main")).not_to_contain_text("is above the limit")
+
+
 async def test_a_group_is_moved_together_from_the_rig_page_by_keyboard(house):
     await house.sim.quiet("x", "y")
     for axis in ("x", "y"):

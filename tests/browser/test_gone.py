@@ -55,8 +55,9 @@ UNMARKED = """(within) => {
     .map((each) => `${each.closest("tr, div, li")?.textContent.trim().slice(0, 60)}`);
 }"""
 CALM = """() => {
-  const text = document.body.innerText;
-  return ["Nothing needs attention", "Ready to move"].filter((each) => text.includes(each));
+  const text = document.body.innerText, strip = document.querySelector(".strip")?.textContent ?? "";
+  return ["Nothing needs attention", "Ready to move"].filter((each) => text.includes(each))
+    .concat(["Nothing moves"].filter((each) => strip.includes(each)));
 }"""
 NAMED = (
     """() => [...document.querySelectorAll(".notices .notice")].some((each) => each.textContent.includes("alpha"))"""

@@ -65,12 +65,16 @@ const MOST_MOVING = 6;
 function Strip({ at }) {
   const axis = at.page === "axis" && axisNamed(at);
   if (axis) return html`<${AxisStrip} axis=${axis} />`;
-  const moving = axesOf().filter((each) => each.info && each.condition.live && each.state?.moving === "yes");
+  const known = axesOf().filter((each) => each.info);
+  const moving = known.filter((each) => each.condition.live && each.state?.moving === "yes");
+  const unsure = known.filter((each) => !each.condition.live || each.state?.moving === "unknown").map(({ name }) => name);
   const [worst] = problems(rigs.values());
   return html`<div class="strip">
     <span class="moving">${moving.length
       ? moving.slice(0, MOST_MOVING).map((each) => html`<a href=${`#/axis/${each.rig.name}/${each.name}`}>${each.name}</a> <${PlaceAndTarget} axis=${each} /> `)
-      : html`<span class="quiet">Nothing moves</span>`}${moving.length > MOST_MOVING && ` and ${moving.length - MOST_MOVING} more move`}</span>
+      : !unsure.length && html`<span class="quiet">Nothing moves</span>`}${moving.length > MOST_MOVING && ` and ${moving.length - MOST_MOVING} more move`}${
+      unsure.length > 0 && html` <span class="mark" data-level="bad">not known whether ${unsure.slice(0, MOST_MOVING).join(", ")}${
+        unsure.length > MOST_MOVING && ` and ${unsure.length - MOST_MOVING} more`} move</span>`}</span>
     ${worst && html`<span class="worst mark" data-level=${worst.level}>${worst.places[0].where}${worst.places.length > 1 ? ` and ${worst.places.length - 1} more` : ""}: ${worst.text}</span>`}
   </div>`;
 }

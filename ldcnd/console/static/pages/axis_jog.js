@@ -1,11 +1,11 @@
 /** Jog: run for as long as a button or an arrow key is held, or move by a step. */
 
-import { html, useId, useState } from "../html.js";
+import { html, useEffect, useId, useState } from "../html.js";
 import { Action, Panel, Reason, RefusalText } from "../parts/controls.js";
 import { NumberField, unread } from "../parts/number_field.js";
 import { number } from "../parts/format.js";
 import { HoldButton } from "../parts/hold_button.js";
-import { beginJog, command, endJog, jogRefusal } from "../session/control.js";
+import { beginJog, command, endJog, forgetJogRefusal, jogRefusal } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 
 const STEPS = [-10, -1, -0.1, 0.1, 1, 10];
@@ -15,6 +15,7 @@ const FIRST_SHARE = 0.1;
 export function JogPanel({ axis }) {
   const [speed, setSpeed] = useState(axis.info.limits.velocity * FIRST_SHARE);
   const reason = useId();
+  useEffect(() => forgetJogRefusal, []);
   const { unit } = axis.info;
   const missing = unread({ Speed: speed }) ?? (speed > 0 ? null : "A speed above 0 is missing.");
   const way = obstacle(axis, "jog", true) ?? missing;

@@ -41,8 +41,12 @@ export function StopAll() {
     return () => removeEventListener("keydown", pressed, true);
   }, []);
 
-  // what a rig publishes now says more than what it answered then
-  const lines = report?.lines.filter(({ answered }) => !answered || rigs.get(answered)?.worth !== null) ?? [];
+  // what a rig publishes now says more than what it answered then, and goes on to when it falls silent later
+  const lines = report?.lines.filter(isNews) ?? [];
+  const left = report && lines.length < report.lines.length;
+  useEffect(() => {
+    if (left) setReport((last) => last && { ...last, lines: last.lines.filter(isNews) });
+  }, [left]);
   const shown = Boolean(report?.text) || lines.length > 0;
   return html`<div class="stop-all">
     <button type="button" class="stop" aria-keyshortcuts=${KEY} onClick=${stop}>
@@ -58,6 +62,10 @@ export function StopAll() {
       }
     </div>
   </div>`;
+}
+
+function isNews({ answered }) {
+  return !answered || rigs.get(answered)?.worth !== null;
 }
 
 function outcome(rig, reply) {

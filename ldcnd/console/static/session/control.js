@@ -101,6 +101,11 @@ export function beginJog(axis, velocity) {
   changed();
 }
 
+/** Forget why the last jog was refused: its page is left. */
+export function forgetJogRefusal() {
+  jogRefusal = null;
+}
+
 /** Halt the axis that jogs. */
 export function endJog() {
   if (!holding) return;
