@@ -44,9 +44,13 @@ def of_options(model: type[ModelT], **values: object) -> ModelT:
     except ValidationError as error:
         wrong = error.errors(include_url=False)[0]
         name = ".".join(map(str, wrong["loc"])) or "value"
-        raise click.BadParameter(
-            f"{wrong['msg'][:1].lower()}{wrong['msg'][1:]}, not {wrong['input']!r}", param_hint=name.replace("_", "-")
-        ) from None
+        given, bounds = wrong["input"], wrong.get("ctx", {})
+        if isinstance(given, tuple | list):
+            bound = f"at least {bounds['min_length']}" if "min_length" in bounds else f"at most {bounds['max_length']}"
+            text = f"takes {bound}, and {len(given)} came"
+        else:
+            text = f"{wrong['msg'][:1].lower()}{wrong['msg'][1:]}, not {given!r}"
+        raise click.BadParameter(text, param_hint=name.replace("_", "-")) from None
 
 
 class AxisName(click.types.StringParamType):

@@ -4,7 +4,9 @@ import asyncio
 import math
 
 import pytest
+from click.testing import CliRunner
 
+from ldcnd.cli.rig import group
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.errors import (
     CommandIdReused,
@@ -261,3 +263,9 @@ async def test_a_start_that_takes_longer_than_members_wait_for_each_other_has_on
             await rig.client.wait_for_end(reply.axis, reply.command_id)
 
         assert [drive(chain, at).shaft.position_counts for at in (1, 2)] == pytest.approx([10_000, -10_000], abs=60)
+
+
+def test_a_group_of_one_is_refused_in_words():
+    said = CliRunner().invoke(group, ["move", "x=5", "--connect", "tcp/127.0.0.1:1"])
+    assert said.exit_code == 2
+    assert "moves: takes at least 2, and 1 came" in said.output
