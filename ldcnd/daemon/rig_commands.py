@@ -32,7 +32,7 @@ from ldcnd.contract.errors import (
     MalformedRequest,
     NotSupported,
 )
-from ldcnd.contract.events import CommandOutcome, ReadEvents, ReadOutcome
+from ldcnd.contract.events import CommandOutcome, CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.leases import Holder, HolderList, ListHolders, Release, Renew
 from ldcnd.contract.rig_commands import (
@@ -242,6 +242,14 @@ class RigCommands:
             for name in self._rig.axes:
                 self._admit(name, self._own(name, command.leases))
         log.info("speed override", percent=command.percent, client=command.client)
+        for axis in axes:
+            name = axis.config.name
+            if share != axis.tracker.status.speed_share:
+                holder = self._authority.holder(name)
+                who = command.client or (holder.client if holder and command.leases else None)
+                self._events.note(
+                    name, command.verb, CommandStatus.DONE, f"speed override {command.percent:g} %", client=who
+                )
         became: dict[str, list[str]] = {"changed": [], "unchanged": [], "halted": []}
 
         async def change(axis: AxisService) -> None:

@@ -103,7 +103,7 @@ async def test_after_a_lost_line_nothing_resumes_and_nothing_is_believed():
         state = await rig.client.state("x")
 
         assert (state.state, state.referenced, state.enabled) == (AxisState.ERROR_STOP, False, True)
-        assert state.last_error.startswith("move_velocity: the drive does not answer")
+        assert state.last_error.startswith("move_velocity: the drive did not answer")
         with pytest.raises(WrongState, match="error stop"):
             await rig.client.command("x", MoveAbsolute(position=0.0))
         await rig.client.command("x", Reset())

@@ -156,3 +156,12 @@ async def test_the_expected_end_follows_the_speed_of_a_move_under_way():
 
         assert after > before + 3e9
         assert 0 <= (ended.t - after) / 1e9 < 0.3
+
+
+async def test_who_has_changed_the_speed_is_in_the_events():
+    async with dialect_rig(SC) as rig:
+        await override(rig, 50, client="ann")
+        await override(rig, 50, client="bob")  # it changes nothing
+        page = await rig.rig.client.ask(ReadEvents(axis=AXIS, count=100))
+        told = [(each.client, each.reason) for each in page.events if each.verb == "set_speed_override"]
+        assert told == [("ann", "speed override 50 %")]

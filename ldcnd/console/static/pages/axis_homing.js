@@ -13,7 +13,7 @@ const STOPS = { smooth: "decelerate, hold", abrupt: "hold at once", off: "open t
 
 export function HomePanel({ axis }) {
   const [values, setValues] = useState({});
-  const [name, setName] = useState(0);
+  const [name, setName] = useState(null);
   const [toHome, toSet] = [useId(), useId()];
   const set = (field) => (value) => setValues((last) => ({ ...last, [field]: value === "" ? null : value }));
   const { unit } = axis.info;
