@@ -23,7 +23,9 @@ from ldcnd.axis.parameters import Parameters
 from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Violations
 from ldcnd.axis.plausibility import PlausibilityGate
 from ldcnd.axis.preview import preview
+from ldcnd.axis.procedures.group import GroupMoveRequest
 from ldcnd.axis.procedures.jog import Hold
+from ldcnd.axis.procedures.path import PathShareRequest
 from ldcnd.axis.quiet_drive import Unmoved
 from ldcnd.axis.readings import AxisReadings, OnEnded, ReadingOutOfTurn
 from ldcnd.axis.recorder import TraceRecorder
@@ -526,6 +528,13 @@ class AxisService:
             return await self._parameters.carry_out(permit.command_id, command)
         try:
             return await self._commands.carry_out(permit, command)
+        except OutcomeUnknown:
+            # its network has sent each member a stop, once: that of a member which did not hear is sent until it has
+            if isinstance(command, GroupMoveRequest | PathShareRequest) and self.tracker.status.is_at(
+                permit.command_id
+            ):
+                self.stops.require(StopMode.SMOOTH)
+            raise
         finally:
             begun = self.tracker.status.command
             if (begun and begun.settling) or not math.isinf(self._commands.watch_s):

@@ -109,6 +109,7 @@ class AxisCommands:
             None  # the last trapezoid, and the speed share of its plan
         )
         self._retry_s: float | None = None  # when the step that was not taken is taken again
+        self._blind = False  # that step was tried while the drive did not answer
 
     async def carry_out(self, permit: Permit, request: AxisCommand[CommandReply]) -> CommandReply:
         """Do what the request says; returns once the drive has acknowledged it.
@@ -184,7 +185,10 @@ class AxisCommands:
             return
         if procedure.outlived(self._tracker):
             self._drop_procedure()
-        elif self._tracker.status.concerns(timing) and procedure.calls_for_step(reading):
+        elif self._tracker.status.concerns(timing) and (
+            # the drive answers again: a step that ends a motion does not wait for its next try
+            (self._retry_s is not None and self._blind) or procedure.calls_for_step(reading)
+        ):
             self.step_due = True
 
     async def step(self) -> None:
@@ -200,8 +204,8 @@ class AxisCommands:
         if procedure.outlived(self._tracker):
             self._drop_procedure()
             return
-        delay_s = STEP_RETRY_S if self._tracker.status.link is LinkState.UP else BLIND_RETRY_S
-        self._retry_s = self._motion.clock.now_s() + delay_s
+        self._blind = self._tracker.status.link is not LinkState.UP
+        self._retry_s = self._motion.clock.now_s() + (BLIND_RETRY_S if self._blind else STEP_RETRY_S)
         try:
             goes_on = await self._take_step(procedure)
         finally:

@@ -48,8 +48,8 @@ def check_not_latched(axis: AxisTracker) -> None:
 
 
 def check_stop_confirmed(axis: AxisTracker) -> None:
-    """Refuse while the drive has not confirmed a stop."""
-    if axis.status.stop_pending:
+    """Refuse while the drive has not confirmed a stop: also one that was sent just now, and is not overdue yet."""
+    if axis.status.stop:
         raise StopLatched(
             f"axis {axis.name}: the drive has not confirmed a stop yet",
             axis=axis.name,

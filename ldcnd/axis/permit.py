@@ -16,7 +16,16 @@ from ldcnd.axis.guards import TO_MOVE, TO_POWER, Guard, check, require
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.config.interlocks import InterlockKind
 from ldcnd.contract.commands import PinMode, Verb, kind_of
-from ldcnd.contract.errors import CommandAborted, LdcndError, Remedy, RequestRefused, ShuttingDown, StopLatched, step
+from ldcnd.contract.errors import (
+    CommandAborted,
+    LdcndError,
+    OutcomeUnknown,
+    Remedy,
+    RequestRefused,
+    ShuttingDown,
+    StopLatched,
+    step,
+)
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import (
     AnalogMotion,
@@ -361,3 +370,11 @@ async def start_together(
     ask_all()
     with only_while(ask_all):
         await network.start_group(motions, about_to_start)
+    try:
+        ask_all()
+    except RequestRefused as error:  # a member was stopped between the packet that started all and their answers
+        raise OutcomeUnknown(
+            f"{error.message}; the others had been started, so all are commanded to stop",
+            axis=error.axis,
+            remedy="read the axis states before anything else",
+        ) from error

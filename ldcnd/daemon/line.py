@@ -31,6 +31,9 @@ CAPTURING = frozenset({Verb.HOME, Verb.PROBE})
 """Commands that wait for a capture in the drive's home register."""
 SCAN_SHARE = 0.01
 """Share of the line's time for these scans; more where the longest pause requires it."""
+STOP_SHARE = 0.1
+"""Share of the line's time for the stops that a drive did not hear; more where the longest pause requires it."""
+FIRST_STOP_PAUSE_S = 0.02
 
 
 class BusService:
@@ -231,26 +234,39 @@ class BusService:
 
     async def _scan_for_lost_drives(self) -> None:
         """Scan for drives that lost power and came back; return when the line is lost."""
-        pause_s = FIRST_SCAN_PAUSE_S
         loop = asyncio.get_running_loop()
-        while not await self._closed_within(pause_s):
-            pause_s = FIRST_SCAN_PAUSE_S
-            self.bus.proofs.heard_again.clear()
-            await self._send_pending_stops()
-            if not self.network.incomplete():
-                continue
+        stop_pause_s = FIRST_SCAN_PAUSE_S
+        due_s = loop.time() + FIRST_SCAN_PAUSE_S
+        while not await self._closed_within(min(due_s - loop.time(), stop_pause_s)):
+            heard_again = self.bus.proofs.heard_again.is_set()
             began_s = loop.time()
-            heard: frozenset[str] = frozenset()
-            try:
-                heard = await self._search()
-            except LdcndError as error:
-                log.warning("search for lost drives failed", bus=self.bus.settings.name, reason=error.message)
-            self.problem = self.network.problem
-            for axis in self.axes:
-                axis.readings.explain_loss()
-            now_s = loop.time()
-            if not heard:
-                pause_s = min((now_s - began_s + self.bus.quarantine_s) / SCAN_SHARE, LONGEST_SCAN_PAUSE_S)
+            await self._send_pending_stops()
+            stop_pause_s = LONGEST_SCAN_PAUSE_S
+            if any(axis.tracker.status.stop_pending for axis in self.axes):
+                # polls of a mute drive come ever more seldom: one that hears again gets its stop before them
+                stop_pause_s = min((loop.time() - began_s) / STOP_SHARE + FIRST_STOP_PAUSE_S, LONGEST_SCAN_PAUSE_S)
+            if loop.time() >= due_s or heard_again:
+                self.bus.proofs.heard_again.clear()
+                pause_s = await self._search_for_lost_drives()
+                due_s = loop.time() + pause_s
+
+    async def _search_for_lost_drives(self) -> float:
+        """Search once, if one is lost; return how long to wait until the next search, in seconds."""
+        if not self.network.incomplete():
+            return FIRST_SCAN_PAUSE_S
+        loop = asyncio.get_running_loop()
+        began_s = loop.time()
+        heard: frozenset[str] = frozenset()
+        try:
+            heard = await self._search()
+        except LdcndError as error:
+            log.warning("search for lost drives failed", bus=self.bus.settings.name, reason=error.message)
+        self.problem = self.network.problem
+        for axis in self.axes:
+            axis.readings.explain_loss()
+        if heard:
+            return FIRST_SCAN_PAUSE_S
+        return min((loop.time() - began_s + self.bus.quarantine_s) / SCAN_SHARE, LONGEST_SCAN_PAUSE_S)
 
     async def _search(self) -> frozenset[str]:
         """Search once for lost drives; a stop that waits goes out meanwhile, first to each drive that answers again.
