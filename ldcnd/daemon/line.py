@@ -1,6 +1,7 @@
 """One line at work: brings its drives up whenever it opens, has them polled, tells the axes when it is gone."""
 
 import asyncio
+import contextlib
 from collections.abc import Mapping
 from typing import Any
 
@@ -234,70 +235,53 @@ class BusService:
 
     async def _scan_for_lost_drives(self) -> None:
         """Scan for drives that lost power and came back; return when the line is lost."""
+        async with asyncio.TaskGroup() as tasks:
+            stops = tasks.create_task(self._repeat_stops(), name=f"stops on {self.bus.settings.name}")
+            pause_s = FIRST_SCAN_PAUSE_S
+            while not await self._closed_within(pause_s):
+                self.bus.proofs.heard_again.clear()
+                pause_s = await self._search() if self.network.incomplete() else FIRST_SCAN_PAUSE_S
+            stops.cancel()
+
+    async def _repeat_stops(self) -> None:
+        """Send stops that no drive has confirmed, until one has: at once when it is heard, and now and then."""
         loop = asyncio.get_running_loop()
-        stop_pause_s = FIRST_SCAN_PAUSE_S
-        due_s = loop.time() + FIRST_SCAN_PAUSE_S
-        while not await self._closed_within(min(due_s - loop.time(), stop_pause_s)):
-            heard_again = self.bus.proofs.heard_again.is_set()
+        pause_s: float | None = FIRST_SCAN_PAUSE_S
+        while True:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(pause_s):
+                    await self._stop_wanted.wait()
             began_s = loop.time()
             await self._send_pending_stops()
-            stop_pause_s = LONGEST_SCAN_PAUSE_S
+            pause_s = None
             if any(axis.tracker.status.stop_pending for axis in self.axes):
                 # polls of a mute drive come ever more seldom: one that hears again gets its stop before them
-                stop_pause_s = min((loop.time() - began_s) / STOP_SHARE + FIRST_STOP_PAUSE_S, LONGEST_SCAN_PAUSE_S)
-            if loop.time() >= due_s or heard_again:
-                self.bus.proofs.heard_again.clear()
-                pause_s = await self._search_for_lost_drives()
-                due_s = loop.time() + pause_s
+                took_s = loop.time() - began_s
+                pause_s = min(took_s / STOP_SHARE + FIRST_STOP_PAUSE_S, LONGEST_SCAN_PAUSE_S)
 
-    async def _search_for_lost_drives(self) -> float:
-        """Search once, if one is lost; return how long to wait until the next search, in seconds."""
-        if not self.network.incomplete():
-            return FIRST_SCAN_PAUSE_S
+    async def _search(self) -> float:
+        """Search once for lost drives; return how long to wait until the next search, in seconds.
+
+        The stop that waits goes out meanwhile, first to each drive that answers again.
+        """
         loop = asyncio.get_running_loop()
         began_s = loop.time()
-        heard: frozenset[str] = frozenset()
+
+        def heard(name: str) -> None:
+            self._poll(self._axis(name), loop.time())
+            self._stop_wanted.set()
+
+        found: frozenset[str] = frozenset()
         try:
-            heard = await self._search()
+            found = await self.network.rejoin(self._restarted, heard)
         except LdcndError as error:
             log.warning("search for lost drives failed", bus=self.bus.settings.name, reason=error.message)
         self.problem = self.network.problem
         for axis in self.axes:
             axis.readings.explain_loss()
-        if heard:
+        if found:
             return FIRST_SCAN_PAUSE_S
         return min((loop.time() - began_s + self.bus.quarantine_s) / SCAN_SHARE, LONGEST_SCAN_PAUSE_S)
-
-    async def _search(self) -> frozenset[str]:
-        """Search once for lost drives; a stop that waits goes out meanwhile, first to each drive that answers again.
-
-        Returns the axes that answer again.
-
-        Raises:
-            LdcndError: as `Network.rejoin`.
-        """
-        back: set[str] = set()
-
-        def heard(name: str) -> None:
-            back.add(name)
-            self._poll(self._axis(name), asyncio.get_running_loop().time())
-            self._stop_wanted.set()
-
-        search = asyncio.create_task(self.network.rejoin(self._restarted, heard), name="search for lost drives")
-        try:
-            while not search.done():
-                wanted = asyncio.ensure_future(self._stop_wanted.wait())
-                try:
-                    await asyncio.wait((search, wanted), return_when=asyncio.FIRST_COMPLETED)
-                    stops = wanted.done()
-                finally:
-                    wanted.cancel()
-                if stops:
-                    await self._send_pending_stops()
-            await search
-        finally:
-            search.cancel()
-        return frozenset(back)
 
     def _axis(self, name: str) -> AxisService:
         return next(axis for axis in self.axes if axis.config.name == name)
@@ -313,16 +297,15 @@ class BusService:
                 log.debug("stop probe lost", bus=self.bus.settings.name, reason=error.message)
 
     async def _closed_within(self, pause_s: float) -> bool:
-        """Tell whether the line is lost within a time, before a stop must be sent again or a node is heard again."""
+        """Tell whether the line is lost within a time, or before a node is heard again."""
         closed = asyncio.ensure_future(self.bus.wait_closed())
-        wanted = asyncio.ensure_future(self._stop_wanted.wait())
         heard = asyncio.ensure_future(self.bus.proofs.heard_again.wait())
         try:
-            await asyncio.wait((closed, wanted, heard), timeout=pause_s, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait((closed, heard), timeout=pause_s, return_when=asyncio.FIRST_COMPLETED)
             return closed.done()
         finally:
-            for each in (closed, wanted, heard):
-                each.cancel()
+            closed.cancel()
+            heard.cancel()
 
     def _restarted(self, name: str) -> None:
         """A drive has lost power and is about to answer again: its loop is open, nothing that was commanded goes on.
