@@ -48,8 +48,8 @@ def check_not_latched(axis: AxisTracker) -> None:
 
 
 def check_stop_confirmed(axis: AxisTracker) -> None:
-    """Refuse while the drive has not confirmed a stop: also one that was sent just now, and is not overdue yet."""
-    if axis.status.stop:
+    """Refuse while the drive has not confirmed a stop; what latches counts from the instant at which it is sent."""
+    if axis.status.stop_pending or (axis.status.stop and axis.status.stop_latched):
         raise StopLatched(
             f"axis {axis.name}: the drive has not confirmed a stop yet",
             axis=axis.name,

@@ -87,6 +87,7 @@ class AxisStops:
         self._commands = commands
         self._next_command_id = next_command_id
         self._note = note
+        self._found_open = False  # a stop waits only because its loop was open when its line was taken over
         self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
 
     async def stop(self, mode: StopMode) -> bool:
@@ -160,13 +161,19 @@ class AxisStops:
         if stop is None:
             return  # such a stop was confirmed while the axis was read
         if await self._send(stop.mode, Verb.STOP, rounds=1):
-            log.warning("stop confirmed late", axis=self._name)
-            self._note(self._name, Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again", None)
+            if self._found_open:
+                how = "switched off when its line was taken over"
+            else:
+                how = "confirmed late, when the drive answered again"
+            self._found_open = False
+            log.warning("stop confirmed", axis=self._name, how=how)
+            self._note(self._name, Verb.STOP, CommandStatus.DONE, how, None)
         self._publish()
 
     def switch_off(self) -> None:
         """Have the motor switched off by the first packet to its drive."""
         if self.possible:
+            self._found_open = True
             self._tracker.take(StopUnconfirmed(self._clock.now_ns(), StopMode.OFF))
 
     def inherit(self) -> None:
@@ -175,7 +182,7 @@ class AxisStops:
 
     def note_power_loss(self) -> None:
         """Note that the drive was reset or had no power: the motion to be stopped has ended."""
-        self.inherited = False
+        self.inherited = self._found_open = False
         self._tracker.take(StopConfirmed())
 
     def watch_inherited(self, reading: AxisReading, at_s: float) -> None:

@@ -233,7 +233,12 @@ class RigClient:
             SessionError: no daemon serves this rig, or access control does not let this login command it.
         """
         if self._instance is None:
-            self._instance = (await self.daemon()).instance
+            try:
+                self._instance = (await self.daemon()).instance
+            except OutcomeUnknown as error:  # of a question: the command itself is not on its way
+                raise SessionError(
+                    f"axis {axis}: {command.verb}: the daemon of rig {self.rig} does not answer; nothing was sent"
+                ) from error
         meant = command if command.instance else command.model_copy(update={"instance": self._instance})
         try:
             return await self._answer(axis, meant, timeout_s)
@@ -402,6 +407,10 @@ class RigClient:
             )
         except SessionError:
             return OutcomeUnknown(f"{what}: no answer, and no daemon serves rig {self.rig} now")
+        except OutcomeUnknown:
+            return OutcomeUnknown(
+                f"{what}: the daemon of rig {self.rig} does not answer; it may be carried out when it answers again"
+            )
         if heard:
             return OutcomeUnknown(f"{what}: its answer was lost on the way; it may be carried out all the same")
         return SessionError(

@@ -10,7 +10,7 @@ import pytest
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import MoveAbsolute, Power
-from ldcnd.contract.errors import OutcomeUnknown, StopLatched
+from ldcnd.contract.errors import OutcomeUnknown, SessionError, StopLatched
 from ldcnd.contract.events import CommandStatus, ReadEvents
 from ldcnd.contract.samples import AxisState, PositionSample, StateSample, TelemetryItem
 from ldcnd.net.zenoh_session import open_zenoh_session
@@ -95,8 +95,10 @@ async def test_a_frozen_daemon_does_not_carry_out_what_its_client_gave_up():
 
                 running.send_signal(signal.SIGSTOP)
                 move = MoveAbsolute(position=50.0, command_id="given-up")
-                with pytest.raises(OutcomeUnknown):
+                with pytest.raises(OutcomeUnknown, match="it may be carried out all the same"):
                     await held.command("x", move, timeout_s=0.5)
+                with pytest.raises(SessionError):
+                    await RigClient(session, "sim").command("x", move)
                 await asyncio.sleep(LEASE_S)
                 running.send_signal(signal.SIGCONT)
 
