@@ -1,5 +1,6 @@
 """The commands of one axis: check, plan, send to the drive, update the tracker."""
 
+import math
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -386,9 +387,10 @@ class AxisCommands:
         """Return the velocity as the drive will have it, and a trapezoid that ends by itself even if this host dies."""
         motion = self._motion
         plan = motion.plan_at(request.velocity, request.acceleration)
-        end = motion.limit_ahead(request.velocity) if self._tracker.status.referenced else None
-        if end is None:
-            end = motion.here + plan.velocity * motion.run_s(request.duration_s, plan.motion.velocity_counts_per_s)
+        run_s = motion.run_s(request.duration_s, plan.motion.velocity_counts_per_s)
+        if request.duration_s is None and motion.limit_ahead(request.velocity) is not None:
+            run_s = math.inf  # the limit is its end
+        end, _ = motion.end_ahead(motion.here, plan.velocity * run_s)
         return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration)
 
     async def _move(

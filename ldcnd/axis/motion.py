@@ -26,6 +26,7 @@ from ldcnd.contract.errors import (
     BusError,
     NotSupported,
     OutcomeUnknown,
+    PositionLimit,
     Remedy,
     RequestRefused,
     ValueOutOfRange,
@@ -330,9 +331,40 @@ class AxisMotion:
         return asked_s
 
     def limit_ahead(self, velocity: float) -> float | None:
-        """Return the software limit that a motion at this velocity runs towards, in axis units."""
+        """Return the software limit that a motion at this velocity runs towards, in axis units; None without one.
+
+        An axis that is not referenced does not know where its limits are.
+        """
         limits = self.config.limits
+        if not self.tracker.status.referenced:
+            return None
         return limits.position_max if velocity > 0 else limits.position_min
+
+    def end_ahead(self, here: float, way: float) -> tuple[float, bool]:
+        """Return where a motion at a velocity ends, in axis units, and whether that is the software limit ahead.
+
+        Args:
+            here: where it begins, in axis units.
+            way: that it would make without limits; negative backwards.
+
+        Raises:
+            PositionLimit: the limit ahead was reached: the motion would be none, or one the other way.
+        """
+        end, forward, limit = here + way, way > 0, self.limit_ahead(way)
+        if limit is not None and (here >= limit if forward else here <= limit):
+            raise PositionLimit(
+                f"axis {self.config.name} is at its limit {limit:g} {self.scale.unit}",
+                axis=self.config.name,
+                value=here,
+                limit=limit,
+                remedy="move it the other way",
+            )
+        if limit is not None and (end >= limit if forward else end <= limit):
+            return limit, True
+        behind = self.limit_ahead(-way)
+        if behind is not None and (end < behind if forward else end > behind):
+            end = behind  # from outside the limits at least to the nearest of them
+        return end, False
 
     def _checked(self, velocity: float | None, acceleration: float | None) -> tuple[float, float]:
         """Return the speed that the speed override leaves, and the acceleration, both within their limits."""

@@ -4,11 +4,14 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import BufferMode, MoveVelocity, Power
-from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.config.rig import load_config
+from ldcnd.contract.commands import BufferMode, MoveVelocity, Power, SetPosition
+from ldcnd.contract.errors import PositionLimit, ValueOutOfRange
 from ldcnd.contract.samples import AxisState
+from ldcnd.testing import simulated_rig
 from tests.support.chain_rig import rig_on
 from tests.support.machine_rig import COUNTS, chain_of_machine, machine, running_machine
+from tests.support.rig import SIMULATED
 
 LONG = {"longest_run_s": 3600, "jog_horizon_s": 5}
 SPIN = MoveVelocity(velocity=5.0, duration_s=20.0)
@@ -72,3 +75,32 @@ async def test_a_longer_one_than_configuration_or_counter_allow_is_refused(longe
                 "rotor", MoveVelocity(velocity=velocity, duration_s=asked_s, buffer_mode=BufferMode.ABORTING)
             )
         assert rig.speed() == 0
+
+
+@pytest.mark.parametrize("name", ["x", "y", "z", "c"])
+@pytest.mark.parametrize("velocity", [8.0, -8.0])
+@pytest.mark.parametrize("mode", BufferMode)
+async def test_software_limits_ahead_do_not_make_it_longer(name, velocity, mode):
+    async with simulated_rig(load_config(SIMULATED)) as rig:
+        client = rig.client.client
+        await client.command(name, Power(on=True))
+        await client.command(name, SetPosition(position=0.0))
+        spin = MoveVelocity(velocity=velocity, duration_s=1.5, buffer_mode=mode)
+        reply = await client.command(name, spin)
+        await asyncio.sleep(4.0)
+        assert reply.position == pytest.approx(1.5 * velocity)
+        assert rig.truth(name).position == pytest.approx(1.5 * velocity, abs=0.1)
+        assert rig.truth(name).at_rest
+
+
+@pytest.mark.parametrize("side", [1, -1])
+async def test_a_limit_that_was_passed_is_not_returned_to(side):
+    async with simulated_rig(load_config(SIMULATED)) as rig:
+        client = rig.client.client
+        await client.command("x", Power(on=True))
+        await client.command("x", SetPosition(position=side * 101.0))
+        before = rig.truth("x").position
+        with pytest.raises(PositionLimit):
+            await client.command("x", MoveVelocity(velocity=side * 8.0))
+        await asyncio.sleep(1.0)
+        assert rig.truth("x").position == pytest.approx(before, abs=0.05)

@@ -78,7 +78,7 @@ class EndlessMotion(Procedure):
             PositionLimit: there is not enough way left.
         """
         motion, tracker = self._motion, self._motion.tracker
-        limit = motion.limit_ahead(velocity) if tracker.status.referenced else None
+        limit = motion.limit_ahead(velocity)
         if limit is None:
             return
         here, unit = motion.here, motion.scale.unit

@@ -18,7 +18,7 @@ from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, Jog
-from ldcnd.contract.errors import LeaseExpired, PositionLimit, Remedy, step
+from ldcnd.contract.errors import LeaseExpired, Remedy, step
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, StopMode
 
@@ -202,29 +202,13 @@ class HeldJog(Procedure):
 
     def _plan(self, here: float, velocity: float, acceleration: float | None) -> tuple[MotionPlan, float, float, bool]:
         """Return the motion, its velocity, for how long it runs, and whether it ends at the software limit."""
-        motion, tracker = self._motion, self._motion.tracker
+        motion = self._motion
         steady = motion.plan_at(velocity, acceleration)
         forward = velocity > 0
         longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(steady.motion.velocity_counts_per_s)
         reach_s = min(self._reach_s, longest_s)
         way = abs(steady.velocity) * reach_s + steady.velocity**2 / (2 * steady.acceleration)
-        end = here + way if forward else here - way
-        at_limit = False
-        if tracker.status.referenced:
-            limits, limit = motion.config.limits, motion.limit_ahead(velocity)
-            if limit is not None and (end >= limit if forward else end <= limit):
-                end, at_limit = limit, True
-                if here >= limit if forward else here <= limit:
-                    raise PositionLimit(
-                        f"axis {tracker.name} is at its limit {limit:g} {tracker.status.unit}",
-                        axis=tracker.name,
-                        value=here,
-                        limit=limit,
-                        remedy="jog the other way",
-                    )
-            behind = limits.position_min if forward else limits.position_max
-            if behind is not None and (end < behind if forward else end > behind):
-                end = behind  # from outside the limits at least to the nearest of them
+        end, at_limit = motion.end_ahead(here, way if forward else -way)
         return motion.plan_to(end, abs(velocity), acceleration), steady.velocity, reach_s, at_limit
 
     @property
