@@ -32,17 +32,15 @@ from ldcnd.line.line_discipline import (
     nearest,
     switch_direction,
 )
-from ldcnd.line.terminal_link import why_not_served
+from ldcnd.line.terminal_link import PSEUDO_TERMINALS, why_not_served
 from ldcnd.line.transport import Framing, Incoming, Receiver, Rs485Config, Transport
 
 OPEN_TIME_S = 5.0
 DRAIN_TIME_S = 1.0
 """Enough for a full output buffer of 1 KiB at 9600 baud."""
 
-PSEUDO_TERMINALS = range(136, 144)
-"""Major device numbers of Unix98 pseudo-terminals (Linux, admin-guide/devices.txt)."""
 USB_TERMINALS = frozenset({166, 188})
-"""Those of USB adapters (the same list)."""
+"""Major device numbers of USB adapters (Linux, admin-guide/devices.txt)."""
 
 READ_BYTES = 256
 """More than most replies have; to make room for 4096 takes a tenth longer, and replies are read one at a time."""
@@ -343,7 +341,7 @@ def _open(settings: SerialSettings) -> _Serial:
 
 def _require_served(path: str) -> None:
     if why := why_not_served(path):
-        raise _Refused(why, f"start `ldcnd sim --pty {path}` again, or remove the link")
+        raise _Refused(why, f"start what serves it again, such as `ldcnd sim --pty {path}`, or make the link anew")
 
 
 def _settle_rates(port: _Serial, settings: SerialSettings) -> None:

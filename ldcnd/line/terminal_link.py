@@ -2,7 +2,7 @@
 
 The kernel gives the number of a terminal to the next program that asks for one, as soon as a simulator is killed; the
 link that it leaves then leads to a stranger. So beside the link there is a file, locked for as long as the simulator
-runs: the kernel drops the lock however that ends.
+runs: the kernel drops the lock however that ends. Links that other programs make are judged by their age.
 """
 
 import fcntl
@@ -11,6 +11,10 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+PSEUDO_TERMINALS = range(136, 144)
+"""Major device numbers of Unix98 pseudo-terminals (Linux, admin-guide/devices.txt)."""
+YOUNGER_S = 5.0
+"""Longest time from a link to the rights of its terminal, with which the kernel dates it anew, seconds."""
 LOOKS = 20
 LOOK_S = 0.01
 """Whoever opens a port looks at the lock for a moment, so one that is about to be taken is tried again, seconds."""
@@ -61,14 +65,14 @@ class TerminalLink:
 
 
 def why_not_served(path: str) -> str:
-    """Say why a port is not the terminal that a simulator has linked there; empty where no simulator made a link."""
+    """Say why a port is not the terminal to which a program has linked it; empty when nothing contradicts that."""
     link = Path(path)
     if not link.is_symlink():
         return ""
     try:
         lock = os.open(lock_of(link), os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
-        return ""
+        return _why_younger(link)
     try:
         fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
@@ -77,3 +81,17 @@ def why_not_served(path: str) -> str:
     finally:
         os.close(lock)
     return "the simulator that has made this link runs no more, and its terminal may be another program's"
+
+
+def _why_younger(link: Path) -> str:
+    """Say whether a terminal is younger than the link to it: then it was given to another program since.
+
+    The kernel changes `st_ctime` of a pseudo-terminal when it makes it, and not when bytes pass (Linux, fs/devpts).
+    """
+    try:
+        terminal, made_s = link.stat(), link.lstat().st_mtime
+    except OSError:
+        return ""
+    if os.major(terminal.st_rdev) not in PSEUDO_TERMINALS or terminal.st_ctime < made_s + YOUNGER_S:
+        return ""
+    return f"the link was made {terminal.st_ctime - made_s:.0f} s before its terminal, which may be another program's"

@@ -215,6 +215,20 @@ async def test_a_missing_device_is_named(tmp_path: Path):
         await open_serial_port(SerialSettings(missing, 115_200))
 
 
+async def test_a_terminal_that_another_program_was_given_since_its_link_was_made_is_not_opened(tmp_path: Path):
+    stranger, link = FarSide(), tmp_path / "line"
+    link.symlink_to(stranger.path)
+    await (await open_serial_port(SerialSettings(str(link), 115_200))).close()
+    long_ago_s = Path(stranger.path).stat().st_ctime - 3600  # the kernel gives the number of a closed one away
+    os.utime(link, (long_ago_s, long_ago_s), follow_symlinks=False)
+
+    with pytest.raises(TransportLost, match="may be another program's") as refused:
+        await open_serial_port(SerialSettings(str(link), 115_200))
+    stranger.close()
+
+    assert "make the link anew" in str(refused.value.remedy)
+
+
 async def test_what_is_no_serial_port_is_refused(tmp_path: Path):
     plain = tmp_path / "plain"
     plain.write_bytes(b"")
