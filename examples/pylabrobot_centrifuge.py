@@ -4,7 +4,6 @@
 """
 
 import asyncio
-import math
 import sys
 from collections.abc import Mapping
 from contextlib import AsyncExitStack
@@ -16,31 +15,22 @@ from pylabrobot.centrifuge.backend import CentrifugeBackend
 import ldcnd
 from ldcnd.contract.samples import IoSample, Moving, StateSample
 
-EARTH_M_S2 = 9.80665
 _SENSORS = ("pin_in", "locked", "door_closed", "door_open", "balanced")
-
-
-def revolutions_of(g: float, radius_m: float) -> float:
-    """Return the revolutions a second at which g times the acceleration of gravity acts at a radius."""
-    return math.sqrt(g * EARTH_M_S2 / radius_m) / math.tau
 
 
 class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no types
     """A rotor, a door, its lock and the pin that holds the rotor at a bucket."""
 
-    def __init__(
-        self, endpoint: str | None = None, *, radius_m: float = 0.1, bucket1: float = 0.1, bucket2: float = 0.6
-    ) -> None:
+    def __init__(self, endpoint: str | None = None, *, bucket1: float = 0.1, bucket2: float = 0.6) -> None:
         """Describe it.
 
         Args:
             endpoint: of the daemon; the local one when missing.
-            radius_m: of the rotor, at the middle of the buckets.
             bucket1: where the first bucket is at the door, in revolutions from the index.
             bucket2: likewise.
         """
         super().__init__()
-        self.endpoint, self.radius_m, self.bucket1, self.bucket2 = endpoint, radius_m, bucket1, bucket2
+        self.endpoint, self.bucket1, self.bucket2 = endpoint, bucket1, bucket2
         self._open = AsyncExitStack()
 
     async def setup(self) -> None:
@@ -107,7 +97,7 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
         """Spin behind a locked door for a time at speed; the drive itself ends it with a ramp.
 
         Args:
-            g: at the radius of the buckets.
+            g: at the radius that the configuration has.
             duration: seconds at speed.
             acceleration: 0 to 1 of the limit of the axis.
 
@@ -117,7 +107,7 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
         (info,) = [each for each in await self._rig.describe() if each.axis == "rotor"]
         await self._shut()
         motion = await self._rotor.move_velocity(
-            revolutions_of(g, self.radius_m),
+            f"{g} g",
             acceleration=acceleration * (info.limits.acceleration or 1.0),
             duration_s=duration,
         )
@@ -128,7 +118,7 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
 
     def serialize(self) -> dict[str, Any]:
         """Return what makes the same backend again."""
-        names = ("endpoint", "radius_m", "bucket1", "bucket2")
+        names = ("endpoint", "bucket1", "bucket2")
         return {"type": type(self).__name__} | {name: getattr(self, name) for name in names}
 
     # -- how it is done ----------------------------------------------------------------------------------------------

@@ -15,6 +15,7 @@ from ldcnd.contract.catalogue import COMMANDS
 from ldcnd.contract.commands import About, AxisCommand, Command, Ends, Stop
 from ldcnd.contract.frozen import Frozen, attribute_docstrings
 from ldcnd.contract.traces import TakeTrace
+from ldcnd.contract.units import DIMENSIONS
 
 BY_HAND = (Stop, TakeTrace)
 """`Axis` has these itself: a stop has a key of its own, and a trace is fetched when it is complete."""
@@ -24,7 +25,6 @@ END = "    # made by `python -m tools client`: end\n"
 HEADER = '''"""The verbs of an axis as methods; made from the command classes by `make fix`, not edited."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import TypeVar
 
 '''
@@ -35,18 +35,22 @@ AxisReplyT = TypeVar("AxisReplyT", bound=CommandReply)
 
 
 class AxisVerbs(ABC):
-    """One method for each command; it returns once the drive has acknowledged the command, or raises why not."""
+    """One method for each command; it returns once the drive has acknowledged the command, or raises why not.
+
+    Positions, velocities and accelerations are numbers in the unit of the axis, that a second and that a second
+    squared, or texts with a unit that the axis has, such as "3000 rpm".
+    """
 
     @abstractmethod
-    async def _send(self, make: Callable[[], AxisCommand[AxisReplyT]]) -> AxisReplyT:
+    async def _send(self, command: type[AxisCommand[AxisReplyT]], **fields: object) -> AxisReplyT:
         """Send a command that ends with its reply."""
 
     @abstractmethod
-    async def _start(self, make: Callable[[], AxisCommand[CommandReply]]) -> Motion:
+    async def _start(self, command: type[AxisCommand[CommandReply]], **fields: object) -> Motion:
         """Send a command that ends later."""
 
     @abstractmethod
-    async def _ask(self, make: Callable[[], Command[ReplyT]]) -> ReplyT:
+    async def _ask(self, command: type[Command[ReplyT]], **fields: object) -> ReplyT:
         """Query the daemon about the axis."""
 '''
 
@@ -95,6 +99,7 @@ def _method(command: type[Command[Frozen]], names: set[type]) -> str:
     names |= {command} | ({command.reply_model()} if reply != "Motion" else set())
     own = [name for name in command.model_fields if name not in AxisCommand.model_fields and name != "lease"]
     annotations, said = _annotations(command), attribute_docstrings(command)
+    annotations |= {name: annotations[name].replace("float", "float | str") for name in own if name in DIMENSIONS}
     positional, keyword = [], []
     for name in own:
         field = command.model_fields[name]
@@ -108,8 +113,7 @@ def _method(command: type[Command[Frozen]], names: set[type]) -> str:
             shown = f"{type(default).__name__}.{default.name}" if hasattr(default, "name") else repr(default)
             keyword.append(f"{name}: {annotations[name]} = {shown}")
     signature = ", ".join(["self", *positional, *(["*", *keyword] if keyword else [])])
-    made = ", ".join(f"{name}={name}" for name in own)
-    made_by = f"lambda: {command.__name__}({made})" if own else command.__name__
+    made_by = ", ".join([command.__name__, *(f"{name}={name}" for name in own)])
     return (
         f"\n    async def {method_name(command)}({signature}) -> {reply}:\n"
         f"{''.join(_docstring(command, own, said))}"

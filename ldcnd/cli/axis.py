@@ -3,6 +3,7 @@
 import asyncio
 import sys
 from functools import partial
+from typing import Any
 
 import click
 
@@ -10,7 +11,7 @@ from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.names import whose
 from ldcnd.cli.output import end_as_interrupted, keys, repetitions, show_lines
-from ldcnd.cli.quantities import number, rounded, seconds
+from ldcnd.cli.quantities import number, seconds
 from ldcnd.cli.sending import (
     NAME,
     WAITING,
@@ -22,7 +23,7 @@ from ldcnd.cli.sending import (
     halted,
     halting,
 )
-from ldcnd.cli.typed import Finite, axis_of
+from ldcnd.cli.typed import Finite, Quantity, axis_of, in_units
 from ldcnd.client.lease import Control, control
 from ldcnd.client.motion import Jogging
 from ldcnd.client.rig_client import RigClient
@@ -50,17 +51,18 @@ from ldcnd.contract.commands import (
 from ldcnd.contract.errors import ConfigError, LeaseExpired
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import AlarmReport, ClearCounter, CounterReply, ReadAlarms
+from ldcnd.contract.units import Dimension, quantity_text, shown_quantity
 
 WAIT, LEAVE = (click.option(name, is_flag=True, help=text) for name, text in WAITING.items())
 
 
 @click.command(context_settings={"ignore_unknown_options": True})
 @click.argument("axis", type=AXIS)
-@click.argument("value", type=Finite())
+@click.argument("value", type=Quantity())
 @click.option("--relative", is_flag=True, help="VALUE is a distance.")
 @click.option("--at-velocity", is_flag=True, help="VALUE is a velocity: run until stopped or to the soft limit.")
-@click.option("--velocity", type=Finite(), help="Units a second; the axis default when missing.")
-@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
+@click.option("--velocity", type=Quantity(), help="Units a second; the axis default when missing.")
+@click.option("--acceleration", type=Quantity(), help="Units a second squared; the axis default when missing.")
 @click.option(
     "--direction",
     type=click.Choice([direction.value for direction in Direction]),
@@ -94,7 +96,7 @@ def move(
     """Move AXIS to the position VALUE, by the distance VALUE, or at the velocity VALUE."""
     if relative and at_velocity:
         raise click.UsageError("--relative and --at-velocity exclude each other")
-    given = {"acceleration": acceleration, "buffer_mode": buffer_mode}
+    given: dict[str, Any] = {"acceleration": acceleration, "buffer_mode": buffer_mode}
     request: MoveVelocity | MoveRelative | MoveAbsolute
     if direction and (relative or at_velocity):
         raise click.UsageError("--direction goes with a position")
@@ -103,12 +105,13 @@ def move(
     if at_velocity:
         if velocity is not None:
             raise click.UsageError("with --at-velocity, VALUE is the velocity; leave --velocity out")
-        request = of_options(MoveVelocity, velocity=value, duration_s=for_s, **given)
+        request = of_options(MoveVelocity, **(given := given | {"velocity": value, "duration_s": for_s}))
     elif relative:
-        request = of_options(MoveRelative, distance=value, velocity=velocity, **given)
+        request = of_options(MoveRelative, **(given := given | {"distance": value, "velocity": velocity}))
     else:
-        request = of_options(MoveAbsolute, position=value, velocity=velocity, direction=direction, **given)
-    sender.send(axis, request, wait=wait, leave_running=leave_running)
+        given |= {"position": value, "velocity": velocity, "direction": direction}
+        request = of_options(MoveAbsolute, **given)
+    sender.send(axis, request, given, wait=wait, leave_running=leave_running)
 
 
 LEASE_S = 1.0
@@ -120,9 +123,9 @@ RENEW_EACH_S = 0.1
 
 @click.command(context_settings={"ignore_unknown_options": True})
 @click.argument("axis", type=AXIS)
-@click.argument("velocity", type=Finite())
+@click.argument("velocity", type=Quantity())
 @click.option("--for", "for_s", type=Finite(0, 3600, min_open=True), help="Duration, seconds.")
-@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis default when missing.")
+@click.option("--acceleration", type=Quantity(), help="Units a second squared; the axis default when missing.")
 @click.option("--force", is_flag=True, help="Take control from its holder.")
 @with_target
 def jog(
@@ -133,12 +136,14 @@ def jog(
     The axis is under control of this command meanwhile. It is halted when the key is released, when the time is over,
     at Ctrl-C and when the terminal goes; if this program dies, the daemon ends the jog within half a second.
     """
-    command = of_options(Jog, velocity=velocity, acceleration=acceleration, hold_s=HOLD_S)
+    given = {"velocity": velocity, "acceleration": acceleration}
+    request = of_options(Jog, hold_s=HOLD_S, **given)
     if for_s is None and not sys.stdin.isatty():
         raise ConfigError("there is no keyboard here", remedy="say how long to run with --for SECONDS")
 
     async def work(client: RigClient) -> str:
         info = await axis_of(client, axis)
+        command = in_units(request, given, info)
         async with (
             control(client, f"{NAME} jog", axis, lease_s=LEASE_S, force=force) as held,
             halting(client, info),
@@ -157,8 +162,8 @@ async def _for_a_time(client: RigClient, info: AxisInfo, held: Control, command:
     """Run the axis for a time, in seconds, or until its software limit."""
     jog = Jogging(partial(held.command, info.axis), command)
     reply = await jog.begin()
-    at = rounded(reply.velocity or command.velocity)
-    show_lines(f"{whose(client.rig)}{info.axis}: runs at {at} {info.unit}/s for {for_s:g} s")
+    at = quantity_text(reply.velocity or command.velocity, info, Dimension.VELOCITY)
+    show_lines(f"{whose(client.rig)}{info.axis}: runs at {at} for {for_s:g} s")
     try:
         async with asyncio.timeout(for_s):
             while True:
@@ -212,18 +217,19 @@ def _preview_lines(reply: PreviewReply, info: AxisInfo) -> list[str]:
     time = f", in {seconds(reply.duration_s)} without settling" if reply.duration_s is not None else ""
     lines = [
         f"{info.axis}: {end}{time}",
-        f"  velocity     {_held(reply.velocity, reply.velocity_error)} {info.unit}/s",
-        f"  acceleration {_held(reply.acceleration, reply.acceleration_error)} {info.unit}/s²",
+        f"  velocity     {_held(reply.velocity, reply.velocity_error, info, Dimension.VELOCITY)}",
+        f"  acceleration {_held(reply.acceleration, reply.acceleration_error, info, Dimension.ACCELERATION)}",
     ]
     if reply.bus_s is not None:
         lines.append(f"  {len(reply.packets)} packets, {seconds(reply.bus_s)} on the line at most")
     return [*lines, *(f"  now in the way: {obstacle}" for obstacle in reply.obstacles)]
 
 
-def _held(value: float | None, error: float | None) -> str:
+def _held(value: float | None, error: float | None, info: AxisInfo, dimension: Dimension) -> str:
     if value is None:
         return "unknown"
-    return f"{value:.6g}" + (f" ({error:+.2g} by rounding)" if error else "")
+    off = f" ({shown_quantity(error, info, dimension)[0]:+.2g} by rounding)" if error else ""
+    return quantity_text(value, info, dimension, ".6g") + off
 
 
 def _alarms(reply: AlarmReport, _info: AxisInfo | None) -> Shown:

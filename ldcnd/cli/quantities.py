@@ -21,6 +21,7 @@ from ldcnd.contract.samples import (
     StateSample,
     VelocitySample,
 )
+from ldcnd.contract.units import Dimension, quantity_text
 from ldcnd.parts import require
 
 if TYPE_CHECKING:
@@ -57,9 +58,9 @@ def values_of(reply: CommandReply, info: AxisInfo) -> str:
     if reply.duty is not None:
         parts.append(f"duty {reply.duty:.1%}")
     if reply.velocity is not None:
-        parts.append(f"at {rounded(reply.velocity)} {info.unit}/s")
+        parts.append(f"at {quantity_text(reply.velocity, info, Dimension.VELOCITY)}")
     if reply.acceleration is not None:
-        parts.append(f"with {rounded(reply.acceleration)} {info.unit}/s²")
+        parts.append(f"with {quantity_text(reply.acceleration, info, Dimension.ACCELERATION)}")
     if reply.duration_s is not None:
         parts.append(f"in {seconds(reply.duration_s)}")
     return f": {', '.join(parts)}" if parts else ""

@@ -6,6 +6,7 @@ import os
 import shlex
 import sys
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import click
 
@@ -15,12 +16,13 @@ from ldcnd.cli.names import whose
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, commanding, derived_for_all, halted
-from ldcnd.cli.typed import Finite, axis_of, number_of
+from ldcnd.cli.typed import Finite, Quantity, axis_of, in_units, number_of
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import CommandReply, MoveVelocity, Power, Reset
 from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError, UnknownAxis, WrongState
 from ldcnd.contract.events import ReadOutcome
+from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.rig_commands import (
@@ -30,13 +32,16 @@ from ldcnd.contract.rig_commands import (
     MoveTogether,
     MoveTogetherReply,
     PreviewTogether,
+    PreviewTogetherReply,
     Rehearse,
     Reload,
     SetSpeedOverride,
     WalkPath,
 )
 from ldcnd.contract.samples import AxisState, StateSample, TelemetryItem
+from ldcnd.contract.units import Dimension, quantity_text
 
+GroupT = TypeVar("GroupT", bound=Frozen)
 NOT_STOPPED = "NOT stopped, use the emergency stop: "
 
 
@@ -204,7 +209,7 @@ PATIENCE_S = 30.0
 @click.command()
 @click.argument("loss", type=click.Choice(["client-loss", "bus-loss", "daemon-stop"]))
 @click.argument("axis", type=AXIS)
-@click.option("--velocity", type=Finite(), required=True, help="Units a second, signed.")
+@click.option("--velocity", type=Quantity(), required=True, help="Units a second, signed.")
 @click.option("--lease", "lease_s", type=Finite(), default=1.0, show_default=True, help="For client-loss, seconds.")
 @click.confirmation_option("--yes", prompt="The axis will move. Go on?")
 @with_target
@@ -216,14 +221,16 @@ def drill(target: Target, loss: str, axis: str, velocity: float, lease_s: float)
     """
 
     async def work(client: RigClient) -> dict[str, float]:
+        info = await axis_of(client, axis)
+        request = in_units(of_options(MoveVelocity, velocity=velocity), {"velocity": velocity}, info)
         if loss == "client-loss":
-            return await _lose_client(client, axis, velocity, lease_s)
-        return await _rehearse(client, axis, velocity, loss.replace("-", "_"))
+            return await _lose_client(client, axis, request, lease_s)
+        return await _rehearse(client, axis, request, loss.replace("-", "_"))
 
     _report(target, axis, loss.replace("-", " "), target.run(work))
 
 
-async def _lose_client(client: RigClient, axis: str, velocity: float, lease_s: float) -> dict[str, float]:
+async def _lose_client(client: RigClient, axis: str, request: MoveVelocity, lease_s: float) -> dict[str, float]:
     """Move an axis under a lease that is not renewed."""
     if client.lease:
         raise WrongState(
@@ -234,7 +241,7 @@ async def _lose_client(client: RigClient, axis: str, velocity: float, lease_s: f
     lease = await client.ask(Acquire(client="drill", axes=(axis,), lease_s=lease_s))
     began_s = asyncio.get_running_loop().time()
     await client.command(axis, Power(on=True, lease=lease.lease))
-    await client.command(axis, MoveVelocity(velocity=velocity, lease=lease.lease))
+    await client.command(axis, request.model_copy(update={"lease": lease.lease}))
     reacted_s, stands_s = await _watch(client, axis)
     return {
         "lease_s": lease_s,
@@ -243,16 +250,16 @@ async def _lose_client(client: RigClient, axis: str, velocity: float, lease_s: f
     }
 
 
-async def _rehearse(client: RigClient, axis: str, velocity: float, kind: str) -> dict[str, float]:
+async def _rehearse(client: RigClient, axis: str, request: MoveVelocity, kind: str) -> dict[str, float]:
     """Play a loss under control of the whole rig: a lost line concerns all axes on it."""
     loop = asyncio.get_running_loop()
     async with control(client, "drill", lease_s=PATIENCE_S) as held:
         await held.command(axis, Power(on=True))
-        await held.command(axis, MoveVelocity(velocity=velocity))
+        await held.command(axis, request)
         await asyncio.sleep(RUN_UP_S)
         began_s = loop.time()
-        request = Rehearse.model_validate({"kind": kind, "axis": axis, "lease": held.lease.lease})
-        await client.ask(request, timeout_s=PATIENCE_S)
+        loss = Rehearse.model_validate({"kind": kind, "axis": axis, "lease": held.lease.lease})
+        await client.ask(loss, timeout_s=PATIENCE_S)
         answered_s = loop.time()
         reacted_s, stands_s = await _watch(client, axis)
     return {
@@ -292,10 +299,10 @@ def group() -> None:
 
 @group.command("move", context_settings={"ignore_unknown_options": True})
 @click.argument("moves", nargs=-1, required=True, metavar="AXIS=POSITION...")
-@click.option("--velocity", type=Finite(), help="Units a second, for each axis; the axis defaults when missing.")
-@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis defaults when missing.")
+@click.option("--velocity", type=Quantity(), help="Units a second, for each axis; the axis defaults when missing.")
+@click.option("--acceleration", type=Quantity(), help="Units a second squared; the axis defaults when missing.")
 @click.option("--straight", is_flag=True, help="Keep to a straight line: all ramp alike and arrive together.")
-@click.option("--max-deviation", type=Finite(), help="Refuse a line that would be left by more, in axis units.")
+@click.option("--max-deviation", type=Quantity(), help="Refuse a line that would be left by more, in axis units.")
 @click.option("--wait", is_flag=True, help="Return when all have ended; Ctrl-C halts them.")
 @commanding
 def group_move(
@@ -312,12 +319,13 @@ def group_move(
     who = {"lease": sender.lease, "client": None if sender.lease else NAME}
     wanted = _shares(moves, velocity, acceleration, who)
     path = LinePath.LINEAR if straight else LinePath.INDEPENDENT
-    request = of_options(MoveTogether, moves=wanted, path=path, max_deviation=max_deviation)
+    moved = tuple(move for move, _ in wanted)
+    request = of_options(MoveTogether, moves=moved, path=path, max_deviation=max_deviation)
     if wait:
         end_as_interrupted()
 
     async def work(client: RigClient) -> list[str]:
-        infos = [await axis_of(client, move.axis) for move in wanted]
+        converted, infos = await _in_units(client, request, wanted, {"max_deviation": max_deviation})
 
         async def follow(reply: MoveTogetherReply) -> list[str]:
             states = [await client.wait_for_end(each.axis, each.command_id) for each in reply.replies]
@@ -327,7 +335,7 @@ def group_move(
                 sender.target.show(state, f"{whose(client.rig)}{outcome(info, ended, state)}")
             return failed
 
-        reply = await client.ask(request)
+        reply = await client.ask(converted)
         lines = _accepted(client, reply.replies, infos)
         if reply.deviation is not None:
             lines.append(f"at most {rounded(reply.deviation)} from the line")
@@ -346,16 +354,23 @@ def group_move(
 
 @group.command("preview", context_settings={"ignore_unknown_options": True})
 @click.argument("moves", nargs=-1, required=True, metavar="AXIS=POSITION...")
-@click.option("--velocity", type=Finite(), help="Units a second, for each axis; the axis defaults when missing.")
-@click.option("--acceleration", type=Finite(), help="Units a second squared; the axis defaults when missing.")
+@click.option("--velocity", type=Quantity(), help="Units a second, for each axis; the axis defaults when missing.")
+@click.option("--acceleration", type=Quantity(), help="Units a second squared; the axis defaults when missing.")
 @with_target
 def group_preview(target: Target, moves: tuple[str, ...], velocity: float | None, acceleration: float | None) -> None:
     """Say how long a straight line of a group would take, and how far from it the axes would get; nothing moves."""
-    request = of_options(PreviewTogether, moves=_shares(moves, velocity, acceleration, {}), path=LinePath.LINEAR)
-    reply = target.run(lambda client: client.ask(request))
+    wanted = _shares(moves, velocity, acceleration, {})
+    request = of_options(PreviewTogether, moves=tuple(move for move, _ in wanted), path=LinePath.LINEAR)
+
+    async def work(client: RigClient) -> tuple[PreviewTogetherReply, list[AxisInfo]]:
+        converted, infos = await _in_units(client, request, wanted, {})
+        return await client.ask(converted), infos
+
+    reply, infos = target.run(work)
     lines = [
-        f"{each.axis}: to {rounded(each.position)} at {rounded(each.velocity)} with {rounded(each.acceleration)}"
-        for each in reply.shares
+        f"{each.axis}: to {rounded(each.position)} at {quantity_text(each.velocity, info, Dimension.VELOCITY)}"
+        f" with {quantity_text(each.acceleration, info, Dimension.ACCELERATION)}"
+        for each, info in zip(reply.shares, infos, strict=True)
     ]
     lines.append(f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation or 0.0)} from the line")
     target.show(reply, *lines)
@@ -363,10 +378,10 @@ def group_preview(target: Target, moves: tuple[str, ...], velocity: float | None
 
 @group.command("path", context_settings={"ignore_unknown_options": True})
 @click.argument("corners", nargs=-1, required=True, metavar="AXIS=P1,P2,...")
-@click.option("--speed", type=Finite(), help="Along the path, in axis units a second; as fast as may be when missing.")
-@click.option("--velocity", type=Finite(), help="The highest of each axis, units a second; the axis defaults.")
-@click.option("--acceleration", type=Finite(), help="Likewise, units a second squared.")
-@click.option("--max-deviation", type=Finite(), help="Refuse a path that would be left by more, in axis units.")
+@click.option("--speed", type=Quantity(), help="Along the path, axis units a second; as fast as may be when missing.")
+@click.option("--velocity", type=Quantity(), help="The highest of each axis, units a second; the axis defaults.")
+@click.option("--acceleration", type=Quantity(), help="Likewise, units a second squared.")
+@click.option("--max-deviation", type=Quantity(), help="Refuse a path that would be left by more, in axis units.")
 @commanding
 def group_path(
     sender: Sender,
@@ -378,17 +393,18 @@ def group_path(
 ) -> None:
     """Walk all members of a configured group along a polyline, on drives with path mode: `z=20,20,0 c=0,15,0`."""
     who = {"lease": sender.lease, "client": None if sender.lease else NAME}
-    moves = []
+    wanted = []
     for each in corners:
         axis, _, places = each.partition("=")
-        *via, end = places.split(",")
-        corner, limits = [number_of(place, each) for place in via], {"velocity": velocity, "acceleration": acceleration}
-        moves.append(of_options(AxisPath, axis=axis, via=corner, position=number_of(end, each), **limits, **who))
-    request = of_options(WalkPath, moves=tuple(moves), speed=speed, max_deviation=max_deviation)
+        *via, end = (number_of(place, each) for place in places.split(","))
+        given = {"via": tuple(via), "position": end, "velocity": velocity, "acceleration": acceleration}
+        wanted.append((of_options(AxisPath, axis=axis, **given, **who), given))
+    bounds = {"speed": speed, "max_deviation": max_deviation}
+    request = of_options(WalkPath, moves=tuple(move for move, _ in wanted), **bounds)
 
     async def work(client: RigClient) -> None:
-        infos = [await axis_of(client, move.axis) for move in moves]
-        reply = await client.ask(request)
+        converted, infos = await _in_units(client, request, wanted, bounds)
+        reply = await client.ask(converted)
         lines = _accepted(client, reply.replies, infos)
         said = f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation)} from the path"
         sender.target.show(reply, *lines, f"{said}; ends within {rounded(reply.ahead_s)} s if the daemon dies")
@@ -405,11 +421,23 @@ def _accepted(client: RigClient, replies: Sequence[CommandReply], infos: Sequenc
 
 def _shares(
     moves: tuple[str, ...], velocity: float | None, acceleration: float | None, who: Mapping[str, str | None]
-) -> tuple[AxisMove, ...]:
-    """Return what is to be done, from `axis=position` of each axis."""
-    shares = []
+) -> list[tuple[AxisMove, Mapping[str, object]]]:
+    """Return what is to be done, from `axis=position` of each axis, and the numbers as they were typed."""
+    shares: list[tuple[AxisMove, Mapping[str, object]]] = []
     for each in moves:
         axis, _, position = each.partition("=")
-        limits = {"velocity": velocity, "acceleration": acceleration}
-        shares.append(of_options(AxisMove, axis=axis, position=number_of(position, each), **limits, **who))
-    return tuple(shares)
+        given = {"position": number_of(position, each), "velocity": velocity, "acceleration": acceleration}
+        shares.append((of_options(AxisMove, axis=axis, **given, **who), given))
+    return shares
+
+
+async def _in_units(
+    client: RigClient,
+    request: GroupT,
+    shares: Sequence[tuple[AxisMove, Mapping[str, object]]],
+    given: Mapping[str, object],
+) -> tuple[GroupT, list[AxisInfo]]:
+    """Return a request with the numbers of each axis in its units, and what the axes are; the first stands for all."""
+    infos = [await axis_of(client, move.axis) for move, _ in shares]
+    moves = tuple(in_units(move, typed, info) for (move, typed), info in zip(shares, infos, strict=True))
+    return in_units(request, given, infos[0]).model_copy(update={"moves": moves}), infos

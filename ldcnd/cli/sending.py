@@ -2,11 +2,11 @@
 
 import asyncio
 import sys
-from collections.abc import AsyncIterator, Callable, Iterator, Sequence
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, nullcontext, suppress
 from enum import Enum
 from functools import wraps
-from types import NoneType
+from types import MappingProxyType, NoneType
 from typing import Any, Literal, TypeVar, get_args, get_origin
 
 import click
@@ -16,7 +16,7 @@ from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.names import typed, whose
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines, show_passing
 from ldcnd.cli.quantities import number, outcome, sample_text, values_of
-from ldcnd.cli.typed import Finite, WholeNumber, axis_of
+from ldcnd.cli.typed import Finite, Quantity, WholeNumber, axis_of, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import About, AxisCommand, Command, CommandReply, Halt, Verb
@@ -25,10 +25,13 @@ from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.frozen import Frozen, attribute_docstrings
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import PositionSample, Sample, StateSample, TelemetryItem
+from ldcnd.contract.units import DIMENSIONS
 
 HALT_TIME_S = 3.0
 NAME = "ldcnd"
 """Under this name the command line is found in events unless a lease says another."""
+
+NOTHING: Mapping[str, object] = MappingProxyType({})
 
 Sent = AxisCommand[CommandReply]
 ReplyT = TypeVar("ReplyT", bound=Frozen)
@@ -58,8 +61,18 @@ class Sender:
         self.target = target
         self.lease = lease
 
-    def send(self, axis: str, command: Sent, *, wait: bool = False, leave_running: bool = False) -> None:
+    def send(
+        self,
+        axis: str,
+        command: Sent,
+        given: Mapping[str, object] = NOTHING,
+        *,
+        wait: bool = False,
+        leave_running: bool = False,
+    ) -> None:
         """Send one command and show its reply; with `wait` return when it has ended.
+
+        Its numbers are taken from what is `given`, in the units of the axis.
 
         Ctrl-C, SIGTERM and the end of the terminal halt an axis that is waited for, unless it is to be left running.
         """
@@ -71,8 +84,9 @@ class Sender:
 
         async def work(client: RigClient) -> tuple[StateSample, str, Sample | None] | None:
             info = await axis_of(client, axis)
+            converted = in_units(command, given, info)
             async with halting(client, info, leave_running=leave_running) if wait else nullcontext():
-                reply = await self.command(client, axis, command)
+                reply = await self.command(client, axis, converted)
                 words = command.verb.replace("_", " ")
                 waits = f", waits until {reply.waits_for} has ended" if reply.waits_for else ""
                 said = f"{whose(client.rig)}{axis}: {words} accepted{values_of(reply, info)}{waits}"
@@ -239,7 +253,7 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
         leave_running: bool = False,
         **given: Any,  # noqa: ANN401
     ) -> None:
-        sender.send(axis, of_options(command, **given), wait=wait, leave_running=leave_running)
+        sender.send(axis, of_options(command, **given), given, wait=wait, leave_running=leave_running)
 
     waiting = [click.Option([name], is_flag=True, help=text) for name, text in WAITING.items()] if moves else []
     return _derived(name, command, callback, arguments, [click.Argument(["axis"], type=AXIS)], waiting)
@@ -285,9 +299,10 @@ def derived_question(
             if axis is None:
                 return await client.ask(request), None
             info = await axis_of(client, axis)
-            if isinstance(request, AxisCommand):
-                return await client.command(axis, request), info
-            return await client.ask(request, axis), info
+            converted = in_units(request, given, info)
+            if isinstance(converted, AxisCommand):
+                return await client.command(axis, converted), info
+            return await client.ask(converted, axis), info
 
         reply, info = target.run(work)
         for part, lines in shows(reply, info):
@@ -309,7 +324,7 @@ def _derived(
     fields = {each: described for each, described in command.model_fields.items() if each not in _SENT_BY_ITSELF}
     params: list[click.Parameter] = list(before)
     for field, described in fields.items():
-        kind, many = _kind(described.annotation)
+        kind, many = (Quantity(), False) if field in DIMENSIONS else _kind(described.annotation)
         if field in arguments:
             params.append(click.Argument([field], type=kind, nargs=-1 if many else 1))
         else:

@@ -1,7 +1,7 @@
 """Typed input: names with the nearest right one, and numbers as `ldcnd.contract.number_text` reads them."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, TypeVar
@@ -11,12 +11,21 @@ from typing_extensions import override
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import ConfigError, UnknownAxis
+from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.number_text import NotANumber, read_number, read_whole
+from ldcnd.contract.number_text import NotANumber, behind_number, read_number, read_whole
+from ldcnd.contract.units import DIMENSIONS, read_quantity
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 
+CommandT = TypeVar("CommandT", bound=Frozen)
 NEAR = 0.4
 """How alike two names must be, from 0 to 1."""
+
+
+class TypedNumber(float):
+    """A number of an axis as it was typed, with its unit if it has one; the axis says what it is in its own unit."""
+
+    text: str
 
 
 def unknown(what: str, name: str, known: Iterable[str]) -> UnknownAxis:
@@ -42,15 +51,15 @@ async def axis_of(client: RigClient, name: str) -> AxisInfo:
     return axes[name]
 
 
-def number_of(text: str, written: str) -> float:
-    """Return the number in a part of an argument; wrong usage if it is none.
+def number_of(text: str, written: str) -> TypedNumber:
+    """Return the number in a part of an argument, with its unit; wrong usage if it is none.
 
     Args:
         text: the part.
         written: the argument that it is of, for the message.
     """
     try:
-        return read_number(text)
+        return typed_number(text)
     except NotANumber as error:
         raise click.UsageError(f"{written!r}: {error}") from None
 
@@ -71,6 +80,50 @@ class Finite(click.FloatRange):
     def _describe_range(self) -> str:
         """Return its limits for help; nothing without limits."""
         return "" if self.min is None and self.max is None else super()._describe_range()
+
+
+class Quantity(Finite):
+    """A position, distance, velocity or acceleration of an axis; a unit may stand behind it."""
+
+    name = "quantity"
+
+    @override
+    def convert(self, value: float | str, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        try:
+            return typed_number(str(value))
+        except NotANumber as error:
+            self.fail(f"{error}.", param, ctx)
+
+
+def typed_number(text: str) -> TypedNumber:
+    """Return a number with any unit, or none.
+
+    Raises:
+        NotANumber: it is none.
+    """
+    number = TypedNumber(read_number(text, *filter(None, [behind_number(text)])))
+    number.text = text
+    return number
+
+
+def in_units(command: CommandT, given: Mapping[str, object], info: AxisInfo) -> CommandT:
+    """Return a command with its numbers in units of the axis, from what was typed.
+
+    Raises:
+        click.BadParameter: a unit does not fit; names those that do.
+    """
+
+    def read(name: str, value: object) -> object:
+        if isinstance(value, tuple):
+            return tuple(read(name, each) for each in value)
+        if not isinstance(value, TypedNumber):
+            return value
+        try:
+            return read_quantity(value.text, info, DIMENSIONS[name])
+        except NotANumber as error:
+            raise click.BadParameter(f"{error}.", param_hint=name.replace("_", "-")) from None
+
+    return command.model_copy(update={name: read(name, given[name]) for name in given if name in DIMENSIONS})
 
 
 class WholeNumber(click.IntRange):
@@ -133,10 +186,10 @@ force_option = click.option("--force", cls=ForceOption)
 
 
 CONSOLE_ADDRESS = "127.0.0.1:8470"
-CommandT = TypeVar("CommandT", bound=Callable[..., object])
+OptionT = TypeVar("OptionT", bound=Callable[..., object])
 
 
-def address_option(name: str, default: str) -> Callable[[CommandT], CommandT]:
+def address_option(name: str, default: str) -> Callable[[OptionT], OptionT]:
     """Return an option of that name, whose value is a `ListenAddress`; anything but HOST:PORT is wrong usage."""
     return click.option(
         name,

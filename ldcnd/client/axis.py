@@ -18,11 +18,13 @@ from ldcnd.client.verbs import AxisVerbs
 from ldcnd.contract.codec import decode_received, explained
 from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
 from ldcnd.contract.condition import assess
-from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError, WrongState
+from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, SessionError, UnknownAxis, WrongState
 from ldcnd.contract.events import FINAL, CommandOutcome, ReadOutcome
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.number_text import NotANumber
 from ldcnd.contract.samples import Moving, PositionSample, StateSample, TelemetryItem
 from ldcnd.contract.traces import TakeTrace, TraceTrigger
+from ldcnd.contract.units import DIMENSIONS, read_quantity
 from ldcnd.net.session import Publication, SampleKind
 
 LINGER_S = 0.03
@@ -33,6 +35,7 @@ HALT_S = 2.0
 """Longest time that a cancelled wait takes to halt its axis, in seconds."""
 
 ReplyT = TypeVar("ReplyT", bound=Frozen)
+CommandT = TypeVar("CommandT", bound=Frozen)
 AxisReplyT = TypeVar("AxisReplyT", bound=CommandReply)
 
 
@@ -174,7 +177,7 @@ class Axis(AxisVerbs):
             LdcndError: as the daemon refused it.
         """
         jog = Jogging(
-            lambda request: self._send(lambda: request),
+            self._sent_as,
             _made(
                 lambda: Jog(
                     velocity=velocity, acceleration=acceleration, hold_s=hold_s, buffer_mode=BufferMode.ABORTING
@@ -256,21 +259,37 @@ class Axis(AxisVerbs):
         self._sent = Sent(reply, None if turns else asked)
         return self._last
 
-    async def _send(self, make: Callable[[], AxisCommand[AxisReplyT]]) -> AxisReplyT:
-        command = _made(make)
+    async def _send(self, command: type[AxisCommand[AxisReplyT]], **fields: object) -> AxisReplyT:
+        return await self._sent_as(await self._made(command, fields))
+
+    async def _sent_as(self, command: AxisCommand[AxisReplyT]) -> AxisReplyT:
         if self.control:
             return await self.control.command(self.name, command)
         return await self._client.command(self.name, command)
 
-    async def _start(self, make: Callable[[], AxisCommand[CommandReply]]) -> Motion:
-        command = _made(make)
-        return self.begun(await self._send(lambda: command), getattr(command, "position", None))
+    async def _start(self, command: type[AxisCommand[CommandReply]], **fields: object) -> Motion:
+        made = await self._made(command, fields)
+        return self.begun(await self._sent_as(made), getattr(made, "position", None))
 
-    async def _ask(self, make: Callable[[], Command[ReplyT]]) -> ReplyT:
-        command = _made(make)
-        if self.control and "lease" in type(command).model_fields:
-            command = command.model_copy(update={"lease": self.control.lease.lease})
-        return await self._client.ask(command, self.name)
+    async def _ask(self, command: type[Command[ReplyT]], **fields: object) -> ReplyT:
+        made = await self._made(command, fields)
+        if self.control and "lease" in command.model_fields:
+            made = made.model_copy(update={"lease": self.control.lease.lease})
+        return await self._client.ask(made, self.name)
+
+    async def _made(self, command: type[CommandT], fields: dict[str, object]) -> CommandT:
+        """Return a command; texts among its numbers are read in the units that the axis has now."""
+        texts = {name: value for name, value in fields.items() if name in DIMENSIONS and isinstance(value, str)}
+        if texts:
+            infos = [info for info in await self._client.axes() if info.axis == self.name]
+            if not infos:
+                raise UnknownAxis(f"there is no axis {self.name} any more", axis=self.name)
+            (info,) = infos
+            try:
+                fields |= {name: read_quantity(text, info, DIMENSIONS[name]) for name, text in texts.items()}
+            except NotANumber as error:
+                raise MalformedRequest(f"axis {self.name}: {error}", axis=self.name) from None
+        return _made(lambda: command.model_validate(fields))
 
     # -- life --------------------------------------------------------------------------------------------------------
 

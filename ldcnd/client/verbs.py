@@ -1,7 +1,7 @@
 """The verbs of an axis as methods; made from the command classes by `make fix`, not edited."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TypeVar
 
 from ldcnd.client.motion import Motion
@@ -69,18 +69,22 @@ AxisReplyT = TypeVar("AxisReplyT", bound=CommandReply)
 
 
 class AxisVerbs(ABC):
-    """One method for each command; it returns once the drive has acknowledged the command, or raises why not."""
+    """One method for each command; it returns once the drive has acknowledged the command, or raises why not.
+
+    Positions, velocities and accelerations are numbers in the unit of the axis, that a second and that a second
+    squared, or texts with a unit that the axis has, such as "3000 rpm".
+    """
 
     @abstractmethod
-    async def _send(self, make: Callable[[], AxisCommand[AxisReplyT]]) -> AxisReplyT:
+    async def _send(self, command: type[AxisCommand[AxisReplyT]], **fields: object) -> AxisReplyT:
         """Send a command that ends with its reply."""
 
     @abstractmethod
-    async def _start(self, make: Callable[[], AxisCommand[CommandReply]]) -> Motion:
+    async def _start(self, command: type[AxisCommand[CommandReply]], **fields: object) -> Motion:
         """Send a command that ends later."""
 
     @abstractmethod
-    async def _ask(self, make: Callable[[], Command[ReplyT]]) -> ReplyT:
+    async def _ask(self, command: type[Command[ReplyT]], **fields: object) -> ReplyT:
         """Query the daemon about the axis."""
 
     async def power(self, *, on: bool) -> CommandReply:
@@ -89,15 +93,15 @@ class AxisVerbs(ABC):
         Args:
             on: True closes the loop at the present position, false opens it and disables the amplifier.
         """
-        return await self._send(lambda: Power(on=on))
+        return await self._send(Power, on=on)
 
     async def move_absolute(
         self,
-        position: float,
+        position: float | str,
         *,
         buffer_mode: BufferMode = BufferMode.REFUSE,
-        velocity: float | None = None,
-        acceleration: float | None = None,
+        velocity: float | str | None = None,
+        acceleration: float | str | None = None,
         direction: Direction | None = None,
     ) -> Motion:
         """Move to a position on a trapezoidal profile.
@@ -110,22 +114,21 @@ class AxisVerbs(ABC):
             direction: Way to turn, on an axis with a modulo only; the shortest when missing.
         """
         return await self._start(
-            lambda: MoveAbsolute(
-                buffer_mode=buffer_mode,
-                position=position,
-                velocity=velocity,
-                acceleration=acceleration,
-                direction=direction,
-            )
+            MoveAbsolute,
+            buffer_mode=buffer_mode,
+            position=position,
+            velocity=velocity,
+            acceleration=acceleration,
+            direction=direction,
         )
 
     async def move_relative(
         self,
-        distance: float,
+        distance: float | str,
         *,
         buffer_mode: BufferMode = BufferMode.REFUSE,
-        velocity: float | None = None,
-        acceleration: float | None = None,
+        velocity: float | str | None = None,
+        acceleration: float | str | None = None,
     ) -> Motion:
         """Move by a distance from the commanded position; becomes absolute when it is admitted.
 
@@ -136,17 +139,15 @@ class AxisVerbs(ABC):
             acceleration: Acceleration in units a second squared; the axis default when missing.
         """
         return await self._start(
-            lambda: MoveRelative(
-                buffer_mode=buffer_mode, distance=distance, velocity=velocity, acceleration=acceleration
-            )
+            MoveRelative, buffer_mode=buffer_mode, distance=distance, velocity=velocity, acceleration=acceleration
         )
 
     async def move_velocity(
         self,
-        velocity: float,
+        velocity: float | str,
         *,
         buffer_mode: BufferMode = BufferMode.REFUSE,
-        acceleration: float | None = None,
+        acceleration: float | str | None = None,
         duration_s: float | None = None,
     ) -> Motion:
         """Move at a constant velocity until the next command, the software limit, or the end of its duration.
@@ -160,17 +161,15 @@ class AxisVerbs(ABC):
                 many units.
         """
         return await self._start(
-            lambda: MoveVelocity(
-                buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, duration_s=duration_s
-            )
+            MoveVelocity, buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, duration_s=duration_s
         )
 
     async def jog(
         self,
-        velocity: float,
+        velocity: float | str,
         *,
         buffer_mode: BufferMode = BufferMode.REFUSE,
-        acceleration: float | None = None,
+        acceleration: float | str | None = None,
         hold_s: float = 0.4,
         renews: str | None = None,
     ) -> Motion:
@@ -184,9 +183,7 @@ class AxisVerbs(ABC):
             renews: The command id of the jog that goes on; without it a new one begins. A renewal leaves no event.
         """
         return await self._start(
-            lambda: Jog(
-                buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, hold_s=hold_s, renews=renews
-            )
+            Jog, buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, hold_s=hold_s, renews=renews
         )
 
     async def halt(self) -> Motion:
@@ -201,14 +198,14 @@ class AxisVerbs(ABC):
         self,
         *,
         method: HomeMethod | None = None,
-        velocity: float | None = None,
-        find_velocity: float | None = None,
-        acceleration: float | None = None,
-        position: float | None = None,
+        velocity: float | str | None = None,
+        find_velocity: float | str | None = None,
+        acceleration: float | str | None = None,
+        position: float | str | None = None,
         timeout_s: float | None = None,
-        distance: float | None = None,
+        distance: float | str | None = None,
         stop: HomeStop | None = None,
-        move_to: float | None = None,
+        move_to: float | str | None = None,
     ) -> Motion:
         """Find the reference position; missing values come from the axis's configuration.
 
@@ -227,27 +224,26 @@ class AxisVerbs(ABC):
             move_to: Position to move to afterwards, in axis units; without one the axis stays where the motor stopped.
         """
         return await self._start(
-            lambda: Home(
-                method=method,
-                velocity=velocity,
-                find_velocity=find_velocity,
-                acceleration=acceleration,
-                position=position,
-                timeout_s=timeout_s,
-                distance=distance,
-                stop=stop,
-                move_to=move_to,
-            )
+            Home,
+            method=method,
+            velocity=velocity,
+            find_velocity=find_velocity,
+            acceleration=acceleration,
+            position=position,
+            timeout_s=timeout_s,
+            distance=distance,
+            stop=stop,
+            move_to=move_to,
         )
 
     async def probe(
         self,
         sources: tuple[ProbeSource, ...],
         *,
-        position: float | None = None,
-        distance: float | None = None,
-        velocity: float | None = None,
-        acceleration: float | None = None,
+        position: float | str | None = None,
+        distance: float | str | None = None,
+        velocity: float | str | None = None,
+        acceleration: float | str | None = None,
         stop: ProbeStop = ProbeStop.SMOOTH,
     ) -> Motion:
         """Move until an input changes and latch the position there; it is published on `latch`, the reference stays.
@@ -263,14 +259,13 @@ class AxisVerbs(ABC):
             stop: How the motor stops there.
         """
         return await self._start(
-            lambda: Probe(
-                sources=sources,
-                position=position,
-                distance=distance,
-                velocity=velocity,
-                acceleration=acceleration,
-                stop=stop,
-            )
+            Probe,
+            sources=sources,
+            position=position,
+            distance=distance,
+            velocity=velocity,
+            acceleration=acceleration,
+            stop=stop,
         )
 
     async def reset(self, *, faults_only: bool = False) -> CommandReply:
@@ -280,15 +275,15 @@ class AxisVerbs(ABC):
             faults_only: Clear faults, and no latch: refused while a stop is latched. Programs that go on by themselves
                 send it so.
         """
-        return await self._send(lambda: Reset(faults_only=faults_only))
+        return await self._send(Reset, faults_only=faults_only)
 
-    async def set_position(self, position: float) -> CommandReply:
+    async def set_position(self, position: float | str) -> CommandReply:
         """Set the position of an axis at standstill; afterwards it is referenced.
 
         Args:
             position: New value of the present position, in axis units.
         """
-        return await self._send(lambda: SetPosition(position=position))
+        return await self._send(SetPosition, position=position)
 
     async def set_gains(
         self,
@@ -323,9 +318,18 @@ class AxisVerbs(ABC):
                 the gains of before are loaded again before it closes. It needs a lease.
         """
         return await self._send(
-            lambda: SetGains(
-                gain_set=gain_set, kp=kp, kd=kd, ki=ki, il=il, ol=ol, cl=cl, el=el, deadband=deadband, sr=sr, lent=lent
-            )
+            SetGains,
+            gain_set=gain_set,
+            kp=kp,
+            kd=kd,
+            ki=ki,
+            il=il,
+            ol=ol,
+            cl=cl,
+            el=el,
+            deadband=deadband,
+            sr=sr,
+            lent=lent,
         )
 
     async def list_parameters(self) -> ParameterList:
@@ -339,7 +343,7 @@ class AxisVerbs(ABC):
             parameter: Its number, such as Pn100, or the manual's name in any case.
             unlisted: Allow a number that the manual does not list.
         """
-        return await self._send(lambda: ReadParameter(parameter=parameter, unlisted=unlisted))
+        return await self._send(ReadParameter, parameter=parameter, unlisted=unlisted)
 
     async def read_all_parameters(self) -> ParameterDump:
         """Read every listed parameter from both memories; takes seconds on a slow line."""
@@ -364,9 +368,12 @@ class AxisVerbs(ABC):
             confirm_unit: The unit number that the drive will have after its next power-on, when this write changes it.
         """
         return await self._send(
-            lambda: WriteParameter(
-                parameter=parameter, value=value, memory=memory, unlisted=unlisted, confirm_unit=confirm_unit
-            )
+            WriteParameter,
+            parameter=parameter,
+            value=value,
+            memory=memory,
+            unlisted=unlisted,
+            confirm_unit=confirm_unit,
         )
 
     async def clear_counter(self, counter: CounterName) -> CounterReply:
@@ -375,7 +382,7 @@ class AxisVerbs(ABC):
         Args:
             counter: Counter to clear.
         """
-        return await self._send(lambda: ClearCounter(counter=counter))
+        return await self._send(ClearCounter, counter=counter)
 
     async def restart_eeprom_count(self, *, writes: int = 0) -> EepromCount:
         """Restart the count of EEPROM writes, because the drive was replaced; nothing is sent to it.
@@ -383,7 +390,7 @@ class AxisVerbs(ABC):
         Args:
             writes: Writes that the drive which is there now has taken already; 0 for a new one.
         """
-        return await self._send(lambda: RestartEepromCount(writes=writes))
+        return await self._send(RestartEepromCount, writes=writes)
 
     async def read_alarms(self) -> AlarmReport:
         """Read the present alarm and the alarm history."""
@@ -395,7 +402,7 @@ class AxisVerbs(ABC):
         Args:
             monitors: Monitors to read; none stands for all.
         """
-        return await self._send(lambda: ReadMonitors(monitors=monitors))
+        return await self._send(ReadMonitors, monitors=monitors)
 
     async def plan_parameters(
         self,
@@ -415,17 +422,17 @@ class AxisVerbs(ABC):
                 in use at once where that is possible.
         """
         return await self._send(
-            lambda: PlanParameters(values=values, driver_type=driver_type, any_type=any_type, memory=memory)
+            PlanParameters, values=values, driver_type=driver_type, any_type=any_type, memory=memory
         )
 
     async def move_analog(
         self,
         target: int,
         *,
-        velocity: float | None = None,
-        acceleration: float | None = None,
+        velocity: float | str | None = None,
+        acceleration: float | str | None = None,
         timeout_s: float | None = None,
-        distance: float | None = None,
+        distance: float | str | None = None,
     ) -> Motion:
         """Move until the analog position sensor reads a value; the drive finds the direction itself.
 
@@ -440,9 +447,12 @@ class AxisVerbs(ABC):
                 ends it, not the drive.
         """
         return await self._start(
-            lambda: MoveAnalog(
-                target=target, velocity=velocity, acceleration=acceleration, timeout_s=timeout_s, distance=distance
-            )
+            MoveAnalog,
+            target=target,
+            velocity=velocity,
+            acceleration=acceleration,
+            timeout_s=timeout_s,
+            distance=distance,
         )
 
     async def set_pwm(self, duty: float, duration_s: float) -> Motion:
@@ -452,15 +462,15 @@ class AxisVerbs(ABC):
             duty: Share of the supply voltage, positive forward.
             duration_s: Duration, in seconds.
         """
-        return await self._start(lambda: SetPwm(duty=duty, duration_s=duration_s))
+        return await self._start(SetPwm, duty=duty, duration_s=duration_s)
 
-    async def track(self, position: float) -> Motion:
+    async def track(self, position: float | str) -> Motion:
         """Go to a position at once, without a profile: one set-point of a stream.
 
         Args:
             position: Set-point in axis units.
         """
-        return await self._start(lambda: Track(position=position))
+        return await self._start(Track, position=position)
 
     async def set_outputs(self, *, limit1: PinMode | None = None, limit2: PinMode | None = None) -> CommandReply:
         """Use limit switch pins as outputs, or as inputs again; a missing pin stays as it is.
@@ -469,7 +479,7 @@ class AxisVerbs(ABC):
             limit1: The pin of limit switch 1 (reverse).
             limit2: The pin of limit switch 2 (forward).
         """
-        return await self._send(lambda: SetOutputs(limit1=limit1, limit2=limit2))
+        return await self._send(SetOutputs, limit1=limit1, limit2=limit2)
 
     async def abort_trace(self) -> TraceAbortReply:
         """End the trace that is under way, or one that was left armed in the drive; its samples are lost."""
@@ -482,16 +492,16 @@ class AxisVerbs(ABC):
             absolute: Whether the motion would name a position, which needs a referenced axis.
             each_command: Whether to say of each command of the axis as well what forbids it.
         """
-        return await self._ask(lambda: Why(absolute=absolute, each_command=each_command))
+        return await self._ask(Why, absolute=absolute, each_command=each_command)
 
     async def preview(
         self,
         *,
-        position: float | None = None,
+        position: float | str | None = None,
         direction: Direction | None = None,
-        distance: float | None = None,
-        velocity: float | None = None,
-        acceleration: float | None = None,
+        distance: float | str | None = None,
+        velocity: float | str | None = None,
+        acceleration: float | str | None = None,
     ) -> PreviewReply:
         """Compute what a motion would do; exactly one of position, distance and velocity alone selects the motion.
 
@@ -503,9 +513,12 @@ class AxisVerbs(ABC):
             acceleration: Units a second squared; the axis default when missing.
         """
         return await self._ask(
-            lambda: Preview(
-                position=position, direction=direction, distance=distance, velocity=velocity, acceleration=acceleration
-            )
+            Preview,
+            position=position,
+            direction=direction,
+            distance=distance,
+            velocity=velocity,
+            acceleration=acceleration,
         )
 
     async def report_shadow(
@@ -519,4 +532,4 @@ class AxisVerbs(ABC):
             judged: Motions that have taught or were judged since the observer began.
             figures: Those of which enough is known.
         """
-        return await self._ask(lambda: ReportShadow(t=t, learning=learning, judged=judged, figures=figures))
+        return await self._ask(ReportShadow, t=t, learning=learning, judged=judged, figures=figures)

@@ -13,6 +13,8 @@ from tomlkit.items import InlineTable, Table
 from ldcnd import durable
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.units import PER, converts
+from ldcnd.drives.axis_config import QUANTITIES, units_of_table
 
 AXIS = "bus.axis"
 Literals = Mapping[str, str]
@@ -45,7 +47,7 @@ def edited_for_axis(config: Path, axis: str, tables: Mapping[str, Literals]) -> 
     with suppress(KeyError, TOMLKitError):
         for each in [each for bus in document["bus"] for each in bus["axis"] if each["name"] == axis]:
             for name, values in tables.items():
-                _set(each, name, values)
+                _set(each, name, {key: _with_unit(each, name, key, literal) for key, literal in values.items()})
     edited = tomlkit.dumps(document)
     with draft_of(config) as draft:
         draft.write_text(edited, encoding="utf-8")
@@ -81,6 +83,14 @@ def draft_of(config: Path) -> Iterator[Path]:
         yield draft
     finally:
         draft.unlink(missing_ok=True)
+
+
+def _with_unit(axis: Any, table: str, key: str, literal: str) -> str:  # noqa: ANN401 - as below
+    """Return a number in units of an axis with its unit, where it would be taken in another one without."""
+    dimension, units = QUANTITIES.get(f"{table}.{key}".lstrip(".")), units_of_table(axis)
+    if dimension is None or not converts(units, dimension):
+        return literal
+    return f'"{literal} {units.unit}{PER[dimension]}"'
 
 
 def _table(name: str, values: Literals) -> str:

@@ -1,5 +1,6 @@
 """The description of a rig for clients without prior knowledge: served under `meta/`."""
 
+from collections.abc import Mapping
 from enum import StrEnum
 from typing import Literal
 
@@ -10,6 +11,7 @@ from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import LineCounters
 from ldcnd.contract.plan import PollPriority
 from ldcnd.contract.samples import PastFault
+from ldcnd.contract.units import Dimension
 
 API = 1
 """Version of keys and payloads: it grows with a change that a program of before does not survive."""
@@ -182,6 +184,12 @@ class AxisInfo(Frozen):
     """Unit of all its values; "count" when no scale is configured."""
     counts_per_unit: float | None
     """Encoder counts per unit; null when no scale is configured and the axis works in counts."""
+    units: Mapping[Dimension, Mapping[str, str]] = {}
+    """Units in which people read and type its positions, velocities and accelerations, each with how many of the units
+    of the network it is, as a ratio of whole numbers; the first is shown. On the network that is `unit`, that a second
+    and that a second squared."""
+    g_velocity: float | None = None
+    """Velocity at which 1 g acts at the radius of a rotor, in units a second; null without a radius."""
     direction: str
     """Sign between counts and units: forward or reverse."""
     modulo: float | None = None

@@ -7,8 +7,10 @@ Files, payloads and programs have numbers of their own syntax (TOML, JSON, Pytho
 import math
 import re
 import unicodedata
+from collections.abc import Sequence
 from dataclasses import dataclass
 from decimal import Decimal
+from fractions import Fraction
 from numbers import Real
 from typing import TypeGuard
 
@@ -17,6 +19,8 @@ _NOT_FINITE = re.compile(r"[+\-\u2212]?\s*(?:inf|nan|∞)", re.IGNORECASE)
 _HEXADECIMAL = re.compile(r"[+\-\u2212]?0[xX]")
 _SEPARATED = re.compile(r"[.,'\u2019_\s]*[0-9]")
 """What follows a number that has separators of thousands, as somewhere in the world, or is one of several."""
+_UNIT = re.compile(r"[^\W\d_]+(?:/[a-z]+[2\u00b2]?)+")
+"""A unit that may have a digit, such as mm/s2."""
 _WORD = re.compile(r"0x([0-9a-f]{1,4})|([0-9a-f]{1,4})h|([0-9]{1,5})", re.IGNORECASE)
 _LONGEST_QUOTE = 40
 _LARGEST_WHOLE = 2**53 - 1
@@ -46,14 +50,14 @@ def is_number(value: object) -> TypeGuard[Real | Decimal]:
     return isinstance(value, Real | Decimal) and not isinstance(value, bool)
 
 
-def read_number(text: str, unit: str = "") -> float:
+def read_number(text: str, *units: str) -> float:
     """Return the number that a text stands for.
 
     A decimal point or comma, a sign (`+`, `-` or the Unicode minus), an exponent and spaces around are taken.
 
     Args:
         text: what was typed.
-        unit: may stand behind the number.
+        units: one of them may stand behind the number.
 
     Raises:
         NotANumber: it is empty, more than one number, not finite, hexadecimal, in another unit, or ambiguous: `1,234`,
@@ -73,26 +77,54 @@ def read_number(text: str, unit: str = "") -> float:
     digits = parts.whole + parts.fraction
     if not digits:
         raise NotANumber(f"{quote} is not a number")
-    is_other = bool(parts.rest) and not _same_unit(parts.rest, unit)
+    is_other = bool(parts.rest) and not any(same_unit(parts.rest, unit) for unit in units)
     if is_other and (several := _about_several(written, parts.rest)):
         raise NotANumber(several)
     if parts.mark == "," and re.fullmatch(r"[1-9][0-9]{0,2}", parts.whole) and len(parts.fraction) == len("000"):
         one, other = f"{parts.sign}{parts.whole}.{parts.fraction}", f"{parts.sign}{digits}"
         raise NotANumber(f"{quote} can mean {one} or {other}: type one of them")
-    if is_other and unit:
-        raise NotANumber(f"{_quoted(parts.rest)} is not the unit here, which is {unit}: type the value in {unit}")
     if is_other:
-        plain = f"{parts.sign}{parts.whole or '0'}{f'.{parts.fraction}' if parts.fraction else ''}"
-        power = "" if parts.power == "0" else f"e{parts.power}"
-        raise NotANumber(
-            f"{_quoted(parts.rest)} is not taken behind the number: type {plain}{power}, in the unit that is named here"
-        )
+        raise NotANumber(f"{_quoted(parts.rest)} {_about_unit(parts, units)}")
     value = float(f"{parts.sign}{parts.whole or '0'}.{parts.fraction or '0'}e{parts.power}")
     if not math.isfinite(value):
         raise NotANumber(f"{quote} is too large")
     if not value and digits.strip("0"):
         raise NotANumber(f"{quote} is too close to 0")
     return value or 0.0  # no minus zero
+
+
+def read_exact(text: str, unit: str = "") -> Fraction:
+    """Return the number that a text stands for, as exactly as it was typed; see `read_number`."""
+    read_number(text, unit)
+    parts = _parts_of(text.strip())
+    return Fraction(f"{parts.sign}{parts.whole or '0'}.{parts.fraction or '0'}e{parts.power}")
+
+
+def behind_number(text: str) -> str:
+    """Return what stands behind a number, such as its unit; empty where there is no number."""
+    parts = _parts_of(text.strip())
+    return parts.rest.strip() if parts.whole + parts.fraction else ""
+
+
+def _about_unit(parts: _Parts, units: Sequence[str]) -> str:
+    """Return why what stands behind a number is not taken there, and what to type."""
+    if len(units) > 1:
+        return f"is not a unit here: type the value in {', '.join(units[:-1])} or {units[-1]}"
+    if any(units):
+        return f"is not the unit here, which is {units[0]}: type the value in {units[0]}"
+    plain = f"{parts.sign}{parts.whole or '0'}{f'.{parts.fraction}' if parts.fraction else ''}"
+    power = "" if parts.power == "0" else f"e{parts.power}"
+    return f"is not taken behind the number: type {plain}{power}, in the unit that is named here"
+
+
+def same_unit(written: str, unit: str) -> bool:
+    """Compare as units look: a superscript 2 is a 2, micro is also written u, degrees with their sign."""
+    return bool(unit) and _plain(written) == _plain(unit)
+
+
+def _plain(unit: str) -> str:
+    plain = unicodedata.normalize("NFKC", unit).replace("\u03bc", "u").replace("\u00b0", "deg")
+    return plain.replace(" ", "")
 
 
 def read_whole(text: str, unit: str = "") -> int:
@@ -134,14 +166,11 @@ def _about_several(written: str, rest: str) -> str:
     """Return why a text is not one number; empty when one stands before something else."""
     if _SEPARATED.match(rest):
         return f"{_quoted(written)} is more than one number, or has thousands separators: type one number without them"
+    if _UNIT.fullmatch(rest):
+        return ""
     if any(each.isdecimal() for each in rest) or rest[0] in ".,+-\u2212":
         return f"{_quoted(written)} is not one number"
     return ""
-
-
-def _same_unit(written: str, unit: str) -> bool:
-    """Compare as units look: a superscript 2 is a 2, and there are two characters for micro."""
-    return bool(unit) and unicodedata.normalize("NFKC", written) == unicodedata.normalize("NFKC", unit)
 
 
 def _quoted(text: str) -> str:

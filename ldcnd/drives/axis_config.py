@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from enum import StrEnum
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -11,10 +11,37 @@ from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.plan import PollPriority
 from ldcnd.contract.samples import TelemetryItem
+from ldcnd.contract.units import AxisUnits, Dimension, UnitTable, g_velocity, unit_table
 from ldcnd.drives.toml import DeviceIdentity, Name
 
 LEAST_TURN_COUNTS = 4
 """Of a rotary axis: one count must be no larger than the way to the other side."""
+
+
+QUANTITIES: Mapping[str, Dimension] = {
+    **dict.fromkeys(("velocity", "limits.velocity", "home.velocity", "home.find_velocity"), Dimension.VELOCITY),
+    **dict.fromkeys(("acceleration", "limits.acceleration"), Dimension.ACCELERATION),
+    **dict.fromkeys(("modulo", "limits.position_min", "limits.position_max", "home.position"), Dimension.POSITION),
+    **dict.fromkeys(("home.distance", "home.move_to", "settle.window", "analog.distance"), Dimension.POSITION),
+    **dict.fromkeys(("tracking.step", "approach.distance"), Dimension.POSITION),
+}
+"""Settings of an axis that may be written with a unit, and what they measure."""
+
+
+def units_of_table(axis: Mapping[str, Any]) -> AxisUnits:
+    """Return the units of an axis as its table in a file gives them.
+
+    Raises:
+        ValueError: the table does not make any.
+    """
+    try:
+        unit, counts, radius_m = axis.get("unit", "count"), axis.get("counts_per_unit"), axis.get("radius_m")
+        table = unit_table(
+            unit, counts, axis.get("velocity_unit"), axis.get("acceleration_unit"), axis.get("units", {})
+        )
+        return AxisUnits(unit, table, g_velocity(table, radius_m) if radius_m else None)
+    except (AttributeError, TypeError) as error:
+        raise ValueError(str(error)) from error
 
 
 class GainsConfig(Frozen):
@@ -187,7 +214,17 @@ class AxisConfig(Frozen):
     address: int = Field(ge=0, le=127)
     """Node address or unit number."""
     unit: str = "count"
-    """Unit of everything that concerns this axis."""
+    """Unit of its positions; programs have velocities in it a second, accelerations in it a second squared. A number
+    may be written as a text with another unit that fits: velocity = "3000 rpm"."""
+    velocity_unit: str | None = None
+    """Unit in which people read velocities, and in which they are meant without a unit, here and where they are typed,
+    such as rpm; without it `unit` a second."""
+    acceleration_unit: str | None = None
+    """Unit of accelerations likewise, such as rpm/s; without it `unit` a second squared."""
+    units: Mapping[str, str] = {}
+    """Further units by name, each with how many of `unit` it is, exactly: { turn = "1/3" }."""
+    radius_m: float | None = Field(default=None, gt=0)
+    """Radius of a rotor, in metres: its velocities are shown with the acceleration there, and taken in g."""
     counts_per_unit: float | None = Field(default=None, ge=1e-9, le=1e12)
     """Encoder counts per unit, 1e-9 to 1e12: every count is a finite position then. There is no default: without it
     the axis works in counts and says so."""
@@ -269,9 +306,20 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             raise ValueError(f"velocity {self.velocity} is above limits.velocity {limits.velocity}")
         if limits.acceleration is not None and self.acceleration > limits.acceleration:
             raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
+        _ = self.unit_table, self.g_velocity
         self._check_gain_sets()
         self._check_tracking()
         return self
+
+    @property
+    def unit_table(self) -> UnitTable:
+        """The units that are taken for its positions, velocities and accelerations."""
+        return unit_table(self.unit, self.counts_per_unit, self.velocity_unit, self.acceleration_unit, self.units)
+
+    @property
+    def g_velocity(self) -> float | None:
+        """Velocity at which 1 g acts at the radius, units a second; None without a radius."""
+        return g_velocity(self.unit_table, self.radius_m) if self.radius_m else None
 
     @property
     def signed_counts_per_unit(self) -> float:

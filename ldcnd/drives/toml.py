@@ -51,8 +51,10 @@ REMOVED_KEYS = {
 """Keys of earlier versions, and what to do about them."""
 
 
-def read_toml(path: Path, document_type: type[DocumentT]) -> DocumentT:
-    """Read and validate a file.
+def read_toml(
+    path: Path, document_type: type[DocumentT], prepare: Callable[[dict[str, Any]], object] = lambda document: document
+) -> DocumentT:
+    """Read and validate a file; `prepare` gets what is in it, and returns what is validated.
 
     Raises:
         ConfigError: the file cannot be read, is not TOML, or cannot work; names file, keys, what is wrong, what is
@@ -69,7 +71,7 @@ def read_toml(path: Path, document_type: type[DocumentT]) -> DocumentT:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: not valid TOML: {error}") from error
     try:
-        return document_type.model_validate(document)
+        return document_type.model_validate(prepare(document))
     except ValidationError as error:
         raise ConfigError("\n".join(f"{path}: {line}" for line in complaints(error, document_type))) from error
 

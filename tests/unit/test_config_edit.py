@@ -131,3 +131,14 @@ def test_an_edit_can_be_seen_before_it_is_made(config):
     assert "lsb-io-shift" in edited
     assert config.read_text() == MIXED
     assert list(config.parent.iterdir()) == [config]
+
+
+def test_a_number_is_written_with_its_unit_where_it_would_be_read_in_another(tmp_path):
+    config = tmp_path / "centrifuge.toml"
+    config.write_text((ROOT / "config" / "centrifuge.toml").read_text())
+
+    set_for_axis(config, "rotor", {"": {"velocity": "0.25"}, "limits": {"velocity": "50.0", "acceleration": "9.0"}})
+
+    rotor = load_config(config).bus[0].axis[0]
+    assert (rotor.velocity, rotor.limits.velocity, rotor.limits.acceleration) == (0.25, 50.0, 9.0)
+    assert 'velocity = "0.25 rev/s" #' in config.read_text()

@@ -26,7 +26,7 @@ from caproto import (
 )
 from caproto.server.records import MotorFields
 
-from ldcnd.contract.number_text import read_number
+from ldcnd.contract.number_text import behind_number, read_number
 
 LONGEST_TEXT = 512
 """Bytes of a text that is an array of characters."""
@@ -134,9 +134,11 @@ class Number(RecordField, ChannelDouble):  # type: ignore[misc]
 
     Attributes:
         deadband: monitors are sent no value that differs by no more from the one before, unless its alarm does.
+        convert: reads a number with a unit; None where only `units` may stand behind it.
     """
 
     deadband = 0.0
+    convert: Callable[[str], float] | None = None
     _sent: tuple[float, RecordAlarm] | None = None
 
     def mean(self, unit: str, precision: int, limits: tuple[float, float]) -> bool:
@@ -172,10 +174,13 @@ class Number(RecordField, ChannelDouble):  # type: ignore[misc]
             ValueError: it is none, or not finite.
         """
         given = super().native(value)
-        number = read_number(given, str(self.units)) if isinstance(given, str) else given
+        number = self._read(given) if isinstance(given, str) else given
         if not math.isfinite(number):
             raise ValueError(f"{number} is not a finite number")
         return number
+
+    def _read(self, text: str) -> float:
+        return self.convert(text) if self.convert and behind_number(text) else read_number(text, str(self.units))
 
 
 class Integer(RecordField, ChannelInteger):  # type: ignore[misc]

@@ -4,6 +4,8 @@ Fields and what they mean follow the documentation of the EPICS collaboration's 
 software"; "User" and "dial" coordinates are the same here: OFF is 0 and DIR is Pos.
 """
 
+from functools import partial
+
 from caproto import AlarmSeverity, AlarmStatus
 
 from ldcnd.contract.commands import Verb
@@ -25,6 +27,7 @@ from ldcnd.contract.samples import (
     TelemetryItem,
     VelocitySample,
 )
+from ldcnd.contract.units import Dimension, read_quantity, shown_quantity
 from ldcnd.lab.borrowed_control import NO_HOLDER
 from ldcnd.lab.epics.fields import (
     NO_ALARM,
@@ -74,6 +77,7 @@ PLACES = (
 )
 STEPS = ("MRES", "ERES", "RRES", "UREV")
 VELOCITIES = ("VELO", "BVEL", "JVEL", "HVEL", "VMAX", "VBAS")
+MEASURED = {Dimension.POSITION: PLACES, Dimension.VELOCITY: VELOCITIES, Dimension.ACCELERATION: ("JAR",)}
 DURATIONS = ("ACCL", "BACC", "DLY")
 MSTA_PLUS, MSTA_DONE, MSTA_HIGH_SWITCH, MSTA_POSITION = 0x1, 0x2, 0x4, 0x20
 MSTA_HOME, MSTA_ENCODER, MSTA_PROBLEM, MSTA_MOVING = 0x80, 0x100, 0x200, 0x400
@@ -111,6 +115,9 @@ class MotorRecord:
         record["SEVR"] = choice("INVALID", *SEVERITIES)
         self.fields: dict[str, RecordField] = {f"{info.axis}.{name}": field for name, field in record.items()}
         self.fields |= self._variables_beside(record["VAL"])
+        for dimension, names in MEASURED.items():
+            for name in names:
+                self[name].convert = partial(self._typed, dimension)
         for name, value in {**self._described(), **self._speeds(), "UDF": 1}.items():
             self[name].begin(value)
         self._set_metadata()
@@ -138,6 +145,9 @@ class MotorRecord:
         if "input_signals" in info.monitors or TelemetryItem.INPUTS in info.items:
             beside[":inputs"] = text()
         return {f"{info.axis}{name}": field for name, field in beside.items()}
+
+    def _typed(self, dimension: Dimension, text: str) -> float:
+        return read_quantity(text, self.info, dimension)
 
     def __getitem__(self, field: str) -> RecordField:
         return self.fields[f"{self.info.axis}.{field}"]
@@ -210,7 +220,7 @@ class MotorRecord:
         fields[self["VAL"]] = unit, places, self._limits
         velocity = self.beside(":velocity")
         if velocity is not None:
-            fields[velocity] = f"{unit}/s", places, (0.0, 0.0)
+            fields[velocity] = shown_quantity(0.0, self.info, Dimension.VELOCITY)[1], places, (0.0, 0.0)
         return [field for field, meaning in fields.items() if isinstance(field, Number) and field.mean(*meaning)]
 
     async def describe(self, info: AxisInfo, defaults: tuple[float, float]) -> None:
@@ -246,7 +256,8 @@ class MotorRecord:
                 await self["UDF"].show(0)
                 await self.show_target()
             case VelocitySample():
-                await self.show_beside(":velocity", sample.value, alarm, at_s)
+                shown, _ = shown_quantity(sample.value, self.info, Dimension.VELOCITY)
+                await self.show_beside(":velocity", shown, alarm, at_s)
                 await self["RVEL"].show(round(sample.value / self._step))
                 if sample.value and self.moving is not Moving.NO:  # a loop at rest goes to and fro
                     await self["TDIR"].show(int(sample.value > 0))

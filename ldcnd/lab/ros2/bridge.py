@@ -1,7 +1,6 @@
 """The bridge: what a rig publishes becomes joint states and diagnostics. Nothing goes the other way."""
 
 import asyncio
-import math
 import secrets
 import time
 from collections.abc import Mapping
@@ -20,11 +19,10 @@ from ldcnd.contract.samples import (
     TelemetryItem,
     VelocitySample,
 )
+from ldcnd.contract.units import si
 from ldcnd.lab.ros2.cdr import DIAGNOSTIC_ARRAY, JOINT_STATE, DiagnosticArray, DiagnosticStatus, JointState
 from ldcnd.lab.ros2.graph import RosNode, RosPublisher, advertise
 
-SI = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "mrad": 1e-3, "deg": math.pi / 180, "rev": math.tau}
-"""Metres or radians in a unit; axes in other units have no joint."""
 FRESH_NS = 200_000_000
 """Maximum age of a velocity relative to the position that it accompanies."""
 PERIOD_S = 1.0
@@ -63,7 +61,7 @@ class Bridge:
                 self._states[axis] = sample
             case FaultSample():
                 self._faults[axis] = sample
-            case PositionSample() if sample.unit in SI and self._is_known(axis, sample):
+            case PositionSample() if si(sample.unit) and self._is_known(axis, sample):
                 made = self._joints() if axis in self._round else None  # of a joint that is late: it is in the next one
                 self._round[axis] = sample
                 if made is None and self._round.keys() >= self._awaited():
@@ -76,7 +74,7 @@ class Bridge:
         return {
             name
             for name, info in self.axes.items()
-            if info.unit in SI
+            if si(info.unit)  # axes in other units have no joint
             and name in self._states
             and assess(self._states[name], self._faults.get(name)).place is Place.KNOWN
         }
@@ -85,7 +83,9 @@ class Bridge:
         """Return the positions of a round, and the velocities if there is one of each joint."""
         positions, self._round = self._round, {}
         names = tuple(name for name in self.axes if name in positions)
-        scales = [SI[positions[name].unit] for name in names]  # of the daemon that has measured it, not as described
+        scales = [
+            si(positions[name].unit) or 1.0 for name in names
+        ]  # of the daemon that has measured it, not as described
         velocities = [self._velocity(name, positions[name]) for name in names]
         known = tuple(each * scale for each, scale in zip(velocities, scales, strict=True) if each is not None)
         return JointState(

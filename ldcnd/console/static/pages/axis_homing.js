@@ -3,6 +3,7 @@
 import { html, useId, useState } from "../html.js";
 import { Action, Choice, Panel, Reason } from "../parts/controls.js";
 import { NumberField, unread } from "../parts/number_field.js";
+import { unitsOf } from "../parts/number_text.js";
 import { HOME_METHODS, HOME_STOPS } from "../session/contract.js";
 import { words } from "../parts/format.js";
 import { command } from "../session/control.js";
@@ -16,10 +17,9 @@ export function HomePanel({ axis }) {
   const [name, setName] = useState(null);
   const [toHome, toSet] = [useId(), useId()];
   const set = (field) => (value) => setValues((last) => ({ ...last, [field]: value === "" ? null : value }));
-  const { unit } = axis.info;
   const empty = { hint: "empty: as configured" };
   const field = (label, of, key) =>
-    html`<${NumberField} label=${label} unit=${of} value=${values[key]} onChange=${set(key)} ...${empty} />`;
+    html`<${NumberField} label=${label} ...${of === "s" ? { unit: of } : { units: unitsOf(axis.info, of) }} value=${values[key]} onChange=${set(key)} ...${empty} />`;
   const way = obstacle(axis, "home") ?? unread(values);
   const naming = obstacle(axis, "set_position") ?? unread({ Position: name }) ?? (name === null ? "A position is missing." : null);
 
@@ -29,13 +29,13 @@ export function HomePanel({ axis }) {
         options=${[CONFIGURED, ...HOME_METHODS.map((each) => [each, words(each)])]} />
       <${Choice} label="At the mark" value=${values.stop} onChange=${set("stop")}
         options=${[CONFIGURED, ...HOME_STOPS.map((each) => [each, STOPS[each]])]} />
-      ${field("Search velocity, signed", `${unit}/s`, "velocity")}
-      ${field("Find a switch first at", `${unit}/s`, "find_velocity")}
-      ${field("Acceleration", `${unit}/s²`, "acceleration")}
-      ${field("Position at the mark", unit, "position")}
-      ${field("Then move to", unit, "move_to")}
+      ${field("Search velocity, signed", "velocity", "velocity")}
+      ${field("Find a switch first at", "velocity", "find_velocity")}
+      ${field("Acceleration", "acceleration", "acceleration")}
+      ${field("Position at the mark", "position", "position")}
+      ${field("Then move to", "position", "move_to")}
       ${field("Longest search", "s", "timeout_s")}
-      ${field("Longest search", unit, "distance")}
+      ${field("Longest search", "position", "distance")}
     </div>
     <p class="row"><${Action} act=${() => command(axis, "home", values)} obstacle=${way} reason=${toHome}
       kind="main">Home<//></p>
@@ -43,7 +43,7 @@ export function HomePanel({ axis }) {
     ${
       axis.can("set_position") &&
       html`<h3>Or set current position</h3>
-      <div class="fields"><${NumberField} label="Current position is" unit=${unit} value=${name} onChange=${setName}
+      <div class="fields"><${NumberField} label="Current position is" units=${unitsOf(axis.info, "position")} value=${name} onChange=${setName}
         meaning=${(text) => `${axis.name} then stands at ${text}`} /></div>
       <p class="row"><${Action} act=${() => command(axis, "set_position", { position: name })} obstacle=${naming}
         reason=${toSet} title="Nothing moves; afterwards the axis counts as homed">Set position<//></p>

@@ -3,6 +3,7 @@
 import { html, useEffect, useId, useState } from "../html.js";
 import { Action, Panel, Reason, RefusalText } from "../parts/controls.js";
 import { NumberField, unread } from "../parts/number_field.js";
+import { unitsOf } from "../parts/number_text.js";
 import { number } from "../parts/format.js";
 import { HoldButton } from "../parts/hold_button.js";
 import { beginJog, command, endJog, forgetJogRefusal, jogRefusal } from "../session/control.js";
@@ -23,7 +24,7 @@ export function JogPanel({ axis }) {
 
   return html`<${Panel} title="Jog" note="Runs while a button or, with it focused, an arrow key is held.">
     <div class="jog-line">
-      <${NumberField} label="Speed" unit=${`${unit}/s`} value=${speed} onChange=${setSpeed} min=${0} />
+      <${NumberField} label="Speed" units=${unitsOf(axis.info, "velocity")} value=${speed} onChange=${setSpeed} min=${0} />
     <p class="row jog" role="group" aria-label=${`Jog ${axis.name}`}>
       <${HoldButton} begin=${() => beginJog(axis, -speed)} end=${endJog} keys=${["ArrowLeft"]} obstacle=${way}
         reason=${reason}>◀ Hold to run −<//>

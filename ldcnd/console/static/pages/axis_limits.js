@@ -3,18 +3,22 @@
 import { html } from "../html.js";
 import { Facts, Panel, Table } from "../parts/controls.js";
 import { number } from "../parts/format.js";
+import { shownQuantity } from "../parts/number_text.js";
 import { GAINS } from "../session/contract.js";
 import { ProvenanceWord } from "./axis_gains.js";
 
 export function LimitsPanel({ axis }) {
   const { limits, unit, counts_per_unit: scale, direction, adc_full_scale: full } = axis.info;
-  const limit = (value, of) => (value === null ? "none" : html`${number(value, 3)} <span class="unit">${of}</span>`);
+  const limit = (value, dimension) => {
+    const shown = shownQuantity(value, axis.info, dimension);
+    return value === null ? "none" : html`${number(shown.value, 3)} <span class="unit">${shown.unit}</span>`;
+  };
   return html`<${Panel} title="Limits" of=${axis.rig} note="From the configuration of the daemon.">
     <${Facts} of=${[
-      ["lowest position", limit(limits.position_min, unit)],
-      ["highest position", limit(limits.position_max, unit)],
-      ["velocity", limit(limits.velocity, `${unit}/s`)],
-      ["acceleration", limit(limits.acceleration, `${unit}/s²`)],
+      ["lowest position", limit(limits.position_min, "position")],
+      ["highest position", limit(limits.position_max, "position")],
+      ["velocity", limit(limits.velocity, "velocity")],
+      ["acceleration", limit(limits.acceleration, "acceleration")],
       ["scale", scale ? `${scale} counts per ${unit}, ${direction}` : "none: it works in counts"],
       ["A/D full scale", full ?? "no A/D input"],
     ]} />

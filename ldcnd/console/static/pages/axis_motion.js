@@ -5,6 +5,7 @@ import { Action, Choice, enterSends, Panel, Reason, RefusalText, useOnce } from 
 import { decimalsOf, duration, number } from "../parts/format.js";
 import { StoryOf } from "../parts/motion_story.js";
 import { NumberField, unread } from "../parts/number_field.js";
+import { shownQuantity, unitsOf } from "../parts/number_text.js";
 import { command, question } from "../session/control.js";
 import { moves, obstacle } from "../session/obstacles.js";
 
@@ -16,7 +17,7 @@ const KINDS = {
     title: "to a position",
     field: "position",
     label: "Position",
-    unit: (unit) => unit,
+    dimension: "position",
     meaning: (axis, text) => `moves ${axis} to ${text}`,
     previewed: true,
   },
@@ -24,7 +25,7 @@ const KINDS = {
     title: "by a distance",
     field: "distance",
     label: "Distance",
-    unit: (unit) => unit,
+    dimension: "position",
     meaning: (axis, text) => `moves ${axis} by ${text}`,
     previewed: true,
   },
@@ -32,23 +33,23 @@ const KINDS = {
     title: "at a velocity",
     field: "velocity",
     label: "Velocity",
-    unit: (unit) => `${unit}/s`,
+    dimension: "velocity",
     meaning: (axis, text) => `runs ${axis} at ${text}`,
     previewed: true,
   },
-  set_pwm: { title: "with a raw duty", field: "duty", label: "Duty, −1 to 1", unit: () => "", previewed: false, min: -1, max: 1 },
+  set_pwm: { title: "with a raw duty", field: "duty", label: "Duty, −1 to 1", previewed: false, min: -1, max: 1 },
   move_analog: {
     title: "to a sensor value",
     field: "target",
     label: "Target",
-    unit: () => "A/D count",
+    unit: "A/D count",
     previewed: false,
   },
   probe: {
     title: "until an input, and latch",
     field: "distance",
     label: "Distance at most",
-    unit: (unit) => unit,
+    dimension: "position",
     previewed: false,
   },
 };
@@ -73,7 +74,7 @@ function Move({ axis, kinds }) {
   const [verb, setVerb] = useState(kinds[0]);
   const [values, setValues] = useState({});
   const reason = useId();
-  const { field, label, unit, previewed, meaning, min, max } = KINDS[verb];
+  const { field, label, unit, dimension, previewed, meaning, min, max } = KINDS[verb];
   const once = useOnce();
   const set = (name) => (value) => setValues((last) => ({ ...last, [name]: value }));
   const body = bodyOf(verb, values);
@@ -87,17 +88,17 @@ function Move({ axis, kinds }) {
     <div class="fields" onKeyDown=${enterSends}>
       <${Choice} label="Move" options=${kinds.map((each) => [each, KINDS[each].title])} value=${verb}
         onChange=${setVerb} />
-      <${NumberField} key=${verb} label=${label} unit=${unit(axis.info.unit)} value=${values[field]} onChange=${set(field)}
+      <${NumberField} key=${verb} label=${label} unit=${unit} units=${dimension && unitsOf(axis.info, dimension)} value=${values[field]} onChange=${set(field)}
         min=${min} max=${max} meaning=${meaning && ((text) => meaning(axis.name, text))} />
       ${
         verb === "set_pwm"
           ? html`<${NumberField} key="for" label="For" unit="s" value=${values.duration_s} onChange=${set("duration_s")} />`
           : html`${
               verb !== "move_velocity" &&
-              html`<${NumberField} key="speed" label="Velocity" unit=${`${axis.info.unit}/s`} value=${values.speed}
+              html`<${NumberField} key="speed" label="Velocity" units=${unitsOf(axis.info, "velocity")} value=${values.speed}
               onChange=${set("speed")} hint="empty: the axis default" />`
             }
-            <${NumberField} key="acceleration" label="Acceleration" unit=${`${axis.info.unit}/s²`} value=${values.acceleration}
+            <${NumberField} key="acceleration" label="Acceleration" units=${unitsOf(axis.info, "acceleration")} value=${values.acceleration}
               onChange=${set("acceleration")} hint="empty: the axis default" />`
       }
       ${
@@ -109,7 +110,7 @@ function Move({ axis, kinds }) {
         verb === "move_analog" &&
         html`<${NumberField} key="timeout" label="For at most" unit="s" value=${values.timeout_s} onChange=${set("timeout_s")}
             hint="empty: as configured" />
-          <${NumberField} key="reach" label="Distance at most" unit=${axis.info.unit} value=${values.reach} onChange=${set("reach")}
+          <${NumberField} key="reach" label="Distance at most" units=${unitsOf(axis.info, "position")} value=${values.reach} onChange=${set("reach")}
             hint="empty: as configured" />`
       }
       ${previewed && html`<${Choice} label="If it moves already" options=${BUFFERING}
@@ -202,11 +203,13 @@ function Planned({ axis, plan, field, onNearest }) {
           onClick=${() => onNearest(nearest)}>Use ${number(nearest, decimals)}</button>`
       }</p>`;
   }
-  const rounding = (value, error) =>
-    Math.abs(error) > NOTICED * Math.abs(value) && ` (${error > 0 ? "+" : ""}${number(error, 4)} by rounding)`;
-  const held = (value, error, of) => `${number(value, 3)} ${of}${rounding(value, error) || ""}`;
+  const held = (value, error, dimension) => {
+    const [shown, off] = [value, error].map((each) => shownQuantity(each, axis.info, dimension));
+    const noticed = Math.abs(error) > NOTICED * Math.abs(value);
+    return `${number(shown.value, 3)} ${shown.unit}${noticed ? ` (${error > 0 ? "+" : ""}${number(off.value, 4)} by rounding)` : ""}`;
+  };
   return html`<p>${plan.position === null ? "Runs until stopped or to the soft limit" : `Ends at ${number(plan.position, decimals)} ${unit}`},
-    ${" "}at ${held(plan.velocity, plan.velocity_error, `${unit}/s`)}, with ${held(plan.acceleration, plan.acceleration_error, `${unit}/s²`)}${
+    ${" "}at ${held(plan.velocity, plan.velocity_error, "velocity")}, with ${held(plan.acceleration, plan.acceleration_error, "acceleration")}${
       plan.duration_s === null ? "" : `, in ${duration(plan.duration_s)} without settling`
     }.
     ${" "}<span class="quiet">${plan.packets.length} packets, ${duration(plan.bus_s)} on the line at most.</span></p>`;

@@ -3,6 +3,7 @@
 import { html, useState } from "../html.js";
 import { Action, Facts, Panel } from "../parts/controls.js";
 import { age, clock, decimalsOf, number, words } from "../parts/format.js";
+import { shownQuantity } from "../parts/number_text.js";
 import { EndOfMotion } from "../parts/motion_story.js";
 import { Lamp, Mark, QualityWord, StateWord } from "../parts/state.js";
 import { readSignals, signalsOf } from "../session/captures.js";
@@ -14,6 +15,7 @@ export function NowPanel({ axis }) {
   const decimals = decimalsOf(info);
   const { position, adc } = samples;
   const { known, live, mark } = axis.condition;
+  const velocity = shownQuantity(live ? axis.velocity : null, info, "velocity");
   const target = live ? state?.command?.target : null;
   const left = target == null || !position ? null : target - position.value;
   return html`<${Panel} title="Now" of=${axis.rig} data-stale=${live ? "no" : "yes"}>
@@ -25,7 +27,7 @@ export function NowPanel({ axis }) {
       <p class="now-state"><${StateWord} axis=${axis} /> <${QualityWord} axis=${axis} /></p>
     </div>
     <${Facts} of=${[
-      ["velocity", html`${number(live ? axis.velocity : null, decimals)} <span class="unit">${info.unit}/s</span>`],
+      ["velocity", html`${number(velocity.value, decimals)} <span class="unit">${velocity.unit}</span>`],
       ["following error", html`${number(position?.following_error, decimals)} <span class="unit">${info.unit}</span>`],
       ["target", html`${number(target, decimals)} <span class="unit">${info.unit}</span>`],
       ["left to go", html`${number(left, decimals)} <span class="unit">${info.unit}</span>`],

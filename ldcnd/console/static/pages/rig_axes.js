@@ -3,6 +3,7 @@
 import { html, useId } from "../html.js";
 import { Action } from "../parts/controls.js";
 import { decimalsOf, number, percent, words } from "../parts/format.js";
+import { shownQuantity } from "../parts/number_text.js";
 import { inPageTerms } from "../parts/remedies.js";
 import { Homed, Mark, Meter, Place, StateWord } from "../parts/state.js";
 import { command, controls, take } from "../session/control.js";
@@ -75,6 +76,7 @@ function AxisRow({ axis }) {
   const { info, samples, state } = axis;
   const decimals = decimalsOf(info);
   const { live, mark, troubles } = axis.condition;
+  const velocity = shownQuantity(live ? axis.velocity : null, info, "velocity");
   const said = troubles.filter(({ short }) => short !== mark);
   const cell = (label, content, kind = "", title = null) => html`<td role="cell" data-label=${label} class=${kind} title=${title}>${content}</td>`;
   return html`<tr role="row" data-axis=${axis.name} data-stale=${live ? "no" : "yes"}>
@@ -84,7 +86,7 @@ function AxisRow({ axis }) {
       "said", [axis.condition.state, ...troubles.map(({ text }) => text)].join(". "))}
     ${cell("Position", html`<${Place} axis=${axis} decimals=${decimals} label="Position" />`, "number main")}
     ${cell("Homed", html`<${Homed} axis=${axis} />`, "homed")}
-    ${cell("Velocity", html`${number(live ? axis.velocity : null, Math.min(decimals, 2))}<span class="unit"> ${info.unit}/s</span>`, "number")}
+    ${cell("Velocity", html`${number(velocity.value, Math.min(decimals, 2))}<span class="unit"> ${velocity.unit}</span>`, "number")}
     ${cell("Target", number(live ? state?.command?.target : null, decimals), "number")}
     ${cell("Following error", number(live ? samples.position?.following_error : null, decimals), "number")}
     ${cell("Control", html`<${HolderWord} axis=${axis} />`, "holder", axis.control)}

@@ -4,6 +4,7 @@ import { html, useId, useState } from "../html.js";
 import { Action, enterSends, Panel, Reason, Tick, useOnce } from "../parts/controls.js";
 import { decimalsOf, number } from "../parts/format.js";
 import { NumberField, unread } from "../parts/number_field.js";
+import { unitsOf } from "../parts/number_text.js";
 import { placeText } from "../parts/state.js";
 import { moveTogether, previewLine } from "../session/control.js";
 import { moves, obstacle } from "../session/obstacles.js";
@@ -35,11 +36,11 @@ function GroupMove({ group, axes }) {
   return html`<${Panel} title=${`Group ${group}`} note="All start in the same servo cycle, or none; on a straight line they ramp alike and arrive together.">
     <div class="fields" onKeyDown=${enterSends}>
       ${axes.map(
-        (axis) => html`<${NumberField} key=${axis.name} label=${`${axis.name} to`} unit=${axis.info.unit} value=${targets[axis.name]}
+        (axis) => html`<${NumberField} key=${axis.name} label=${`${axis.name} to`} units=${unitsOf(axis.info, "position")} value=${targets[axis.name]}
         meaning=${(text) => `moves ${axis.name} to ${text};`} hint=${`now ${placeText(axis, decimalsOf(axis.info))}`}
         onChange=${(value) => setTargets((last) => ({ ...last, [axis.name]: value }))} />`,
       )}
-      <${NumberField} label="Velocity" unit=${`${axes[0].info.unit}/s`} value=${speed} onChange=${setSpeed} hint="empty: the axis default" />
+      <${NumberField} label="Velocity" units=${unitsOf(axes[0].info, "velocity")} value=${speed} onChange=${setSpeed} hint="empty: the axis default" />
     </div>
     <${Tick} label="Straight line" checked=${straight} onChange=${setStraight} />
     <p class="row"><${Action} kind="main" act=${move} obstacle=${way || null}

@@ -6,6 +6,7 @@ import { Action, Choice, Panel, Reason, Table, Tick } from "../parts/controls.js
 import { Curve } from "../parts/curve.js";
 import { decimalsOf, duration, number, percent } from "../parts/format.js";
 import { NumberField, unread } from "../parts/number_field.js";
+import { unitsOf } from "../parts/number_text.js";
 import { OneAxis } from "../parts/one_axis.js";
 import { TraceProgress } from "../parts/trace_progress.js";
 import { look } from "../session/channels.js";
@@ -49,7 +50,7 @@ function TestMove({ axis }) {
     <div class="fields">
       <${Choice} label="Shape" options=${Object.entries(MOVES).map(([key, { title }]) => [key, title])} value=${kind}
         onChange=${setKind} hint=${MOVES[kind].hint} />
-      <${NumberField} label="Distance" unit=${axis.info.unit} value=${distance} onChange=${setDistance} min=${0} />
+      <${NumberField} label="Distance" units=${unitsOf(axis.info, "position")} value=${distance} onChange=${setDistance} min=${0} />
       <${NumberField} label="Record after it" unit="s" value=${settleS} onChange=${setSettleS} min=${0} max=${60} />
     </div>
     <p class="row"><${Action} kind="main" obstacle=${hindered} reason=${reason} onDone=${() => setWay(-way)}

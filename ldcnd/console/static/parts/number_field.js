@@ -6,21 +6,23 @@ import { range, readNumber, Unread } from "./number_text.js";
 /** A labelled field for a number.
  *
  * `value` is what the page holds: a number, null for none, or the `Unread` that this field has reported. `onChange` gets
- * the same. `meaning` says what the number will do, from its text with unit. Nothing writes into the field while it has
+ * the same. With the `units` of an axis it is the number that is sent, whatever unit is typed. `meaning` says what the number will do, from its text with unit. Nothing writes into the field while it has
  * the focus: what the page has changed meanwhile is shown when the focus leaves.
  */
-export function NumberField({ label, unit = "", hint, value, onChange, meaning = (text) => text, whole, min, max, plain }) {
+export function NumberField({ label, units, unit = units?.[0].unit.replace("/s2", "/s²") ?? "", hint, value, onChange, meaning = (text) => text, whole, min, max, plain }) {
   const id = useId();
   const [reading, setReading] = useState(value ?? null);
-  const read = (text) => readNumber(text, { unit, whole, min, max });
-  const input = useText(value ?? null, textOf, (text) => {
+  const read = (text) => readNumber(text, { unit, units, whole, min, max });
+  const write = (held) => textOf(typeof held === "number" && units ? Number(units[0].to(held).toPrecision(15)) : held);
+  const input = useText(value ?? null, write, (text) => {
     const now = read(text);
     setReading(now);
     onChange(now);
     return now;
   }, setReading);
   const refused = reading instanceof Unread;
-  const shown = refused || reading === null ? "" : meaning(`${textOf(reading)}${unit && ` ${unit}`}`);
+  const sent = units && units[0].unit !== units[0].sent ? ` = ${reading} ${units[0].sent}` : "";
+  const shown = refused || reading === null ? "" : meaning(`${write(reading)}${unit && ` ${unit}`}${sent}`);
   const wanted = min === undefined && max === undefined ? "" : `${range(min ?? -Infinity, max ?? Infinity)} ${unit}`;
   const about = `${id}-about`;
   return html`<div class="field">

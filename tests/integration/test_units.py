@@ -1,0 +1,72 @@
+"""Numbers with units at every face of a rig: the simulated shaft turns as fast as was typed."""
+
+import asyncio
+
+import pytest
+
+from ldcnd.config.rig import load_config
+from ldcnd.contract.errors import MalformedRequest
+from ldcnd.testing import run, simulated_rig
+from tests.support.command_line import virtual_rig
+from tests.support.process import ROOT
+
+CENTRIFUGE = load_config(ROOT / "config" / "centrifuge.toml")
+
+
+async def _ready(rig):
+    """Wait until door and lock are seen shut, and find the index."""
+    async with rig.control("rotor", client="test") as rotor:
+        async with rig.samples("cabinet", "io") as samples:
+            async for _, sample in samples:
+                if sample.named["locked"] and sample.named["door_closed"]:
+                    break
+        await rotor.power(on=True)
+        await (await rotor.home()).done()
+
+
+def test_programs_send_numbers_with_units():
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            await _ready(rig.client)
+            async with rig.client.control("rotor", client="test") as rotor:
+                await rotor.move_velocity("600 rpm", acceleration="600 rpm/s")
+                await rig.until(lambda: abs(rig.truth("rotor").velocity - 10) < 0.1)
+                await rotor.move_velocity("50 g")
+                await rig.until(lambda: abs(rig.truth("rotor").velocity - 11.14) < 0.1)
+                with pytest.raises(MalformedRequest, match="type the value in rpm, rev/s"):
+                    await rotor.move_velocity("600 mm/s")
+                await (await rotor.halt()).done()
+                await (await rotor.move_absolute("90 deg", velocity="30 rpm")).done()
+                return rotor.position.value, (await rotor.preview(velocity="-30 rpm")).velocity
+
+    position, velocity = run(program())
+
+    assert position == pytest.approx(0.25, abs=0.002)
+    assert velocity == pytest.approx(-0.5, rel=1e-3)
+
+
+def test_a_unit_can_be_typed_wherever_a_value_is(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        lines = [
+            'move rotor "600 rpm" --at-velocity --acceleration "10 rev/s²"',
+            "move rotor 300 --at-velocity --for 100",
+            'axis preview rotor --velocity "-1000 g"',
+            'jog rotor "6 deg/s" --for 0.2',
+            "halt rotor",
+        ]
+        machine.wait(asyncio.sleep(1))
+        begun = [machine.run(line).code for line in ("power on rotor", "home rotor --wait")]
+        ran = [machine.run(line) for line in lines]
+        refused = machine.run('move rotor "600 mm/s" --at-velocity')
+        machine.wait(machine.rig.until("rotor", lambda state: state.moving == "no"))
+        limited = machine.run('move rotor "4000 rpm" --at-velocity')
+
+    said = [each.printed for each in ran]
+    assert (begun, [each.code for each in ran]) == ([0, 0], [0, 0, 0, 1, 0]), ran  # one jogs nothing that runs
+    assert "at 600 rpm (40.26 g), with 9.997 rev/s²" in said[0]
+    assert "at 300 rpm (10.06 g)" in said[1]
+    assert "  velocity     -2990.42 rpm (1000 g)" in said[2]
+    assert refused.code == 2
+    assert "type the value in rpm, rev/s, deg/s" in refused.errors
+    assert limited.code == 1
+    assert "velocity 66.6667 rev/s is above the limit 55 rev/s" in limited.errors
