@@ -231,3 +231,18 @@ async def test_a_refused_target_leaves_the_one_before():
             await put(made, "T:x.RLV", 1000.0)
 
         assert values(made, "VAL", "RLV", "LVIO") == (5.0, 0.0, 1)
+
+
+async def test_a_text_may_carry_a_unit_and_the_velocity_is_in_that_of_people():
+    config = two_axes()
+    (bus,) = config.bus
+    axes = tuple(axis.model_copy(update={"velocity_unit": "m/min"}) for axis in bus.axis)
+    config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
+    async with records(config=config) as (_, made):
+        await put(made, "T:x", "0.5 cm")
+        metadata, _ = await made.variables["T:x:velocity"].read(ChannelType.CTRL_DOUBLE)
+        with pytest.raises(ValueError, match="type the value in mm, m, cm, um"):
+            await put(made, "T:x", "5 kg")
+
+        assert values(made, "VAL", "RBV") == (5.0, pytest.approx(5.0, abs=0.02))
+        assert metadata.units == b"m/min"

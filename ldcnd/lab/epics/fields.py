@@ -23,6 +23,7 @@ from caproto import (
     ChannelString,
     ChannelType,
     SubscriptionType,
+    native_type,
 )
 from caproto.server.records import MotorFields
 
@@ -156,6 +157,12 @@ class Number(RecordField, ChannelDouble):  # type: ignore[misc]
         self._data.update(said)
         return is_new
 
+    async def write_from_dbr(self, data: Any, data_type: Any, metadata: Any, *, flags: int = 0) -> Any:  # noqa: ANN401
+        """Take a put; a text as it is, which caproto would read by the rule of Python."""
+        if native_type(data_type) is ChannelType.STRING:
+            return await self.write(bytes(data[0]).rstrip(b"\0"))
+        return await super().write_from_dbr(data, data_type, metadata, flags=flags)
+
     async def publish(self, flags: Any) -> None:  # noqa: ANN401
         """Send the value to those who monitor it, if it has left the deadband or its description is new."""
         alarm = RecordAlarm(self.status, self.severity)
@@ -174,12 +181,12 @@ class Number(RecordField, ChannelDouble):  # type: ignore[misc]
             ValueError: it is none, or not finite.
         """
         given = super().native(value)
-        number = self._read(given) if isinstance(given, str) else given
+        number = self._number_of(given) if isinstance(given, str) else given
         if not math.isfinite(number):
             raise ValueError(f"{number} is not a finite number")
         return number
 
-    def _read(self, text: str) -> float:
+    def _number_of(self, text: str) -> float:
         return self.convert(text) if self.convert and behind_number(text) else read_number(text, str(self.units))
 
 
