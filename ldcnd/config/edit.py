@@ -37,6 +37,28 @@ def set_for_axis(config: Path, axis: str, tables: Mapping[str, Literals]) -> Non
         draft.replace(config)
 
 
+def teach(config: Path, name: str, places: Mapping[str, float]) -> None:
+    """Write where axes stand into a configuration as a named position, new or in the place of the old one.
+
+    Raises:
+        ConfigError: the file would be no configuration any more; it is as it was.
+    """
+    before = config.read_text(encoding="utf-8")
+    document = tomlkit.parse(before)
+    known = document.setdefault("position", tomlkit.aot())
+    table = next((each for each in known if each.get("name") == name), None)
+    if table is None:
+        table = tomlkit.table()
+        table["name"] = name
+        known.append(table)
+    table["axes"] = tomlkit.inline_table()
+    table["axes"].update(places)
+    with draft_of(config) as draft:
+        draft.write_text(tomlkit.dumps(document), encoding="utf-8")
+        load_config(draft)
+    write_over(config, before, tomlkit.dumps(document))
+
+
 def edited_for_axis(config: Path, axis: str, tables: Mapping[str, Literals]) -> str:
     """Return a configuration as `set_for_axis` would make it, checked whole; the file stays as it is.
 

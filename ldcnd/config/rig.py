@@ -9,11 +9,13 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from ldcnd.config.interlocks import InterlockConfig, check_interlocks
 from ldcnd.config.ports import PortConfig, check_ports
+from ldcnd.config.sequences import check_sequences
 from ldcnd.config.simulated import SimulatedLine, simulator
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.number_text import NotANumber
-from ldcnd.contract.units import AxisUnits, Dimension, converts, read_quantity
+from ldcnd.contract.sequences import NamedPosition, SequenceConfig
+from ldcnd.contract.units import DIMENSIONS, AxisUnits, Dimension, converts, read_quantity
 from ldcnd.drives import known
 from ldcnd.drives.axis_config import QUANTITIES, units_of_table
 from ldcnd.drives.line_config import BusConfig
@@ -117,6 +119,10 @@ class RigConfig(Frozen):
     """The lines."""
     interlock: tuple[InterlockConfig, ...] = Field(default=(), max_length=100)
     """What motions and outputs require of the machine; software, and no safety function."""
+    position: tuple[NamedPosition, ...] = Field(default=(), max_length=500)
+    """Named positions; `ldcnd position teach` writes them from where the axes stand."""
+    sequence: tuple[SequenceConfig, ...] = Field(default=(), max_length=100)
+    """Sequences; `ldcnd sequence run` carries one out as a client, the daemon does nothing with them."""
     port: tuple[PortConfig, ...] = Field(default=(), max_length=20)
     """Terminals on which existing host software shares a line."""
     sim: tuple[SimulatedLine, ...] = ()
@@ -134,6 +140,7 @@ class RigConfig(Frozen):
         named += [name for bus in self.bus for name in (*bus.inputs, *bus.outputs)]
         refuse_duplicates("axis", [axis.name for bus in self.bus for axis in bus.axis] + named)
         check_interlocks(self.interlock, self.bus)
+        check_sequences(self.position, self.sequence, self.bus)
         refuse_duplicates("port", [port.name for port in self.port])
         check_ports(self.port, self.bus)
         refuse_duplicates("sim", [line.name for line in self.sim])
@@ -206,6 +213,15 @@ def _with_units(document: dict[str, Any]) -> dict[str, Any]:
         _convert(rule, known.get(rule.get("of", "")), {"above": Dimension.VELOCITY}, where)
         for at, each in _tables(rule, "requires"):
             _convert(each, known.get(each.get("axis", "")), _REQUIRED, f"{where}.requires[{at}]")
+    for at, position in _tables(document, "position"):
+        places = position.get("axes")
+        for axis in places if isinstance(places, dict) else ():
+            _convert(position, known.get(axis), {f"axes.{axis}": Dimension.POSITION}, f"position[{at}]")
+    for at, sequence in _tables(document, "sequence"):
+        for step_at, step in _tables(sequence, "step"):
+            if isinstance(given := step.get("arguments"), dict):
+                where = f"sequence[{at}].step[{step_at}].arguments"
+                _convert(given, known.get(step.get("axis", "")), DIMENSIONS, where)
     return document
 
 

@@ -149,7 +149,9 @@ def plan_reload(running: RigConfig, wanted: RigConfig) -> ReloadPlan:
     """
     wanted_buses = {bus.name: bus for bus in wanted.bus}
     buses = tuple(_bus(bus, wanted_buses.get(bus.name, bus)) for bus in running.bus)
-    config = running.model_copy(update={"bus": buses})
+    config = running.model_copy(
+        update={"bus": buses, "position": wanted.position, "sequence": wanted.sequence}  # of clients alone
+    )
     changes = (
         *_differences(running, config, "", restart=False),
         *_differences(config, wanted, "", restart=True),

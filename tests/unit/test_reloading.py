@@ -151,3 +151,11 @@ def test_a_direction_that_is_turned_leaves_everything_of_that_axis_alone():
 
     assert reload.config == RUNNING
     assert set(reload.refused) == {"bus.line0.axis.x.direction", "bus.line0.axis.x.limits.position_max"}
+
+
+def test_what_clients_alone_use_applies():
+    wanted = document() | {"position": [{"name": "park", "axes": {"x": 1.0}}]}
+
+    reload = plan_reload(RUNNING, validated(wanted))
+
+    assert (reload.refused, [each.name for each in reload.config.position]) == ((), ["park"])

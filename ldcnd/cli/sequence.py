@@ -1,0 +1,155 @@
+"""`ldcnd sequence` and `ldcnd position`: named positions and sequences, carried out by this program as a client."""
+
+import asyncio
+import sys
+import time
+from contextlib import ExitStack
+from pathlib import Path
+
+import click
+
+from ldcnd.cli.connection import AXIS, Target, with_target
+from ldcnd.cli.main import CommandGroup
+from ldcnd.cli.output import end_as_interrupted, keys, show_lines
+from ldcnd.cli.quantities import decimals, seconds
+from ldcnd.cli.typed import NewFile, WholeNumber, axis_of, force_option, unknown
+from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config.edit import teach
+from ldcnd.config.rig import RigConfig, load_config
+from ldcnd.contract.errors import NotReferenced, WrongState
+from ldcnd.contract.samples import Moving
+from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
+from ldcnd.lab.sequences import SequenceRun
+
+FILE = click.Path(path_type=Path, dir_okay=False)
+PAUSE = " "
+
+
+@click.group(cls=CommandGroup)
+def sequence() -> None:
+    """Carry out a sequence of the configuration, step by step."""
+
+
+@sequence.command("list")
+@click.argument("file", type=FILE)
+def list_sequences(file: Path) -> None:
+    """Show the sequences of FILE, a rig's configuration, and their steps."""
+    for each in load_config(file).sequence:
+        show_lines(each.name, *(f"  {at:3}  {step.title}" for at, step in enumerate(each.step, 1)))
+
+
+@sequence.command("run")
+@click.argument("file", type=FILE)
+@click.argument("name")
+@click.option("--from", "first", type=WholeNumber(1), default=1, show_default=True, help="Begin with this step.")
+@click.option("--record", type=NewFile(), help="Write what happens to each step to this file, as JSON lines.")
+@force_option
+@click.option("--take", is_flag=True, help="Take control from its holder.")
+@with_target
+def run_sequence(target: Target, file: Path, name: str, first: int, record: Path | None, *, take: bool) -> None:
+    """Carry out the sequence NAME of FILE, a rig's configuration.
+
+    On a terminal the space bar has the next step wait, and go on. Ctrl-C, and a step that fails, halt what moves;
+    outputs stay as they are.
+    """
+    rig = load_config(file)
+    known = {each.name: each for each in rig.sequence}
+    if name not in known:
+        raise unknown("sequence", name, known)
+    _carry_out(target, rig, known[name], record, first, take=take)
+
+
+def _carry_out(
+    target: Target, rig: RigConfig, wanted: SequenceConfig, record: Path | None, first: int = 1, *, take: bool = False
+) -> None:
+    positions = {each.name: each for each in rig.position}
+    with ExitStack() as open_files:
+        written = open_files.enter_context(record.open("w", encoding="utf-8")) if record else None
+
+        def report(step: StepReport) -> None:
+            if written:
+                written.write(f"{step.model_dump_json()}\n")
+                written.flush()
+            took = f" in {seconds(step.took_s)}" if step.took_s is not None else ""
+            why = f": {step.reason}" if step.reason else ""
+            target.show(step, f"{step.step:3}/{step.of}  {step.title}: {step.event}{took}{why}")
+
+        async def work(client: RigClient) -> None:
+            run = SequenceRun(Rig(client, await client.daemon()), wanted, positions, report, time.time_ns)
+            async with asyncio.TaskGroup() as group:
+                pausing = group.create_task(_pause_by_key(run.going), name="pause")
+                try:
+                    await run.run(first, force=take)
+                finally:
+                    pausing.cancel()
+
+        end_as_interrupted()
+        target.run(work)
+
+
+async def _pause_by_key(going: asyncio.Event) -> None:
+    if not sys.stdin.isatty():
+        return
+    with keys() as pressed:
+        while True:
+            if await pressed.get() == PAUSE:
+                going.clear() if going.is_set() else going.set()
+                show_lines("goes on" if going.is_set() else "pauses before the next step; space goes on", err=True)
+
+
+@click.group(cls=CommandGroup)
+def position() -> None:
+    """Teach named positions from where axes stand, and go to them."""
+
+
+@position.command("list")
+@click.argument("file", type=FILE)
+def list_positions(file: Path) -> None:
+    """Show the named positions of FILE, a rig's configuration."""
+    rig = load_config(file)
+    units = {axis.name: axis.unit for bus in rig.bus for axis in bus.axis}
+    for each in rig.position:
+        show_lines(f"{each.name:16} {', '.join(f'{axis} {at:g} {units[axis]}' for axis, at in each.axes.items())}")
+
+
+@position.command("teach")
+@click.argument("file", type=FILE)
+@click.argument("name")
+@click.argument("axes", type=AXIS, nargs=-1, required=True, metavar="AXIS...")
+@with_target
+def teach_position(target: Target, file: Path, name: str, axes: tuple[str, ...]) -> None:
+    """Write where each AXIS stands into FILE, a rig's configuration, as the position NAME; nothing moves.
+
+    `go` moves them in the order in which they are named here. A position of that name is replaced.
+    """
+
+    async def work(client: RigClient) -> NamedPosition:
+        places = {}
+        for axis in axes:
+            info, state, place = await axis_of(client, axis), await client.state(axis), await client.position(axis)
+            if state is None or place is None or not state.referenced:
+                raise NotReferenced(f"axis {axis}: where it stands is not known", axis=axis, remedy="home it first")
+            if state.moving is not Moving.NO:
+                raise WrongState(f"axis {axis} moves: {state.moving.value}", axis=axis, remedy="wait until it stands")
+            places[axis] = round(place.value, decimals(info))
+        return NamedPosition(name=name, axes=places)
+
+    taught = target.run(work)
+    teach(file, name, taught.axes)
+    target.show(taught, f"{name}: {', '.join(f'{axis} {at:g}' for axis, at in taught.axes.items())}")
+
+
+@position.command("go")
+@click.argument("file", type=FILE)
+@click.argument("name")
+@click.option("--take", is_flag=True, help="Take control from its holder.")
+@with_target
+def go(target: Target, file: Path, name: str, *, take: bool) -> None:
+    """Move the axes of the position NAME of FILE there, one after the other; Ctrl-C halts them."""
+    rig = load_config(file)
+    known = {each.name for each in rig.position}
+    if name not in known:
+        raise unknown("position", name, known)
+    there = SequenceConfig(name=f"go_{name}"[:63], step=(SequenceStep(go=name, timeout_s=86_400),))
+    _carry_out(target, rig, there, None, take=take)

@@ -1,0 +1,91 @@
+"""Named positions and sequences of a machine: data of its configuration, which a client carries out.
+
+The daemon reads them over and does nothing with them: every command of a sequence passes its gate as any other.
+"""
+
+from collections.abc import Mapping
+from typing import Literal
+
+from pydantic import Field
+
+from ldcnd.contract.frozen import Frozen
+
+SequenceVerb = Literal[
+    "power", "home", "move_absolute", "move_relative", "move_velocity", "halt", "set_gains", "set_position", "reset"
+]
+
+
+class NamedPosition(Frozen):
+    """Position of several axes under one name."""
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]{0,62}$")
+    """Name of the position, such as `park`."""
+    axes: Mapping[str, float] = Field(min_length=1)
+    """Position of each axis; `go` moves them one after the other, in this order."""
+
+
+class SequenceStep(Frozen):
+    """One step: what it commands, what it waits for, and for how long."""
+
+    name: str = ""
+    """Name for people; made from the rest when missing."""
+    do: SequenceVerb | None = None
+    """Command that is sent to `axis`; its motion has ended when the step is over."""
+    axis: str | None = None
+    """Axis of the command."""
+    arguments: Mapping[str, bool | float | str] = {}
+    """Fields of the command, such as { velocity = "3000 rpm", duration_s = 60 }."""
+    go: str | None = None
+    """Named position to which its axes are moved."""
+    set: Mapping[str, bool] = {}
+    """Named outputs that are written before anything moves, true for high."""
+    until: Mapping[str, bool] = {}
+    """Named inputs and outputs, and the values that they must have at the end; what is not known has none."""
+    leave_running: bool = False
+    """The step is over when its command is accepted; a later step may wait for `standstill`."""
+    standstill: tuple[str, ...] = ()
+    """Axes that must stand at the end."""
+    pause_s: float = Field(default=0.0, ge=0, le=86_400)
+    """Time that follows, seconds."""
+    timeout_s: float = Field(default=60.0, gt=0, le=90_000)
+    """Longest time of all but the pause, seconds; then the sequence has failed."""
+
+    @property
+    def title(self) -> str:
+        """What people read."""
+        parts = [f"{self.do.replace('_', ' ')} {self.axis}"] if self.do else []
+        parts += [f"go to {self.go}"] if self.go else []
+        parts += [f"{name} {'high' if high else 'low'}" for name, high in self.set.items()]
+        parts += [f"until {name} is {str(value).lower()}" for name, value in self.until.items()]
+        parts += [f"until {axis} stands" for axis in self.standstill]
+        return self.name or ", ".join(parts) or f"wait for {self.pause_s:g} s"
+
+
+class SequenceConfig(Frozen):
+    """Steps that a client carries out one after the other; the first that fails ends it, and what moves is halted."""
+
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]{0,62}$")
+    """Name of the sequence."""
+    step: tuple[SequenceStep, ...] = Field(min_length=1, max_length=500)
+    """The steps."""
+
+
+class StepReport(Frozen):
+    """What came of one step: a line of the record."""
+
+    sequence: str
+    """Name of the sequence."""
+    step: int
+    """Number of the step, from 1."""
+    of: int
+    """Number of steps."""
+    title: str
+    """Name of the step."""
+    event: Literal["begun", "done", "failed", "stopped", "paused"]
+    """What happened to it; paused: it waits to begin."""
+    t: int
+    """Instant, UTC in ns since 1970."""
+    took_s: float | None = None
+    """How long it took, seconds; null before its end."""
+    reason: str | None = None
+    """Why it has failed."""

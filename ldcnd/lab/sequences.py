@@ -1,0 +1,153 @@
+"""A sequence at work: its steps one after the other, as a client of the rig that anybody else could be, too."""
+
+import asyncio
+from collections.abc import Callable, Mapping
+from contextlib import AsyncExitStack
+
+from ldcnd.client.axis import Axis
+from ldcnd.client.motion import Motion
+from ldcnd.client.rig import Rig
+from ldcnd.contract.errors import ConfigError, LdcndError, WrongState
+from ldcnd.contract.samples import IoSample, Moving, TelemetryItem
+from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
+
+LEASE_S = 2.0
+"""The daemon applies `loss.client` so soon when this program disappears, seconds."""
+
+
+class SequenceRun:
+    """One run of a sequence.
+
+    Args:
+        rig: the rig.
+        sequence: what is done.
+        positions: the named positions, by name.
+        report: gets what happens to each step; the record is made of it.
+        now_ns: UTC in ns since 1970.
+
+    Attributes:
+        going: cleared, the next step waits to begin; a motion under way is not touched.
+    """
+
+    def __init__(
+        self,
+        rig: Rig,
+        sequence: SequenceConfig,
+        positions: Mapping[str, NamedPosition],
+        report: Callable[[StepReport], None],
+        now_ns: Callable[[], int],
+    ) -> None:
+        self.going = asyncio.Event()
+        self.going.set()
+        self._rig = rig
+        self._sequence = sequence
+        self._positions = positions
+        self._report = report
+        self._now_ns = now_ns
+        self._axes: dict[str, Axis] = {}
+        self._modules: dict[str, str] = {}  # by the names of their lines
+
+    async def run(self, first: int = 1, *, force: bool = False) -> None:
+        """Carry it out under control of its axes, of all axes of the rig if it writes outputs.
+
+        Whatever ends it early halts the axes whose motions have not ended; outputs stay as they are.
+
+        Args:
+            first: number of the step with which it begins.
+            force: take control from its holder.
+
+        Raises:
+            LdcndError: a step was refused or has failed; nothing after it was begun.
+        """
+        steps = self._sequence.step
+        if not 1 <= first <= len(steps):
+            raise ConfigError(f"sequence {self._sequence.name} has no step {first}", value=first, limit=len(steps))
+        axes = () if any(step.set for step in steps) else tuple(dict.fromkeys(self._used()))
+        who = f"sequence {self._sequence.name}"
+        async with AsyncExitStack() as held:
+            controlled = await held.enter_async_context(self._rig.controlled(axes, who, LEASE_S, force=force))
+            self._axes = {axis.name: axis for axis in controlled}
+            self._modules = await self._lines()
+            for number in range(first, len(steps) + 1):
+                await self._carry_out(number, steps[number - 1])
+
+    def _used(self) -> list[str]:
+        used: list[str] = []
+        for step in self._sequence.step:
+            used += [step.axis] if step.axis else []
+            used += [*self._positions[step.go].axes] if step.go else []
+            used += step.standstill
+        return used
+
+    async def _lines(self) -> dict[str, str]:
+        lines: dict[str, str] = {}
+        for module in [each.name for bus in await self._rig.buses() for each in bus.modules if each.name]:
+            sample = await self._rig.latest(module, TelemetryItem.IO)
+            lines |= dict.fromkeys(sample.named, module) if isinstance(sample, IoSample) else {}
+        return lines
+
+    async def _carry_out(self, number: int, step: SequenceStep) -> None:
+        loop = asyncio.get_running_loop()
+
+        def report(event: str, took_s: float | None = None, reason: str | None = None) -> None:
+            about = {"sequence": self._sequence.name, "step": number, "of": len(self._sequence.step)}
+            said = {"title": step.title, "event": event, "t": self._now_ns(), "took_s": took_s, "reason": reason}
+            self._report(StepReport.model_validate(about | said))
+
+        if not self.going.is_set():
+            report("paused")
+            await self.going.wait()
+        report("begun")
+        began_s = loop.time()
+        try:
+            await self._within(number, step)
+            await asyncio.sleep(step.pause_s)
+        except LdcndError as error:
+            report("failed", loop.time() - began_s, str(error))
+            raise
+        except BaseException:
+            report("stopped", loop.time() - began_s)
+            raise
+        report("done", loop.time() - began_s)
+
+    async def _within(self, number: int, step: SequenceStep) -> None:
+        seen: dict[str, bool | None] = dict.fromkeys(step.until)
+        try:
+            async with asyncio.timeout(step.timeout_s):
+                for name, high in step.set.items():
+                    await self._write(name, high=high)
+                await self._command(step)
+                if step.until:
+                    await self._come(step, seen)
+                for axis in step.standstill:
+                    while self._axes[axis].state.sample.moving is not Moving.NO:
+                        await self._axes[axis].news(None)
+        except TimeoutError:
+            words = [f"{name} is {'not known' if each is None else str(each).lower()}" for name, each in seen.items()]
+            words += [f"{axis} moves: {self._axes[axis].state.sample.moving.value}" for axis in step.standstill]
+            raise WrongState(
+                f"sequence {self._sequence.name}: step {number}, {step.title}, is not over within"
+                f" {step.timeout_s:g} s{': ' if words else ''}{', '.join(words)}",
+                limit=step.timeout_s,
+            ) from None
+
+    async def _write(self, name: str, *, high: bool) -> None:
+        if name not in self._modules:
+            raise WrongState(f"output {name}: its module has not been seen", value=name)
+        await self._rig.set_io(self._modules[name], high=[name] if high else (), low=() if high else [name])
+
+    async def _command(self, step: SequenceStep) -> None:
+        for axis, place in self._positions[step.go].axes.items() if step.go else ():
+            await (await self._axes[axis].move_absolute(place)).done()
+        if step.do and step.axis:
+            done = await getattr(self._axes[step.axis], step.do)(**step.arguments)
+            if isinstance(done, Motion) and not step.leave_running:
+                await done.done()
+
+    async def _come(self, step: SequenceStep, seen: dict[str, bool | None]) -> None:
+        """Wait until lines have their values; samples of before the step are not looked at."""
+        async with self._rig.samples(item=TelemetryItem.IO) as samples:
+            while seen != dict(step.until):
+                _, sample = await anext(samples)
+                if isinstance(sample, IoSample):
+                    seen |= {name: value for name, value in sample.named.items() if name in seen}

@@ -1,0 +1,206 @@
+"""Named positions and sequences of the centrifuge: carried out by a client, judged by the gate of the daemon."""
+
+import asyncio
+import json
+import tomllib
+
+import pytest
+
+from ldcnd.config.rig import load_config
+from ldcnd.contract.errors import ConfigError, InterlockViolated, WrongState
+from ldcnd.contract.sequences import SequenceConfig, SequenceStep
+from ldcnd.lab.sequences import SequenceRun
+from ldcnd.testing import run, simulated_rig
+from tests.support.command_line import virtual_rig
+from tests.support.process import ROOT
+
+FILE = ROOT / "config" / "centrifuge.toml"
+CENTRIFUGE = load_config(FILE)
+SEQUENCES = {each.name: each for each in CENTRIFUGE.sequence}
+POSITIONS = {each.name: each for each in CENTRIFUGE.position}
+JAMMED = 4
+"""Line of the sensor of the closed door."""
+
+
+def machine(program):
+    """Run a program with the simulated rig and a function that makes a run of a sequence and its reports."""
+
+    async def whole():
+        async with simulated_rig(CENTRIFUGE) as rig:
+
+            def made(sequence):
+                reports = []
+                return SequenceRun(rig.client, sequence, POSITIONS, reports.append, lambda: 0), reports
+
+            async with asyncio.timeout(600):
+                return await program(rig, made)
+
+    return run(whole())
+
+
+def speed(rig):
+    return abs(rig.truth("rotor").velocity)
+
+
+def test_a_whole_cycle_runs_and_is_recorded():
+    async def program(rig, made):
+        fastest = 0.0
+
+        async def look():
+            nonlocal fastest
+            while True:
+                fastest = max(fastest, speed(rig))
+                await asyncio.sleep(0.05)
+
+        async with asyncio.TaskGroup() as group:
+            looking = group.create_task(look())
+            for name in ("shut", "spin", "shut"):
+                running, reports = made(SEQUENCES[name])
+                await running.run()
+                steps = range(1, len(SEQUENCES[name].step) + 1)
+                assert [(each.step, each.event) for each in reports] == [
+                    (step, event) for step in steps for event in ("begun", "done")
+                ]
+            looking.cancel()
+        return fastest, await rig.client.latest("rotor", "position"), (await rig.client.holders()).holders
+
+    fastest, position, holders = machine(program)
+
+    assert fastest == pytest.approx(15.77, rel=0.01)  # 100 g at 0.1 m
+    assert position.value == pytest.approx(0.1, abs=0.002)
+    assert [each.client for each in holders] == [None]
+
+
+def test_a_step_that_fails_ends_the_sequence_and_halts_what_moves():
+    spin = SequenceStep(
+        do="move_velocity",
+        axis="rotor",
+        arguments={"velocity": 5.0, "duration_s": 60.0},
+        leave_running=True,
+        timeout_s=5,
+    )
+    sequence = SequenceConfig(
+        name="fails", step=(spin, SequenceStep(until={"door_open": True}, timeout_s=3), SequenceStep(go="bucket1"))
+    )
+
+    async def program(rig, made):
+        await made(SEQUENCES["shut"])[0].run()
+        await made(SequenceConfig(name="ready", step=SEQUENCES["spin"].step[:3]))[0].run()
+        running, reports = made(sequence)
+        with pytest.raises(WrongState, match=r"step 2, until door_open is true, is not over within 3 s: door_open is"):
+            await running.run()
+        await rig.at_rest("rotor")
+        return reports, speed(rig)
+
+    reports, left = machine(program)
+
+    assert [(each.step, each.event) for each in reports][-2:] == [(2, "begun"), (2, "failed")]
+    assert left < 0.05
+
+
+def test_the_gate_of_the_daemon_judges_each_step():
+    async def program(rig, made):
+        running, reports = made(SequenceConfig(name="ready", step=SEQUENCES["spin"].step[:3]))
+        await made(SEQUENCES["shut"])[0].run()
+        await running.run()
+        opened = SequenceConfig(name="opens", step=(*SEQUENCES["spin"].step[-2:], SequenceStep(go="bucket2")))
+        running, reports = made(opened)
+        with pytest.raises(InterlockViolated, match="door_shut"):
+            await running.run()
+        return reports
+
+    assert machine(program)[-1].event == "failed"
+
+
+@pytest.mark.parametrize("when_s", [0.5, 3.0, 14.0])
+def test_a_stop_halts_what_moves_and_a_pause_does_not(when_s):
+    async def program(rig, made):
+        await made(SEQUENCES["shut"])[0].run()
+        running, reports = made(SEQUENCES["spin"])
+        running.going.clear()
+        task = asyncio.ensure_future(running.run())
+        await asyncio.sleep(2)
+        assert [each.event for each in reports] == ["paused"]
+        running.going.set()
+        await asyncio.sleep(when_s)
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        await rig.at_rest("rotor")
+        return reports
+
+    reports = machine(program)
+
+    assert reports[-1].event == "stopped"
+
+
+def test_it_is_typed_and_taught(monkeypatch, tmp_path):
+    config = tmp_path / "rig.toml"
+    config.write_text(FILE.read_text(encoding="utf-8"), encoding="utf-8")
+    with virtual_rig(monkeypatch, CENTRIFUGE) as rig:
+        rig.wait(asyncio.sleep(1))
+        record = tmp_path / "record.jsonl"
+        unhomed = rig.run(f"position teach {config} there rotor")
+        ran = [
+            rig.run(line)
+            for line in (
+                f"sequence run {config} spin --record {record}",
+                f"sequence run {config} shut",
+                f"position go {config} bucket2",
+                f"position teach {config} here rotor",
+                f"position list {config}",
+                f"sequence list {config}",
+            )
+        ]
+        refused = rig.run(f"sequence run {config} shutt")
+        jammed = SequenceStep(until={"door_open": True}, timeout_s=1)
+        config.write_text(config.read_text() + f'\n[[sequence]]\nname = "waits"\nstep = [{_toml(jammed)}]\n')
+        failed = rig.run(f"sequence run {config} waits")
+
+    assert unhomed.code == 1
+    assert "home it first" in unhomed.errors
+    assert [each.code for each in ran] == [0] * 6, ran
+    assert "  8/8  door high, until door_open is true: done in " in ran[0].printed
+    assert [json.loads(line)["event"] for line in record.read_text().splitlines()] == ["begun", "done"] * 8
+    taught = {each["name"]: each["axes"] for each in tomllib.loads(config.read_text())["position"]}
+    assert taught["here"]["rotor"] == pytest.approx(0.6, abs=0.002)
+    assert "here             rotor 0.6" in ran[4].printed
+    assert (refused.code, "did you mean 'shut'?" in refused.errors) == (1, True)
+    assert failed.code == 1
+    assert "door_open is false" in failed.errors
+
+
+def _toml(step):
+    return f"{{ until = {{ door_open = true }}, timeout_s = {step.timeout_s:g} }}"
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ('go = "bucket1"', 'go = "bucket3"', "sequence spin: step 6: there is no position 'bucket3'"),
+        ("axes = { rotor = 0.1 }", "axes = { lid = 0.1 }", "position bucket1: there is no axis 'lid'"),
+        ("{ pin = false }", "{ pim = false }", "sequence shut: step 2: there is no output 'pim'; there are: door, pin"),
+        (
+            'velocity = "100 g"',
+            'velocity = "100 mm/s"',
+            "sequence[1].step[3].arguments.velocity: \u201cmm/s\u201d",
+        ),
+        ('velocity = "100 g", ', "", "sequence spin: step 4: move_velocity needs velocity"),
+        ("arguments = { on = true }", "arguments = { off = true }", "power has no off and needs on"),
+        (
+            "axes = { rotor = 0.6 }",
+            'axes = { rotor = "0.6 mm" }',
+            "position[1].axes.rotor: \u201cmm\u201d is not",
+        ),
+    ],
+)
+def test_what_cannot_be_carried_out_is_refused_with_the_configuration(tmp_path, old, new, said):
+    config = tmp_path / "rig.toml"
+    text = FILE.read_text(encoding="utf-8")
+    assert old in text
+    config.write_text(text.replace(old, new, 1), encoding="utf-8")
+
+    with pytest.raises(ConfigError) as refused:
+        load_config(config)
+
+    assert said in refused.value.message
