@@ -13,7 +13,7 @@ BENCH = ("commission", "examine", "terminal_person")
 STANDING = {
     "bench": ("console.commissioning", *(f"cli.{name}" for name in BENCH)),
     "console": (),
-    "lab": ("bluesky", "cli.top"),
+    "lab": ("cli.sequence", "bluesky", "cli.top"),
     "ops": ("cli.pki",),
     "ports": (),
     "sim": ("bench.tuning", "cli.sim", "cli.twin", "ports", "testing"),
