@@ -27,6 +27,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving
+from ldcnd.contract.units import Dimension
 
 
 def check_reachable(axis: AxisTracker) -> None:
@@ -143,8 +144,8 @@ def check_velocity(axis: AxisTracker, limits: AxisLimits, velocity: float) -> No
     """Refuse a speed above the limit."""
     if limits.velocity is not None and abs(velocity) > limits.velocity:
         raise VelocityLimit(
-            f"axis {axis.name}: velocity {velocity:g} {axis.status.unit}/s is above the limit"
-            f" {limits.velocity:g} {axis.status.unit}/s",
+            f"axis {axis.name}: velocity {axis.status.scale.text(velocity, Dimension.VELOCITY)} is above the limit"
+            f" {axis.status.scale.text(limits.velocity, Dimension.VELOCITY)}",
             axis=axis.name,
             value=velocity,
             limit=limits.velocity,
@@ -156,8 +157,8 @@ def check_acceleration(axis: AxisTracker, limits: AxisLimits, acceleration: floa
     """Refuse an acceleration above the limit."""
     if limits.acceleration is not None and acceleration > limits.acceleration:
         raise AccelerationLimit(
-            f"axis {axis.name}: acceleration {acceleration:g} {axis.status.unit}/s2 is above the limit"
-            f" {limits.acceleration:g} {axis.status.unit}/s2",
+            f"axis {axis.name}: acceleration {axis.status.scale.text(acceleration, Dimension.ACCELERATION)} is above"
+            f" the limit {axis.status.scale.text(limits.acceleration, Dimension.ACCELERATION)}",
             axis=axis.name,
             value=acceleration,
             limit=limits.acceleration,

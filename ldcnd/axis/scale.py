@@ -1,7 +1,8 @@
 """The coordinates of one axis: its unit, its counts per unit, its modulo, and the count at which its position is 0."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
+from ldcnd.contract.units import AxisUnits, Dimension, quantity_text
 from ldcnd.drives.axis_config import AxisConfig
 
 
@@ -14,17 +15,24 @@ class AxisScale:
         counts_per_unit: negative where forward in axis units is backward in counts.
         modulo: length of one turn, in axis units; None for an axis without one.
         origin_counts: count of the drive at position 0. It means something only while the axis is referenced.
+        units: in which people read velocities and accelerations; None for those of the network.
     """
 
     unit: str
     counts_per_unit: float = 1.0
     modulo: float | None = None
     origin_counts: float = 0.0
+    units: AxisUnits | None = field(default=None, compare=False)
 
     @classmethod
     def of(cls, config: AxisConfig) -> "AxisScale":
         """Return the scale that an axis is configured with, with its origin at count 0."""
-        return cls(config.unit, config.signed_counts_per_unit, config.modulo)
+        units = AxisUnits(config.unit, config.unit_table, config.g_velocity)
+        return cls(config.unit, config.signed_counts_per_unit, config.modulo, units=units)
+
+    def text(self, value: float, dimension: Dimension) -> str:
+        """Return a number in units of the axis as people read it."""
+        return quantity_text(value, self.units or AxisUnits(self.unit, {}), dimension, ".6g")
 
     def position(self, counts: float) -> float:
         """Return the position that a count of the drive stands for, in axis units, counted through all turns."""

@@ -32,7 +32,9 @@ from ldcnd.contract.samples import (
     Sample,
     StateSample,
     TelemetryItem,
+    VelocitySample,
 )
+from ldcnd.contract.units import Dimension, shown_quantity
 from ldcnd.net.session import Session
 
 SILENT_S = 3.0
@@ -143,6 +145,9 @@ class Watched:
             if isinstance(sample, PositionSample):
                 return f"position {condition.position(f'{sample.value:.4f}', sample.unit)}"
             return f"state    {condition.in_full}"
+        if name in self._now and isinstance(sample, VelocitySample):
+            value, unit = shown_quantity(sample.value, self._now[name].info, Dimension.VELOCITY)
+            sample = sample.model_copy(update={"value": value, "unit": unit})
         return sample_text(sample)
 
 

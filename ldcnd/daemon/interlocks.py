@@ -21,6 +21,7 @@ from ldcnd.contract.errors import InterlockViolated, LdcndError, ValueOutOfRange
 from ldcnd.contract.events import INTERLOCK, CommandStatus
 from ldcnd.contract.rig_commands import OverrideInterlock, OverrideReply
 from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.contract.units import Dimension
 from ldcnd.daemon.leases import STOP_MODES, Authority
 from ldcnd.daemon.ledger import EventLog
 from ldcnd.daemon.modules import ModuleService
@@ -223,8 +224,8 @@ class Interlocks:
         if each.standstill and not (status.rest.rests is True and not _commanded(status)):
             return f"axis {name} does not stand, or is not known to"
         if each.below is not None and (speed := _speed(axis)) >= each.below:
-            unit = status.unit
-            return f"axis {name} may be at {speed:.6g} {unit}/s, which is not below {each.below:g} {unit}/s"
+            now, limit = (status.scale.text(value, Dimension.VELOCITY) for value in (speed, each.below))
+            return f"axis {name} may be at {now}, which is not below {limit}"
         in_range = (each.min, each.max) != (None, None)
         if (each.homed or in_range) and (not status.referenced or status.position_lost):
             return f"axis {name} is not homed"

@@ -52,6 +52,7 @@ def test_a_unit_can_be_typed_wherever_a_value_is(monkeypatch):
             "move rotor 300 --at-velocity --for 100",
             'axis preview rotor --velocity "-1000 g"',
             'jog rotor "6 deg/s" --for 0.2',
+            "watch rotor --item velocity --count 1",
             "halt rotor",
         ]
         machine.wait(asyncio.sleep(1))
@@ -62,11 +63,12 @@ def test_a_unit_can_be_typed_wherever_a_value_is(monkeypatch):
         limited = machine.run('move rotor "4000 rpm" --at-velocity')
 
     said = [each.printed for each in ran]
-    assert (begun, [each.code for each in ran]) == ([0, 0], [0, 0, 0, 1, 0]), ran  # one jogs nothing that runs
+    assert (begun, [each.code for each in ran]) == ([0, 0], [0, 0, 0, 1, 0, 0]), ran  # one jogs nothing that runs
     assert "at 600 rpm (40.26 g), with 9.997 rev/s²" in said[0]
     assert "at 300 rpm (10.06 g)" in said[1]
     assert "  velocity     -2990.42 rpm (1000 g)" in said[2]
+    assert " rpm\n" in said[4]
     assert refused.code == 2
     assert "type the value in rpm, rev/s, deg/s" in refused.errors
     assert limited.code == 1
-    assert "velocity 66.6667 rev/s is above the limit 55 rev/s" in limited.errors
+    assert "velocity 4000 rpm (1789 g) is above the limit 3300 rpm (1218 g)" in limited.errors
