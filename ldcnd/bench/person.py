@@ -12,6 +12,7 @@ from contextlib import AbstractAsyncContextManager
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.number_text import NotANumber, read_number
+from ldcnd.contract.units import Described, Dimension, read_quantity
 
 YES = ("y", "yes")
 NO = ("n", "no")
@@ -97,21 +98,24 @@ class Person(ABC):
         """Return what is answered to the question for a number, as text."""
         return await self.ask(question if default is None else f"{question} [{default:g}]")
 
-    async def number(self, question: str, default: float | None = None) -> float:
-        """Ask until the answer is 0 or a number from `LEAST` to `MOST`, either way; an empty one is the default."""
+    async def number(self, question: str, default: float | None = None, of: Described | None = None) -> float:
+        """Ask until the answer is 0 or a number from `LEAST` to `MOST`, either way; an empty one is the default.
+
+        It may be a distance `of` an axis, in any of its units.
+        """
         while True:
             answer = await self.ask_number(question, default)
             if not answer and default is not None:
                 return default
-            if (number := typed_number(answer)) is not None:
+            if (number := typed_number(answer, of)) is not None:
                 return number
             self.tell(f"{answer!r} is no number: 0, or {LEAST:g} to {MOST:g} either way")
 
 
-def typed_number(text: str) -> float | None:
+def typed_number(text: str, of: Described | None = None, dimension: Dimension = Dimension.POSITION) -> float | None:
     """Return a number that was typed; None for any other text, and for one that is too large or too small."""
     try:
-        number = read_number(text)
+        number = read_number(text) if of is None else read_quantity(text, of, dimension)
     except NotANumber:
         return None
     return number if not number or LEAST <= abs(number) <= MOST else None

@@ -502,7 +502,7 @@ async def test_a_wrong_scale_and_a_reversed_encoder_are_found_and_written(tmp_pa
 
 
 async def test_a_right_scale_proposes_nothing(tmp_path):
-    async with commissioning_rig(tmp_path, {"how far shall": "4", "how far did": "4.0"}) as rig:
+    async with commissioning_rig(tmp_path, {"how far shall": "0.4 cm", "how far did": "4000 um"}) as rig:
         kept = await (await rig.checklist()).run("scale")
 
         assert kept.result.state is StepState.DONE

@@ -20,6 +20,7 @@ from ldcnd.bench.person import typed_number
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Home, Verb
 from ldcnd.contract.errors import LeaseExpired, ValueOutOfRange
+from ldcnd.contract.units import Dimension
 from ldcnd.drives.axis_config import HomeConfig
 
 SCALE_SHARE = 0.5
@@ -64,7 +65,11 @@ class Scale(Step):
     async def run(self, site: StepContext, axis: Axis) -> Result:
         person, unit = site.person, site.info.unit
         velocity = SCALE_SHARE * site.config.velocity
-        while not (distance := await person.number(f"how far shall it move, signed, in {unit}", velocity * DEFAULT_S)):
+        while not (
+            distance := await person.number(
+                f"how far shall it move, signed, in {unit}", velocity * DEFAULT_S, site.info
+            )
+        ):
             person.tell("that would not move it")
         refuse_previewed(await axis.preview(distance=distance, velocity=velocity))
         moves = f"{site.info.axis} moves by {site.length(distance)}"
@@ -75,7 +80,7 @@ class Scale(Step):
                 raise key_released(axis)
         if ended is None:
             person.tell("halted; what it went until then can be measured as well")
-        measured = await person.number(f"how far did it go, signed, in {unit}")
+        measured = await person.number(f"how far did it go, signed, in {unit}", of=site.info)
         return _scale_found(site, distance, counts, measured)
 
 
@@ -297,9 +302,9 @@ class Travel(Step):
                 case ["here"]:
                     await rest_counts(axis)
                     return axis.position.value
-                case ["jog", text] if velocity := typed_number(text):
+                case ["jog", *text] if velocity := typed_number(" ".join(text), site.info, Dimension.VELOCITY):
                     await self._jog(site, axis, velocity)
-                case [text] if (position := typed_number(text)) is not None:
+                case text if (position := typed_number(" ".join(text), site.info)) is not None:
                     return position
                 case _:
                     person.tell(HELP)

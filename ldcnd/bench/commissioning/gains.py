@@ -86,7 +86,7 @@ async def _tuned(site: StepContext, axis: Axis) -> Result:
     if axis.state.enabled and not await _is_switched_off(site):
         return kept
     usual = WITHIN_COUNTS / site.counts_per_unit
-    within = await person.number(f"within which distance of where it stands may it move, in {unit}", usual)
+    within = await person.number(f"within which distance of where it stands may it move, in {unit}", usual, site.info)
     tuned = await reports.tune(site.rig.client, person, axis.name, within, await _bandwidth(site))
     if tuned is None:
         return kept

@@ -95,7 +95,10 @@ class HighestSpeed(Step):
         velocity, _ = _highest(site)
         enough = CRUISE * velocity * velocity / config.acceleration
         least = config.velocity * config.velocity / config.acceleration
-        while abs(distance := await person.number(f"how far may it move, signed, in {site.info.unit}", enough)) < least:
+        while (
+            abs(distance := await person.number(f"how far may it move, signed, in {site.info.unit}", enough, site.info))
+            < least
+        ):
             person.tell(f"in less than {site.length(least)} it does not reach its velocity")
         refuse_previewed(await axis.preview(distance=distance, velocity=config.velocity))
         moves = f"{axis.name} moves by {site.length(distance)} and back, again and again"
