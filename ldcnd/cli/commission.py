@@ -21,7 +21,7 @@ from ldcnd.cli.connection import AXIS, AxisName, Target, with_target
 from ldcnd.cli.output import FAILED, end_as_interrupted, on_end, show_lines
 from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
-from ldcnd.cli.typed import Finite, NewFile, axis_of, force_option
+from ldcnd.cli.typed import Finite, NewFile, Quantity, TypedNumber, axis_of, force_option, in_unit
 from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
 from ldcnd.client.kept_gains import put_back as put_back_gains
 from ldcnd.client.lease import program_name
@@ -30,6 +30,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.edit import write_over
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError, NotSupported, WrongState
+from ldcnd.contract.units import Dimension
 from ldcnd.parts import require
 from ldcnd.version import version
 
@@ -179,7 +180,7 @@ STYLES = {"new gains, predicted": "--", "command": ":k"}
 )
 @click.option(
     "--within",
-    type=Finite(0, min_open=True),
+    type=Quantity(0, min_open=True),
     help="Stay within this distance of where the axis stands, in its unit; 2000 counts when missing.",
 )
 @click.option("--dry-run", is_flag=True, help="Say what it would do, and do nothing.")
@@ -201,7 +202,7 @@ def tune(
     target: Target,
     axis: str,
     bandwidth_hz: float | None,
-    within: float | None,
+    within: TypedNumber | None,
     plot: Path | None,
     file: Path | None,
     *,
@@ -229,10 +230,11 @@ def tune(
         raise NotSupported(f"axis {axis}: the gains of a {info.model} are not found by the host", axis=axis)
     require("numpy")
     figure = stacked_rows(ROWS)[0] if plot else None  # missing matplotlib is reported before anything moves
+    distance = None if within is None else in_unit(within, "within", info, Dimension.POSITION)
     if dry_run:
-        _plan(target, axis, within)
+        _plan(target, axis, distance)
         return
-    tuned = _tune(target, axis, within, bandwidth_hz, asks=not yes)
+    tuned = _tune(target, axis, distance, bandwidth_hz, asks=not yes)
     if figure and plot:
         _draw(figure, tuned)
         save_figure(figure, plot)

@@ -14,7 +14,7 @@ from ldcnd.contract.errors import ConfigError, UnknownAxis
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, behind_number, read_number, read_whole
-from ldcnd.contract.units import DIMENSIONS, read_quantity
+from ldcnd.contract.units import DIMENSIONS, Dimension, read_quantity
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 
 CommandT = TypeVar("CommandT", bound=Frozen)
@@ -90,9 +90,11 @@ class Quantity(Finite):
     @override
     def convert(self, value: float | str, param: click.Parameter | None, ctx: click.Context | None) -> float:
         try:
-            return typed_number(str(value))
+            number = typed_number(str(value))
         except NotANumber as error:
             self.fail(f"{error}.", param, ctx)
+        super().convert(float(number), param, ctx)  # its sign is the same in every unit
+        return number
 
 
 def typed_number(text: str) -> TypedNumber:
@@ -116,14 +118,21 @@ def in_units(command: CommandT, given: Mapping[str, object], info: AxisInfo) -> 
     def read(name: str, value: object) -> object:
         if isinstance(value, tuple):
             return tuple(read(name, each) for each in value)
-        if not isinstance(value, TypedNumber):
-            return value
-        try:
-            return read_quantity(value.text, info, DIMENSIONS[name])
-        except NotANumber as error:
-            raise click.BadParameter(f"{error}.", param_hint=name.replace("_", "-")) from None
+        return in_unit(value, name, info, DIMENSIONS[name]) if isinstance(value, TypedNumber) else value
 
     return command.model_copy(update={name: read(name, given[name]) for name in given if name in DIMENSIONS})
+
+
+def in_unit(value: TypedNumber, name: str, info: AxisInfo, dimension: Dimension) -> float:
+    """Return a number in units of an axis, from what was typed.
+
+    Raises:
+        click.BadParameter: its unit does not fit; names those that do.
+    """
+    try:
+        return read_quantity(value.text, info, dimension)
+    except NotANumber as error:
+        raise click.BadParameter(f"{error}.", param_hint=name.replace("_", "-")) from None
 
 
 class WholeNumber(click.IntRange):

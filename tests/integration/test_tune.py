@@ -165,7 +165,7 @@ def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, m
     with rig_on(loop) as rig:
         monkeypatch.setattr(Target, "run", lambda _, work: loop.run_until_complete(work(rig.client)))
         with pytest.raises(click.Abort):  # nothing can be typed here
-            tune.main(["x", "--within", "1"], standalone_mode=False)
+            tune.main(["x", "--within", "1000 um"], standalone_mode=False)
         unasked = capsys.readouterr()
         tune.main(["x", "--json", "--dry-run"], standalone_mode=False)
         dry = capsys.readouterr()
