@@ -12,6 +12,7 @@ from ldcnd.axis.clock import Clock
 from ldcnd.axis.commands import AxisCommands
 from ldcnd.axis.events import DriveLost, FaultFound, PollMissed, ReadingsContradicted, ReplyUnusable
 from ldcnd.axis.faults import DRIVE_CHANGED, DRIVE_RESET, JUMPED, NOT_SETTLED
+from ldcnd.axis.history import AxisHistory
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.plausibility import ROUNDS, CounterStep, PlausibilityGate, ReadingVerdict, agree
 from ldcnd.axis.scale import AxisScale
@@ -115,6 +116,7 @@ class AxisReadings:
     Attributes:
         returned: called when the drive replies again after it was out of reach, once its state is known.
         ask_at: has the drive read at an instant of the loop's clock, besides its ordinary polls.
+        history: the last readings.
     """
 
     def __init__(
@@ -144,6 +146,8 @@ class AxisReadings:
         self._on_ended = on_ended
         self._note = note
         self._digested: AxisReading | None = None
+        rates_hz = motion.config.rates.wanted_hz(adc=False)
+        self.history = AxisHistory(max(rates_hz.values(), default=1.0))
         self._over: tuple[CommandEnd, Arrival] | None = None
         motion.tracker.watch(self._watch, "last_end")
 
@@ -186,6 +190,7 @@ class AxisReadings:
                 log.error("readings contradict each other", axis=self._name, counts=reading.position_counts)
                 self._stops.stop_what_is_not_understood(self._motion.config.loss.bus)
             self._queue.changed.set()
+            self.history.forget()
             self._telemetry.publish_stale(tracker.status, now_ns)
         if judged.foreign:
             self._bus.distrust()  # another drive's reply that came late would be followed by others
@@ -246,6 +251,7 @@ class AxisReadings:
 
     def disconnect(self) -> None:
         """The drive is out of reach, or has lost power."""
+        self.history.forget()
         self._plausibility.after_gap()
         now_ns = self._clock.now_ns()
         self._telemetry.publish_stale(
@@ -281,6 +287,7 @@ class AxisReadings:
         if self._over:
             asked |= END_ITEMS
         self._telemetry.publish(tracker.status, reading, asked, t, t_error_ns)
+        self.history.take(reading, tracker.status.scale.origin_counts, t, t_error_ns)
         if before.command:
             self._report_end()
             self._ask_in_time(timing.sent_at_s)
@@ -333,6 +340,7 @@ class AxisReadings:
 
     def _take_step(self, step: CounterStep, reading: AxisReading) -> None:
         """No motion has led to where the drive is: its counter was set, or the encoder slips."""
+        self.history.forget()
         if step is CounterStep.ZEROED:
             self._tracker.take(FaultFound(DRIVE_RESET))
             self._report_change(DRIVE_RESET, "its position counter has restarted at 0")
@@ -351,6 +359,7 @@ class AxisReadings:
         if status.link is not before.link:
             log.warning("drive does not answer", axis=self._name, link=status.link.value)
             if status.link is LinkState.DOWN:
+                self.history.forget()
                 self._plausibility.after_gap()
             self._telemetry.publish_stale(status, now_ns)
 

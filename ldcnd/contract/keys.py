@@ -174,6 +174,10 @@ class Keys:
         """Return the key on which an item of an axis is published."""
         return f"{self._root}/tele/{_chunk('axis', axis)}/{_chunk('item', item)}"
 
+    def at(self, axis: str) -> str:
+        """Return the key that answers where an axis was at an instant, `_time` of the selector."""
+        return self.telemetry(axis, "at")
+
     def monitor(self, axis: str, name: str) -> str:
         """Return the key on which a monitor of an axis is published; the name may be `*`."""
         return f"{self.telemetry(axis, 'monitor')}/{name if name == '*' else _chunk('monitor', name)}"

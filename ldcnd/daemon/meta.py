@@ -1,6 +1,7 @@
 """The rig's description of itself and its last values: answers to `get` on `meta/**` and `tele/**`."""
 
 from collections.abc import Callable, Iterator, Mapping
+from datetime import datetime
 from functools import lru_cache, partial
 from typing import Literal, TypeAlias
 
@@ -92,10 +93,18 @@ class Describing:
                 self._described[keys.axis(axis.config.name)] = _Encoded(
                     partial(_axis_source, axis), partial(axis_info, bus, axis, group)
                 )
+        self._histories = {keys.at(name): axis for name, axis in rig.axes.items()}
         self._schemas = {keys.schema(name): text for name, text in shipped_schemas().items()}
 
     def on_telemetry(self, query: Query) -> Iterator[None]:
-        """Answer with the last value of every key that the query covers."""
+        """Answer with the last value of every key that the query covers, or where axes were at an instant."""
+        if query.key.endswith("/at"):
+            try:
+                t = _instant(query.parameters.get("_time", ""), self._clock.now_ns())
+            except MalformedRequest as error:
+                query.refuse(error)
+                return iter(())
+            return _in_steps(query, self._at(query, t))
         return _in_steps(query, self._newest(query, self._publisher.last))
 
     def on_meta(self, query: Query) -> Iterator[None]:
@@ -129,6 +138,14 @@ class Describing:
             payload, name = encode(published, encoding)
             self._latest[key, encoding] = published, payload, name
             yield Answer(key, payload, name, published.t), SAMPLE_WORK
+
+    def _at(self, query: Query, t: int) -> Iterator[_Part]:
+        """Yield where every axis that the query covers was at an instant."""
+        for key in _covered(query.key, tuple(self._histories)):
+            axis = self._histories[key]
+            status = axis.tracker.status
+            payload, name = encode(axis.readings.history.at(t, status.scale, status.quality), _wanted_encoding(query))
+            yield Answer(key, payload, name, t), DESCRIPTION_WORK
 
     def _bus_source(self, bus: BusService) -> object:
         """Return what the description of a line is made of; its counters never stand still."""
@@ -247,6 +264,26 @@ def command_list() -> CommandList:
         errors=tuple(code.value for code in ErrorCode),
         encodings=tuple(encoding.value for encoding in Encoding),
     )
+
+
+def _instant(text: str, now_ns: int) -> int:
+    """Return the instant that a selector's `_time` names, UTC in ns since 1970.
+
+    Raises:
+        MalformedRequest: it names none.
+    """
+    try:
+        if text.startswith("now(") and text.endswith("s)"):
+            return now_ns + round(float(text[4:-2]) * 1e9)
+        if text.isdecimal():
+            return int(text)
+        moment = datetime.fromisoformat(text)
+        seconds = round(moment.replace(microsecond=0).timestamp())
+    except (ValueError, OverflowError):
+        raise MalformedRequest(
+            f"_time={text!r} is no instant", value=text, remedy="_time=now(-2s), RFC 3339, or ns since 1970, UTC"
+        ) from None
+    return seconds * 1_000_000_000 + moment.microsecond * 1000
 
 
 def _wanted_encoding(query: Query) -> Encoding:
