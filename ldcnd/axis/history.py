@@ -9,7 +9,7 @@ import struct
 from typing import Final
 
 from ldcnd.axis.scale import AxisScale
-from ldcnd.contract.history import Inputs, Instant, Within
+from ldcnd.contract.history import AxisInstant, InputLevels, Within
 from ldcnd.contract.samples import Quality
 from ldcnd.drives.driver import AxisReading
 
@@ -33,7 +33,7 @@ _LEVELS = {None: 0, False: 1, True: 2}
 _SHOWN = (None, False, True)
 
 
-class AxisHistory:
+class ReadingRing:
     """The last readings of one axis.
 
     Args:
@@ -80,11 +80,11 @@ class AxisHistory:
         """Conclude nothing across now: the drive was out of reach, or its counter was set."""
         self._count = 0
 
-    def at(self, t: int, scale: AxisScale, quality: Quality) -> Instant:
+    def at(self, t: int, scale: AxisScale, quality: Quality) -> AxisInstant:
         """Return what the readings prove of an instant, UTC in ns since 1970."""
         place = self._find(t)
         if place is None:
-            return Instant(t=t, unit=scale.unit, quality=Quality.BAD, reason="no readings around this instant")
+            return _unknown(t, scale, "no readings around this instant")
         start, end = self._at(place), self._at(place + 1)
         apart_ns, first, last = (end[0] - start[0]) // 4, max(0, self._count - self._most), self._count - 1
         earlier, later = place - 1, place + 2
@@ -94,9 +94,13 @@ class AxisHistory:
             later += 1
         before, after = self._at(earlier), self._at(later)
         if max(start[0] - before[0], end[0] - start[0], after[0] - end[0]) > self._gap_ns:
-            return Instant(t=t, unit=scale.unit, quality=Quality.BAD, reason="readings are missing around this instant")
+            return AxisInstant(
+                t=t, unit=scale.unit, quality=Quality.BAD, reason="readings are missing around this instant"
+            )
         if start[4] != end[4]:
-            return Instant(t=t, unit=scale.unit, quality=Quality.BAD, reason="the axis got other coordinates just then")
+            return AxisInstant(
+                t=t, unit=scale.unit, quality=Quality.BAD, reason="the axis got other coordinates just then"
+            )
         return _between(before, start, end, after, t, scale, quality)
 
     def _find(self, t: int) -> int | None:
@@ -113,9 +117,13 @@ class AxisHistory:
         return _RECORD.unpack_from(self._ring, number % self._most * _RECORD.size)
 
 
+def _unknown(t: int, scale: AxisScale, reason: str) -> AxisInstant:
+    return AxisInstant(t=t, unit=scale.unit, quality=Quality.BAD, reason=reason)
+
+
 def _between(
     before: _Record, start: _Record, end: _Record, after: _Record, t: int, scale: AxisScale, quality: Quality
-) -> Instant:
+) -> AxisInstant:
     length_s, early_s, late_s = (end[0] - start[0]) / 1e9, (start[0] - before[0]) / 1e9, (after[0] - end[0]) / 1e9
     share = (t - start[0]) / (end[0] - start[0])
     slope, earlier, later = (
@@ -143,7 +151,7 @@ def _between(
     ripple = (BEND_OF_VELOCITY * curve + 2 * error) / length_s + RIPPLE * start[3]
     speeds = min(slope, earlier, later) - ripple, max(slope, earlier, later) + ripple
     low_speed, high_speed = sorted(each / scale.counts_per_unit for each in speeds)
-    return Instant(
+    return AxisInstant(
         t=t,
         unit=scale.unit,
         quality=quality,
@@ -153,9 +161,9 @@ def _between(
     )
 
 
-def _inputs(levels: int) -> Inputs:
+def _inputs(levels: int) -> InputLevels:
     shown = []
-    for _ in Inputs.model_fields:
+    for _ in InputLevels.model_fields:
         levels, level = divmod(levels, 3)
         shown.append(_SHOWN[level])
-    return Inputs(**dict(zip(Inputs.model_fields, shown, strict=True)))
+    return InputLevels(**dict(zip(InputLevels.model_fields, shown, strict=True)))

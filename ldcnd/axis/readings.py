@@ -12,7 +12,7 @@ from ldcnd.axis.clock import Clock
 from ldcnd.axis.commands import AxisCommands
 from ldcnd.axis.events import DriveLost, FaultFound, PollMissed, ReadingsContradicted, ReplyUnusable
 from ldcnd.axis.faults import DRIVE_CHANGED, DRIVE_RESET, JUMPED, NOT_SETTLED
-from ldcnd.axis.history import AxisHistory
+from ldcnd.axis.history import ReadingRing
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.plausibility import ROUNDS, CounterStep, PlausibilityGate, ReadingVerdict, agree
 from ldcnd.axis.scale import AxisScale
@@ -147,7 +147,7 @@ class AxisReadings:
         self._note = note
         self._digested: AxisReading | None = None
         rates_hz = motion.config.rates.wanted_hz(adc=False)
-        self.history = AxisHistory(max(rates_hz.values(), default=1.0))
+        self.history = ReadingRing(max(rates_hz.values(), default=1.0))
         self._over: tuple[CommandEnd, Arrival] | None = None
         motion.tracker.watch(self._watch, "last_end")
 

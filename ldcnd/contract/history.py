@@ -15,7 +15,7 @@ class Within(Frozen):
     """The true value is not above this."""
 
 
-class Inputs(Frozen):
+class InputLevels(Frozen):
     """The inputs of a drive, the same in the readings before and behind an instant; null while one is not shown."""
 
     reverse_limit: bool | None
@@ -30,7 +30,7 @@ class Inputs(Frozen):
     """The amplifier enable."""
 
 
-class Instant(Frozen):
+class AxisInstant(Frozen):
     """Where an axis was at an instant, in the coordinates of then, and how it moved."""
 
     t: int
@@ -43,7 +43,7 @@ class Instant(Frozen):
     """Position in axis units, counted through all turns; null where it is not known."""
     velocity: Within | None = None
     """Velocity in axis units a second; likewise."""
-    inputs: Inputs | None = None
+    inputs: InputLevels | None = None
     """The inputs; null where one of them changed meanwhile."""
     reason: str | None = None
     """Why nothing is known."""

@@ -132,7 +132,7 @@ def test_the_shaft_was_within_the_bounds_of_100000_instants():
 
 def test_a_query_of_an_instant_answers_with_bounds_and_refuses_what_is_none():
     async def program() -> None:
-        async with simulated_rig(Path("config/simulated.toml"), seed=1) as rig, rig.broker.session() as session:
+        async with simulated_rig(Path("config/simulated.toml"), seed=1) as rig, rig.network.session() as session:
             await asyncio.sleep(2)
             (answer,) = await session.query("ldcn/sim/tele/x/at", parameters={"_time": "now(-1s)"})
             found = json.loads(answer.payload)
