@@ -40,6 +40,7 @@ MODULES = (
     "ldcnd.contract.parameters",
     "ldcnd.contract.traces",
     "ldcnd.contract.events",
+    "ldcnd.contract.history",
     "ldcnd.contract.meta",
     "ldcnd.contract.leases",
 )

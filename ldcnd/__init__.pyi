@@ -97,6 +97,7 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.events import CommandEvent, CommandOutcome, CommandStatus, EventList
+from ldcnd.contract.history import AxisInstant, InputLevels, Within
 from ldcnd.contract.leases import Holder, HolderList, LeaseReply, LeaseRequest
 from ldcnd.contract.meta import (
     AxisInfo,
@@ -198,6 +199,7 @@ __all__ = [
     "AlarmReport",
     "Axis",
     "AxisInfo",
+    "AxisInstant",
     "AxisLimits",
     "AxisShare",
     "AxisState",
@@ -258,6 +260,7 @@ __all__ = [
     "HolderList",
     "HomeMethod",
     "HomeStop",
+    "InputLevels",
     "InputsSample",
     "InterlockViolated",
     "InternalError",
@@ -373,6 +376,7 @@ __all__ = [
     "WhyReply",
     "WildcardRefused",
     "WireLogReply",
+    "Within",
     "WrongState",
     "connect",
     "connect_blocking",

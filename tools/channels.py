@@ -13,6 +13,7 @@ from ldcnd.contract.commands import About, Stop, StopReply
 from ldcnd.contract.events import CommandEvent
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.contract.health import BusHealth, DaemonHealth
+from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.keys import EVENT, RIG_ITSELF, Keys
 from ldcnd.contract.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.contract.plan import RigBudget
@@ -37,6 +38,8 @@ class Kind(StrEnum):
     """Published once a second; `get` answers the last report."""
     DESCRIPTION = "description"
     """Answered; it moves nothing."""
+    PAST = "past"
+    """Answered for an instant, `_time` of the selector; it is not published."""
     COMMAND = "command"
     """Answered once it was carried out or refused."""
     STOP = "stop"
@@ -85,6 +88,7 @@ def _telemetry() -> Iterator[Channel]:
         chunk.summary,
     )  # fmt: skip
     yield _channel(_KEYS.telemetry(_AXIS, EVENT), Kind.NEWS, CommandEvent)
+    yield _channel(_KEYS.at(_AXIS), Kind.PAST, AxisInstant)
 
 
 def _descriptions() -> Iterator[Channel]:

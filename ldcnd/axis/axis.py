@@ -178,6 +178,7 @@ class AxisService:
         self.config = config
         self._motion.reconfigure(config)
         self._plausibility.reconfigure(config)
+        self.readings.reconfigure(config)
 
     async def recall(self, report: BringUpReport) -> None:
         """Take up the reference that an earlier daemon has kept, if everything proves it; the line has come up."""

@@ -13,8 +13,10 @@ from ldcnd.contract.history import AxisInstant, InputLevels, Within
 from ldcnd.contract.samples import Quality
 from ldcnd.drives.driver import AxisReading
 
-HISTORY_S = 600.0
+HISTORY_S: Final = 600.0
 """Time for which readings are kept at the rate of the polls, seconds."""
+MOST_READINGS: Final = 60_000
+"""Readings that are kept of an axis at most, 38 bytes each: 2.3 MB, 600 s of 100 polls a second."""
 COUNTS: Final = 1.5
 """Distance by which a closed loop hunts around its place, counts."""
 BEND: Final = 0.3
@@ -37,33 +39,33 @@ class ReadingRing:
     """The last readings of one axis.
 
     Args:
-        rate_hz: how often it is polled; extra readings shorten the time that the ring spans.
+        rate_hz: how often its position is polled; extra readings shorten the time that the ring spans.
     """
 
     def __init__(self, rate_hz: float) -> None:
-        self._most = max(8, int(HISTORY_S * rate_hz))
-        self._gap_ns = round(LONGEST_GAP * 1e9 / rate_hz)
+        self.rate_hz = rate_hz
+        self._most = min(MOST_READINGS, max(8, int(HISTORY_S * rate_hz)))
+        self._gap_ns = round(LONGEST_GAP * 1e9 / max(rate_hz, 1e-3))
         self._ring = bytearray(self._most * _RECORD.size)
         self._count = 0
-
-    @property
-    def memory_bytes(self) -> int:
-        """Memory of the ring, in bytes."""
-        return len(self._ring)
+        self._last_ns = 0
+        self._levels: tuple[bool | None, ...] = ()
+        self._packed = 0
 
     def take(self, reading: AxisReading, origin_counts: float, t: int, t_error_ns: int) -> None:
-        """Keep a reading."""
-        levels = 0
-        for level in (
-            reading.amplifier_enable,
-            reading.stop_input,
-            reading.index,
-            reading.forward_limit,
+        """Keep a reading; in every poll, so what seldom changes is compared and not computed."""
+        levels = (
             reading.reverse_limit,
-        ):
-            levels = levels * 3 + _LEVELS[level]
-        if self._count and t <= self._at(self._count - 1)[0]:
+            reading.forward_limit,
+            reading.index,
+            reading.stop_input,
+            reading.amplifier_enable,
+        )
+        if levels != self._levels:
+            self._levels, self._packed = levels, sum(_LEVELS[each] * 3**at for at, each in enumerate(levels))
+        if t <= self._last_ns:
             self._count = 0  # the clock was set back: which instants these were is not known
+        self._last_ns = t
         _RECORD.pack_into(
             self._ring,
             self._count % self._most * _RECORD.size,
@@ -72,7 +74,7 @@ class ReadingRing:
             reading.position_counts,
             reading.velocity_resolution_counts_per_s,
             origin_counts,
-            levels,
+            self._packed,
         )
         self._count += 1
 
@@ -94,13 +96,9 @@ class ReadingRing:
             later += 1
         before, after = self._at(earlier), self._at(later)
         if max(start[0] - before[0], end[0] - start[0], after[0] - end[0]) > self._gap_ns:
-            return AxisInstant(
-                t=t, unit=scale.unit, quality=Quality.BAD, reason="readings are missing around this instant"
-            )
+            return _unknown(t, scale, "readings are missing around this instant")
         if start[4] != end[4]:
-            return AxisInstant(
-                t=t, unit=scale.unit, quality=Quality.BAD, reason="the axis got other coordinates just then"
-            )
+            return _unknown(t, scale, "the axis got other coordinates just then")
         return _between(before, start, end, after, t, scale, quality)
 
     def _find(self, t: int) -> int | None:

@@ -26,6 +26,7 @@ from ldcnd.contract.errors import BadReply, BusError, PacketRejected
 from ldcnd.contract.events import ALARM_HISTORY, UNSETTLED, CommandStatus
 from ldcnd.contract.rig_commands import FrozenPosition
 from ldcnd.contract.samples import LinkState, TelemetryItem
+from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import AxisReading, Fault, Moves
 from ldcnd.drives.parameter_access import MonitorValue
 from ldcnd.line.bus import Bus
@@ -146,10 +147,14 @@ class AxisReadings:
         self._on_ended = on_ended
         self._note = note
         self._digested: AxisReading | None = None
-        rates_hz = motion.config.rates.wanted_hz(adc=False)
-        self.history = ReadingRing(max(rates_hz.values(), default=1.0))
+        self.history = ReadingRing(motion.config.rates.position)
         self._over: tuple[CommandEnd, Arrival] | None = None
         motion.tracker.watch(self._watch, "last_end")
+
+    def reconfigure(self, config: AxisConfig) -> None:
+        """Take the rates of another configuration."""
+        if config.rates.position != self.history.rate_hz:
+            self.history = ReadingRing(config.rates.position)
 
     @property
     def seen(self) -> bool:
@@ -287,7 +292,8 @@ class AxisReadings:
         if self._over:
             asked |= END_ITEMS
         self._telemetry.publish(tracker.status, reading, asked, t, t_error_ns)
-        self.history.take(reading, tracker.status.scale.origin_counts, t, t_error_ns)
+        if TelemetryItem.POSITION in asked:  # of the others some drives have a position of before
+            self.history.take(reading, tracker.status.scale.origin_counts, t, t_error_ns)
         if before.command:
             self._report_end()
             self._ask_in_time(timing.sent_at_s)

@@ -114,6 +114,7 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "sequence run": "rig.toml load --record load.jsonl",
     "axis": "probe x --source index --distance 5 --wait",
     "axis alarms": "feed",
+    "axis at": "x --ago 2.5",
     "axis clear-counter": "feed feedback",
     "axis gains": "x --kp 400",
     "axis monitors": "feed --read",

@@ -21,6 +21,7 @@ from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, SessionError, UnknownAxis, WrongState
 from ldcnd.contract.events import FINAL, CommandOutcome, ReadOutcome
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.number_text import NotANumber
 from ldcnd.contract.samples import Moving, PositionSample, StateSample, TelemetryItem
 from ldcnd.contract.traces import TakeTrace, TraceTrigger
@@ -131,6 +132,14 @@ class Axis(AxisVerbs):
         state = self.state.sample
         target = self._sent.target(state) if self._sent else state.target
         return self.position.value if target is None else target
+
+    async def at(self, t: int) -> AxisInstant:
+        """Return where it was at an instant of the last 600 s, UTC in ns since 1970, with bounds that hold.
+
+        Raises:
+            MalformedRequest: it is no instant.
+        """
+        return (await self._client.at(t, self.name))[self.name]
 
     def positions(self) -> Positions:
         """Iterate over the positions that come from now on; several readers do not disturb each other."""

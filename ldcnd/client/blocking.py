@@ -116,6 +116,7 @@ class BlockingAxis(Facade[asynchronous.Axis]):
 
     stop = _waiting(asynchronous.Axis.stop)
     take_trace = _waiting(asynchronous.Axis.take_trace)
+    at = _waiting(asynchronous.Axis.at)
 
     @contextmanager
     def jogging(
@@ -167,6 +168,7 @@ class BlockingRig(Facade[rig.Rig]):
         self._close()
 
     stop = _waiting(rig.Rig.stop)
+    at = _waiting(rig.Rig.at)
     daemon = _waiting(rig.Rig.daemon)
     describe = _waiting(rig.Rig.describe)
     buses = _waiting(rig.Rig.buses)

@@ -18,6 +18,7 @@ from ldcnd.client.rig_client import RigClient, find_rig
 from ldcnd.contract.commands import StopReply
 from ldcnd.contract.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
 from ldcnd.contract.events import FINAL, CommandEvent, CommandOutcome, ReadOutcome
+from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.leases import HolderList, ListHolders
 from ldcnd.contract.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.contract.rig_commands import (
@@ -347,6 +348,17 @@ class Rig:
     async def holders(self) -> HolderList:
         """Return who controls what."""
         return await self._client.ask(ListHolders())
+
+    async def at(self, t: int) -> dict[str, AxisInstant]:
+        """Return where every axis was at an instant of the last 600 s, with bounds that hold.
+
+        Args:
+            t: UTC in ns since 1970, as in samples; two polls later its answer is known.
+
+        Raises:
+            MalformedRequest: it is no instant.
+        """
+        return await self._client.at(t)
 
     async def snapshot(self, bus: str) -> SnapshotReply:
         """Return the positions of all axes of a line at one instant, and how sure that instant is.

@@ -12,6 +12,7 @@ from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
 from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownAxis, UnknownCommand
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.keys import ALL_DAEMONS, ALL_RUNS, RIG_ITSELF, Keys
 from ldcnd.contract.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.contract.samples import (
@@ -170,6 +171,11 @@ class RigClient:
         daemon, source = max(found, key=lambda each: each[0].started)
         self._origin.found(source)
         return daemon
+
+    async def at(self, t: int | str, axis: str = "*") -> dict[str, AxisInstant]:
+        """Return where an axis, or each of them, was at an instant; see `Rig.at`."""
+        answers = await self._values(self.keys.at(axis), {"_time": str(t)})
+        return {answer.key.split("/")[-2]: self._decoded(answer, AxisInstant) for answer in answers}
 
     async def axes(self) -> list[AxisInfo]:
         """Return all axes, in the order of their addresses."""

@@ -9,6 +9,7 @@ from ldcnd.contract.commands import About, AxisCommand, Capability, Command, Com
 from ldcnd.contract.events import CommandEvent
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.contract.health import BusHealth, DaemonHealth
+from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.leases import LeaseRequest
 from ldcnd.contract.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
 from ldcnd.contract.plan import RigBudget
@@ -53,6 +54,7 @@ PUBLIC_MODELS: tuple[type[Frozen], ...] = (
     *(command.reply_model() for command in COMMANDS),
     *SAMPLE_MODELS.values(),
     AxisInfo,
+    AxisInstant,
     BusHealth,
     BusInfo,
     CommandEvent,

@@ -31,7 +31,10 @@ class InputLevels(Frozen):
 
 
 class AxisInstant(Frozen):
-    """Where an axis was at an instant, in the coordinates of then, and how it moved."""
+    """Place and velocity of an axis at an instant, in the coordinates of then: `_time` of the selector names it.
+
+    `_time` is ns since 1970 (UTC), RFC 3339, or `now(-2s)`. Readings of the last 600 s answer, from two polls ago on.
+    """
 
     t: int
     """The instant, UTC in ns since 1970."""

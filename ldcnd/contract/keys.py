@@ -175,8 +175,8 @@ class Keys:
         return f"{self._root}/tele/{_chunk('axis', axis)}/{_chunk('item', item)}"
 
     def at(self, axis: str) -> str:
-        """Return the key that answers where an axis was at an instant, `_time` of the selector."""
-        return self.telemetry(axis, "at")
+        """Return the key that answers where an axis, or with `*` each, was at an instant, `_time` of the selector."""
+        return f"{self._root}/tele/{axis if axis == '*' else _chunk('axis', axis)}/at"
 
     def monitor(self, axis: str, name: str) -> str:
         """Return the key on which a monitor of an axis is published; the name may be `*`."""

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.errors import LdcndError, MalformedRequest
 from ldcnd.testing import run, simulated_rig
 from ldcnd.testing.rig import BEGINS_NS, SimulatedRig
 
@@ -143,5 +143,28 @@ def test_a_query_of_an_instant_answers_with_bounds_and_refuses_what_is_none():
             assert json.loads(unknown.payload)["reason"]
             (refused,) = await session.query("ldcn/sim/tele/x/at")
             assert refused.is_error
+
+    run(program())
+
+
+def test_a_program_asks_where_axes_were_and_what_is_not_known_is_not_guessed():
+    async def program() -> None:
+        async with simulated_rig(Path("config/simulated.toml"), seed=1) as rig:
+            async with rig.client.control("x", client="day") as x:
+                await x.power(on=True)
+                await x.set_position(5.0)
+                await asyncio.sleep(2)
+                t = BEGINS_NS + round((rig.now_s - 0.5) * 1e9)
+                found = await x.at(t)
+                assert found.t == t
+                assert found.position.lower <= 5.0 <= found.position.upper
+                assert found.position.upper - found.position.lower < 0.01
+                assert set(await rig.client.at(t)) == set(AXES)
+                rig.faults.mute("x")
+                await asyncio.sleep(3)
+                silent = await x.at(BEGINS_NS + round((rig.now_s - 1) * 1e9))
+                assert (silent.quality, silent.position) == ("bad", None)
+                with pytest.raises(MalformedRequest):
+                    await x.at("yesterday")
 
     run(program())

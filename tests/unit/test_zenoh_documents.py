@@ -54,6 +54,7 @@ def test_a_channel_lies_where_the_daemon_serves_or_publishes_its_kind(channel) -
         Kind.NEWS: KEYS.all_telemetry,
         Kind.HEALTH: KEYS.all_meta,
         Kind.DESCRIPTION: KEYS.all_meta,
+        Kind.PAST: KEYS.all_telemetry,
         Kind.COMMAND: KEYS.all_commands,
         Kind.STOP: KEYS.all_stops[0],
     }
