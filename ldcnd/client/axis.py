@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import weakref
 from collections import deque
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Mapping
 from typing import TypeVar
 
 import pydantic
@@ -171,28 +171,22 @@ class Axis(AxisVerbs):
 
     @contextlib.asynccontextmanager
     async def jogging(
-        self, velocity: float, *, acceleration: float | None = None, hold_s: float = 0.4
+        self, velocity: float | str, *, acceleration: float | str | None = None, hold_s: float = 0.4
     ) -> AsyncIterator[Jogging]:
         """Jog for as long as `Jogging.held` is called; the end of the context halts the axis, whatever ends it.
 
         What the axis does already, such as coming to rest from another jog, is halted first.
 
         Args:
-            velocity: in units a second, positive forward, not 0.
-            acceleration: in units a second squared; the axis default when missing.
+            velocity: in units a second, positive forward, not 0; or a text with its unit, such as "300 rpm".
+            acceleration: in units a second squared, or likewise; the axis default when missing.
             hold_s: longest time between two renewals, 0.2 to 1 s; then the daemon ends the jog.
 
         Raises:
             LdcndError: as the daemon refused it.
         """
-        jog = Jogging(
-            self._sent_as,
-            _made(
-                lambda: Jog(
-                    velocity=velocity, acceleration=acceleration, hold_s=hold_s, buffer_mode=BufferMode.ABORTING
-                )
-            ),
-        )
+        fields = {"velocity": velocity, "acceleration": acceleration, "hold_s": hold_s}
+        jog = Jogging(self._sent_as, await self._made(Jog, {**fields, "buffer_mode": BufferMode.ABORTING}))
         try:
             await jog.begin()
             yield jog
@@ -218,15 +212,9 @@ class Axis(AxisVerbs):
             trigger: what to wait for; starts at once when missing.
             within_s: longest time from its arming to its end.
         """
-        command = _made(
-            lambda: TakeTrace(
-                channels=channels,
-                samples=samples,
-                interval_s="fastest" if interval_s is None else interval_s,
-                pre_trigger=pre_trigger,
-                trigger=trigger,
-            )
-        )
+        fields = {"channels": channels, "samples": samples, "pre_trigger": pre_trigger, "trigger": trigger}
+        every = "fastest" if interval_s is None else interval_s
+        command = await self._made(TakeTrace, {**fields, "interval_s": every})
         stamped = self.control.stamped(command, self.name) if self.control else command
         return await take_trace(self._client, self.name, stamped, within_s)
 
@@ -277,28 +265,17 @@ class Axis(AxisVerbs):
         return await self._client.command(self.name, command)
 
     async def _start(self, command: type[AxisCommand[CommandReply]], **fields: object) -> Motion:
-        made = await self._made(command, fields)
-        return self.begun(await self._sent_as(made), getattr(made, "position", None))
+        request = await self._made(command, fields)
+        return self.begun(await self._sent_as(request), getattr(request, "position", None))
 
     async def _ask(self, command: type[Command[ReplyT]], **fields: object) -> ReplyT:
-        made = await self._made(command, fields)
+        request = await self._made(command, fields)
         if self.control and "lease" in command.model_fields:
-            made = made.model_copy(update={"lease": self.control.lease.lease})
-        return await self._client.ask(made, self.name)
+            request = request.model_copy(update={"lease": self.control.lease.lease})
+        return await self._client.ask(request, self.name)
 
-    async def _made(self, command: type[CommandT], fields: dict[str, object]) -> CommandT:
-        """Return a command; texts among its numbers are read in the units that the axis has now."""
-        texts = {name: value for name, value in fields.items() if name in DIMENSIONS and isinstance(value, str)}
-        if texts:
-            infos = [info for info in await self._client.axes() if info.axis == self.name]
-            if not infos:
-                raise UnknownAxis(f"there is no axis {self.name} any more", axis=self.name)
-            (info,) = infos
-            try:
-                fields |= {name: read_quantity(text, info, DIMENSIONS[name]) for name, text in texts.items()}
-            except NotANumber as error:
-                raise MalformedRequest(f"axis {self.name}: {error}", axis=self.name) from None
-        return _made(lambda: command.model_validate(fields))
+    async def _made(self, command: type[CommandT], fields: Mapping[str, object]) -> CommandT:
+        return await made(self._client, self.name, command, fields)
 
     # -- life --------------------------------------------------------------------------------------------------------
 
@@ -368,9 +345,20 @@ class Axis(AxisVerbs):
         return f"<axis {self.name}: {self.position}, {self.state}>"
 
 
-def _made(make: Callable[[], ReplyT]) -> ReplyT:
+async def made(client: RigClient, axis: str, command: type[CommandT], fields: Mapping[str, object]) -> CommandT:
+    """Return a command to an axis; texts among its numbers are read in the units that the axis has now."""
+    texts = {name: value for name, value in fields.items() if name in DIMENSIONS and isinstance(value, str)}
+    if texts:
+        infos = [info for info in await client.axes() if info.axis == axis]
+        if not infos:
+            raise UnknownAxis(f"there is no axis {axis} any more", axis=axis)
+        (info,) = infos
+        try:
+            fields = {**fields} | {name: read_quantity(text, info, DIMENSIONS[name]) for name, text in texts.items()}
+        except NotANumber as error:
+            raise MalformedRequest(f"axis {axis}: {error}", axis=axis) from None
     try:
-        return make()
+        return command.model_validate(fields)
     except pydantic.ValidationError as error:
         raise explained(error) from None
 

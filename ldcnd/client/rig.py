@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Generic, Literal, TypeVar, overload
 
-from ldcnd.client.axis import Axis
+from ldcnd.client.axis import Axis, made
 from ldcnd.client.events import follow_events
 from ldcnd.client.lease import Control, inherited_lease, take_control
 from ldcnd.client.motion import Motion
@@ -200,17 +200,18 @@ class Rig:
 
     async def move_together(
         self,
-        targets: Mapping[str, float],
+        targets: Mapping[str, float | str],
         *,
-        velocity: float | None = None,
-        acceleration: float | None = None,
+        velocity: float | str | None = None,
+        acceleration: float | str | None = None,
         path: LinePath = LinePath.INDEPENDENT,
         max_deviation: float | None = None,
     ) -> tuple[Motion, ...]:
         """Start absolute moves of the members of one group in the same servo cycle, or none of them.
 
         Args:
-            targets: by axis, in axis units; exactly the members of a configured group, all controlled here.
+            targets: by axis, in axis units or a text with a unit; exactly the members of a configured group, all
+                controlled here.
             velocity: of each of them, in its units a second; the axis default when missing. On a line the highest.
             acceleration: likewise.
             path: the way between: each for itself, or on a straight line.
@@ -219,10 +220,12 @@ class Rig:
         Raises:
             LeaseRequired: one of them is not controlled by this program.
         """
+        limits = {"velocity": velocity, "acceleration": acceleration}
         moves = []
         for name, position in targets.items():
-            move = AxisMove(axis=name, position=position, velocity=velocity, acceleration=acceleration)
-            moves.append(self._control_of(name).stamped(move, name))
+            control = self._control_of(name)
+            move = await made(self._client, name, AxisMove, {"axis": name, "position": position, **limits})
+            moves.append(control.stamped(move, name))
         reply = await self._client.ask(MoveTogether(moves=tuple(moves), path=path, max_deviation=max_deviation))
         return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
 

@@ -204,3 +204,28 @@ def test_what_cannot_be_carried_out_is_refused_with_the_configuration(tmp_path, 
         load_config(config)
 
     assert said in refused.value.message
+
+
+def test_axes_go_to_a_position_one_after_the_other_in_the_order_of_the_configuration(tmp_path):
+    config = tmp_path / "rig.toml"
+    text = (ROOT / "config" / "simulated.toml").read_text(encoding="utf-8")
+    config.write_text(text + '\n[[position]]\nname = "park"\naxes = { y = "1 cm", x = 2 }\n', encoding="utf-8")
+    wanted = load_config(config)
+    go = SequenceConfig(name="park", step=(SequenceStep(go="park"),))
+
+    async def program():
+        async with simulated_rig(wanted) as rig:
+            async with rig.client.control("x", "y", client="test") as axes:
+                for axis in axes:
+                    await axis.set_position(0.0)
+                    await axis.power(on=True)
+            async with rig.client.events() as events:
+                await SequenceRun(rig.client, go, {"park": wanted.position[0]}, lambda _: None, lambda: 0).run()
+                ended = [await anext(events) for _ in range(6)]
+            there = [(await rig.client.latest(axis, "position")).value for axis in "xy"]
+            return [(each.axis, each.status.value) for each in ended], there
+
+    order, there = run(program())
+
+    assert order == [(axis, status) for axis in "yx" for status in ("accepted", "executing", "done")]
+    assert there == pytest.approx([2.0, 10.0], abs=0.05)

@@ -31,7 +31,12 @@ def test_programs_send_numbers_with_units():
             async with rig.client.control("rotor", client="test") as rotor:
                 await rotor.move_velocity("600 rpm", acceleration="600 rpm/s")
                 await rig.until(lambda: abs(rig.truth("rotor").velocity - 10) < 0.1)
-                await rotor.move_velocity("50 g")
+                await (await rotor.halt()).done()
+                async with rotor.jogging("120 rpm", acceleration="600 rpm/s") as jog:
+                    while abs(rig.truth("rotor").velocity - 2) > 0.1:
+                        await jog.held()
+                await (await rotor.halt()).done()
+                await rotor.move_velocity("50 g", acceleration=10)
                 await rig.until(lambda: abs(rig.truth("rotor").velocity - 11.14) < 0.1)
                 with pytest.raises(MalformedRequest, match="type the value in rpm, rev/s"):
                     await rotor.move_velocity("600 mm/s")

@@ -25,6 +25,7 @@ from ldcnd.contract.samples import (
     StateSample,
     VelocitySample,
 )
+from ldcnd.contract.units import Dimension, shown_quantity
 from ldcnd.lab.borrowed_control import BorrowedControl
 
 WHO = "secop node"
@@ -93,8 +94,8 @@ class AxisLink:
 
     def values(self) -> Mapping[str, str]:
         """Return the units of what the axis publishes besides its position, by the names of their modules."""
-        name, unit = self.info.axis, self.info.unit
-        found = {f"{name}_velocity": f"{unit}/s"}
+        name = self.info.axis
+        found = {f"{name}_velocity": shown_quantity(0.0, self.info, Dimension.VELOCITY)[1]}
         if self.info.adc_full_scale:
             found[f"{name}_adc"] = "V"
         return found | {f"{name}_{monitor}": "" for monitor in self.info.monitors}
@@ -142,7 +143,8 @@ class AxisLink:
                 self._show(self.info.axis, sample, sample.value, step + abs(self._velocity) * sample.t_error_ns * 1e-9)
             case VelocitySample():
                 self._velocity = sample.value
-                self._show(f"{self.info.axis}_velocity", sample, sample.value)
+                shown, _ = shown_quantity(sample.value, self.info, Dimension.VELOCITY)
+                self._show(f"{self.info.axis}_velocity", sample, shown)
             case AdcSample():
                 self._show(f"{self.info.axis}_adc", sample, sample.volts)
             case FaultSample():
@@ -249,7 +251,15 @@ class AxisLink:
 
 def described_by(info: AxisInfo) -> tuple[object, ...]:
     """Return all of an axis that the description of its modules is made of."""
-    return info.unit, info.counts_per_unit, info.limits, info.capabilities, info.monitors, info.adc_full_scale
+    return (
+        info.unit,
+        info.units,
+        info.counts_per_unit,
+        info.limits,
+        info.capabilities,
+        info.monitors,
+        info.adc_full_scale,
+    )
 
 
 @asynccontextmanager
