@@ -93,6 +93,8 @@ def unit_table(
     if counts_per_unit:
         places.setdefault("count", 1 / Fraction(counts_per_unit))
     for name, written in own.items():
+        if not name.isalpha() or name in ("g", "rpm", *places):
+            raise ValueError(f"units: {name!r} is the name of another unit, or has other characters than letters")
         places[name] = ratio(written)
     speeds = {f"{name}/{time}": scale / s for time, s in (("s", 1), ("min", 60)) for name, scale in places.items()}
     gains = {f"{name}/s2": scale for name, scale in places.items()}

@@ -148,6 +148,8 @@ def test_a_configuration_says_numbers_with_their_units(tmp_path):
     [
         ("velocity = 30 ", 'velocity = "3 mm/s" ', "bus[0].axis[0].velocity: \u201cmm/s\u201d is not a unit here"),
         ('velocity_unit = "rpm"', 'velocity_unit = "mm/s"', "'mm/s' does not fit: it is one of rev/s, deg/s"),
+        (UNIT, 'unit = "rev"\nunits = { deg = "1/3" }\n', "units: 'deg' is the name of another unit"),
+        (UNIT, 'unit = "rev"\nunits = { "a/s" = "1/3" }\n', "units: 'a/s' is the name of another unit"),
         (UNIT, 'unit = "rev"\nunits = { third = "1/0" }\n', "'1/0' is not a ratio above 0"),
         ('unit = "rev"\nvelocity_unit = "rpm"', 'unit = "mm"', "only an axis that turns has one"),
         ("above = 120", 'above = "2 m"', "interlock[1].above: \u201cm\u201d is not a unit here"),

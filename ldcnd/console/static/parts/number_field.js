@@ -21,8 +21,7 @@ export function NumberField({ label, units, unit = units?.[0].unit.replace("/s2"
     return now;
   }, setReading);
   const refused = reading instanceof Unread;
-  const sent = units && units[0].unit !== units[0].sent ? ` = ${reading} ${units[0].sent}` : "";
-  const shown = refused || reading === null ? "" : meaning(`${write(reading)}${unit && ` ${unit}`}${sent}`);
+  const shown = refused || reading === null ? "" : meaning(units ? inUnits(reading, units[0]) : `${reading}${unit && ` ${unit}`}`);
   const wanted = min === undefined && max === undefined ? "" : `${range(min ?? -Infinity, max ?? Infinity)} ${unit}`;
   const about = `${id}-about`;
   return html`<div class="field">
@@ -33,6 +32,12 @@ export function NumberField({ label, units, unit = units?.[0].unit.replace("/s2"
       ? html`<span class="unread">${reading.message}</span>`
       : html`<span class="read">${shown}</span> ${hint ?? (whole || plain ? wanted : "")}`}</small>
   </div>`;
+}
+
+/** Return a number as it is shown and, where that is another one, as it is sent. */
+function inUnits(value, { unit, sent, to }) {
+  const [shown, network] = [to(value), value].map((each) => Number(each.toPrecision(9)));
+  return `${shown} ${unit.replace("/s2", "/s²")}${unit === sent ? "" : ` = ${network} ${sent}`}`;
 }
 
 /** A labelled field for a text; an empty one is null. */
