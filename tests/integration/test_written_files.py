@@ -9,7 +9,14 @@ from ldcnd.cli.main import cli
 from ldcnd.cli.typed import NewFile
 from tests.support.command_line import run_here
 
-SAMPLES = {"file": ".toml", "out": ".csv", "output": ".png", "report": ".html", "wire_log": ".capture"}
+SAMPLES = {
+    "file": ".toml",
+    "out": ".csv",
+    "output": ".png",
+    "record": ".jsonl",
+    "report": ".html",
+    "wire_log": ".capture",
+}
 """Names of the arguments and options that are files to be written, with a suffix that each command takes."""
 KEPT_OTHERWISE = {
     ("record", "out"),  # a recording refuses a name that is taken itself
