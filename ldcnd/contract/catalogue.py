@@ -1,6 +1,7 @@
 """All commands, and all models that cross the network."""
 
 from collections.abc import Mapping
+from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
@@ -75,6 +76,7 @@ MODELS: Mapping[str, type[Frozen]] = MappingProxyType({schema_name(model): model
 """The same by the name of their schema."""
 
 
+@cache
 def shipped_schemas() -> Mapping[str, bytes]:
     """Return all schemas, that of the configuration too, from their files, as `meta/schema/<name>` has them.
 
@@ -84,4 +86,4 @@ def shipped_schemas() -> Mapping[str, bytes]:
     package = Path(__file__).parents[1]
     installed = package / "schemas"  # a wheel has a copy here; in a checkout they are beside the package
     folder = installed if installed.is_dir() else package.parent / "schemas"
-    return {path.stem: path.read_bytes() for path in sorted(folder.glob("*.json"))}
+    return MappingProxyType({path.stem: path.read_bytes() for path in sorted(folder.glob("*.json"))})
