@@ -452,6 +452,8 @@ def _fail(status: AxisStatus, reason: str, *, settled: bool | None = None) -> Ax
 
 def _abort(status: AxisStatus, by: Verb) -> AxisStatus:
     """Return the status of a command that another one ends, with the reason where something is wrong, too."""
+    if by is Verb.HALT and status.command and status.command.verb is Verb.JOG and not status.failure:
+        return _end(status, CommandStatus.DONE)  # MC_Jog: a jog has no other end than to be let go
     why = f": {status.failure}" if status.failure else ""
     return _end(status, CommandStatus.ABORTED, f"aborted by {by}{why}")
 

@@ -64,9 +64,12 @@ async def test_a_jog_that_is_halted_ends_at_once(dialect):
         await asyncio.sleep(0.2)
         before = await position(rig)
         state = await rig.done(Halt())
+        events = (await rig.rig.client.ask(ReadEvents())).events
 
         assert await position(rig) - before < 0.3
-        assert state.state is AxisState.STANDSTILL
+        assert (state.state, state.last_error) == (AxisState.STANDSTILL, None)
+        last = [event for event in events if event.verb == "jog"][-1]
+        assert (last.status, last.reason) == ("done", None)  # as it should
 
 
 @dialects
