@@ -14,7 +14,7 @@ from typing_extensions import override
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.errors import BusDown, BusError, TraceTimedOut, ValueOutOfRange
 from ldcnd.contract.samples import TelemetryItem
-from ldcnd.contract.traces import TakeTrace, TraceChannel, TracePhase, TraceSource, TraceTrigger
+from ldcnd.contract.traces import TakeTrace, TraceChannel, TracePhase, TraceShape, TraceSource, TraceTrigger
 from ldcnd.drives.driver import AxisReading, Readable
 from ldcnd.drives.tracer import (
     ArmedTrace,
@@ -259,13 +259,15 @@ class HostTracer(Tracer):
         now_s = asyncio.get_running_loop().time()
         capture = self._capture = HostCapture(self._driver.spec.address, exchange, now_s, interval_s, wanted)
         granted = Granted(
-            channels=tuple(
-                each.channel.model_copy(update={"raw_column": column}) for column, each in enumerate(chosen)
+            shape=TraceShape(
+                channels=tuple(
+                    each.channel.model_copy(update={"raw_column": column}) for column, each in enumerate(chosen)
+                ),
+                interval_s=interval_s,
+                samples=request.samples,
+                pre_trigger=pre_trigger,
             ),
             raw_columns=tuple(f"{each.channel.name} of the drive" for each in chosen),
-            interval_s=interval_s,
-            samples=request.samples,
-            pre_trigger=pre_trigger,
             phase=_first_phase(request.trigger, pre_trigger),
         )
         self._bus.add_poller(capture)

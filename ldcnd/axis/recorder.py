@@ -134,12 +134,9 @@ class TraceRecorder:
             axis=self._axis,
             source=self._tracer.source,
             phase=granted.phase,
-            channels=granted.channels,
-            interval_s=granted.interval_s,
-            samples=granted.samples,
-            pre_trigger=granted.pre_trigger,
             trigger=request.trigger,
             raw_columns=granted.raw_columns,
+            **dict(granted.shape),
         )
         trace = self._current = _Trace(armed, header)
         self._publisher.withdraw_trace_chunks(self._axis)
@@ -151,10 +148,7 @@ class TraceRecorder:
             verb=Verb.TRACE,
             trace_id=command_id,
             source=self._tracer.source,
-            channels=granted.channels,
-            interval_s=granted.interval_s,
-            samples=granted.samples,
-            pre_trigger=granted.pre_trigger,
+            **dict(granted.shape),
         )
 
     def _check(self, request: TakeTrace) -> None:

@@ -135,7 +135,20 @@ class DriveTraceInfo(Frozen):
     """Gearing of command pulses that was assumed."""
 
 
-class TraceHeader(Sample):
+class TraceShape(Frozen):
+    """What a trace holds, as granted: it may differ from the request."""
+
+    channels: tuple[TraceChannel, ...]
+    """The channels recorded, in the order of the columns of `values` in each chunk."""
+    interval_s: float = Field(ge=0)
+    """Time between two samples; 0 is as fast as the line allows. Actual times are in the chunks."""
+    samples: int = Field(ge=0)
+    """How many samples there will be; once the trace is complete, how many there are."""
+    pre_trigger: int = Field(ge=0)
+    """Number of samples before the trigger."""
+
+
+class TraceHeader(TraceShape, Sample):
     """A trace without its samples; `t` is the instant of offset 0: the trigger, or the first sample without one."""
 
     trace_id: str
@@ -150,14 +163,6 @@ class TraceHeader(Sample):
     """Share of the drive's trace memory that has been read, 0 to 1, while it is uploading; null otherwise."""
     problem: str | None = None
     """Why it was not completed, or why its values are uncertain."""
-    channels: tuple[TraceChannel, ...]
-    """The columns of `values` in each chunk."""
-    interval_s: float = Field(ge=0)
-    """Time between two samples as granted; 0 is as fast as the line allowed. Actual times are in the chunks."""
-    samples: int = Field(ge=0)
-    """How many samples were granted; how many there are once it is complete."""
-    pre_trigger: int = Field(ge=0)
-    """Number of samples before the trigger."""
     trigger: TraceTrigger | None = None
     """The condition for which it waits or has waited."""
     trigger_index: int | None = None
@@ -192,21 +197,13 @@ class TraceChunk(Sample):
     """One column for each of the header's raw columns: counts, or words of the trace memory."""
 
 
-class TraceReply(CommandReply):
+class TraceReply(TraceShape, CommandReply):
     """The trace is armed; values are as granted, and may differ from the request."""
 
     trace_id: str
     """Names the trace in its header and chunks."""
     source: TraceSource
     """Who takes the samples."""
-    channels: tuple[TraceChannel, ...]
-    """The channels recorded."""
-    interval_s: float
-    """Time between two samples; 0 is as fast as the line allows."""
-    samples: int
-    """How many samples there will be."""
-    pre_trigger: int
-    """Number of them before the trigger."""
 
 
 class TraceAbortReply(CommandReply):

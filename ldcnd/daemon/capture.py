@@ -114,47 +114,33 @@ class Run:
 class RecorderSnapshot:
     """The contents of a line's flight recorder at one instant; quick to take, and then independent of the line."""
 
-    bus: str
-    family: str
-    port: str
-    baud: int
-    zero_ns: int
-    until_s: float
-    added: int
+    header: CaptureHeader
     entries: WireEntries
 
 
-def snapshot_of(line: BusService, clock: Clock) -> RecorderSnapshot:
+def snapshot_of(line: BusService, run: Run) -> RecorderSnapshot:
     """Take what a line's flight recorder holds: less than a millisecond for a full one."""
     log = line.bus.wire_log
-    return RecorderSnapshot(
+    entries = log.entries()
+    header = CaptureHeader(
+        version=version(),
         bus=line.bus.settings.name,
         family=line.family,
         port=line.port,
         baud=line.bus.baud,
-        zero_ns=clock.wall_ns(0.0),
-        until_s=clock.now_s(),
-        added=log.added,
-        entries=log.entries(),
-    )
-
-
-def capture_of(snapshot: RecorderSnapshot, config: RigConfig, run: Run, cause: str) -> Capture:
-    """Return a snapshot as a capture; needs no event loop, and takes its time."""
-    header = CaptureHeader(
-        version=version(),
-        bus=snapshot.bus,
-        family=snapshot.family,
-        port=snapshot.port,
-        baud=snapshot.baud,
         instance=run.instance,
-        zero_ns=snapshot.zero_ns,
+        zero_ns=run.clock.wall_ns(0.0),
         started_s=run.clock.started_s,
-        until_s=snapshot.until_s,
-        first_record=snapshot.added - len(snapshot.entries),
-        cause=cause,
-        config=of_one_line(config, snapshot.bus).model_dump(mode="json", exclude_defaults=True),
+        until_s=run.clock.now_s(),
+        first_record=log.added - len(entries),
     )
+    return RecorderSnapshot(header, entries)
+
+
+def capture_of(snapshot: RecorderSnapshot, config: RigConfig, cause: str) -> Capture:
+    """Return a snapshot as a capture; needs no event loop, and takes its time."""
+    alone = of_one_line(config, snapshot.header.bus).model_dump(mode="json", exclude_defaults=True)
+    header = snapshot.header.model_copy(update={"cause": cause, "config": alone})
     return Capture(header, tuple(WireRecord(*entry) for entry in snapshot.entries))
 
 
@@ -230,16 +216,16 @@ class CaptureWatch:
                 if news:
                     await asyncio.sleep(AFTERMATH_S)
                     self._last_s[name] = clock.now_s()
-                    snapshot = snapshot_of(line, clock)
+                    snapshot = snapshot_of(line, self._run)
                     await asyncio.to_thread(self._write, snapshot, "; ".join(sorted(news)))
 
     def write_all(self, cause: str) -> None:
         """Write a capture of every line here and now; for a process that is about to die."""
         for line in self._rig.buses:
-            self._write(snapshot_of(line, self._run.clock), cause)
+            self._write(snapshot_of(line, self._run), cause)
 
     def _write(self, snapshot: RecorderSnapshot, cause: str) -> None:
-        self._store.write(capture_of(snapshot, self._config(), self._run, cause))
+        self._store.write(capture_of(snapshot, self._config(), cause))
 
 
 def _causes(line: BusService, now_s: float) -> Iterator[str]:

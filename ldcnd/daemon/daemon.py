@@ -103,7 +103,7 @@ class Daemon:
         Raises:
             ValueOutOfRange: there is no such line.
         """
-        return capture_of(snapshot_of(self.rig.lines[bus], self._run.clock), self._config, self._run, cause)
+        return capture_of(snapshot_of(self.rig.lines[bus], self._run), self._config, cause)
 
     def reconfigure(self, config: RigConfig, plan: RigBudget) -> None:
         """Take other limits, speeds, rates and priorities of axes; everything else is as before, see `plan_reload`.

@@ -8,8 +8,8 @@ from ldcnd.contract.errors import ValueOutOfRange
 from ldcnd.contract.traces import (
     DriveTraceInfo,
     TakeTrace,
-    TraceChannel,
     TracePhase,
+    TraceShape,
     TraceSource,
     TraceTrigger,
     TriggerKind,
@@ -23,21 +23,10 @@ Progress = Callable[[TracePhase, float | None], None]
 
 @dataclass(frozen=True, slots=True)
 class Granted:
-    """The properties of a trace, as far as they can differ from the request.
+    """A trace that is about to begin: its shape, the names of its raw columns, and the phase in which it begins."""
 
-    Attributes:
-        channels: in the order of the values.
-        raw_columns: names of the raw columns.
-        interval_s: time between two samples; 0 is as fast as the line allows.
-        samples: how many, `pre_trigger` of them before the trigger.
-        phase: in which it begins.
-    """
-
-    channels: tuple[TraceChannel, ...]
+    shape: TraceShape
     raw_columns: tuple[str, ...]
-    interval_s: float
-    samples: int
-    pre_trigger: int
     phase: TracePhase
 
 

@@ -157,7 +157,7 @@ async def test_readings_while_armed_need_no_setting_and_the_trigger_level_is_sca
         read = drive.drive.recorder.read
 
         assert (read(0x5004), read(0x5005)) == (BENCH_TRIGGER_MAP.trace2 | BENCH_TRIGGER_MAP.rising, 13_333)
-        assert armed.granted.interval_s == pytest.approx(0.0005)
+        assert armed.granted.shape.interval_s == pytest.approx(0.0005)
 
 
 async def test_cancelled_recording_leaves_the_drive_in_its_normal_mode():
@@ -322,7 +322,7 @@ async def test_the_trigger_may_have_come_two_milliseconds_before_it_was_seen():
         unit.drive.set_pulse_rate(8000.0, asyncio.get_running_loop().time())
         running_at_s = armed._running_at_s
         recorded = await armed.record(ignore)
-        after_s = 499 * armed.granted.interval_s
+        after_s = 499 * armed.granted.shape.interval_s
 
     assert recorded.zero_from_s <= armed._running_at_s - after_s - 0.002 + 1e-9
     assert recorded.trigger_late_s == pytest.approx(0.002)
@@ -405,7 +405,7 @@ async def test_the_fastest_interval_is_two_time_units_of_the_drive(cyclec_us):
     async with smartstep_line([simulated(1, SimulatedVariant(cyclec_us=cyclec_us))]) as line:
         armed = await line.axis("u1").tracer.arm(TakeTrace(channels=("speed_feedback",), interval_s="fastest"))
 
-    assert armed.granted.interval_s == pytest.approx(2 * cyclec_us * 1e-6)
+    assert armed.granted.shape.interval_s == pytest.approx(2 * cyclec_us * 1e-6)
 
 
 async def test_a_trace_is_not_given_up_because_a_busy_line_answers_late():

@@ -18,6 +18,7 @@ from ldcnd.contract.traces import (
     TakeTrace,
     TraceChannel,
     TracePhase,
+    TraceShape,
     TraceSource,
 )
 from ldcnd.drives.tracer import ArmedTrace, Granted, Recorded, Tracer
@@ -34,7 +35,11 @@ class FakeTrace(ArmedTrace):
     def __init__(self, columns):
         names = [f"c{number}" for number in range(columns)]
         channels = tuple(TraceChannel(name=name, unit="u") for name in names)
-        self.granted = Granted(channels, tuple(names), 0.0, MOST_SAMPLES, 0, TracePhase.RECORDING)
+        self.granted = Granted(
+            TraceShape(channels=channels, interval_s=0.0, samples=MOST_SAMPLES, pre_trigger=0),
+            tuple(names),
+            TracePhase.RECORDING,
+        )
         self.outcome = asyncio.get_running_loop().create_future()
         self.stubborn = False
 

@@ -47,17 +47,11 @@ class RefusalReason(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Refusal:
+class Refusal(ReplyPacket):
     """An intact reply by which the drive declines; nothing was changed, and the same again will be declined again.
 
-    Attributes:
-        data: as echoed; the value or the requested number of bytes.
+    Its data are as echoed: the value, or the requested number of bytes.
     """
-
-    unit: int
-    status: ResponseStatus
-    address: int
-    data: int
 
     @property
     def reason(self) -> RefusalReason:

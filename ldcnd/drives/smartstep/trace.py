@@ -29,7 +29,7 @@ from ldcnd.contract.errors import (
     TraceTimedOut,
     ValueOutOfRange,
 )
-from ldcnd.contract.traces import TakeTrace, TracePhase, TraceSource, TraceTrigger
+from ldcnd.contract.traces import TakeTrace, TracePhase, TraceShape, TraceSource, TraceTrigger
 from ldcnd.drives.smartstep.addresses import OperatingMode, Register, TraceRegister
 from ldcnd.drives.smartstep.commands import read_operating_mode, reference, write_trace_register
 from ldcnd.drives.smartstep.modes import (
@@ -293,11 +293,13 @@ class ArmedSmartStep(ArmedTrace):
         """
         request = setup.request
         self.granted = Granted(
-            channels=granted_channels(profile, setup.constants, setup.assignment),
+            shape=TraceShape(
+                channels=granted_channels(profile, setup.constants, setup.assignment),
+                interval_s=setup.interval_s,
+                samples=POINTS,
+                pre_trigger=setup.settings[TraceRegister.PTRGNO],
+            ),
             raw_columns=raw_columns(setup.assignment),
-            interval_s=setup.interval_s,
-            samples=POINTS,
-            pre_trigger=setup.settings[TraceRegister.PTRGNO],
             phase=TracePhase.WAITING if request.trigger else TracePhase.RECORDING,
         )
         self._bus = bus
@@ -443,7 +445,7 @@ class ArmedSmartStep(ArmedTrace):
         address: int | None = None
         if setup.trigger:
             address = await words.ask(reference(words.unit, Register.TRGADR), Lane.BACKGROUND)
-        first = 0 if address is None else ring_start(address, self.granted.pre_trigger)
+        first = 0 if address is None else ring_start(address, self.granted.shape.pre_trigger)
         upload = TraceUpload(self._bus, words, self._profile)
         used = setup.assignment.used
 
