@@ -97,7 +97,7 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.events import CommandEvent, CommandOutcome, CommandStatus, EventList
-from ldcnd.contract.history import AxisInstant, InputLevels, Within
+from ldcnd.contract.history import AxisInstant, Within
 from ldcnd.contract.leases import Holder, HolderList, LeaseReply, LeaseRequest
 from ldcnd.contract.meta import (
     AxisInfo,
@@ -157,6 +157,7 @@ from ldcnd.contract.samples import (
     FaultEntry,
     FaultSample,
     FigureRange,
+    InputLevels,
     InputsSample,
     IoReading,
     IoSample,

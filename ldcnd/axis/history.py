@@ -9,8 +9,8 @@ import struct
 from typing import Final
 
 from ldcnd.axis.scale import AxisScale
-from ldcnd.contract.history import AxisInstant, InputLevels, Within
-from ldcnd.contract.samples import Quality
+from ldcnd.contract.history import AxisInstant, Within
+from ldcnd.contract.samples import InputLevels, Quality
 from ldcnd.drives.driver import AxisReading
 
 HISTORY_S: Final = 600.0

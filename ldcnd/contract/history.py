@@ -1,7 +1,7 @@
 """Where an axis was at an instant: the answer to a query of `tele/<axis>/at`."""
 
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.samples import Quality
+from ldcnd.contract.samples import InputLevels, Quality
 
 
 class Within(Frozen):
@@ -13,21 +13,6 @@ class Within(Frozen):
     """The true value is not below this."""
     upper: float
     """The true value is not above this."""
-
-
-class InputLevels(Frozen):
-    """The inputs of a drive, the same in the readings before and behind an instant; null while one is not shown."""
-
-    reverse_limit: bool | None
-    """Level of the reverse limit switch input."""
-    forward_limit: bool | None
-    """Level of the forward limit switch input."""
-    index: bool | None
-    """Level of the encoder's index."""
-    stop_input: bool | None
-    """The stop input is open."""
-    amplifier_enable: bool | None
-    """The amplifier enable."""
 
 
 class AxisInstant(Frozen):
@@ -47,6 +32,6 @@ class AxisInstant(Frozen):
     velocity: Within | None = None
     """Velocity in axis units a second; likewise."""
     inputs: InputLevels | None = None
-    """The inputs; null where one of them changed meanwhile."""
+    """The inputs, the same in the readings before and behind the instant; null where one of them changed meanwhile."""
     reason: str | None = None
     """Why nothing is known."""

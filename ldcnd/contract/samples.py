@@ -122,8 +122,8 @@ class AdcSample(Sample):
     """Voltage at the input, as configured for full scale."""
 
 
-class InputsSample(Sample):
-    """The inputs of a drive and its amplifier enable, which every poll carries; null while one is not shown."""
+class InputLevels(Frozen):
+    """The inputs of a drive and its amplifier enable; null while one is not shown."""
 
     reverse_limit: bool | None
     """Level of the reverse limit switch input; true is high. A Logosol drive shows it while its power driver is on."""
@@ -135,6 +135,10 @@ class InputsSample(Sample):
     """The stop input is open, which keeps the motor off; a Logosol drive shows it while its power driver is off."""
     amplifier_enable: bool | None
     """The amplifier enable that the drive holds; null when it is not known, such as after a lost acknowledgement."""
+
+
+class InputsSample(InputLevels, Sample):
+    """The inputs of a drive and its amplifier enable, which every poll carries; null while one is not shown."""
 
 
 class LatchSample(Sample):
