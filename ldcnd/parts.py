@@ -33,7 +33,7 @@ EXTRAS = {
 DEBIAN = {
     "ldcnd": ("console", "fast", "gpio", "journal", "lab", "ops", "tui"),
     "ldcnd-tuning": ("bench", "plot"),
-    "ldcnd-bridges": ("bluesky", "epics", "epics-pva", "foxglove", "parquet", "secop"),
+    "ldcnd-bridges": ("bluesky", "epics", "epics-pva", "foxglove", "secop"),
 }
 """Debian packages, each upon those before it, with the extras that it brings."""
 

@@ -2,11 +2,15 @@
 
 `python -m tools client` writes the methods of the client alone, also when those that there are cannot be loaded;
 `python -m tools check` fails when the schemas are not what the models say; `python -m tools man FOLDER` writes
-man pages.
+man pages; `python -m tools sbom FILE` writes what this interpreter's environment is made of, vendored scripts included.
 """
 
 import argparse
 import ast
+import json
+import os
+import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -21,13 +25,14 @@ REFERENCE = ROOT / "docs" / "reference"
 SCHEMAS = ROOT / "schemas"
 KEPT = ROOT / "tests" / "kept"
 STUB = ROOT / "ldcnd" / "__init__.pyi"
+VENDORED = ROOT / "ldcnd" / "console" / "static" / "vendor"
 
 
 def main() -> None:
     """Do what the first argument says; without one, write everything but the client's methods."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", nargs="?", choices=("all", "client", "check", "man"), default="all")
-    parser.add_argument("folder", nargs="?", type=Path, help="of the man pages")
+    parser.add_argument("what", nargs="?", choices=("all", "client", "check", "man", "sbom"), default="all")
+    parser.add_argument("place", nargs="?", type=Path, help="folder of the man pages, file of the bill of materials")
     options = parser.parse_args()
     match options.what:
         case "client":
@@ -35,7 +40,9 @@ def main() -> None:
         case "check":
             check()
         case "man":
-            write_man_pages(options.folder)
+            write_man_pages(options.place)
+        case "sbom":
+            write_bill(options.place)
         case _:
             write_all()
 
@@ -97,6 +104,26 @@ def write_man_pages(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in man_pages().items():
         (folder / name).write_text(text, encoding="utf-8")
+
+
+def write_bill(file: Path) -> None:
+    """Write a bill of materials of the environment, in CycloneDX, by cyclonedx-py (or the program $CYCLONEDX)."""
+    program = os.environ.get("CYCLONEDX") or str(Path(sys.executable).with_name("cyclonedx-py"))
+    words = [program, "environment", sys.executable, "--of", "JSON", "--output-reproducible"]
+    bill = json.loads(subprocess.run(words, check=True, capture_output=True).stdout)  # noqa: S603 - our own
+    for row in re.findall(r"(?m)^\| `(?!folder).*$", (VENDORED / "README.md").read_text(encoding="utf-8")):
+        folder, name, release, _, licence, *_ = (cell.strip(" `") for cell in row.strip("|").split("|"))
+        bill["components"].append(
+            {
+                "bom-ref": f"vendored/{folder}",
+                "type": "library",
+                "name": name,
+                "version": release,
+                "purl": f"pkg:npm/{name.replace('@', '%40')}@{release}",
+                "licenses": [{"license": {"id": each}} for each in re.findall(r"MIT|ISC|Apache-2\.0", licence)],
+            }
+        )
+    file.write_text(json.dumps(bill, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def renew_table(page: Path, table: str) -> None:

@@ -24,8 +24,9 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_session import open_zenoh_session
-from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, ZenohSettings, user_settings
+from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, ZenohSettings, reached_at, user_settings
 
+CONFIG_HELP = "Zenoh configuration file to start from; or the daemon's own configuration, a .toml."
 COMPLETION_S = 2.0
 """Longest time that a shell waits for the names of axes."""
 ResultT = TypeVar("ResultT")
@@ -67,14 +68,15 @@ class AxisName(click.types.StringParamType):
         """Return the axes that begin so; none when no daemon answers in time."""
         given = {name: ctx.params.get(name) for name in ("connect", "listen", self.session_option, "rig")}
         connect = given["connect"] or tuple(filter(None, [os.environ.get("LDCND_CONNECT")]))
-        target = Target(connect, given["listen"] or (), given[self.session_option], given["rig"], as_json=False)
 
         async def names(client: RigClient) -> list[str]:
             async with asyncio.timeout(COMPLETION_S):
                 return [info.axis for info in await client.axes()]
 
         try:
-            found = target.run(names)
+            found = Target.given(
+                connect, given["listen"] or (), given[self.session_option], given["rig"], as_json=False
+            ).run(names)
         except (LdcndError, TimeoutError):
             return []
         return [CompletionItem(name) for name in found if name.startswith(incomplete)]
@@ -104,6 +106,22 @@ class Target:
     config: Path | None
     rig: str | None
     as_json: bool
+
+    @classmethod
+    def given(
+        cls, connect: tuple[str, ...], listen: tuple[str, ...], config: Path | None, rig: str | None, *, as_json: bool
+    ) -> "Target":
+        """Return the target of what was typed; a daemon's configuration names its endpoint and its rig.
+
+        Raises:
+            ConfigError: the configuration cannot be read.
+        """
+        if config and config.suffix == ".toml":
+            from ldcnd.config.rig import load_config  # noqa: PLC0415 - most commands do without
+
+            daemon = load_config(config)
+            return cls(connect or (reached_at(daemon.zenoh.listen),), listen, None, rig or daemon.rig, as_json)
+        return cls(connect, listen, config, rig, as_json)
 
     def run(self, work: Callable[[RigClient], Awaitable[ResultT]]) -> ResultT:
         """Open a session, find the rig, do the work, and close."""
@@ -163,7 +181,7 @@ def _target_options(command: CommandT) -> CommandT:
     for given in (
         option("--json", "as_json", is_flag=True, help="Print JSON lines."),
         option("--rig", help="Which rig, when several can be reached."),
-        option("--config", type=click.Path(path_type=Path), help="Zenoh configuration file to start from."),
+        option("--config", type=click.Path(path_type=Path), help=CONFIG_HELP),
         option("--listen", "-l", multiple=True, help="Zenoh endpoint to listen on; may be repeated."),
         option(
             "--connect",
@@ -185,7 +203,7 @@ def with_target(work: Callable[..., None]) -> Callable[..., None]:
     def command(**options: object) -> None:
         OPTIONS_TYPED.set(_options_typed(click.get_current_context()))
         # click has converted the five options to the types of the fields
-        target = Target(**{name: options.pop(name) for name in Target.__slots__})  # type: ignore[arg-type]
+        target = Target.given(**{name: options.pop(name) for name in Target.__slots__})  # type: ignore[arg-type]
         work(target, **options)
 
     return command

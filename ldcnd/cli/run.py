@@ -28,7 +28,7 @@ from ldcnd.daemon.systemd import Notifier
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 from ldcnd.log import configure_logging, get_logger
 from ldcnd.net.zenoh_config import zenoh_config
-from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT
+from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, reached_at
 from ldcnd.net.zenoh_threads import senders_wait
 
 LINK_S = 20.0
@@ -44,7 +44,7 @@ async def show_first_steps(daemon: Daemon, rig: RigConfig, address: ListenAddres
         rig: its configuration.
         address: where the console serves.
     """
-    endpoint = next(iter(rig.zenoh.listen), DEFAULT_ENDPOINT)
+    endpoint = reached_at(rig.zenoh.listen)
     await daemon.wait_up()
     async with _console(endpoint, address) as link:
         show_lines(*first_steps(rig, endpoint, link))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import CONFIG_HELP, Target, with_target
 from ldcnd.cli.output import on_end
 from ldcnd.cli.typed import CONSOLE_ADDRESS, WholeNumber, address_option, parsed_address
 from ldcnd.client.overview import health_reports
@@ -35,7 +35,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
 @click.option(
     "--connect", "-e", multiple=True, help=f"Zenoh endpoint of a daemon or router; repeatable [{DEFAULT_ENDPOINT}]."
 )
-@click.option("--config", type=FILE, help="Zenoh configuration file to start from, for each endpoint.")
+@click.option("--config", type=FILE, help=CONFIG_HELP)
 @click.option("--rig", multiple=True, help="Show this rig only; may be repeated.")
 @address_option("--listen", CONSOLE_ADDRESS)
 @click.option("--host", multiple=True, help="Name under which browsers reach it, beside that; may be repeated.")
@@ -86,6 +86,9 @@ def console(
         show_link(asyncio.run(ask_for_link(listen.port)), as_json=as_json)
         return
     configure_logging(level=log_level)
+    if config and config.suffix == ".toml":
+        target = Target.given(connect, (), config, None, as_json=as_json)
+        connect, config, rig = target.connect, None, rig or ((target.rig,) if target.rig else ())
     endpoints = connect or (() if config else (DEFAULT_ENDPOINT,))
     settings = ConsoleSettings(
         endpoints=tuple(

@@ -72,6 +72,11 @@ def endpoint_of(written: str) -> str:
     return written if "/" in written else f"tcp/{written}"
 
 
+def reached_at(listen: Sequence[str]) -> str:
+    """Return where a program of the same machine reaches a daemon that listens at these endpoints."""
+    return next(iter(listen), DEFAULT_ENDPOINT).replace("/0.0.0.0:", "/127.0.0.1:").replace("/[::]:", "/[::1]:")
+
+
 def user_settings(
     connect: Sequence[str], listen: Sequence[str] = (), config_file: Path | str | None = None
 ) -> ZenohSettings:
