@@ -186,7 +186,7 @@ release=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 install_parts ""
 "$opt/bin/python" -c 'from ldcnd.parts import DEBIAN
 for name, extras in DEBIAN.items(): print(name, ",".join(extras))' > "$stage/packages"
-depends="systemd"
+depends="libc6, systemd"
 of_python="python3 (>= $release), python3 (<< ${release%.*}.$((${release#*.} + 1)))"
 while read -r name extras; do
     install_parts "$extras"

@@ -32,7 +32,7 @@ OURS = (
 WANTED = {"tune": "numpy", "epics": "caproto"}
 COMMANDS = re.compile(r"(?ms)^```sh\n(.*?)^```$")
 
-pytestmark = [pytest.mark.system, pytest.mark.real_time]
+pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(400)]  # the first builds the packages
 no_package = why_no_package()
 no_machine = no_package or why_no_machine()
 packaged = pytest.mark.skipif(no_package is not None, reason=no_package or "")
@@ -139,7 +139,6 @@ def test_every_command_of_the_guide_works(deb: Path):
 
 @packaged
 @pytest.mark.skipif(not shutil.which("lintian"), reason="no lintian")
-@pytest.mark.timeout(300)
 def test_lintian_finds_no_error(deb: Path):
     for each in sorted(deb.parent.glob("*.deb")):
         done = subprocess.run(  # noqa: S603

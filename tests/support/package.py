@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PARTS = ("ldcnd", "schemas", "tools", "deploy", "config", "pyproject.toml", "constraints.txt", "README.md", "LICENSE")
-PARTS += ("CHANGELOG.md",)
+PARTS = ("ldcnd", "schemas", "tools", "deploy", "config", "pyproject.toml", "constraints.txt")
+PAGES = ("README.md", "LICENSE", "CHANGELOG.md")
 BUILD_TIME_S = 180.0
 """For a build by itself; the first one on a machine fetches packages."""
 
@@ -42,7 +42,7 @@ def snapshot(place: Path) -> Path:
     """Return a copy of what the package is made of, which nobody changes meanwhile."""
     copy = place / "source"
     if not copy.exists():
-        for part in PARTS:
+        for part in (*PARTS, *PAGES):
             if (ROOT / part).is_dir():
                 shutil.copytree(ROOT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
             else:
