@@ -6,8 +6,10 @@ PYTHON ?= python3
 export PYTHONDONTWRITEBYTECODE :=
 
 PYTHONS ?= python3.11 python3.12 python3.13 python3.14
+SOURCE ?= .
+OUT ?= dist
 
-.PHONY: run test tests test-system test-edges test-pythons check fix docs dist soak mutants newcomer bench screenshots clean
+.PHONY: run test tests test-system test-edges test-pythons check fix docs dist dist-check soak mutants newcomer bench screenshots clean
 
 # what `make test` needs is nine times as large as what `make run` needs
 run: $(if $(wildcard .venv/ready),.venv/ready,.venv/small)
@@ -45,10 +47,21 @@ fix: .venv/ready
 docs: .venv/ready
 	.venv/bin/sphinx-build -W --keep-going -q -b html -d build/doctrees docs build/docs
 
-# wheel and sdist, the same bytes from the same commit
+# what a release is made of: wheel, sdist, Debian packages, bills of materials, checksums
 dist: export SOURCE_DATE_EPOCH ?= $(shell git log -1 --format=%ct)
+dist: export UV ?= $(CURDIR)/.venv/bin/uv
 dist: .venv/ready
-	$(PY) -m hatchling build -d dist
+	rm -rf $(OUT)
+	cd $(SOURCE) && $(CURDIR)/$(PY) -m hatchling build -d $(abspath $(OUT))
+	$(SOURCE)/deploy/build_deb.sh $(OUT)
+	cd $(OUT) && sha256sum * | tee SHA256SUMS
+
+# that a second build of the last commit, elsewhere, gives the same bytes
+dist-check: dist
+	rm -rf build/again
+	git clone -q . build/again
+	$(MAKE) --no-print-directory dist SOURCE=build/again OUT=build/again/dist
+	diff $(OUT)/SHA256SUMS build/again/dist/SHA256SUMS
 
 # the installed package on the kernel's own serial drivers, in a machine under QEMU; skipped with the reason where there is none
 test-drivers: .venv/ready

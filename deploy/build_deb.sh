@@ -1,7 +1,7 @@
 #!/bin/bash
 # build_deb.sh OUT_DIR: the Debian packages of this checkout for the Debian release it runs on: an environment in
-# /opt/ldcnd on Debian's Python, and what others add to it (`DEBIAN` in ldcnd/parts.py). Prints their paths. Needs uv,
-# cyclonedx-bom (both in .venv) and dpkg-deb.
+# /opt/ldcnd on Debian's Python, and what others add to it (`DEBIAN` in ldcnd/parts.py), each with its bill of
+# materials. Prints their paths. Needs uv, cyclonedx-bom (both in .venv) and dpkg-deb.
 # COMPRESSION: xz, or none where time matters more than size. UV_OFFLINE=1: nothing is fetched. ONLY: the packages to
 # make, where not all are needed. Same input and SOURCE_DATE_EPOCH: same bytes.
 set -euo pipefail
@@ -179,6 +179,7 @@ CONTROL
     (cd "$root" && find . -type f ! -path './DEBIAN/*' ! -path './etc/*' -printf '%P\0' | sort -z | xargs -0 md5sum) > "$root/DEBIAN/md5sums"
     package=$out/$1_${version}_$(dpkg --print-architecture).deb
     dpkg-deb --root-owner-group -Z"${COMPRESSION:-xz}" --build "$root" "$package" >/dev/null
+    cp "$root/usr/share/doc/$1/sbom.cdx.json" "${package%.deb}.cdx.json"
     echo "$package"
 }
 

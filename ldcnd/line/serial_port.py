@@ -325,8 +325,9 @@ def _open(settings: SerialSettings) -> _Serial:
         exclusive=settings.exclusive or None,
     )
     try:
-        if settings.exclusive:
-            # pyserial's lock binds only programs that use it; this one refuses every other user's open
+        if settings.exclusive and not _is_pseudo_terminal(settings.path):
+            # pyserial's lock binds only programs that use it; this one refuses every other user's open. It ends with
+            # the last close (tty_ioctl(4)): what serves a pseudo-terminal has it open, so no second daemon could come.
             fcntl.ioctl(port.fileno(), termios.TIOCEXCL)
         _require_served(settings.path)  # the simulator may have ended, and the number been given away, in between
         _settle_rates(port, settings)

@@ -7,10 +7,11 @@ import shutil
 import subprocess
 import sysconfig
 from pathlib import Path
+from typing import Any
 
 import pytest
 
-from tests.support.booted_machine import booted_machine, why_no_machine
+from tests.support.booted_machine import Machine, booted_machine, why_no_machine
 from tests.support.package import ROOT, build, package, snapshot, why_no_package
 
 DEPLOY = ROOT / "deploy"
@@ -30,6 +31,33 @@ OURS = (
     "./usr/share/lintian/overrides/ldcnd",
 )
 WANTED = {"tune": "numpy", "epics": "caproto"}
+DRIVES = ("/usr/bin/ldcnd", "sim", "--pty", "/run/drives/port", "--chain", "ls-182ap,ls-182ap")
+AXIS = """
+[[bus.axis]]
+name = "{}"
+address = {}
+model = "ls-182ap"
+unit = "mm"
+counts_per_unit = 1000
+velocity = 20
+acceleration = 200
+limits = {{ position_min = -100, position_max = 100, velocity = 50, acceleration = 1000 }}
+gains = {{ kp = 350, kd = 3000, ki = 400, il = 400, ol = 250, el = 4000 }}
+"""
+RIG = """
+rig = "cell"
+state_dir = "/var/lib/ldcnd"
+[zenoh]
+listen = ["tcp/127.0.0.1:7447"]
+[[bus]]
+name = "line0"
+port = "/run/drives/port"
+baud = 115200
+margin_ms = 50
+start = "adopt"
+adopt_fallback = "reset"
+"""
+RIG += AXIS.format("x", 1) + AXIS.format("y", 2)
 COMMANDS = re.compile(r"(?ms)^```sh\n(.*?)^```$")
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(400)]  # the first builds the packages
@@ -135,6 +163,63 @@ def test_every_command_of_the_guide_works(deb: Path):
 
         assert machine.run("ldcnd", "--version").returncode != 0
         assert (machine.root / "etc/ldcnd/ldcnd.toml").exists()
+
+
+@booted
+def test_upgrade_leaves_what_moves_alone_and_keeps_references(deb: Path, tmp_path: Path):
+    newer = repacked(deb, tmp_path, "9.9")
+    with booted_machine() as machine:
+        for each in (deb, newer):
+            (machine.root / "root" / each.name).write_bytes(each.read_bytes())
+        machine.must("ip", "link", "set", "lo", "up")
+        machine.must("dpkg", "-i", f"/root/{deb.name}")
+        machine.must("systemd-run", "--unit=drives", "--uid=ldcnd", "-p", "RuntimeDirectory=drives", *DRIVES)
+        machine.write("/etc/ldcnd/ldcnd.toml", RIG)
+        machine.must("systemctl", "start", "ldcnd")
+        machine.until_shown("ldcnd", "StatusText", lambda text: "2/2 axes up" in text)
+        for axis in ("x", "y"):
+            machine.must("ldcnd", "power", "on", axis)
+            machine.must("ldcnd", "axis", "set-position", axis, "0")
+            machine.must("ldcnd", "move", axis, "3", "--wait")
+        machine.must("ldcnd", "move", "x", "60", "--velocity", "2")
+
+        machine.must("dpkg", "-i", f"/root/{newer.name}", timeout_s=60)
+
+        assert seen(machine, "x")["moving"] == "yes"
+        machine.must("systemctl", "restart", "ldcnd")
+        machine.until_shown("ldcnd", "StatusText", lambda text: "2/2 axes up" in text)
+        assert "9.9" in machine.must("ldcnd", "--version")
+        first = [seen(machine, axis) for axis in ("x", "y")]
+        machine.must("ldcnd", "move", "y", "4", "--wait")
+        again = seen(machine, "x")
+        assert [axis["referenced"] for axis in first] == [True, True]
+        assert first[1]["position"] == pytest.approx(3, abs=0.003)
+        assert 3 < first[0]["position"] < 60
+        assert again["position"] == pytest.approx(first[0]["position"], abs=0.003)  # stopped on its way, and stands
+        assert again["moving"] == "no"
+        machine.must("ldcnd", "move", "x", "3", "--wait")  # an absolute move: what the drive counts is still true
+
+        machine.must("dpkg", "-i", f"/root/{deb.name}", timeout_s=60)  # and back
+        machine.must("systemctl", "restart", "ldcnd")
+        machine.until_shown("ldcnd", "StatusText", lambda text: "2/2 axes up" in text)
+        assert [seen(machine, axis)["referenced"] for axis in ("x", "y")] == [True, True]
+
+
+def repacked(deb: Path, place: Path, version: str) -> Path:
+    """Return the same package as another version of it."""
+    root, newer = place / "again", place / f"ldcnd_{version}.deb"
+    told("dpkg-deb", "--raw-extract", str(deb), str(root))
+    [metadata] = root.glob("opt/ldcnd/lib/python*/site-packages/ldcnd-*.dist-info/METADATA")
+    for file in (root / "DEBIAN/control", metadata):
+        file.write_text(re.sub("(?m)^Version: .*", f"Version: {version}", file.read_text()), encoding="utf-8")
+    told("dpkg-deb", "--root-owner-group", "-Znone", "--build", str(root), str(newer))
+    return newer
+
+
+def seen(machine: Machine, axis: str) -> dict[str, Any]:
+    """Return an axis as `ldcnd list` shows it."""
+    rows = [json.loads(line) for line in machine.must("ldcnd", "list", "--json").splitlines()]
+    return next(row for row in rows if row["axis"] == axis)
 
 
 @packaged

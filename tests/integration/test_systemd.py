@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support.booted_machine import Machine, booted_machine, why_no_machine
+from tests.support.booted_machine import Machine, booted_machine, eventually, why_no_machine
 from tests.support.package import package, why_no_package
 
 why_not = why_no_machine() or why_no_package()
@@ -22,6 +22,9 @@ UNIT = "ldcnd.service"
 CONFIG = "/etc/ldcnd/ldcnd.toml"
 SIMULATED = (Path(__file__).parents[2] / "config" / "simulated.toml").read_text(encoding="utf-8")
 DEPLOY = Path(__file__).parents[2] / "deploy"
+LINK = re.compile(r"http://127\.0\.0\.1:8470/\S+")
+RECORDINGS = "/var/lib/ldcnd-record/ldcnd"
+METRICS = "http://127.0.0.1:9464/metrics"
 DROP_INS = "/etc/systemd/system/ldcnd.service.d"
 FAST_WATCHDOG = "[Service]\nWatchdogSec=2\nStartLimitBurst=100\n"
 
@@ -71,6 +74,15 @@ def service(machine: Machine) -> Iterator[Machine]:
     machine.must("systemctl", "stop", UNIT)
     machine.run("systemctl", "reset-failed", UNIT)
     machine.must("rm", "-r", DROP_INS)
+
+
+def fetched(machine: Machine, url: str) -> str:
+    """Return what is served there; nothing while nothing is."""
+    opened = (
+        f"build_opener(HTTPCookieProcessor()).open({url!r}, timeout=5)"  # as a browser, which keeps what it is given
+    )
+    asked = f"from urllib.request import *; print({opened}.read().decode())"
+    return machine.run("/opt/ldcnd/bin/python", "-c", asked).stdout
 
 
 def log_of(machine: Machine, unit: str = UNIT) -> str:
@@ -273,6 +285,31 @@ def test_lan_drop_in_opens_the_named_subnet(devices: Machine):
 
     assert found["elsewhere"] == "done"
     assert found["other"] == "EPERM"
+
+
+def test_console_recording_and_metrics_run_beside_the_daemon(service: Machine):
+    beside = [f"ldcnd-{name}@ldcnd.service" for name in ("console", "record", "metrics")]
+    try:
+        service.must("systemctl", "enable", "--now", *beside)
+        eventually(lambda: fetched(service, METRICS), lambda text: 'axis="x"' in text, 20.0)
+        log = eventually(lambda: log_of(service, beside[0]), lambda text: bool(LINK.search(text)), 20.0)
+        assert "<html" in fetched(service, LINK.findall(log)[-1])
+        eventually(lambda: service.run("ls", RECORDINGS).stdout, lambda text: ".mcap" in text, 20.0)
+        pids = [service.show(unit, "MainPID") for unit in beside]
+
+        service.must("systemctl", "restart", UNIT)
+        service.until_shown(UNIT, "StatusText", lambda text: "4/4 axes up" in text)
+        assert [service.show(unit, "MainPID") for unit in beside] == pids
+
+        service.must("systemctl", "stop", UNIT)
+        for unit in beside:
+            service.until_shown(unit, "ActiveState", lambda state: state == "inactive")
+        assert all(name.endswith(".mcap") for name in service.must("ls", RECORDINGS).split())  # none cut off
+        service.must("systemctl", "start", UNIT)
+        eventually(lambda: fetched(service, METRICS), lambda text: 'axis="x"' in text, 20.0)
+        assert {service.show(unit, "ActiveState") for unit in beside} == {"active"}
+    finally:
+        service.run("systemctl", "disable", "--now", *beside)
 
 
 def test_units_are_understood_whole(machine: Machine):
