@@ -25,6 +25,8 @@ BITS_PER_BYTE = 10
 BAUD_TOLERANCE = 0.045
 """A receiver samples the stop bit right up to about this difference of the two clocks."""
 NEVER_S = math.inf
+NOISE = b""
+"""What a module understands of bytes at another rate than its own."""
 _ALMOST = 1e-6
 """Byte times: an end that is this close counts as reached, whatever the rounding."""
 
@@ -108,7 +110,7 @@ class Module(ABC):
     def takes_whole(self, data: bytes) -> bool:  # noqa: ARG002 - the general answer
         """Tell whether these bytes, received without a gap, have no effect before the last one has ended.
 
-        Only then `hear_all` may be called.
+        Only then `hear_all` may be called; for `NOISE`, a single framing error stands for all of them.
         """
         return False
 
@@ -132,6 +134,7 @@ class _Request:
     values: deque[int | None]
     starts_at_s: float
     byte_s: float
+    piecewise: bool = False
 
     @property
     def next_at_s(self) -> float:
@@ -367,18 +370,22 @@ class Chain:
         Nearly every request is a single packet, and most modules have nothing to do with it.
         """
         slowest, fastest = self._understood_bauds()
-        if None in request.values:
+        if request.piecewise or None in request.values:
             return False
         data = bytes(value for value in request.values if value is not None)
         for module in self._reached:
-            if not (slowest <= module.baud <= fastest and module.takes_whole(data)):
+            if not module.takes_whole(data if slowest <= module.baud <= fastest else NOISE):
+                request.piecewise = True
                 return False
         self._requests.popleft()
         self._interrupt(request.next_at_s)
         hears = True
         for module in self._reached:
             if hears or module.latched:
-                module.hear_all(data, request.starts_at_s, request.byte_s)
+                if slowest <= module.baud <= fastest:
+                    module.hear_all(data, request.starts_at_s, request.byte_s)
+                else:
+                    module.hear(None, request.ends_at_s)
             hears = module.address_out
         return True
 

@@ -119,9 +119,9 @@ class SimulatedModule(Module):
 
     def takes_whole(self, data: bytes) -> bool:
         """Exactly one packet, or no beginning of any."""
-        if self._reader.in_packet:
+        if self._reader.in_packet or self._missed.in_packet:
             return False
-        return _is_packet(data) or HEADER not in data
+        return HEADER not in data or _is_packet(data)
 
     def hear_all(self, data: bytes, starts_at_s: float, byte_s: float) -> None:
         """A packet for another module only ends what this one was about to do."""
