@@ -1,7 +1,7 @@
 #!/bin/bash
 # build_deb.sh OUT_DIR: the Debian packages of this checkout for the Debian release it runs on: an environment in
 # /opt/ldcnd on Debian's Python, and what others add to it (`DEBIAN` in ldcnd/parts.py), each with its bill of
-# materials. Prints their paths. Needs uv, cyclonedx-bom (both in .venv) and dpkg-deb.
+# materials. Prints their paths. Needs uv (in .venv) and dpkg-deb.
 # COMPRESSION: xz, or none where time matters more than size. UV_OFFLINE=1: nothing is fetched. ONLY: the packages to
 # make, where not all are needed. Same input and SOURCE_DATE_EPOCH: same bytes.
 set -euo pipefail
@@ -10,7 +10,6 @@ out=$(mkdir -p "$1" && cd "$1" && pwd)
 here=$(cd "$(dirname "$0")" && pwd)
 source=$(dirname "$here")
 uv=${UV:-$(PATH=$PATH:$source/.venv/bin command -v uv)}
-bom=${CYCLONEDX:-$(PATH=$PATH:$(dirname "$uv") command -v cyclonedx-py)}
 python=${PYTHON:-/usr/bin/python3}
 export SOURCE_DATE_EPOCH=${SOURCE_DATE_EPOCH:-1700000000} PYTHONHASHSEED=0
 stage=$(mktemp -d)
@@ -21,6 +20,8 @@ old_systemd=$([ "$(systemctl --version | sed -n '1s/^systemd \([0-9]*\).*/\1/p')
 
 "$uv" build --quiet --wheel --build-constraints "$source/constraints.txt" --python "$python" --out-dir "$stage" "$source"
 wheel=$(echo "$stage"/*.whl)
+"$uv" venv --quiet --no-config --python "$python" "$stage/bom"
+"$uv" pip install --quiet --python "$stage/bom/bin/python" -c "$source/constraints.txt" cyclonedx-bom
 version=$(basename "$wheel" | cut -d- -f2)
 "$uv" venv --quiet --no-config --relocatable --python "$python" "$opt"
 rm -f "$opt/.lock" "$opt"/bin/activate* "$opt"/bin/deactivate* "$opt"/CACHEDIR.TAG "$opt"/.gitignore
@@ -204,7 +205,7 @@ while read -r name extras; do
             ;;
     esac
     doc=$stage/$name/usr/share/doc/$name
-    (cd "$source" && CYCLONEDX=$bom "$opt/bin/python" -m tools sbom "$doc/sbom.cdx.json")
+    (cd "$source" && CYCLONEDX=$stage/bom/bin/cyclonedx-py "$opt/bin/python" -m tools sbom "$doc/sbom.cdx.json")
     [[ " ${ONLY:-$name} " != *" $name "* ]] || pack "$name" "$of_python, $depends" "$summary"
     depends="$name (= $version)"
     [[ $name != "${ONLY:-}" ]] || break
