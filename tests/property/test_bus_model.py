@@ -335,5 +335,5 @@ class UnrulyLine(RuleBasedStateMachine):
 def test_every_caller_of_an_unruly_line_has_one_outcome_and_it_is_its_own():
     run_state_machine_as_test(
         UnrulyLine,
-        settings=settings(max_examples=45, stateful_step_count=40, deadline=None, derandomize=True, database=None),
+        settings=settings(max_examples=25, stateful_step_count=40, deadline=None, derandomize=True, database=None),
     )

@@ -351,7 +351,7 @@ def cut_short(seeds: range) -> list[str]:
 
 @pytest.mark.promise("address-only-of-its-place")
 def test_a_line_whose_bring_up_was_cut_short_is_taken_over_or_says_what_to_do() -> None:
-    assert cut_short(range(60)) == []
+    assert cut_short(range(30)) == []
 
 
 @pytest.mark.soak
