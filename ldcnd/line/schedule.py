@@ -220,6 +220,7 @@ class MuteNodes:
 
     def __init__(self) -> None:
         self.misses: dict[int, int] = {}
+        self._lost_polls: dict[int, int] = {}
         self._backed_off: set[int] = set()
 
     def failing(self) -> set[int]:
@@ -233,11 +234,15 @@ class MuteNodes:
     def pause_s(self, node: int, lost_s: float) -> float:
         """Return how long to pause polling a node whose poll has just been lost, in seconds.
 
+        Only its polls count: the first node of a line without any reply is also asked after each loss of the others,
+        and its axis would never learn that it is lost.
+
         Args:
             node: its miss was counted.
             lost_s: time that a poll without a reply takes on the line.
         """
-        beyond = self.misses[node] - MISSES_BEFORE_BACKOFF
+        self._lost_polls[node] = lost = self._lost_polls.get(node, 0) + 1
+        beyond = lost - MISSES_BEFORE_BACKOFF
         if beyond < 0:
             return 0.0
         self._backed_off.add(node)
@@ -250,6 +255,7 @@ class MuteNodes:
 
         A common cause, such as a connector or the supply of one node, often ends for all mute nodes together.
         """
+        self._lost_polls.pop(node, None)
         if self.misses.pop(node, None) is None or node not in self._backed_off:
             return None
         self._backed_off.discard(node)
@@ -258,6 +264,7 @@ class MuteNodes:
     def forget(self) -> None:
         """Clear all misses: the line was opened."""
         self.misses.clear()
+        self._lost_polls.clear()
         self._backed_off.clear()
 
 

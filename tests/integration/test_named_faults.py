@@ -72,3 +72,19 @@ async def test_every_fault_does_to_the_machine_what_its_name_says(ldcnd_rig, nam
     truth = ldcnd_rig.truth(case.axis)
     assert (abs(truth.position - 20) < 0.05) == (case.goes_on if case.arrives is None else case.arrives)
     assert case.says in told
+
+
+async def test_the_axis_next_to_a_cut_cable_is_lost_as_the_others_are_and_does_not_go_on(ldcnd_rig):
+    """Its drive is also asked for a sign of life after each poll of the others that is lost: that may not hide its own."""
+    ldcnd_rig.faults.cable_cut("x", at=10, for_s=5.0)
+    async with ldcnd_rig.client.control("x", client="test") as axis, asyncio.timeout(60):
+        await axis.power(on=True)
+        motion = await axis.move_absolute(100, velocity=10)
+
+        with pytest.raises(ldcnd.OutcomeUnknown):
+            await motion.done()
+
+        assert 10 < ldcnd_rig.truth("x").position < 50, "only a drive that answers again can have told it"
+        await asyncio.sleep(8)
+    assert ldcnd_rig.truth("x").at_rest
+    assert ldcnd_rig.truth("x").position < 80
