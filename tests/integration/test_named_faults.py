@@ -75,7 +75,7 @@ async def test_every_fault_does_to_the_machine_what_its_name_says(ldcnd_rig, nam
 
 
 async def test_the_axis_next_to_a_cut_cable_is_lost_as_the_others_are_and_does_not_go_on(ldcnd_rig):
-    """Its drive is also asked for a sign of life after each poll of the others that is lost: that may not hide its own."""
+    """Its drive is also asked for a sign of life after each lost poll of the others: that may not hide its own."""
     ldcnd_rig.faults.cable_cut("x", at=10, for_s=5.0)
     async with ldcnd_rig.client.control("x", client="test") as axis, asyncio.timeout(60):
         await axis.power(on=True)

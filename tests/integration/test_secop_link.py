@@ -71,6 +71,7 @@ async def test_a_latch_is_an_error_that_is_cleared_and_limits_are_refused():
         await link.go(50.0)
         await running.client.stop("x")
         said = await becomes(link, StatusCode.ERROR)
+        assert (await running.client.state("x")).moving is not Moving.YES, "an axis that brakes is busy"
         with pytest.raises(LdcndError, match="latch"):
             await link.go(1.0)
         await running.until("x", lambda state: state.moving is Moving.NO)
@@ -99,9 +100,11 @@ async def test_control_is_given_back_when_the_axis_idles_and_never_taken_by_forc
 
 async def test_a_daemon_that_says_nothing_is_an_error():
     async with linked_x() as (running, link, updates):
+        await link.go(1.0)
+        await becomes(link, StatusCode.IDLE)
         running.daemon.end()
-        async with asyncio.timeout(30):
-            while "nothing is published any more" not in {update.problem for update in updates}:
+        async with asyncio.timeout(3):
+            while "its position is old: nothing newer came" not in {update.problem for update in updates}:
                 await asyncio.sleep(0.1)
 
         assert link.status()[0] == StatusCode.ERROR

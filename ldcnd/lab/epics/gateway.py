@@ -9,6 +9,7 @@ from functools import partial
 
 from caproto.asyncio.server import Context
 
+from ldcnd.client.fresh import fresh_samples
 from ldcnd.client.rig import Rig
 from ldcnd.contract.errors import LdcndError, UnknownAxis
 from ldcnd.contract.meta import AxisInfo
@@ -18,8 +19,6 @@ from ldcnd.lab.epics.motor import MovedRecord
 from ldcnd.lab.epics.record import MotorRecord
 from ldcnd.listen_address import ListenAddress
 
-SILENT_S = 5.0
-"""Time without samples after which an axis is shown as unknown, seconds."""
 MOTIONLESS = (1.0, 1.0)
 """Velocity and acceleration that are shown of what has none."""
 WHO = "epics gateway"
@@ -112,12 +111,9 @@ class Gateway:
                 last = await self._rig.latest(axis, item)
                 if last:
                     await record.take(last)
-            while True:
-                try:
-                    async with asyncio.timeout(SILENT_S):
-                        _, sample = await anext(samples)
-                except TimeoutError:
-                    await record.silent()
+            async for sample in fresh_samples(samples):
+                if sample is None:
+                    await record.grow_old()
                 else:
                     await record.take(sample)
 

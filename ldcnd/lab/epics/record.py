@@ -4,6 +4,7 @@ Fields and what they mean follow the documentation of the EPICS collaboration's 
 software"; "User" and "dial" coordinates are the same here: OFF is 0 and DIR is Pos.
 """
 
+import math
 from functools import partial
 
 from caproto import AlarmSeverity, AlarmStatus
@@ -233,7 +234,7 @@ class MotorRecord:
         is_other_unit = info.unit != before.unit
         if is_other_unit:
             self.state = None
-            await self.silent()  # what is shown is of the former daemon
+            await self.grow_old()  # what is shown is of the former daemon
         for field in self._set_metadata():
             await field.write_metadata()
         is_too_fast = float(self["VELO"].value) > (info.limits.velocity or NO_LIMIT)
@@ -327,10 +328,10 @@ class MotorRecord:
             self._switches |= bit * on
             await self[field].show(int(on), UNDEFINED if level is None else alarm, at_s)
 
-    async def silent(self) -> None:
-        """Show that nothing is known of the axis: the daemon does not publish."""
+    async def grow_old(self) -> None:
+        """Show that nothing newer is known of the axis: its drive, its line or its daemon is silent."""
         self.moving, self._alarm = Moving.UNKNOWN, SILENT
-        self.condition = assess(None, silence="nothing is published any more")
+        self.condition = assess(self.state, self._faults, age_s=math.inf)
         await self._show_condition()
         await self["RBV"].show(self["RBV"].value, SILENT)
         await self.show_motion()

@@ -1,12 +1,14 @@
 """An axis for a module of a SECoP node: what the module shows, and what is done to it."""
 
 import asyncio
+import math
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from enum import IntEnum
 
 from ldcnd.client.axis import Axis
+from ldcnd.client.fresh import fresh_samples
 from ldcnd.client.motion import Motion
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import BufferMode
@@ -29,8 +31,6 @@ from ldcnd.contract.units import Dimension, shown_quantity
 from ldcnd.lab.borrowed_control import BorrowedControl
 
 WHO = "secop node"
-SILENT_S = 5.0
-"""Time without samples after which an axis is shown as unknown, seconds."""
 
 
 class StatusCode(IntEnum):
@@ -114,14 +114,11 @@ class AxisLink:
                 last = await self._rig.latest(axis, item)
                 if last:
                     self.take(last)
-            while True:
-                try:
-                    async with asyncio.timeout(SILENT_S):
-                        _, sample = await anext(samples)
-                except TimeoutError:
+            async for sample in fresh_samples(samples):
+                if sample is None:
+                    self._condition = assess(self._state, self._faults, age_s=math.inf)
                     self._state = None
-                    self._condition = assess(None, silence="nothing is published any more")
-                    self._update("value", problem="nothing is published any more")
+                    self._update("value", problem=self._condition.troubles[0].text)
                     self._show_status()
                 else:
                     self.take(sample)
@@ -174,6 +171,10 @@ class AxisLink:
         said, state = ", ".join(trouble.short for trouble in self._condition.troubles), self._state
         if state is None or state.moving is Moving.UNKNOWN or self._condition.alarm is Alarm.INVALID:
             return StatusCode.ERROR, said or "its state is not known"
+        if (
+            self.moves and state.moving is Moving.YES
+        ):  # after a stop or a fault, too: clients take what is not busy to stand
+            return StatusCode.BUSY, said or state.state.value
         if state.state is AxisState.ERROR_STOP or self._condition.alarm is Alarm.MAJOR or state.stop_latched:
             return StatusCode.ERROR, said
         if self.moves and self.is_busy():
