@@ -132,7 +132,8 @@ def check_position(axis: AxisTracker, limits: AxisLimits, position: float) -> No
     else:
         return
     raise PositionLimit(
-        f"axis {axis.name}: target {position:g} {axis.status.unit} is {side} the limit {limit:g} {axis.status.unit}",
+        f"axis {axis.name}: target {position:.12g} {axis.status.unit} is {side} the limit"
+        f" {limit:.12g} {axis.status.unit}",
         axis=axis.name,
         value=position,
         limit=limit,

@@ -1,3 +1,5 @@
+import re
+
 import pytest
 
 from ldcnd.axis import guards
@@ -84,6 +86,15 @@ def test_the_limits_themselves_are_allowed():
     guards.check_position(READY, LIMITS, -10)
     guards.check_velocity(READY, LIMITS, -5)
     guards.check_acceleration(READY, LIMITS, 50)
+
+
+@pytest.mark.parametrize("beyond", [1e-7, 1e-4])
+def test_a_target_hardly_beyond_its_limit_does_not_read_as_the_limit(beyond):
+    with pytest.raises(PositionLimit) as refused:
+        guards.check_position(READY, LIMITS, LIMITS.position_max + beyond)
+
+    target, limit = re.findall(r"[\d.]+(?= mm)", refused.value.message)
+    assert float(target) > float(limit)
 
 
 def test_without_limits_everything_is_allowed():

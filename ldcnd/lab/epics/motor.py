@@ -197,7 +197,7 @@ class MovedRecord(MotorRecord):
             await self["LVIO"].show(1)
             nearest = min(max(target, low), high)
             raise PositionLimit(
-                f"axis {self.info.axis}: {target:g} {self.info.unit} is beyond its limit of {nearest:g}",
+                f"axis {self.info.axis}: {target:.12g} {self.info.unit} is beyond its limit of {nearest:.12g}",
                 axis=self.info.axis,
                 value=target,
                 limit=nearest,
