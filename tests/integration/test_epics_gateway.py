@@ -1,6 +1,7 @@
 """Motor records on a whole daemon: what puts do, what is refused, and that nothing moves without permission."""
 
 import asyncio
+import math
 import random
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 
@@ -200,6 +201,18 @@ async def test_a_target_beyond_the_limit_is_refused_and_moves_nothing():
         assert (await running.client.state("x")).moving is Moving.NO
         await put(made, "T:x", 0.5)
         assert made.variables["T:x.LVIO"].value == 0
+
+
+@pytest.mark.parametrize(("asked", "said"), [(math.nan, "nan"), (math.inf, "inf"), ("10 furlong", "furlong")])
+async def test_what_is_no_target_is_refused_in_words_and_moves_nothing(asked, said):
+    async with records() as (running, made):
+        with pytest.raises(ValueError, match=said):
+            await put(made, "T:x", asked)
+
+        assert said in made.variables["T:x:message"].value
+        assert (await running.client.state("x")).moving is Moving.NO
+        await put(made, "T:x", 0.5)
+        assert made.variables["T:x:message"].value == ""
 
 
 @pytest.mark.record("BDST", "the last part of a move goes in its direction, and is part of the same motion")

@@ -72,10 +72,12 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
 
     Attributes:
         action: what a put does; None when it is refused.
+        explain: told why a put has no value that the channel can have.
         followers: called after each change, for those who serve the channel by another protocol.
     """
 
     action: Action | None = None
+    explain: Callable[[str], Awaitable[None]] | None = None
 
     def __init__(self, **given: Any) -> None:  # noqa: ANN401
         super().__init__(**given)
@@ -96,7 +98,13 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
         """Take a put, and return when it has had its effect, or has begun to have it."""
         if self.action is None:
             raise PermissionError("this field is read-only")
-        put = await self.action(self.native(self.preprocess_value(value)))
+        try:
+            asked = self.native(self.preprocess_value(value))
+        except ValueError as error:
+            if self.explain:
+                await self.explain(str(error))
+            raise
+        put = await self.action(asked)
         if put.value is not None:
             await self.show(put.value)
         if put.end is not None and wait:

@@ -103,6 +103,7 @@ class MovedRecord(MotorRecord):
             field = self.beside(name)
             if field is not None:
                 field.action = self._explained(action, is_always=name in always)
+                field.explain = partial(self.show_beside, ":message")
 
     # -- what the axis says ------------------------------------------------------------------------------------------
 
