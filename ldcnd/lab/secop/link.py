@@ -116,8 +116,9 @@ class AxisLink:
                     self.take(last)
             async for sample in fresh_samples(samples):
                 if sample is None:
-                    self._condition = assess(self._state, self._faults, age_s=math.inf)
-                    self._state = None
+                    if self._state is not None:
+                        self._condition = assess(self._state, self._faults, age_s=math.inf)
+                        self._state = None
                     self._update("value", problem=self._condition.troubles[0].text)
                     self._show_status()
                 else:
