@@ -95,6 +95,34 @@ async def test_an_axis_is_a_drivable_that_is_sent_stopped_and_reset():
         assert (await rig.state("x")).moving is Moving.NO
 
 
+@pytest.mark.parametrize("command", ["stop", "power off"])
+async def test_a_stopped_axis_is_busy_until_it_rests(command: str):
+    def use(uri: str, stop: Callable[[], None]) -> tuple[float, float]:
+        with Client(uri, log=None) as there:
+            there.setParameter("x", "enabled", value=True)
+            there.rests("x")
+            there.setParameter("x", "speed", 50.0)
+            there.setParameter("x", "target", 90.0)
+            there.until("x_velocity", "value", lambda value: value > 45)
+            stop()
+            there.until("x", "status", lambda status: status[0] != BUSY)
+            at_end = there.cache["x", "value"].value
+            there.until("x_velocity", "value", lambda value: value == 0)
+            there.until("x", "status", lambda status: status[0] == (ERROR if command == "stop" else DISABLED))
+            return at_end, there.cache["x", "value"].value
+
+    async with node("--moves") as (endpoint, uri), client(endpoint) as rig:
+        loop = asyncio.get_running_loop()
+
+        def stop() -> None:
+            sent = rig.stop("x") if command == "stop" else rig.command("x", Power(on=False))
+            asyncio.run_coroutine_threadsafe(sent, loop).result(10)
+
+        at_end, at_rest = await asyncio.to_thread(use, uri, stop)
+
+    assert abs(at_end - at_rest) < 0.1, (at_end, at_rest)
+
+
 async def test_a_read_only_node_has_readables():
     def use(uri: str) -> None:
         with Client(uri, log=None) as there:

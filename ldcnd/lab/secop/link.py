@@ -170,12 +170,15 @@ class AxisLink:
     def status(self) -> tuple[int, str]:
         """Return the status of the module: its code, and all that is to be said."""
         said, state = ", ".join(trouble.short for trouble in self._condition.troubles), self._state
-        if state is None or state.moving is Moving.UNKNOWN or self._condition.alarm is Alarm.INVALID:
+        if state is None or self._condition.alarm is Alarm.INVALID:
             return StatusCode.ERROR, said or "its state is not known"
         if (
-            self.moves and state.moving is Moving.YES
-        ):  # after a stop or a fault, too: clients take what is not busy to stand
-            return StatusCode.BUSY, said or state.state.value
+            self.moves and state.moving is not Moving.NO
+        ):  # after a stop, a fault or power off, too: it may not stand yet
+            unknown = "whether it moves is not known: " if state.moving is Moving.UNKNOWN else ""
+            return StatusCode.BUSY, unknown + self._condition.summary
+        if state.moving is Moving.UNKNOWN:
+            return StatusCode.ERROR, said or "its state is not known"
         if state.state is AxisState.ERROR_STOP or self._condition.alarm is Alarm.MAJOR or state.stop_latched:
             return StatusCode.ERROR, said
         if self.moves and self.is_busy():

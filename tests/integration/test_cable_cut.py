@@ -1,0 +1,39 @@
+"""A cable that is cut before the first drive of a line: every axis behind it is soon shown as not answering."""
+
+import asyncio
+
+from ldcnd.contract.commands import MoveAbsolute, Power
+from ldcnd.contract.samples import LinkState
+from ldcnd.testing import run, simulated_rig
+from tests.support.rig import SIMULATED
+
+LONGEST_S = 4.5
+"""Three polls of each of four drives, between which stops and searches go out that nobody answers either."""
+
+
+async def found_lost(mover: str) -> dict[str, float]:
+    """Return after how many seconds each axis is down, with one that moves when the cable is cut."""
+    async with simulated_rig(SIMULATED) as rig:
+        client = rig.client.client
+        await client.command(mover, Power(on=True))
+        async with asyncio.TaskGroup() as group:
+            moving = group.create_task(client.command(mover, MoveAbsolute(position=45.0)))
+            await asyncio.sleep(1.0)
+            rig.faults.cable_cut("x")
+            began_s, down_s = rig.now_s, {}
+            while len(down_s) < len(rig.daemon.rig.axes):
+                await asyncio.sleep(0.01)
+                for axis in rig.daemon.rig.axes:
+                    state = await client.state(axis)
+                    if state and state.link is LinkState.DOWN:
+                        down_s.setdefault(axis, rig.now_s - began_s)
+                assert rig.now_s - began_s < 30, down_s
+            moving.cancel()
+        return down_s
+
+
+def test_an_axis_that_moves_is_found_lost_as_soon_as_the_others():
+    for mover in "xz":
+        down_s = run(found_lost(mover))
+
+        assert max(down_s.values()) < LONGEST_S, down_s
