@@ -85,7 +85,11 @@ def twin(
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
         signal.signal(number, lambda *_: ended.set())
     with served_rig(file, endpoint=endpoint, state=state) as served:
-        show_lines(f"export {CONNECT}={served.endpoint}", "# the twin stands where the rig does; SIGINT ends it")
+        show_lines(
+            f"export {CONNECT}={served.endpoint}",
+            "# the twin stands where the rig does; SIGINT ends it",
+            *(f"# an old program finds the port {name} at {link}" for name, link in served.ports.items()),
+        )
         done = served.watch(lambda: asyncio.to_thread(ended.wait))
     _show(target, done, report, None)
 

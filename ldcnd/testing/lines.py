@@ -32,7 +32,8 @@ def simulated_config(config: RigConfig, *, seed: int | None = None) -> RigConfig
     A line that is simulated already stays as it is. The others get the modules of their configuration in the order of
     addresses. The machine on each shaft fits the configured gains and is somewhat faster than the configured limits;
     its limit switches are a little behind the software limits, or where homing expects them. Nothing is kept on the
-    disk: `state_dir`, `captures` and the heartbeat are left out.
+    disk: `state_dir`, `captures` and the heartbeat are left out, and so are ports for old programs, whose links those
+    of the real rig are.
 
     Args:
         config: the rig.
@@ -56,6 +57,7 @@ def simulated_config(config: RigConfig, *, seed: int | None = None) -> RigConfig
             "sim": tuple(lines),
             "state_dir": None,
             "heartbeat": None,
+            "port": (),
             "captures": type(config.captures)(),
         }
     )

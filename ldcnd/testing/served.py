@@ -3,9 +3,10 @@
 import os
 import socket
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import AsyncExitStack, asynccontextmanager, contextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from contextlib import AsyncExitStack, ExitStack, asynccontextmanager, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TypeVar
 
 from ldcnd.client.loop_thread import LoopThread, loop_thread
@@ -33,10 +34,12 @@ class ServedRig:
 
     Attributes:
         endpoint: of its daemon, as `ldcnd --connect` and `ldcnd.connect` take it.
+        ports: links to the terminals for old programs, by name of the port; not those of the real rig.
     """
 
-    def __init__(self, endpoint: str, thread: LoopThread, rig: SimulatedRig) -> None:
+    def __init__(self, endpoint: str, ports: Mapping[str, Path], thread: LoopThread, rig: SimulatedRig) -> None:
         self.endpoint = endpoint
+        self.ports = ports
         self._thread = thread
         self._rig = rig
 
@@ -101,14 +104,23 @@ def served_rig(
         ConfigError: the file is none of a rig, or of another rig than the state.
         TimeoutError: its lines do not come up.
     """
-    settings = simulated_config(loaded(config), seed=seed)
+    real = loaded(config)
+    settings = simulated_config(real, seed=seed)
     slow = (bus.model_copy(update={"margin_ms": max(bus.margin_ms, COARSE_MS)}) for bus in settings.bus)
     settings = settings.model_copy(update={"bus": tuple(slow)})
     if state:
         settings = config_of_twin(settings, state)
     endpoint = endpoint or f"tcp/127.0.0.1:{_free_port()}"
-    with loop_thread() as thread, thread.inside(_serving(settings, endpoint, state)) as rig:
-        yield ServedRig(endpoint, thread, rig)
+    with ExitStack() as stack:
+        ports: dict[str, Path] = {}
+        if real.port:
+            folder = Path(stack.enter_context(TemporaryDirectory(prefix="ldcnd-")))
+            ports = {port.name: folder / port.name for port in real.port}
+            own = tuple(port.model_copy(update={"link": ports[port.name]}) for port in real.port)
+            settings = settings.model_copy(update={"port": own})
+        thread = stack.enter_context(loop_thread())
+        rig = stack.enter_context(thread.inside(_serving(settings, endpoint, state)))
+        yield ServedRig(endpoint, ports, thread, rig)
 
 
 @asynccontextmanager

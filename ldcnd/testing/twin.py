@@ -130,6 +130,10 @@ def _axis(axis: object, info: AxisInfo) -> object:
         return axis
     held = {each.name: each.value for each in info.registers if each.value is not None}
     known = {name: held[name] for name in Gains.__slots__ if name in held and name in type(axis.gains).model_fields}
+    if not held.get(
+        "ol"
+    ):  # no output: gains have not been sent since the drive was reset, so those of the file are next
+        return axis
     return axis.model_copy(update={"gains": axis.gains.model_copy(update=known)})
 
 

@@ -9,9 +9,11 @@ import time
 from pathlib import Path
 
 import pytest
+import serial
 
 import ldcnd
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.testing import run, served_rig, simulated_rig
 from tests.support.pages import ROOT, blocks_of
 from tests.support.rig import SIMULATED
@@ -153,7 +155,7 @@ axis = [{ name = "feed", address = 1, model = "smartstep" }]
 """
 
 
-async def test_a_rig_with_ports_is_rehearsed_without_them_and_leaves_nothing_behind(tmp_path):
+async def test_a_rig_on_serial_lines_is_rehearsed_without_them_and_leaves_nothing_behind(tmp_path):
     file = tmp_path / "rig.toml"
     file.write_text(REAL)
     async with simulated_rig(file) as rig, rig.client.control("x", "y", client="test") as (x, y):
@@ -169,6 +171,32 @@ async def test_a_rig_with_ports_is_rehearsed_without_them_and_leaves_nothing_beh
         with pytest.raises(NotSupported, match="axis feed"):
             rig.faults.slip("feed", 1)
     assert list(tmp_path.iterdir()) == [file]
+
+
+def with_guest(file: Path) -> Path:
+    """Write the simulated rig with a port for an old program; return the link that the program would open."""
+    link = file.with_name("old")
+    file.write_text(SIMULATED.read_text() + f'\n[[port]]\nname = "old"\nbus = "line0"\nlink = "{link}"\n')
+    return link
+
+
+async def test_a_rehearsal_opens_no_port_for_an_old_program(tmp_path):
+    link = with_guest(tmp_path / "rig.toml")
+    async with simulated_rig(tmp_path / "rig.toml"):
+        assert not link.is_symlink()
+
+
+@pytest.mark.system
+@pytest.mark.real_time
+def test_an_old_program_finds_a_served_rig_at_a_link_of_its_own(tmp_path):
+    link = with_guest(tmp_path / "rig.toml")
+    with served_rig(tmp_path / "rig.toml") as rig:
+        assert not link.is_symlink()
+        with serial.Serial(str(rig.ports["old"]), 19200, timeout=10) as line:
+            line.write(encode_packet(Packet(0xFF, CommandCode.HARD_RESET)))
+            line.write(encode_packet(Packet(0, CommandCode.SET_ADDRESS, bytes((1, 0xFF)))))
+            assert len(line.read(2)) == 2
+    assert not rig.ports["old"].is_symlink()
 
 
 @pytest.mark.parametrize("start", [{"after_s": 1.0, "at": 2.0}, {"at": 1.0, "when": lambda truth: truth.at_rest}])

@@ -87,6 +87,19 @@ def test_a_twin_stands_where_the_rig_does_and_predicts_its_run():
     assert list(rehearsed.differences(real)) == []
 
 
+async def night_on_a_twin_of_a_rig_that_was_never_switched_on():
+    async with simulated_rig(SIMULATED) as rig:
+        state = await read_state(rig.client.client)
+    async with simulated_rig(SIMULATED, state=state) as twin:
+        return await seen(twin, night)
+
+
+def test_the_drives_of_a_rig_that_was_never_switched_on_have_no_gains_and_their_twin_moves_all_the_same():
+    report = run(night_on_a_twin_of_a_rig_that_was_never_switched_on())
+    assert report.failures == ()
+    assert report.axes["x"].motions == 21
+
+
 async def stepper():
     config = load_config(MIXED)
     line, steps = config.sim
@@ -310,3 +323,40 @@ def test_a_program_is_rehearsed_fast_from_the_rig_that_runs(tmp_path):
     assert "axis x: 1 motions" in good.stdout
     assert "the sample is empty" in bad.stderr
     assert "axis x: 1 motions" in bad.stdout
+
+
+SCAN = """
+import ldcnd.bluesky
+from bluesky import RunEngine
+from bluesky.plans import scan
+
+seen = []
+with ldcnd.bluesky.connect() as rig, rig.control_all("x", client="night") as (x,):
+    x.power(on=True).wait()
+    RunEngine()(scan([], x, 0, 10, 200), {"event": lambda name, document: seen.append(document["data"])})
+print(len(seen), "points")
+"""
+
+
+@pytest.mark.system
+@pytest.mark.real_time
+@pytest.mark.timeout(300)
+def test_a_bluesky_scan_runs_on_a_twin_as_it_is(tmp_path):
+    rig_file, night, scan = tmp_path / "rig.toml", tmp_path / "night.json", tmp_path / "scan.py"
+    rig_file.write_text(SIMULATED.read_text())
+    scan.write_text(SCAN)
+    with served_rig(rig_file) as real:
+        command = [sys.executable, "-m", "ldcnd", "twin", str(rig_file), "--report", str(night)]
+        with subprocess.Popen(command, env=real.environment, stdout=subprocess.PIPE, text=True) as twin:  # noqa: S603
+            assert twin.stdout is not None
+            endpoint = twin.stdout.readline().strip().removeprefix("export LDCND_CONNECT=")
+            environment = {**real.environment, "LDCND_CONNECT": endpoint}
+            ran = subprocess.run(  # noqa: S603
+                [sys.executable, str(scan)], env=environment, capture_output=True, text=True, timeout=200, check=False
+            )
+            twin.send_signal(signal.SIGINT)
+            twin.communicate(timeout=30)
+        assert real.ask(lambda there: there.truth("x").position) == pytest.approx(0, abs=0.02)
+    assert ran.stdout.endswith("200 points\n"), ran.stdout + ran.stderr
+    report = RunReport.model_validate(json.loads(night.read_text()))
+    assert report.axes["x"].ends[-1] == pytest.approx(10, abs=0.02)
