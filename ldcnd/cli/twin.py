@@ -72,6 +72,8 @@ def twin(
     if arguments and not program:
         raise click.UsageError(f"{arguments[0]} is for a program: name that with --fast")
     machines = _plants(plants)
+    if not (target.connect or target.listen or target.config) and file.suffix == ".toml":
+        target = Target.given((), (), file, target.rig, as_json=target.as_json)  # the rig that has this configuration
     state = target.run(lambda client: read_state(client, machines))
     configure_logging(level="error")
     if program:
