@@ -1,13 +1,13 @@
 """The door to ports for guests: existing host software that shares a line; a rig without `[[port]]` runs without it."""
 
-from collections.abc import Awaitable, Sequence
+from collections.abc import Awaitable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Literal, Protocol
 
 from pydantic import Field
 
-from ldcnd.contract.commands import AxisCommand, CommandReply
+from ldcnd.contract.commands import Command
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.driver import Drive
@@ -28,10 +28,61 @@ class PortConfig(Frozen):
     """The line; the guest finds its axes and named PIC-I/O modules in the order of their addresses."""
     link: Path
     """The link to the terminal that the program opens."""
-    access: Literal["read"] = "read"
-    """What the guest may do: with "read" it reads, stops and switches motors off; all else is answered and not done."""
+    access: Literal["read", "control"] = "read"
+    """What the guest may do: with "read" it reads, stops and switches motors off; all else is answered and not done.
+    With "control" it moves axes as any client does, under a lease in its name."""
+    idle_s: float = Field(default=60.0, gt=0, le=86_400)
+    """A guest that has sent nothing for so long, in seconds, loses control, as one that has closed its port; one that
+    only reads loses it once its axes rest."""
     mode: str = Field(default="0600", pattern=r"^0[0-7]{3}$")
     """Permissions of the terminal, octal."""
+
+
+class ScaleView(Protocol):
+    """Coordinates of an axis."""
+
+    @property
+    def counts_per_unit(self) -> float:
+        """Negative where forward in axis units is backward in counts."""
+
+    @property
+    def modulo(self) -> float | None:
+        """Length of one turn, in axis units; None for an axis without one."""
+
+    def position(self, counts: float) -> float:
+        """Return the position that a count of the drive stands for, in axis units, counted through all turns."""
+
+
+class StatusView(Protocol):
+    """How an axis is, as far as the commands of a guest depend on it."""
+
+    @property
+    def scale(self) -> ScaleView:
+        """Its coordinates."""
+
+    @property
+    def enabled(self) -> bool:
+        """Its position loop is closed."""
+
+    @property
+    def referenced(self) -> bool:
+        """Its place is known."""
+
+    @property
+    def at_rest(self) -> bool:
+        """Its readings prove that nothing moves."""
+
+    @property
+    def command(self) -> object:
+        """What is under way, settling included; None without anything."""
+
+    @property
+    def ends_at_s(self) -> float | None:
+        """When its profile should end, in loop time; None of a motion without an end."""
+
+    @property
+    def target_counts(self) -> int | None:
+        """Target of its last motion, counts; None when it had no end or was followed by something else."""
 
 
 class GuestHost(Protocol):
@@ -40,11 +91,21 @@ class GuestHost(Protocol):
     def is_up(self) -> bool:
         """Tell whether every module of the line has its address, so that a guest's reading disturbs nothing."""
 
-    def carry_out(self, axis: str, command: AxisCommand[CommandReply]) -> Awaitable[object]:
-        """Carry out a command as of any client."""
+    def status(self, axis: str) -> StatusView:
+        """Return how an axis is."""
 
-    def refuse(self, axis: str, what: str, client: str) -> None:
-        """Enter what was refused to a guest among the events."""
+    def levels(self, module: str) -> Mapping[str, bool | None]:
+        """Return the levels of the named outputs of a module; None while one is not known."""
+
+    def carry_out(self, about: str, command: Command[Frozen]) -> Awaitable[Frozen]:
+        """Carry out a command about an axis, or about `RIG_ITSELF`, as of any client.
+
+        Raises:
+            LdcndError: as any client would get it.
+        """
+
+    def refuse(self, about: str, what: str, client: str) -> None:
+        """Enter what was refused to a guest, and why, among the events."""
 
 
 class Ports(Protocol):

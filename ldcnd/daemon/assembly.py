@@ -13,12 +13,13 @@ from ldcnd.axis.clock import Clock
 from ldcnd.axis.kept import KeptFiles
 from ldcnd.axis.latches import LatchKeeper
 from ldcnd.config.plan import demand_of
-from ldcnd.config.ports import ports
+from ldcnd.config.ports import StatusView, ports
 from ldcnd.config.rig import RigConfig
 from ldcnd.config.simulated import simulator
 from ldcnd.contract.codec import Encoding
-from ldcnd.contract.commands import AxisCommand, CommandReply
+from ldcnd.contract.commands import Command
 from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import Keys
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.dispatch import Dispatcher, EarlyStops
@@ -135,7 +136,7 @@ def build_daemon(
             line.bus,
             tuple(line.network.axes.values()),
             tuple(line.network.io.values()),
-            _GuestHost(line, dispatcher),
+            _GuestHost(line, rig, dispatcher),
         )
         for port in config.port
         for line in (rig.lines[port.bus],)
@@ -158,18 +159,23 @@ def build_daemon(
 class _GuestHost:
     """What the daemon does for the guest of a port: see `ldcnd.config.ports.GuestHost`."""
 
-    def __init__(self, line: BusService, dispatcher: Dispatcher) -> None:
-        self._line, self._dispatcher = line, dispatcher
+    def __init__(self, line: BusService, rig: OwnedRig, dispatcher: Dispatcher) -> None:
+        self._line, self._rig, self._dispatcher = line, rig, dispatcher
 
     def is_up(self) -> bool:
         return self._line.report is not None
 
-    async def carry_out(self, axis: str, command: AxisCommand[CommandReply]) -> object:
-        return await self._dispatcher.answer(axis, command)
+    def status(self, axis: str) -> StatusView:
+        return self._rig.axes[axis].tracker.status
 
-    def refuse(self, axis: str, what: str, client: str) -> None:
-        reason = f"{what}: the port {client} has access = read; the guest has its answer, nothing was done"
-        self._dispatcher.events.note(axis, "guest", CommandStatus.REFUSED, reason, client=client)
+    def levels(self, module: str) -> Mapping[str, bool | None]:
+        return self._rig.modules[module].values
+
+    async def carry_out(self, about: str, command: Command[Frozen]) -> Frozen:
+        return await self._dispatcher.answer(about, command)
+
+    def refuse(self, about: str, what: str, client: str) -> None:
+        self._dispatcher.events.note(about, "guest", CommandStatus.REFUSED, what, client=client)
 
 
 def _build_bus(

@@ -2,7 +2,7 @@
 
 The guest talks to a chain of these instead of to the line. What only arranges (Hard Reset, Set Address, Set Baud Rate,
 Define Status) is obeyed here, as `SimulatedModule` does, and never reaches the line. Nothing here sends: readings are
-asked for with `ask`, and a command that could concern a drive is handed to `command`.
+asked for with `ask`, a command that could concern a drive is handed to `command`, and a Hard Reset is told to `reset`.
 """
 
 from collections.abc import Callable
@@ -37,13 +37,15 @@ class GuestModule(SimulatedModule):
         settings: ModuleSettings,
         ask: Callable[[StatusItem, PendingReply], None],
         command: Callable[[ReceivedCommand], None],
+        reset: Callable[[], None],
     ) -> None:
-        self._ask, self._command = ask, command
+        self._ask, self._command, self._reset_here = ask, command, reset
         self._asked: _StatusReply | None = None
         super().__init__(profile, settings)
 
     def restart(self) -> None:
         """A guest's Hard Reset reaches no drive."""
+        self._reset_here()
 
     def run(self, cycles: int) -> None:
         """The drive counts its own servo cycles."""

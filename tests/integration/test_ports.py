@@ -1,12 +1,7 @@
 """A program that knows nothing of ldcnd reads and stops drives on a port while clients move them."""
 
 import asyncio
-import os
 import random
-import termios
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager, suppress
-from pathlib import Path
 
 import pytest
 
@@ -17,6 +12,7 @@ from ldcnd.contract.samples import LinkState
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
+from tests.support.guest_program import guest, with_port
 from tests.support.machine_rig import Machine, machine, running_machine
 
 SET_ADDRESS, STOP, NO_OPERATION = CommandCode.SET_ADDRESS, CommandCode.STOP_MOTOR, CommandCode.NO_OPERATION
@@ -34,66 +30,6 @@ CHANGES = (
     Packet(1, CommandCode.CLEAR_STICKY_BITS),
     Packet(1, CommandCode.SAVE_CURRENT_POSITION_AS_HOME),
 )
-
-
-def with_port(link: Path, **axis: object) -> RigConfig:
-    document = machine(axis=axis).model_dump(mode="json", exclude_defaults=True)
-    return RigConfig.model_validate(document | {"port": [{"name": "old", "bus": "line", "link": str(link)}]})
-
-
-def set_rate(descriptor: int, rate: int) -> None:
-    settings = termios.tcgetattr(descriptor)
-    settings[4] = settings[5] = rate
-    termios.tcsetattr(descriptor, termios.TCSANOW, settings)
-
-
-class Program:
-    """The program, with the port open."""
-
-    def __init__(self, descriptor: int) -> None:
-        self._descriptor = descriptor
-
-    def send_bytes(self, data: bytes) -> None:
-        """Send bytes, and drop what has come until now."""
-        with suppress(BlockingIOError):
-            os.read(self._descriptor, 4096)
-        os.write(self._descriptor, data)
-
-    async def send(self, packet: Packet, within_s: float = 1.0) -> str:
-        """Send a packet; return the reply once nothing more comes."""
-        self.send_bytes(encode_packet(packet))
-        reply, loop = b"", asyncio.get_running_loop()
-        until_s = loop.time() + within_s
-        while loop.time() < until_s:
-            await asyncio.sleep(0.0002)
-            try:
-                reply += os.read(self._descriptor, 100)
-            except BlockingIOError:
-                if reply:
-                    break  # it comes in one piece
-        return reply.hex()
-
-    async def change_rate(self) -> None:
-        """Change to 115,200 bits/s, as every program does that wants to be quick."""
-        await self.send(Packet(0xFF, CommandCode.SET_BAUD_RATE, b"\x0a"), 0.05)
-        set_rate(self._descriptor, termios.B115200)
-
-    async def begin(self) -> None:
-        """Do as every program does: reset the line and give addresses."""
-        await self.send(Packet(0xFF, CommandCode.HARD_RESET), 0.05)
-        for address in (1, 2, 3):
-            assert await self.send(Packet(0, SET_ADDRESS, bytes((address, 0xFF))))
-
-
-@asynccontextmanager
-async def guest(tmp_path: Path, **axis: object) -> AsyncIterator[tuple[Machine, Program]]:
-    async with running_machine(with_port(tmp_path / "port", **axis)) as rig:
-        descriptor = os.open(tmp_path / "port", os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        set_rate(descriptor, termios.B19200)
-        try:
-            yield rig, Program(descriptor)
-        finally:
-            os.close(descriptor)
 
 
 def registers(rig: Machine) -> list[tuple[object, ...]]:

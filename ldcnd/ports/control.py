@@ -1,0 +1,93 @@
+"""Control of axes by a guest: a lease that it takes with its first command, and loses when it goes or falls idle."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Iterable
+from contextlib import suppress
+
+from ldcnd.config.ports import GuestHost
+from ldcnd.contract.commands import Command
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.keys import RIG_ITSELF
+from ldcnd.contract.leases import Acquire, LeaseReply, Release, Renew
+
+LEASE_S = 2.0
+"""Duration of a guest's lease, renewed while the guest is there, seconds."""
+LOOKS_S = 0.5
+
+
+class GuestControl:
+    """The lease of one guest.
+
+    Attributes:
+        axes: that it controls.
+    """
+
+    def __init__(self, name: str, host: GuestHost, idle_s: float) -> None:
+        self.axes: frozenset[str] = frozenset()
+        self._name, self._host, self._idle_s = name, host, idle_s
+        self._token: str | None = None
+        self._changing = asyncio.Lock()
+        self._loop = asyncio.get_running_loop()
+        self._heard_s = self._commanded_s = self._loop.time()
+
+    def heard(self) -> None:
+        """The guest has sent something."""
+        self._heard_s = self._loop.time()
+
+    async def over(self, axes: Iterable[str]) -> str:
+        """Return the lease under which the guest commands these axes, and take it if need be.
+
+        Raises:
+            LdcndError: another client controls one of them.
+        """
+        self._commanded_s = self._loop.time()
+        async with self._changing:
+            wanted = self.axes.union(axes)
+            if self._token is None or wanted != self.axes:
+                await self._ask(Acquire(client=self._name, axes=tuple(sorted(wanted)), lease_s=LEASE_S))
+            if self._token is None:
+                raise AssertionError("a lease that was given has a name")
+            return self._token
+
+    async def end(self) -> None:
+        """Give control back; an axis that still moves does what its policy for the loss of a client says."""
+        async with self._changing:
+            if self._token is not None:
+                token, self._token, self.axes = self._token, None, frozenset()
+                with suppress(LdcndError):  # it was taken away meanwhile
+                    await self._host.carry_out(RIG_ITSELF, Release(lease=token))
+
+    async def watch(self, gone: Callable[[], Awaitable[None]]) -> None:
+        """Keep the lease for as long as the guest uses it, until cancelled.
+
+        Args:
+            gone: called when nothing has come from the guest for its time.
+        """
+        while True:
+            await asyncio.sleep(LOOKS_S)
+            if self._token is None:
+                continue
+            now_s = self._loop.time()
+            if now_s - self._heard_s > self._idle_s:
+                await gone()
+            elif now_s - self._commanded_s > self._idle_s and all(
+                self._host.status(axis).at_rest for axis in self.axes
+            ):
+                await self.end()
+            else:
+                await self._renew()
+
+    async def _renew(self) -> None:
+        async with self._changing:
+            if self._token is None:
+                return
+            try:
+                await self._ask(Renew(lease=self._token))
+            except LdcndError:  # taken by force: the next command of the guest asks for it anew
+                self._token, self.axes = None, frozenset()
+
+    async def _ask(self, command: Command[Frozen]) -> None:
+        reply = await self._host.carry_out(RIG_ITSELF, command)
+        if isinstance(reply, LeaseReply):
+            self._token, self.axes = reply.lease, frozenset(reply.axes)

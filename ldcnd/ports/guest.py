@@ -1,0 +1,343 @@
+"""A guest on one line: a chain of its own, and what of its packets reaches the drives."""
+
+import asyncio
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+from ldcnd.config.ports import GuestHost, PortConfig
+from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Power
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.keys import RIG_ITSELF
+from ldcnd.drives.driver import Drive
+from ldcnd.drives.ldcn.commands import Node, read_status
+from ldcnd.drives.ldcn.io_module import IoModule
+from ldcnd.drives.ldcn.packet import POSITION, CommandCode, StatusFlag, StatusItem, item_bytes
+from ldcnd.drives.ldcn.pic_io import IoItem, IoNode, IoStatus, read_io_status
+from ldcnd.drives.ldcn.profiles import PIC_IO, Profile
+from ldcnd.drives.ldcn.received import LoadTrajectory, PlainCommand, ReceivedCommand
+from ldcnd.drives.ldcn.servo import LdcnAxis
+from ldcnd.drives.network import IoDriver
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange
+from ldcnd.log import get_logger
+from ldcnd.ports.control import GuestControl
+from ldcnd.ports.guest_module import GuestModule, PendingReply
+from ldcnd.ports.outputs import GuestOutputs
+from ldcnd.ports.translate import GuestServo, name_of, relief
+from ldcnd.sim.chain import Chain
+from ldcnd.sim.ldcn.quirks import ModuleSettings
+
+log = get_logger("ports")
+
+PAUSE_PER_EXCHANGE = 3.0
+"""A guest's exchange is followed by a pause of so many times its length: others keep three quarters of the line."""
+SAME_REFUSAL_S = 1.0
+"""The same refusal of an axis is one event in this time: old programs repeat themselves."""
+MOST_WAITING = 32
+"""Commands of a guest that wait for their turn at one module; what comes beyond is refused."""
+REPLY_WAIT_S = 0.04
+"""How long a reply waits for what was commanded before it, seconds: programs wait for 50 ms and more."""
+SETTLES_S = 2.0
+COMES_TO_REST_S = 60.0
+LOOK_S = 0.01
+
+
+@dataclass(slots=True)
+class _Reached:
+    """An axis or another module as a guest reaches it, with what it has set going.
+
+    Attributes:
+        servo: its drive as the guest commands it; None of a module that is none.
+        outputs: of a module, likewise.
+        reliefs: what takes energy out and is on its way, by its kind.
+        again: of these, what is asked for once more meanwhile.
+        waiting: what waits for its turn.
+        idle: set while nothing of the guest's commands is under way.
+        at_work: the command that is being carried out.
+    """
+
+    name: str
+    profile: Profile
+    read: Callable[[StatusItem], Exchange[Any]]
+    servo: GuestServo | None = None
+    outputs: GuestOutputs | None = None
+    reliefs: "dict[type, asyncio.Task[None]]" = field(default_factory=dict)
+    again: set[type] = field(default_factory=set)
+    waiting: deque[ReceivedCommand] = field(default_factory=deque)
+    idle: asyncio.Event = field(default_factory=asyncio.Event)
+    at_work: ReceivedCommand | None = None
+
+    def about_to_move(self) -> bool:
+        """Tell whether a motion of the guest has yet to begin: a drive that has the command itself would move."""
+        return any(_moves(each) for each in (self.at_work, *self.waiting))
+
+
+def _moves(command: ReceivedCommand | None) -> bool:
+    match command:
+        case LoadTrajectory(trajectory):
+            return trajectory.start_now
+        case PlainCommand(code):
+            return code is CommandCode.START_MOTION
+    return False
+
+
+class Guest:
+    """A guest on one line: takes its bytes, returns what the modules answer.
+
+    Attributes:
+        chain: as the guest sees the line.
+        receive: takes what is for the guest.
+    """
+
+    def __init__(
+        self,
+        port: PortConfig,
+        bus: Bus,
+        drives: Sequence[Drive],
+        ios: Sequence[IoDriver],
+        host: GuestHost,
+        group: asyncio.TaskGroup,
+    ) -> None:
+        self._name, self._bus, self._host, self._group = port.name, bus, host, group
+        self._loop = asyncio.get_running_loop()
+        self._line, self._free_at_s = asyncio.Lock(), 0.0
+        self._refused: dict[tuple[str, str], float] = {}
+        self._timer: asyncio.TimerHandle | None = None
+        self.receive: Callable[[bytes], None] = lambda _: None
+        self._control = GuestControl(port.name, host, port.idle_s) if port.access == "control" else None
+        self._axes = tuple(drive.spec.name for drive in drives)
+        self._reached: list[_Reached] = []
+        settings = ModuleSettings(reset_dead_s=0.0)  # programs take a terminal for drained at once
+        modules: dict[int, GuestModule] = {}
+
+        def add(address: int, reached: _Reached) -> None:
+            reached.idle.set()
+            self._reached.append(reached)
+            ask, command = partial(self._ask, reached), partial(self._command, reached)
+            modules[address] = GuestModule(reached.profile, settings, ask, command, partial(self._reset, reached))
+
+        for drive in drives:
+            if isinstance(drive, LdcnAxis):
+                name, node = drive.spec.name, Node(drive.spec.address, drive.profile)
+                servo = GuestServo(drive, partial(host.status, name), port.name)
+                add(node.address, _Reached(name, drive.profile, partial(read_status, node), servo))
+        for io in ios:
+            if isinstance(io, IoModule):
+                outputs = GuestOutputs(io.name, io.outputs, host.levels)
+                add(io.node, _Reached(io.name, PIC_IO, partial(_read_io, io.node), outputs=outputs))
+        self.chain = Chain([modules[address] for address in sorted(modules)])
+        if self._control:
+            group.create_task(self._control.watch(self.gone), name=f"guest {self._name} control")
+
+    def send(self, data: bytes) -> None:
+        """Take bytes of the guest."""
+        if self._control:
+            self._control.heard()
+        self.chain.write(self._loop.time(), data)
+        self._advance()
+
+    async def gone(self) -> None:
+        """The guest has gone: what it has commanded and has not begun is dropped, and control ends."""
+        for each in self._reached:
+            each.waiting.clear()
+        if self._control:
+            await self._control.end()
+
+    def _advance(self) -> None:
+        """Do what is due on the guest's chain, and come back for what is due next."""
+        if self._timer:
+            self._timer.cancel()
+        due = b"".join(piece for _, piece in self.chain.advance(self._loop.time()))
+        next_s = self.chain.next_event_s()
+        self._timer = self._loop.call_at(next_s, self._advance) if next_s is not None else None
+        if due:
+            self.receive(due)
+
+    # -- reading -----------------------------------------------------------------------------------------------------
+
+    def _ask(self, module: _Reached, items: StatusItem, answer: PendingReply) -> None:
+        self._group.create_task(self._read(module, items, answer), name=f"guest {self._name} reads {module.name}")
+
+    async def _read(self, module: _Reached, items: StatusItem, answer: PendingReply) -> None:
+        """Answer with a reading of the drive, made after what the guest has set going there before."""
+        if module.reliefs:
+            await asyncio.wait(tuple(module.reliefs.values()))
+        with suppress(TimeoutError):
+            async with asyncio.timeout(REPLY_WAIT_S):
+                await module.idle.wait()
+        async with self._line:
+            await asyncio.sleep(self._free_at_s - self._loop.time())
+            if not answer.wanted() or not self._host.is_up():
+                return
+            began_s = self._loop.time()
+            try:
+                status = await self._bus.execute(_as_sent(module.read(items)))
+            except LdcndError as error:
+                log.debug("not read", guest=self._name, axis=module.name, reason=error.message)
+                return
+            finally:
+                now_s = self._loop.time()
+                self._free_at_s = now_s + PAUSE_PER_EXCHANGE * (now_s - began_s)
+        answer.give(_as_guest(module, items, status), self._loop.time())
+        self._advance()
+
+    # -- commanding --------------------------------------------------------------------------------------------------
+
+    def _command(self, module: _Reached, command: ReceivedCommand) -> None:
+        """Take energy out at once; what does more waits for its turn, or is refused."""
+        found = relief(command, self._name) if module.servo else None
+        if found is not None and not (self._control and self._closes_the_loop(module, found)):
+            module.waiting.clear()
+            self._relieve(module, found)
+        elif self._control is None:
+            self._refuse(module.name, command, f"the port {self._name} has access = read")
+        elif len(module.waiting) >= MOST_WAITING:
+            self._refuse(module.name, command, f"{MOST_WAITING} commands wait already")
+        else:
+            if found is not None and not module.idle.is_set():
+                self._relieve(module, found)  # whatever is on its way may move it by then
+            module.waiting.append(command)
+            if module.idle.is_set():
+                module.idle.clear()
+                self._group.create_task(self._work(module), name=f"guest {self._name} commands {module.name}")
+
+    def _closes_the_loop(self, module: _Reached, found: AxisCommand[CommandReply]) -> bool:
+        return isinstance(found, Halt) and not self._host.status(module.name).enabled
+
+    def _relieve(self, module: _Reached, command: AxisCommand[CommandReply]) -> None:
+        kind = type(command)
+        if kind in module.reliefs:
+            module.again.add(kind)  # one more behind it, however many come: each is followed by one that begins later
+            return
+        task = self._group.create_task(self._carry_out(module, command), name=f"guest {self._name} stops {module.name}")
+        module.reliefs[kind] = task
+        task.add_done_callback(lambda _: module.reliefs.pop(kind))
+
+    async def _carry_out(self, module: _Reached, command: AxisCommand[CommandReply]) -> None:
+        again = True
+        while again:
+            with suppress(LdcndError):  # the daemon has entered it among the events
+                await self._host.carry_out(module.name, command)
+            again = type(command) in module.again
+            module.again.discard(type(command))
+
+    def _reset(self, module: _Reached) -> None:
+        """A Hard Reset of the guest's chain: the motors of the axes that it controls are off, as on a line."""
+        module.waiting.clear()
+        if module.outputs:
+            module.outputs.restart()
+        if module.servo:
+            module.servo.restart()
+            if self._control and module.name in self._control.axes:
+                self._relieve(module, Power(on=False, client=self._name))
+
+    async def _work(self, module: _Reached) -> None:
+        """Carry out what waits, one after another."""
+        try:
+            while module.waiting:
+                if module.reliefs:
+                    await asyncio.wait(tuple(module.reliefs.values()))
+                    continue
+                module.at_work = module.waiting.popleft()
+                try:
+                    await self._obey(module, module.at_work)
+                except LdcndError as error:
+                    self._refuse(module.name, module.at_work, error.message)
+                except TimeoutError:
+                    self._refuse(module.name, module.at_work, "the axis does not come to rest")
+        finally:
+            module.at_work = None
+            module.idle.set()
+
+    async def _obey(self, module: _Reached, command: ReceivedCommand) -> None:
+        if self._control is None:
+            return
+        if module.servo:
+            await self._obey_servo(module.name, module.servo, self._control, command)
+        elif module.outputs and (wanted := module.outputs.meaning(command)):
+            lease = await self._control.over(self._axes)
+            await self._host.carry_out(RIG_ITSELF, wanted.model_copy(update={"lease": lease}))
+
+    async def _obey_servo(self, axis: str, servo: GuestServo, control: GuestControl, received: ReceivedCommand) -> None:
+        meaning = servo.meaning(received)
+        if meaning.from_rest:
+            await self._come_to_rest(axis)
+            meaning = servo.meaning(received)  # the distance is another one from there
+        elif not meaning.interrupts:
+            await self._settled(axis)
+        if meaning.zeroes_home:
+            await self._zero_home(servo)
+        command = meaning.command
+        if command is None:
+            return
+        if not command.takes_energy_out:
+            command = command.model_copy(update={"lease": await control.over((axis,))})
+        await self._host.carry_out(axis, command)
+        if meaning.zeroes is not None:
+            scale = self._host.status(axis).scale
+            placed = meaning.zeroes / scale.counts_per_unit - scale.position(0)
+            servo.set_zero(placed * scale.counts_per_unit, meaning.zeroes)
+
+    async def _settled(self, axis: str) -> None:
+        """Wait until a motion whose profile is over has settled: its program knows no more than that it is over."""
+        with suppress(TimeoutError):
+            async with asyncio.timeout(SETTLES_S):
+                await self._until(lambda: self._host.status(axis).command is None)
+
+    async def _come_to_rest(self, axis: str) -> None:
+        """Wait until the axis stands, after having halted what goes on."""
+        status = self._host.status(axis)
+        if status.command is not None and (status.ends_at_s or math.inf) <= self._loop.time():
+            await self._settled(axis)
+        if self._host.status(axis).command is not None or not self._host.status(axis).at_rest:
+            await self._host.carry_out(axis, Halt(client=self._name))
+        async with asyncio.timeout(COMES_TO_REST_S):
+            await self._until(lambda: self._host.status(axis).command is None and self._host.status(axis).at_rest)
+
+    async def _until(self, condition: Callable[[], bool]) -> None:
+        while not condition():  # noqa: ASYNC110 - its readings tell, and nobody announces them here
+            await asyncio.sleep(LOOK_S)
+
+    async def _zero_home(self, servo: GuestServo) -> None:
+        drive = servo.drive
+        status = await self._bus.execute(read_status(Node(drive.spec.address, drive.profile), StatusItem.HOME))
+        if status.home is not None:
+            servo.set_zero(status.home + drive.state.offset_counts, 0)
+
+    def _refuse(self, about: str, command: ReceivedCommand, why: str) -> None:
+        what, now_s = name_of(command), self._loop.time()
+        if now_s - self._refused.get((about, what), -SAME_REFUSAL_S) >= SAME_REFUSAL_S:
+            self._refused[about, what] = now_s
+            self._host.refuse(about, f"{what}: {why}; the guest has its answer, nothing was done", self._name)
+
+
+def _read_io(address: int, items: StatusItem) -> Exchange[IoStatus]:
+    return read_io_status(IoNode(address), IoItem(int(items)))
+
+
+def _as_sent(exchange: Exchange[Any]) -> Exchange[bytes]:
+    """Return an exchange that returns the reply as it was sent: intact, and not decoded."""
+    return replace(exchange, decode=bytes)
+
+
+def _as_guest(module: _Reached, items: StatusItem, status: bytes) -> bytes:
+    """Return a status packet as this guest's own drive would send it now: its counter, and what it has set going."""
+    servo = module.servo
+    if servo is None:
+        return status
+    told = bytearray(status)
+    if module.about_to_move():
+        told[0] &= ~int(StatusFlag.MOVE_DONE)
+    if servo.armed:
+        told[0] |= int(StatusFlag.HOME_IN_PROGRESS)
+    for item in (StatusItem.POSITION, StatusItem.HOME):
+        if items & item:
+            at = 1 + item_bytes(module.profile, items & (int(item) - 1))
+            counter = servo.counter(POSITION.decode(bytes(told[at : at + POSITION.width])))
+            told[at : at + POSITION.width] = counter.to_bytes(POSITION.width, "little", signed=True)
+    return bytes(told)

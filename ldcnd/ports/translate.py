@@ -1,0 +1,272 @@
+"""What the packets of a guest mean in commands of an axis: a servo drive as an old program commands it.
+
+A program speaks of counts and ticks of a counter that it believes to be its own. It gets one: where it sets its counter
+is where the counter of its port is. What moves, sets or forgets is a command as of any client, so limits, interlocks,
+latches and books are those of everybody. Sources: LS-182AP manual, "Load Trajectory", "Stop Motor"; PIC-SERVO manual, 5.2.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+
+from ldcnd.config.ports import StatusView
+from ldcnd.contract.commands import (
+    AxisCommand,
+    BufferMode,
+    CommandReply,
+    Halt,
+    Home,
+    HomeMethod,
+    HomeStop,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Power,
+    Reset,
+    SetGains,
+    SetPosition,
+)
+from ldcnd.contract.errors import NotSupported
+from ldcnd.drives.driver import Gains
+from ldcnd.drives.ldcn.controls import STOPS_ON_HOME, HomingControl, StopControl
+from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.drives.ldcn.profiles import HomingSource, Profile
+from ldcnd.drives.ldcn.received import (
+    LoadTrajectory,
+    PlainCommand,
+    ReceivedCommand,
+    ResetPosition,
+    SetGain,
+    SetHomingMode,
+    StopMotor,
+    UndefinedCommand,
+    UndescribedCommand,
+)
+from ldcnd.drives.ldcn.servo import LdcnAxis, homing_source
+from ldcnd.drives.ldcn.trajectory import (
+    ProfileMode,
+    Trajectory,
+    acceleration_counts_per_s2,
+    velocity_counts_per_s,
+)
+
+_STOPS = {
+    HomingControl.STOP_ABRUPT: HomeStop.ABRUPT,
+    HomingControl.STOP_SMOOTH: HomeStop.SMOOTH,
+    HomingControl.MOTOR_OFF: HomeStop.OFF,
+}
+_NO_HOMING = HomingControl(0)
+
+
+def name_of(command: ReceivedCommand) -> str:
+    """Return what a person calls a command of a guest."""
+    match command:
+        case PlainCommand(code) | UndefinedCommand(code) | UndescribedCommand(code):
+            return CommandCode(code).name.lower()
+        case _:
+            return type(command).__name__
+
+
+def relief(command: ReceivedCommand, client: str) -> AxisCommand[CommandReply] | None:
+    """Return what takes the energy out that a guest's Stop Motor takes out; None for what does more or something else.
+
+    Without its amplifier bit it switches the power driver off whatever else it says; going to a position is motion.
+    """
+    if not isinstance(command, StopMotor):
+        return None
+    if command.control & StopControl.MOTOR_OFF or not command.control & StopControl.AMP_ENABLE:
+        return Power(on=False, client=client)
+    if command.control & (StopControl.ABRUPT | StopControl.SMOOTH):
+        return Halt(client=client)
+    return None
+
+
+@dataclass(frozen=True, slots=True)
+class Meaning:
+    """What a command of a guest means.
+
+    Attributes:
+        command: of the axis; None where nothing is to be done.
+        from_rest: it is said as a distance, so the axis has to stand first.
+        interrupts: it does not wait for the end of a motion under way.
+        zeroes: the guest's counter has this value afterwards.
+        zeroes_home: it is 0 at the captured home position afterwards.
+    """
+
+    command: AxisCommand[CommandReply] | None = None
+    from_rest: bool = False
+    interrupts: bool = False
+    zeroes: int | None = None
+    zeroes_home: bool = False
+
+
+NOTHING = Meaning(interrupts=True)
+
+
+class GuestServo:
+    """One drive as its guest commands it.
+
+    Attributes:
+        drive: the drive.
+        zero: count of the drive at which the guest's counter is 0.
+        armed: how the guest has armed the capture of a home position; 0 for not at all.
+    """
+
+    def __init__(self, drive: LdcnAxis, status: Callable[[], StatusView], client: str) -> None:
+        self.drive, self._status, self._client = drive, status, client
+        self.zero = 0
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget what the guest has loaded, as its drive does with a reset; its counter goes on."""
+        self._registers = Trajectory()
+        self.armed = _NO_HOMING
+
+    def counter(self, wire_counts: int) -> int:
+        """Return the guest's counter for that of the drive; 32 bits, signed."""
+        counts = wire_counts + self.drive.state.offset_counts - self.zero
+        return (counts + (1 << 31)) % (1 << 32) - (1 << 31)
+
+    def set_zero(self, counts: float, value: int) -> None:
+        """Let the guest's counter have a value where the drive's count is this."""
+        self.zero = round(counts) - value
+
+    def meaning(self, command: ReceivedCommand) -> Meaning:
+        """Return what a command means now; what it loads is kept.
+
+        Raises:
+            NotSupported: there is no command of an axis that does the same.
+        """
+        match command:
+            case LoadTrajectory(trajectory):
+                self._load(trajectory)
+                return self._start() if trajectory.start_now else NOTHING
+            case PlainCommand(CommandCode.START_MOTION):
+                return self._start()
+            case PlainCommand(CommandCode.CLEAR_STICKY_BITS):
+                return Meaning(Reset(faults_only=True, client=self._client))
+            case StopMotor():
+                return self._stop(command)
+            case SetGain(gains):
+                return self._gains(gains)
+            case SetHomingMode(control):
+                self.armed = control
+                return NOTHING
+            case ResetPosition(relative_to_home=True):
+                return Meaning(zeroes_home=True)
+            case ResetPosition(position):
+                place = position / self._status().scale.counts_per_unit
+                return Meaning(SetPosition(position=place, client=self._client), zeroes=position)
+            case _:
+                raise NotSupported("no command of an axis does the same")
+
+    def _load(self, new: Trajectory) -> None:
+        held = self._registers
+        kept = {
+            name: getattr(held, name) if getattr(new, name) is None else getattr(new, name)
+            for name in ("position", "velocity", "acceleration", "pwm_or_target")
+        }
+        self._registers = replace(new, **kept, start_now=False)
+
+    def _stop(self, command: StopMotor) -> Meaning:
+        found = relief(command, self._client)
+        if found is not None:  # a stop that holds closes the loop of a motor that is off
+            holds = isinstance(found, Halt) and not self._status().enabled
+            return Meaning(Power(on=True, client=self._client) if holds else found, interrupts=not holds)
+        if command.control & StopControl.HERE:
+            raise NotSupported("it would go to a position without a profile")
+        return NOTHING  # the power driver alone: it is switched with the loop
+
+    def _gains(self, gains: Gains) -> Meaning:
+        held = self.drive.gains
+        if gains == held and self.drive.holds_gains:
+            return NOTHING
+        if gains.step_multiplier != (held.step_multiplier if held else 1):
+            raise NotSupported("the step multiplier is set by the configuration")
+        values = {each.name: getattr(gains, each.name) for each in fields(gains) if each.name != "step_multiplier"}
+        return Meaning(SetGains(client=self._client, **values))
+
+    # -- motion ------------------------------------------------------------------------------------------------------
+
+    def _start(self) -> Meaning:
+        loaded = self._registers
+        if not loaded.servo:
+            if loaded.pwm_or_target:
+                raise NotSupported("a raw duty has no end: the drive goes on when its program is gone")
+            return Meaning(Power(on=False, client=self._client), interrupts=True)
+        if loaded.pwm_or_target and loaded.mode is ProfileMode.VELOCITY and self.drive.profile.analog_target:
+            raise NotSupported("a motion to an analog value has limits of its own: use move_analog")
+        if loaded.mode is ProfileMode.VELOCITY:
+            return self._run(loaded)
+        return self._go(loaded)
+
+    def _rates(self, loaded: Trajectory) -> tuple[float, float | None]:
+        """Return velocity and acceleration in axis units; the default of the axis for one that was never loaded."""
+        gains, profile = self.drive.gains, self.drive.profile
+        divisor, scale = (gains.sr if gains else 1), abs(self._status().scale.counts_per_unit)
+        velocity = velocity_counts_per_s(loaded.velocity or 0, divisor, profile) / scale
+        acceleration = acceleration_counts_per_s2(loaded.acceleration or 0, divisor, profile) / scale
+        return velocity, acceleration or None
+
+    def _run(self, loaded: Trajectory) -> Meaning:
+        velocity, acceleration = self._rates(loaded)
+        if not velocity:
+            return Meaning(Halt(client=self._client), interrupts=True)
+        forward = loaded.reverse is (self._status().scale.counts_per_unit < 0)
+        if self.armed:
+            return Meaning(self._home(velocity if forward else -velocity, acceleration, None))
+        return Meaning(
+            MoveVelocity(
+                velocity=velocity if forward else -velocity,
+                acceleration=acceleration,
+                buffer_mode=BufferMode.ABORTING,
+                client=self._client,
+            ),
+            interrupts=True,
+        )
+
+    def _go(self, loaded: Trajectory) -> Meaning:
+        status, scale = self._status(), self._status().scale
+        velocity, acceleration = self._rates(loaded)
+        here = self.drive.state.counts if status.target_counts is None else status.target_counts
+        if loaded.position is None:
+            raise NotSupported("no position was loaded since the program has reset its chain")
+        target = here + loaded.position if loaded.relative else loaded.position + self.zero
+        if not status.enabled and target == self.drive.state.counts:
+            return NOTHING  # how a program initialises a drive: where it stands, with its motor off
+        if not velocity:
+            raise NotSupported("it has no velocity")
+        way = (target - here) / scale.counts_per_unit
+        if self.armed:
+            return Meaning(self._home(velocity if way > 0 else -velocity, acceleration, abs(way) or None))
+        if loaded.relative or scale.modulo is not None or not status.referenced:
+            distance = MoveRelative(distance=way, velocity=velocity, acceleration=acceleration, client=self._client)
+            return Meaning(distance, from_rest=True)
+        return Meaning(
+            MoveAbsolute(
+                position=scale.position(target),
+                velocity=velocity,
+                acceleration=acceleration,
+                buffer_mode=BufferMode.ABORTING,
+                client=self._client,
+            ),
+            interrupts=True,
+        )
+
+    def _home(self, velocity: float, acceleration: float | None, distance: float | None) -> Home:
+        armed, self.armed = self.armed, _NO_HOMING
+        stop = _STOPS.get(armed & STOPS_ON_HOME, HomeStop.SMOOTH)
+        return Home(
+            method=_method(self.drive.profile, HomingSource(armed & ~STOPS_ON_HOME)),
+            velocity=velocity,
+            acceleration=acceleration,
+            distance=distance,
+            stop=stop,
+            client=self._client,
+        )
+
+
+def _method(profile: Profile, sources: HomingSource) -> HomeMethod:
+    for method in HomeMethod:
+        if homing_source(profile, method) == sources:
+            return method
+    raise NotSupported("a home position has one signal, and the program has armed several")

@@ -1,0 +1,325 @@
+"""An old program moves axes through its port: the simulated shaft decides, and everybody's rules hold for it too."""
+
+import asyncio
+import os
+
+import pytest
+
+from ldcnd.contract.commands import MoveRelative, Power, Reset, SetPosition, Stop
+from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag
+from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
+from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
+from tests.support.guest_program import guest
+from tests.support.machine_rig import COUNTS, GAINS
+
+LOAD, START, STOP = CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION, CommandCode.STOP_MOTOR
+READ, NO_OPERATION = CommandCode.READ_STATUS, CommandCode.NO_OPERATION
+ENABLE, SMOOTH, OFF = Packet(1, STOP, b"\x05"), Packet(1, STOP, b"\x09"), Packet(1, STOP, b"\x02")
+GO_NOW, GO_LATER, RUN_NOW = 0x97, 0x17, 0xB6
+POSITION = b"\x01"
+
+
+def load(control, *, counts=None, speed=5.0, rate=20.0, address=1):
+    """Return Load Trajectory with a position in counts, a speed and an acceleration in revolutions."""
+    velocity = programmed_velocity(speed * COUNTS, 1, PIC_SERVO_SC) if speed else 0
+    data = bytes((control,)) + (b"" if counts is None else counts.to_bytes(4, "little", signed=True))
+    data += velocity.to_bytes(4, "little")
+    data += programmed_acceleration(rate * COUNTS, 1, PIC_SERVO_SC).to_bytes(4, "little")
+    return Packet(address, LOAD, data)
+
+
+def flags(reply):
+    return StatusFlag(bytes.fromhex(reply)[0])
+
+
+def position(reply):
+    return int.from_bytes(bytes.fromhex(reply)[1:5], "little", signed=True)
+
+
+async def finished(program, address=1, within_s=10.0):
+    """Poll as a program does until the drive says that its move is done; return its counter."""
+    async with asyncio.timeout(within_s):
+        while True:
+            reply = await program.send(Packet(address, READ, POSITION))
+            if flags(reply) & StatusFlag.MOVE_DONE:
+                return position(reply)
+            await asyncio.sleep(0.01)
+
+
+def shaft(rig, place=1):
+    """Return where a simulated shaft is, in counts."""
+    drive = rig.chain.modules[place - 1]
+    drive.catch_up(asyncio.get_running_loop().time())
+    return drive.shaft.position_counts
+
+
+async def events(rig, axis="rotor"):
+    return [each for each in (await rig.client.ask(ReadEvents(axis=axis, count=100))).events if each.client == "old"]
+
+
+async def test_a_program_enables_moves_and_finds_its_counts(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        assert await program.send(ENABLE)
+        assert await program.send(load(GO_NOW, counts=2500))
+        assert await finished(program) == pytest.approx(2500, abs=5)
+        assert shaft(rig) == pytest.approx(2500, abs=5)
+
+        await program.send(load(GO_LATER, counts=-1200))
+        await asyncio.sleep(0.3)
+        assert shaft(rig) == pytest.approx(2500, abs=5)  # it waits for Start Motion
+        await program.send(Packet(1, START))
+        assert await finished(program) == pytest.approx(-1200, abs=5)
+        assert shaft(rig) == pytest.approx(-1200, abs=5)
+        holders = {each.axis: each.client for each in (await rig.client.ask(ListHolders())).holders}
+        assert holders == {"rotor": "old", "table": None}
+
+
+async def test_the_registers_of_the_drive_are_those_that_the_program_has_loaded(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        sent = load(GO_NOW, counts=2500, speed=3.21, rate=17.3)
+        await program.send(sent)
+        await finished(program)
+        info = next(each for each in await rig.client.axes() if each.axis == "rotor")
+        known = {each.name: each.value for each in info.registers}
+        loaded = tuple(int.from_bytes(sent.data[at : at + 4], "little") for at in (5, 9))
+        assert (known["velocity"], known["acceleration"]) == loaded
+
+
+async def test_a_program_runs_at_a_velocity_and_ends_it_with_a_velocity_of_0_or_a_stop(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        for end in (load(RUN_NOW, speed=0), SMOOTH):
+            await program.send(load(RUN_NOW, speed=4.0))
+            async with asyncio.timeout(5):
+                while rig.speed() < 3.8:
+                    await asyncio.sleep(0.01)
+            await program.send(end)
+            async with asyncio.timeout(5):
+                while rig.speed() > 0.02:
+                    await asyncio.sleep(0.01)
+
+
+async def test_a_stop_of_anybody_holds_against_the_program_until_a_person_resets(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=4.0))
+        async with asyncio.timeout(5):
+            while rig.speed() < 3.8:
+                await asyncio.sleep(0.01)
+        await rig.client.ask(Stop(), "rotor")
+        async with asyncio.timeout(5):
+            while rig.speed() > 0.02:
+                await asyncio.sleep(0.01)
+
+        stands = shaft(rig)
+        for packet in (ENABLE, Packet(1, CommandCode.CLEAR_STICKY_BITS), load(GO_NOW, counts=0), load(RUN_NOW)):
+            assert await program.send(packet)
+        await asyncio.sleep(1.0)
+        assert shaft(rig) == pytest.approx(stands, abs=5)
+        told = [each for each in await events(rig) if each.verb == "guest"]
+        assert any("latched" in (each.reason or "") for each in told)
+
+
+async def test_a_program_that_goes_loses_control_and_what_it_moved_halts(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=4.0))
+        async with asyncio.timeout(5):
+            while rig.speed() < 3.8:
+                await asyncio.sleep(0.01)
+        program.close()
+        async with asyncio.timeout(5):
+            while rig.speed() > 0.02:
+                await asyncio.sleep(0.01)
+        assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)
+
+
+async def test_a_program_that_falls_silent_loses_control_too(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=4.0))
+        await asyncio.sleep(4.0)
+        assert rig.speed() > 3.8
+        await asyncio.sleep(3.0)
+        assert rig.speed() < 0.02
+
+
+async def test_a_program_that_only_reads_gives_axes_back_that_rest(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        for _ in range(80):
+            await program.send(Packet(1, NO_OPERATION))
+            await asyncio.sleep(0.1)
+        assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)
+        assert rig.daemon.rig.axes["rotor"].tracker.status.enabled
+
+
+async def test_another_client_that_has_control_keeps_it(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await rig.client.ask(Power(on=True), "rotor")
+        await rig.client.ask(Acquire(client="ada", axes=("rotor",), lease_s=60))
+        await program.send(load(GO_NOW, counts=2500))
+        await asyncio.sleep(1.0)
+        assert shaft(rig) == pytest.approx(0, abs=5)
+        assert any("controlled by ada" in (each.reason or "") for each in await events(rig))
+
+
+async def test_a_hard_reset_of_the_program_switches_off_what_it_controls_and_nothing_else(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await rig.client.ask(Power(on=True), "table")
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=2.0))
+        await asyncio.sleep(1.0)
+        await program.send(Packet(0xFF, CommandCode.HARD_RESET), 0.05)
+        async with asyncio.timeout(5):
+            while rig.daemon.rig.axes["rotor"].tracker.status.enabled:
+                await asyncio.sleep(0.02)
+        assert rig.daemon.rig.axes["table"].tracker.status.enabled
+
+
+async def test_limits_hold_for_the_program_and_its_move_is_not_done(tmp_path):
+    limits = {"limits": {"position_min": -2.0, "position_max": 2.0, "velocity": 11.0}}
+    async with guest(tmp_path, "control", **limits) as (rig, program):
+        await program.begin()
+        await rig.client.ask(SetPosition(position=0.0), "rotor")
+        await program.send(ENABLE)
+        for packet in (load(GO_NOW, counts=2500), load(GO_NOW, counts=1500, speed=11.5)):
+            await program.send(packet)
+            await finished(program)
+            assert shaft(rig) == pytest.approx(0, abs=5)
+        refused = [each for each in await events(rig) if each.verb == "guest"]
+        assert any("2.5 rev" in (each.reason or "") for each in refused)
+
+        await program.send(load(GO_NOW, counts=1500))
+        await finished(program)
+        assert shaft(rig) == pytest.approx(1500, abs=5)
+
+
+async def test_a_zero_that_the_program_sets_is_its_own_counter_and_the_position_of_everybody(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=2500))
+        await finished(program)
+        async with asyncio.timeout(5):
+            while not rig.daemon.rig.axes["rotor"].tracker.status.at_rest:
+                await asyncio.sleep(0.02)
+        reply = await program.send(Packet(1, CommandCode.RESET_POSITION))
+        assert reply
+        assert position(await program.send(Packet(1, READ, POSITION))) == pytest.approx(0, abs=5)
+        async with asyncio.timeout(5):
+            while abs((await rig.client.last("rotor", "position")).value) > 0.01:
+                await asyncio.sleep(0.02)
+
+        await program.send(load(GO_NOW, counts=-500))
+        assert await finished(program) == pytest.approx(-500, abs=5)
+        assert shaft(rig) == pytest.approx(2000, abs=8)
+
+
+async def test_a_search_for_the_index_is_the_homing_of_everybody(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=300))
+        await finished(program)
+        armed = await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))  # index, then a smooth stop
+        assert flags(armed) & StatusFlag.HOME_IN_PROGRESS
+        await program.send(load(RUN_NOW, speed=0.5))
+        async with asyncio.timeout(20):
+            while flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.HOME_IN_PROGRESS:
+                await asyncio.sleep(0.02)
+        await finished(program)
+        await program.send(Packet(1, CommandCode.RESET_POSITION, b"\x01"))  # relative to the home position
+        await program.send(load(GO_NOW, counts=0))
+        await finished(program)
+        async with asyncio.timeout(5):
+            while not (await rig.client.state("rotor")).referenced:
+                await asyncio.sleep(0.02)
+        assert (await rig.client.last("rotor", "position")).value == pytest.approx(0.0, abs=0.02)
+        plant = rig.chain.modules[0].shaft.plant
+        assert (shaft(rig) - plant.index_at_counts) % plant.counts_per_rev == pytest.approx(0, abs=10)
+
+
+async def test_gains_that_the_program_sets_are_in_the_drive_and_in_the_books(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        gains = b"".join(
+            (GAINS[name] if name != "kp" else 77).to_bytes(2, "little") for name in ("kp", "kd", "ki", "il")
+        )
+        gains += bytes((GAINS["ol"], 0)) + GAINS["el"].to_bytes(2, "little") + bytes((1, 0, 1))
+        await program.send(Packet(1, CommandCode.SET_GAIN, gains))
+        await asyncio.sleep(0.2)
+        assert rig.chain.modules[0].loop.gains.kp == 77
+        info = next(each for each in await rig.client.axes() if each.axis == "rotor")
+        assert {each.name: each.value for each in info.registers}["kp"] == 77
+
+
+async def test_a_move_that_follows_a_motion_under_way_goes_where_it_says_even_without_a_reference(tmp_path):
+    """It is a distance for the daemon; measured in mid-motion it would end a braking distance too far."""
+    async with guest(tmp_path, "control", modulo=1.0) as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=4.0))
+        async with asyncio.timeout(5):
+            while rig.speed() < 3.8:
+                await asyncio.sleep(0.01)
+        await program.send(load(GO_NOW, counts=1234))
+        assert not flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.MOVE_DONE
+        assert await finished(program, within_s=30) == pytest.approx(1234, abs=8)
+        assert shaft(rig) == pytest.approx(1234, abs=8)
+
+
+async def test_two_axes_start_with_one_group_packet(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        for address in (1, 2):
+            await program.send(Packet(address, CommandCode.SET_ADDRESS, bytes((address, 0x80))))
+            await program.send(Packet(address, STOP, b"\x05"))
+            await program.send(load(GO_LATER, counts=1000 * address, address=address))
+        await asyncio.sleep(0.2)
+        assert shaft(rig, 1) == pytest.approx(0, abs=5)
+        program.send_bytes(bytes.fromhex("aa800585"))
+        await finished(program, 1)
+        await finished(program, 2)
+        assert shaft(rig, 1) == pytest.approx(1000, abs=5)
+        assert shaft(rig, 2) == pytest.approx(2000, abs=5)
+
+
+async def test_an_output_that_the_program_writes_is_the_named_one_and_others_are_refused(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(Packet(3, CommandCode.RESET_POSITION, bytes((0xFF, 0x0D))))  # line 10 is an output
+        await program.send(Packet(3, CommandCode.SET_GAIN, bytes((0x00, 0x02))))
+        await rig.named(lock=True)
+        await program.send(Packet(3, CommandCode.SET_GAIN, bytes(2)))
+        await rig.named(lock=False)
+        await program.send(Packet(3, CommandCode.RESET_POSITION, bytes((0xFE, 0x0D))))  # and line 1
+        await asyncio.sleep(0.1)
+        assert any("no output at line 1" in (each.reason or "") for each in await events(rig, "cabinet"))
+
+
+async def test_what_the_program_has_set_going_is_refused_to_nobody_who_stops_it(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=4.0))
+        with pytest.raises(LdcndError, match="controlled by old"):
+            await rig.client.ask(MoveRelative(distance=1.0), "rotor")
+        await program.send(OFF)
+        async with asyncio.timeout(5):
+            while rig.daemon.rig.axes["rotor"].tracker.status.enabled:
+                await asyncio.sleep(0.02)
