@@ -76,6 +76,9 @@ class StatusView(Protocol):
     def command(self) -> object:
         """What is under way, settling included; None without anything."""
 
+    def is_at(self, command_id: str) -> bool:
+        """Tell whether a command is under way."""
+
     @property
     def ends_at_s(self) -> float | None:
         """When its profile should end, in loop time; None of a motion without an end."""

@@ -19,7 +19,7 @@ from ldcnd.drives.ldcn.io_module import IoModule
 from ldcnd.drives.ldcn.packet import POSITION, CommandCode, StatusFlag, StatusItem, item_bytes
 from ldcnd.drives.ldcn.pic_io import IoItem, IoNode, IoStatus, read_io_status
 from ldcnd.drives.ldcn.profiles import PIC_IO, Profile
-from ldcnd.drives.ldcn.received import LoadTrajectory, PlainCommand, ReceivedCommand
+from ldcnd.drives.ldcn.received import LoadTrajectory, PlainCommand, ReceivedCommand, StopMotor
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.drives.network import IoDriver
 from ldcnd.line.bus import Bus
@@ -183,13 +183,15 @@ class Guest:
             finally:
                 now_s = self._loop.time()
                 self._free_at_s = now_s + PAUSE_PER_EXCHANGE * (now_s - began_s)
-        answer.give(_as_guest(module, items, status), self._loop.time())
+        answer.give(_as_guest(module, items, status, self._loop.time()), self._loop.time())
         self._advance()
 
     # -- commanding --------------------------------------------------------------------------------------------------
 
     def _command(self, module: _Reached, command: ReceivedCommand) -> None:
         """Take energy out at once; what does more waits for its turn, or is refused."""
+        if module.servo and isinstance(command, StopMotor):
+            module.servo.stopped(command.control)
         found = relief(command, self._name) if module.servo else None
         if found is not None and not (self._control and self._closes_the_loop(module, found)):
             module.waiting.clear()
@@ -277,7 +279,9 @@ class Guest:
             return
         if not command.takes_energy_out:
             command = command.model_copy(update={"lease": await control.over((axis,))})
-        await self._host.carry_out(axis, command)
+        reply = await self._host.carry_out(axis, command)
+        if isinstance(reply, CommandReply):
+            servo.begun(command, reply.command_id, self._loop.time())
         if meaning.zeroes is not None:
             scale = self._host.status(axis).scale
             placed = meaning.zeroes / scale.counts_per_unit - scale.position(0)
@@ -325,16 +329,13 @@ def _as_sent(exchange: Exchange[Any]) -> Exchange[bytes]:
     return replace(exchange, decode=bytes)
 
 
-def _as_guest(module: _Reached, items: StatusItem, status: bytes) -> bytes:
+def _as_guest(module: _Reached, items: StatusItem, status: bytes, now_s: float) -> bytes:
     """Return a status packet as this guest's own drive would send it now: its counter, and what it has set going."""
     servo = module.servo
     if servo is None:
         return status
-    told = bytearray(status)
-    if module.about_to_move():
-        told[0] &= ~int(StatusFlag.MOVE_DONE)
-    if servo.armed:
-        told[0] |= int(StatusFlag.HOME_IN_PROGRESS)
+    told, flags = bytearray(status), servo.flags(StatusFlag(status[0]), now_s)
+    told[0] = int(flags & ~StatusFlag.MOVE_DONE if module.about_to_move() else flags)
     for item in (StatusItem.POSITION, StatusItem.HOME):
         if items & item:
             at = 1 + item_bytes(module.profile, items & (int(item) - 1))

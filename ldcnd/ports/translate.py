@@ -1,10 +1,11 @@
 """What the packets of a guest mean in commands of an axis: a servo drive as an old program commands it.
 
-A program speaks of counts and ticks of a counter that it believes to be its own. It gets one: where it sets its counter
-is where the counter of its port is. What moves, sets or forgets is a command as of any client, so limits, interlocks,
-latches and books are those of everybody. Sources: LS-182AP manual, "Load Trajectory", "Stop Motor"; PIC-SERVO manual, 5.2.
+A program speaks of counts of a counter that it believes to be its own, and its port has one. What moves, sets or forgets
+is a command as of any client, so limits, interlocks, latches and books are those of everybody. Sources: LS-182AP manual,
+"Load Trajectory", "Stop Motor"; PIC-SERVO manual, 5.2.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 
@@ -27,8 +28,8 @@ from ldcnd.contract.commands import (
 )
 from ldcnd.contract.errors import NotSupported
 from ldcnd.drives.driver import Gains
-from ldcnd.drives.ldcn.controls import STOPS_ON_HOME, HomingControl, StopControl
-from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.drives.ldcn.controls import STOPS_ON_HOME, WAYS_TO_STOP, HomingControl, StopControl
+from ldcnd.drives.ldcn.packet import CommandCode, StatusFlag
 from ldcnd.drives.ldcn.profiles import HomingSource, Profile
 from ldcnd.drives.ldcn.received import (
     LoadTrajectory,
@@ -109,6 +110,9 @@ class GuestServo:
         drive: the drive.
         zero: count of the drive at which the guest's counter is 0.
         armed: how the guest has armed the capture of a home position; 0 for not at all.
+        homing: id of the search that it has begun; empty without one.
+        running: likewise of its motion in velocity mode, and of a search that is one.
+        slews_at_s: when that has reached its velocity, in loop time.
     """
 
     def __init__(self, drive: LdcnAxis, status: Callable[[], StatusView], client: str) -> None:
@@ -119,7 +123,10 @@ class GuestServo:
     def restart(self) -> None:
         """Forget what the guest has loaded, as its drive does with a reset; its counter goes on."""
         self._registers = Trajectory()
+        self._holds = False  # the guest's drive has its servo on, whatever its amplifier does
         self.armed = _NO_HOMING
+        self.homing = self.running = ""
+        self.slews_at_s = 0.0
 
     def counter(self, wire_counts: int) -> int:
         """Return the guest's counter for that of the drive; 32 bits, signed."""
@@ -129,6 +136,29 @@ class GuestServo:
     def set_zero(self, counts: float, value: int) -> None:
         """Let the guest's counter have a value where the drive's count is this."""
         self.zero = round(counts) - value
+
+    def begun(self, command: AxisCommand[CommandReply], command_id: str, now_s: float) -> None:
+        """Take note that a command of the guest is under way."""
+        self.homing = self.running = ""
+        if isinstance(command, Home):
+            self.homing, self.armed = command_id, _NO_HOMING
+        if isinstance(command, Home | MoveVelocity) and self._registers.mode is ProfileMode.VELOCITY:
+            self.running = command_id
+            self.slews_at_s = now_s + abs(command.velocity or 0.0) / (command.acceleration or math.inf)
+
+    def flags(self, flags: StatusFlag, now_s: float) -> StatusFlag:
+        """Return the status byte as a drive would send it that has the guest's commands itself.
+
+        In velocity mode MOVE_DONE says that the velocity is reached (PIC-SERVO manual, 5.3); the daemon runs with
+        trapezoids that end by themselves.
+        """
+        status = self._status()
+        if self.armed or (self.homing and status.is_at(self.homing)):
+            flags |= StatusFlag.HOME_IN_PROGRESS
+        if self.running and status.is_at(self.running):
+            reached = now_s >= self.slews_at_s
+            flags = flags | StatusFlag.MOVE_DONE if reached else flags & ~StatusFlag.MOVE_DONE
+        return flags
 
     def meaning(self, command: ReceivedCommand) -> Meaning:
         """Return what a command means now; what it loads is kept.
@@ -150,7 +180,8 @@ class GuestServo:
                 return self._gains(gains)
             case SetHomingMode(control):
                 self.armed = control
-                return NOTHING
+                searches = bool(control) and self.running and self._status().is_at(self.running)
+                return self._run(self._registers) if searches else NOTHING  # it is armed in mid-motion
             case ResetPosition(relative_to_home=True):
                 return Meaning(zeroes_home=True)
             case ResetPosition(position):
@@ -167,14 +198,19 @@ class GuestServo:
         }
         self._registers = replace(new, **kept, start_now=False)
 
+    def stopped(self, control: StopControl) -> None:
+        """Take note of a Stop Motor of the guest."""
+        if control & WAYS_TO_STOP:
+            self._holds = not control & StopControl.MOTOR_OFF
+
     def _stop(self, command: StopMotor) -> Meaning:
-        found = relief(command, self._client)
-        if found is not None:  # a stop that holds closes the loop of a motor that is off
-            holds = isinstance(found, Halt) and not self._status().enabled
-            return Meaning(Power(on=True, client=self._client) if holds else found, interrupts=not holds)
-        if command.control & StopControl.HERE:
+        control, enabled = command.control, self._status().enabled
+        if control & StopControl.HERE:
             raise NotSupported("it would go to a position without a profile")
-        return NOTHING  # the power driver alone: it is switched with the loop
+        if control & StopControl.AMP_ENABLE and self._holds and not enabled:
+            return Meaning(Power(on=True, client=self._client))
+        found = relief(command, self._client)  # the power driver alone is switched with the loop
+        return NOTHING if found is None else Meaning(found, interrupts=True)
 
     def _gains(self, gains: Gains) -> Meaning:
         held = self.drive.gains
@@ -213,7 +249,7 @@ class GuestServo:
             return Meaning(Halt(client=self._client), interrupts=True)
         forward = loaded.reverse is (self._status().scale.counts_per_unit < 0)
         if self.armed:
-            return Meaning(self._home(velocity if forward else -velocity, acceleration, None))
+            return Meaning(self._home(velocity if forward else -velocity, acceleration, None), from_rest=True)
         return Meaning(
             MoveVelocity(
                 velocity=velocity if forward else -velocity,
@@ -237,7 +273,8 @@ class GuestServo:
             raise NotSupported("it has no velocity")
         way = (target - here) / scale.counts_per_unit
         if self.armed:
-            return Meaning(self._home(velocity if way > 0 else -velocity, acceleration, abs(way) or None))
+            home = self._home(velocity if way > 0 else -velocity, acceleration, abs(way) or None)
+            return Meaning(home, from_rest=True)
         if loaded.relative or scale.modulo is not None or not status.referenced:
             distance = MoveRelative(distance=way, velocity=velocity, acceleration=acceleration, client=self._client)
             return Meaning(distance, from_rest=True)
@@ -253,7 +290,7 @@ class GuestServo:
         )
 
     def _home(self, velocity: float, acceleration: float | None, distance: float | None) -> Home:
-        armed, self.armed = self.armed, _NO_HOMING
+        armed = self.armed
         stop = _STOPS.get(armed & STOPS_ON_HOME, HomeStop.SMOOTH)
         return Home(
             method=_method(self.drive.profile, HomingSource(armed & ~STOPS_ON_HOME)),

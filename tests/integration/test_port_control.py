@@ -253,6 +253,28 @@ async def test_a_search_for_the_index_is_the_homing_of_everybody(tmp_path):
         assert (shaft(rig) - plant.index_at_counts) % plant.counts_per_rev == pytest.approx(0, abs=10)
 
 
+async def test_a_search_that_is_armed_in_mid_motion_shows_what_a_drive_shows(tmp_path):
+    """As the driver of a centrifuge does it: servo and amplifier in two packets, and armed once the rotor turns."""
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        for control in (b"\x02", b"\x04", b"\x01"):
+            await program.send(Packet(1, STOP, control))
+        await program.send(load(RUN_NOW, speed=0.5))
+        async with asyncio.timeout(5):
+            while not flags(await program.send(Packet(1, NO_OPERATION))) & StatusFlag.MOVE_DONE:
+                await asyncio.sleep(0.01)
+        assert 0.05 < rig.speed() < 0.7  # done is said of the velocity
+        await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))
+        seen = []
+        async with asyncio.timeout(20):
+            while not seen or seen[-1] & StatusFlag.HOME_IN_PROGRESS:
+                seen.append(flags(await program.send(Packet(1, NO_OPERATION))))
+                await asyncio.sleep(0.05)
+        assert len(seen) > 5
+        assert rig.speed() < 0.02
+        assert (await rig.client.state("rotor")).referenced
+
+
 async def test_gains_that_the_program_sets_are_in_the_drive_and_in_the_books(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
         await program.begin()
