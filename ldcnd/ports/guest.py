@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from ldcnd.config.ports import GuestHost, PortConfig
-from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Power
+from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, MoveRelative, Power
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.drives.driver import Drive
@@ -269,7 +269,8 @@ class Guest:
         meaning = servo.meaning(received)
         if meaning.from_rest:
             await self._come_to_rest(axis)
-            meaning = servo.meaning(received)  # the distance is another one from there
+            if isinstance(meaning.command, MoveRelative):
+                meaning = servo.meaning(received)  # the distance is another one from there
         elif not meaning.interrupts:
             await self._settled(axis)
         if meaning.zeroes_home:
