@@ -27,7 +27,8 @@ FAULTS_OF_A_DRIVE = """async ({ reset }) => {
   const { html, render } = await import('/static/html.js');
   const { FaultPanel } = await import('/static/pages/axis_faults.js');
   const fault = { code: "alarm_0010", text: "A.10: Overcurrent", since: 0, source: "drive", stops: true };
-  const axis = { name: "feed", can: (verb) => verb !== "reset" || reset, faults: [fault], samples: {}, rig: { commands: new Map() } };
+  const rig = { commands: new Map() };
+  const axis = { name: "feed", can: (verb) => verb !== "reset" || reset, faults: [fault], samples: {}, rig };
   const place = document.createElement("div");
   render(html`<${FaultPanel} axis=${axis} />`, place);
   return { text: place.innerText || place.textContent, buttons: place.querySelectorAll("button").length };

@@ -1,11 +1,10 @@
 """An old program moves axes through its port: the simulated shaft decides, and everybody's rules hold for it too."""
 
 import asyncio
-import os
 
 import pytest
 
-from ldcnd.contract.commands import MoveRelative, Power, Reset, SetPosition, Stop
+from ldcnd.contract.commands import MoveRelative, Power, SetPosition, Stop
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders
