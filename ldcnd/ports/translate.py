@@ -1,8 +1,8 @@
 """What the packets of a guest mean in commands of an axis: a servo drive as an old program commands it.
 
 A program speaks of counts of a counter that it believes to be its own, and its port has one. What moves, sets or
-forgets is a command as of any client, so limits, interlocks, latches and books are those of everybody. Sources: LS-182AP
-manual, "Load Trajectory", "Stop Motor"; PIC-SERVO manual, 5.2.
+forgets is a command as of any client, so limits, interlocks, latches and books are those of everybody. Sources:
+LS-182AP manual, "Load Trajectory", "Stop Motor"; PIC-SERVO manual, 5.2.
 """
 
 import math
