@@ -99,7 +99,7 @@ async def ready(window, house):
     await until(window, PRESS, "Take control")
     await until(window, PRESS, "Enable")
     await house.sim.until("x", lambda state: state.enabled)
-    await until(window, "() => document.querySelector('.now-state').textContent.includes('standstill')")
+    await until(window, windows.PRESSABLE, "+0.1 mm")
 
 
 async def type_over(window, text):
@@ -209,6 +209,7 @@ async def test_twice_is_one_motion_even_where_a_second_would_wait_its_turn(house
     await until(window, READ)
     await type_over(window, "0.2")
     await until(window, READ, wanted=lambda field: field["read"] == "moves x by 0.2 mm")
+    await until(window, windows.PRESSABLE, "Move")
     if way == "enter":
         await window.keys(ENTER, ENTER, ENTER, pause_ms=60)
     elif way == "click":

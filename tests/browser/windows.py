@@ -13,9 +13,14 @@ from playwright.async_api import Page
 from tests.browser.house import House, console
 from tests.support.marionette import CONTROL, DELETE, ENTER, ESCAPE, SHIFT, TAB, Firefox, firefox, open_firefox
 
-__all__ = ["Chromium", "Window", "console", "open_chromium", "open_gecko", "until"]
+__all__ = ["PRESSABLE", "Chromium", "Window", "console", "open_chromium", "open_gecko", "until"]
 PATIENCE_S = 45.0
 NAMED = {CONTROL: "Control", DELETE: "Delete", ENTER: "Enter", TAB: "Tab", ESCAPE: "Escape", SHIFT: "Shift"}
+
+
+PRESSABLE = """(text) => [...document.querySelectorAll("main button")].some(
+  (each) => each.textContent.trim() === text && !each.getAttribute("aria-disabled"))"""
+"""Tells whether a button of the page can act, as it is drawn; a page is drawn a moment after the daemon has told."""
 
 
 class Chromium:
