@@ -26,7 +26,13 @@ class Program:
         self.commands: list[ReceivedCommand] = []
         settings = ModuleSettings(reset_dead_s=0.0)
         self.asked: list[tuple[PendingReply, StatusItem]] = []
-        self.chain = Chain([GuestModule(PIC_SERVO_SC, settings, self._ask, self.commands.append) for _ in range(2)])
+        self.resets: list[int] = []
+        self.chain = Chain(
+            GuestModule(
+                PIC_SERVO_SC, settings, self._ask, self.commands.append, lambda which=which: self.resets.append(which)
+            )
+            for which in (1, 2)
+        )
         self.now_s = 0.0
 
     def _ask(self, items: StatusItem, answer: PendingReply) -> None:
@@ -55,7 +61,9 @@ def test_addresses_resets_and_rates_of_a_guest_are_its_own() -> None:
     assert program.send(Packet(0xFF, CommandCode.SET_BAUD_RATE, bytes((0x14,)))) == [""]
     program.chain.baud = 57_600
     assert program.send(Packet(2, CommandCode.NO_OPERATION)) == ["0909"]
+    program.resets.clear()  # those of the power coming
     assert program.send(Packet(0xFF, CommandCode.HARD_RESET)) == [""]
+    assert program.resets == [1, 2]
     assert program.send(Packet(1, CommandCode.NO_OPERATION)) == [""]
     program.chain.baud = 19_200
     assert program.send(ADDRESS_1) == ["0909"]
