@@ -17,7 +17,7 @@ from ldcnd.client.overview import AxisNow, AxisSeen, overview, seen_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
 from ldcnd.contract.commands import Why, WhyReply
-from ldcnd.contract.condition import assess
+from ldcnd.contract.condition import SILENT_S, assess
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.fault_pages import codes, page_text
 from ldcnd.contract.meta import AxisInfo
@@ -36,9 +36,6 @@ from ldcnd.contract.samples import (
 )
 from ldcnd.contract.units import Dimension, shown_quantity
 from ldcnd.net.session import Session
-
-SILENT_S = 3.0
-"""Time without a sample after which `watch` says why, seconds."""
 
 
 class AxisRow(AxisSeen, AxisInfo):

@@ -16,7 +16,7 @@ from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample,
 if TYPE_CHECKING:
     from ldcnd.client.axis import Axis
 
-SILENT_S = 10.0
+PATIENCE_S = 10.0
 """Time without samples after which the outcome of a motion is unknown, seconds."""
 
 
@@ -223,9 +223,10 @@ class Motion:
     async def _outcome(self) -> CommandOutcome:
         while True:
             while self._under_way():
-                if not await self._axis.news(SILENT_S):
+                if not await self._axis.news(PATIENCE_S):
                     raise OutcomeUnknown(
-                        f"axis {self._axis.name}: nothing was received from it for {SILENT_S:g} s", axis=self._axis.name
+                        f"axis {self._axis.name}: nothing was received from it for {PATIENCE_S:g} s",
+                        axis=self._axis.name,
                     )
             try:
                 outcome = await self._axis.outcome(self.command_id)

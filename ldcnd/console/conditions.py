@@ -13,7 +13,7 @@ import msgpack
 
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.contract.codec import Encoding, decode_received
-from ldcnd.contract.condition import Condition, Place, Severity, Trouble, TroubleKind, assess
+from ldcnd.contract.condition import SILENT_S, Condition, Place, Severity, Trouble, TroubleKind, assess
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.health import BusHealth
 from ldcnd.contract.keys import Keys
@@ -24,8 +24,6 @@ TOPIC = "condition"
 """The last chunk of the key under which a page gets the condition of an axis; no daemon publishes it."""
 PERIOD_S = 0.25
 """Time between two decisions, seconds."""
-SILENT_S = 3.0
-"""Time without any sample after which a daemon counts as silent, seconds."""
 LEVELS = {Severity.FINE: "", Severity.NOTICE: "warn", Severity.WRONG: "bad"}
 MeasuredT = TypeVar("MeasuredT", bound=Measured)
 _MODELS: dict[str, type[Measured]] = {

@@ -29,6 +29,9 @@ OLD_S = 1.5
 """Age from which a position is old, seconds, besides `OLD_PERIODS`."""
 OLD_PERIODS = 4
 """Periods of a position's rate that may pass besides: a poll may be lost or late."""
+SILENT_S = 3.0
+"""Time without anything from a daemon after which nothing that it said counts as known, seconds; each axis gives a sign
+of life every second. The same in each face."""
 FULL_SPEED = 100.0
 """Speed override at which nothing is slowed, percent."""
 

@@ -15,7 +15,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Histo
 from prometheus_client.exposition import choose_encoder
 from prometheus_client.registry import Collector
 
-from ldcnd.contract.condition import Place, assess
+from ldcnd.contract.condition import SILENT_S, Place, assess
 from ldcnd.contract.health import BusHealth, DaemonHealth
 from ldcnd.contract.samples import (
     AxisState,
@@ -30,10 +30,8 @@ from ldcnd.version import version
 
 SHORTEST_LATENCY_S = 64e-6
 """Upper limit of the first bucket of a `LaneHealth`; each further one has twice the limit of the one before."""
-FRESH_S = 5.0
-"""Maximum age of a report that counts, seconds."""
 SHADOW_FRESH_S = 60.0
-"""Likewise of what an observer says of an axis; it does so every 10 s."""
+"""Maximum age of what an observer says of an axis, seconds; it does so every 10 s."""
 ERRORS = ("timeouts", "corrupt_replies", "rejected_packets", "resynchronisations", "stray_bytes", "losses")
 
 
@@ -83,7 +81,7 @@ class HealthCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics; those of reports that have stopped coming are left out."""
-        since_s = self._now_s() - FRESH_S
+        since_s = self._now_s() - SILENT_S
         daemon = self._daemon[1] if self._daemon and self._daemon[0] >= since_s else None
         buses = [report for at_s, report in self._buses.values() if at_s >= since_s]
         up = GaugeMetricFamily("ldcnd_daemon_up", "1 while the daemon reports", labels=["rig"])
@@ -186,10 +184,14 @@ class HealthCollector(Collector):
             "ldcnd_axis_stop_pending", "1 while a stop is not confirmed by the drive", labels=labels
         )
         down = {axis.axis for bus in buses if not bus.up for axis in bus.axes}
-        since_s = self._now_s() - FRESH_S
+        reports = {axis.axis: axis for bus in buses for axis in bus.axes}
+        since_s = self._now_s() - SILENT_S
         for axis, (at_s, state) in self._states.items():
             silence = "" if at_s >= since_s else "its state is not reported any more"
-            now = assess(state, self._faults.get(axis), line_up=axis not in down, silence=silence)
+            report = reports.get(axis)
+            age_s = report.sample_age_s if report else None
+            faults = self._faults.get(axis)
+            now = assess(state, faults, report, age_s=age_s, line_up=axis not in down, silence=silence)
             known.add_metric([self._rig, axis], float(now.place is Place.KNOWN))
             severity.add_metric([self._rig, axis], now.alarm)
             for note in dict.fromkeys((*([now.mark] if now.mark else []), *(each.short for each in now.troubles))):

@@ -159,6 +159,18 @@ def test_reports_that_stop_coming_are_not_shown_as_if_they_were_true(registry, c
     ]
 
 
+@pytest.mark.parametrize(("age_s", "known"), [(0.04, 1.0), (1.6, 1.0), (1.8, 0.0)])
+def test_a_position_that_its_daemon_reports_as_old_is_not_known(clock, age_s, known):
+    collector = HealthCollector("sim", clock)
+    report = BUS.axes[0].model_copy(update={"sample_age_s": age_s})  # at 20 Hz it is old after 1.7 s
+    collector.take(BUS.model_copy(update={"axes": (report,)}))
+    collector.take_state("x", LATCHED.model_copy(update={"referenced": True}))
+    registry = CollectorRegistry()
+    registry.register(collector)
+
+    assert registry.get_sample_value("ldcnd_axis_place_known", {"rig": "sim", "axis": "x"}) == known
+
+
 @pytest.mark.parametrize("name", ["alerts.yml", "dashboard.json"])
 def test_every_metric_that_a_file_names_exists(registry, name):
     text = (GRAFANA / name).read_text()

@@ -30,7 +30,7 @@ from ldcnd.lab.bluesky.setting import Setting
 from ldcnd.lab.bluesky.status import Status
 from ldcnd.lab.bluesky.trace import TraceDetector
 from ldcnd.lab.bluesky.values import (
-    SILENT_S,
+    PATIENCE_S,
     ValueCallback,
     by_value,
     instant,
@@ -123,7 +123,7 @@ class ReadableAxis:
         async def measure() -> None:
             positions = self._axis.positions()
             not_before_ns = await instant(self._rig)
-            async with within(SILENT_S, f"axis {self._info.axis}: no position was measured within {SILENT_S:g} s"):
+            async with within(PATIENCE_S, f"axis {self._info.axis}: no position was measured within {PATIENCE_S:g} s"):
                 async for sample in positions:
                     if sample.t > not_before_ns and sample.quality is not Quality.BAD:
                         self._not_before_ns = max(self._not_before_ns, sample.t)
@@ -181,7 +181,7 @@ class ReadableAxis:
 
     async def measured(self) -> Position:
         """Return a position that is a measurement, not old, and newer than the end of the last motion."""
-        async with within(SILENT_S, f"axis {self._info.axis}: no new position came for {SILENT_S:g} s"):
+        async with within(PATIENCE_S, f"axis {self._info.axis}: no new position came for {PATIENCE_S:g} s"):
             while True:
                 if self._axis.state.link is LinkState.DOWN:
                     raise AxisUnreachable(
@@ -471,7 +471,7 @@ class PlanAxis(ReadableAxis):
     async def _rest(self, *, is_news: bool = False) -> None:
         """Wait until the axis stands, as far as the daemon knows it; after a stop that is news, in a later state."""
         known = self._axis.state.sample
-        async with within(SILENT_S, f"axis {self._info.axis}: it did not come to rest within {SILENT_S:g} s"):
+        async with within(PATIENCE_S, f"axis {self._info.axis}: it did not come to rest within {PATIENCE_S:g} s"):
             while is_news and self._axis.state.sample is known:
                 await self._axis.news(None)
             while self._axis.state.moving is not Moving.NO and self._axis.state.link is not LinkState.DOWN:

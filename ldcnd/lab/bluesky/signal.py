@@ -19,7 +19,7 @@ from ldcnd.contract.samples import (
 )
 from ldcnd.lab.bluesky.status import Status
 from ldcnd.lab.bluesky.values import (
-    SILENT_S,
+    PATIENCE_S,
     ValueCallback,
     by_value,
     instant,
@@ -69,9 +69,9 @@ class Signal:
 
     async def _take_next(self) -> None:
         self._triggered = None
-        problem = f"axis {self._axis}: no {self._item} was measured within {SILENT_S:g} s after the trigger"
+        problem = f"axis {self._axis}: no {self._item} was measured within {PATIENCE_S:g} s after the trigger"
         async with (
-            within(SILENT_S, problem, f"raise the rate of {self._item} in the daemon's configuration"),
+            within(PATIENCE_S, problem, f"raise the rate of {self._item} in the daemon's configuration"),
             self._rig.samples(self._axis, self._item) as samples,
         ):
             not_before_ns = await instant(self._rig)

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from event_model.documents import DataKey
 
 ValueT = TypeVar("ValueT")
-SILENT_S = 10.0
+PATIENCE_S = 10.0
 """Longest wait for a new value, and for an axis to come to rest after a motion that failed, in seconds."""
 SEVERITIES = {Quality.GOOD: 0, Quality.UNCERTAIN: 1, Quality.BAD: 2}
 

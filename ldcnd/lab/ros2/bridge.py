@@ -8,7 +8,7 @@ from contextlib import AsyncExitStack
 
 from ldcnd.client.network import Session
 from ldcnd.client.rig import Rig
-from ldcnd.contract.condition import Alarm, Place, assess
+from ldcnd.contract.condition import SILENT_S, Alarm, Place, assess
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import (
     FaultSample,
@@ -27,8 +27,6 @@ FRESH_NS = 200_000_000
 """Maximum age of a velocity relative to the position that it accompanies."""
 PERIOD_S = 1.0
 """Between two reports on all axes, in seconds."""
-SILENT_NS = 5_000_000_000
-"""An axis whose last state is older is stale."""
 OK, WARN, ERROR, STALE = range(4)
 LEVELS = {Alarm.NONE: OK, Alarm.MINOR: WARN, Alarm.MAJOR: ERROR, Alarm.INVALID: ERROR}
 NOT_REPORTED = "its state is not reported any more"
@@ -115,7 +113,7 @@ class Bridge:
     def _status(self, axis: str, now_ns: int) -> DiagnosticStatus:
         info, state, faults = self.axes[axis], self._states.get(axis), self._faults.get(axis)
         active = faults.active if faults else ()
-        is_old = state is not None and now_ns - state.t > SILENT_NS
+        is_old = state is not None and now_ns - state.t > SILENT_S * 1e9
         condition = assess(state, faults, silence=NOT_REPORTED if is_old else "")
         values = (
             ("place", condition.place.value),

@@ -9,7 +9,7 @@ from typing import TypeVar
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.client.overview import seen_of
 from ldcnd.contract.codec import decode_received
-from ldcnd.contract.condition import SHARED, Severity, Trouble, TroubleKind, assess, line_troubles
+from ldcnd.contract.condition import SHARED, SILENT_S, Severity, Trouble, TroubleKind, assess, line_troubles
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import BusHealth, LaneHealth
 from ldcnd.contract.keys import Keys
@@ -23,9 +23,6 @@ from ldcnd.contract.samples import (
     VelocitySample,
 )
 from ldcnd.lab.top.glance import AxisGlance, BusGlance, RigGlance
-
-SILENT_S = 3.0
-"""Time without a report after which a daemon is shown as silent: three reports."""
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 
