@@ -180,6 +180,7 @@ class Daemon:
                 if self._failure:
                     raise self._failure
             finally:
+                leases.group = None  # what ends from now on has nobody any more that would carry it out
                 requests.finish()
                 for task in serving:
                     task.cancel()

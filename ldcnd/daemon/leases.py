@@ -326,7 +326,10 @@ class LeaseWatch:
         log.info("control released", client=lease.client, axes=sorted(lease.axes), leave_running=leave_running)
         moving = [name for name in lease.axes if self._rig.axes[name].tracker.status.moving is not Moving.NO]
         if not leave_running:
-            self._lost(lease, moving, "released while it moved", None)
+            for name in moving:
+                seen = self._rig.axes[name].tracker.status.moving is Moving.YES
+                why = "released while it moved" if seen else "released before it was seen to rest"
+                self._lost(lease, (name,), why, None)
         self._take_gains_back(lease.axes)
         for name in sorted(moving) if leave_running else ():
             self._note(name, lease, CommandStatus.DONE, "released; what moves was left running on purpose", None)

@@ -9,7 +9,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+from pydantic import ValidationError
+
 from ldcnd.config.ports import GuestHost, PortConfig
+from ldcnd.contract.codec import explained
 from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, MoveRelative, Power
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.keys import RIG_ITSELF
@@ -108,6 +111,7 @@ class Guest:
         self._line, self._free_at_s = asyncio.Lock(), 0.0
         self._refused: dict[tuple[str, str], float] = {}
         self._timer: asyncio.TimerHandle | None = None
+        self._closed = False
         self.receive: Callable[[bytes], None] = lambda _: None
         self._control = GuestControl(port.name, host, port.idle_s) if port.access == "control" else None
         self._axes = tuple(drive.spec.name for drive in drives)
@@ -131,15 +135,25 @@ class Guest:
                 outputs = GuestOutputs(io.name, io.outputs, host.levels)
                 add(io.node, _Reached(io.name, PIC_IO, partial(_read_io, io.node), outputs=outputs))
         self.chain = Chain([modules[address] for address in sorted(modules)])
+        for each in modules.values():
+            each.neighbours = tuple(modules.values())
         if self._control:
             group.create_task(self._control.watch(self.gone), name=f"guest {self._name} control")
 
     def send(self, data: bytes) -> None:
         """Take bytes of the guest."""
+        if self._closed:
+            return
         if self._control:
             self._control.heard()
         self.chain.write(self._loop.time(), data)
         self._advance()
+
+    def close(self) -> None:
+        """Nothing begins any more: its port ends."""
+        self._closed = True
+        if self._timer:
+            self._timer.cancel()
 
     async def gone(self) -> None:
         """The guest has gone: what it has commanded and has not begun is dropped, and control ends."""
@@ -150,6 +164,8 @@ class Guest:
 
     def _advance(self) -> None:
         """Do what is due on the guest's chain, and come back for what is due next."""
+        if self._closed:
+            return
         if self._timer:
             self._timer.cancel()
         due = b"".join(piece for _, piece in self.chain.advance(self._loop.time()))
@@ -250,6 +266,8 @@ class Guest:
                     await self._obey(module, module.at_work)
                 except LdcndError as error:
                     self._refuse(module.name, module.at_work, error.message)
+                except ValidationError as error:  # a packet holds values that no command has
+                    self._refuse(module.name, module.at_work, explained(error).message)
                 except TimeoutError:
                     self._refuse(module.name, module.at_work, "the axis does not come to rest")
         finally:

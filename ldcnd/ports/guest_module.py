@@ -5,10 +5,10 @@ Define Status) is obeyed here, as `SimulatedModule` does, and never reaches the 
 asked for with `ask`, a command that could concern a drive is handed to `command`, and a Hard Reset is told to `reset`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol
 
-from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, StatusItem
 from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.drives.ldcn.received import ReceivedCommand
 from ldcnd.sim.ldcn.module import SimulatedModule
@@ -29,7 +29,11 @@ class PendingReply(Protocol):
 
 
 class GuestModule(SimulatedModule):
-    """A module that answers with readings of the one on the line; without one it is silent: no value is invented."""
+    """A module that answers with readings of the one on the line; without one it is silent: no value is invented.
+
+    Attributes:
+        neighbours: all modules of its chain.
+    """
 
     def __init__(
         self,
@@ -41,6 +45,7 @@ class GuestModule(SimulatedModule):
     ) -> None:
         self._ask, self._command, self._reset_here = ask, command, reset
         self._asked: _StatusReply | None = None
+        self.neighbours: Sequence[GuestModule] = ()
         super().__init__(profile, settings)
 
     def restart(self) -> None:
@@ -68,6 +73,20 @@ class GuestModule(SimulatedModule):
         """Begin a reply at that instant."""
         self._asked = None
         self._reply, self.next_event_s = data, at_s
+
+    def _obey(self, packet: Packet, at_s: float) -> bytes | None:
+        # a program repeats Set Address because a module that restarts after a reset hears nothing (LS-182AP manual,
+        # "Addressing"); here the first one is heard, and the second must not give the next module the same address
+        if self.address == 0 and packet.command == CommandCode.SET_ADDRESS and packet.data:
+            for named in self.neighbours:
+                if named.address == packet.data[0]:
+                    return named.obey_again(packet, self._due_cycle, at_s)
+        return super()._obey(packet, at_s)
+
+    def obey_again(self, packet: Packet, due_cycle: int, at_s: float) -> bytes | None:
+        """Obey a packet that came to the module behind this one and is for this one."""
+        self._answers, self._intact, self._due_cycle = True, True, due_cycle
+        return super()._obey(packet, at_s)
 
     def _fall_silent(self) -> None:
         self._asked = None

@@ -31,6 +31,7 @@ async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequen
             with ExitStack() as stack:
                 terminal = GuestTerminal(port.link, int(port.mode, 8), stack)
                 guest = Guest(port, bus, drives, ios, host, group)
+                stack.callback(guest.close)
 
                 def take(data: bytes, baud: int | None) -> None:
                     guest.chain.baud = baud or guest.chain.baud

@@ -201,3 +201,13 @@ async def test_the_link_is_gone_with_the_daemon(tmp_path):
     async with guest(tmp_path):
         assert (tmp_path / "port").is_symlink()
     assert not (tmp_path / "port").is_symlink()
+
+
+async def test_set_address_is_repeated_as_programs_do_and_the_next_module_keeps_its_own(tmp_path):
+    async with guest(tmp_path) as (_, program):
+        await program.send(Packet(0xFF, CommandCode.HARD_RESET), 0.05)
+        for address in (1, 1, 1, 2, 2, 3):
+            assert await program.send(Packet(0, SET_ADDRESS, bytes((address, 0xFF))))
+        kinds = [await program.send(Packet(address, READ_STATUS, b"\x20")) for address in (1, 2, 3)]
+        assert kinds[0] == kinds[1] != kinds[2]
+        assert all(kinds)
