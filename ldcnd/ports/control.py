@@ -6,7 +6,7 @@ from contextlib import suppress
 
 from ldcnd.config.ports import GuestHost
 from ldcnd.contract.commands import Command
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.errors import LdcndError, LeaseExpired
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.contract.leases import Acquire, LeaseReply, Release, Renew
@@ -21,10 +21,12 @@ class GuestControl:
 
     Attributes:
         axes: that it controls.
+        visit: number of the times that the guest has gone; what it commanded before begins nothing any more.
     """
 
     def __init__(self, name: str, host: GuestHost, idle_s: float) -> None:
         self.axes: frozenset[str] = frozenset()
+        self.visit = 0
         self._name, self._host, self._idle_s = name, host, idle_s
         self._token: str | None = None
         self._changing = asyncio.Lock()
@@ -35,20 +37,31 @@ class GuestControl:
         """The guest has sent something."""
         self._heard_s = self._loop.time()
 
-    async def over(self, axes: Iterable[str]) -> str:
+    async def over(self, axes: Iterable[str], visit: int) -> str:
         """Return the lease under which the guest commands these axes, and take it if need be.
 
+        Args:
+            axes: that it commands.
+            visit: when it sent the command.
+
         Raises:
-            LdcndError: another client controls one of them.
+            LdcndError: another client controls one of them, or the guest has gone since.
         """
         self._commanded_s = self._loop.time()
         async with self._changing:
+            if visit != self.visit:  # a command may have waited for its axis to come to rest
+                raise LeaseExpired(f"{self._name} has gone before it began")
             wanted = self.axes.union(axes)
             if self._token is None or wanted != self.axes:
                 await self._ask(Acquire(client=self._name, axes=tuple(sorted(wanted)), lease_s=LEASE_S))
             if self._token is None:
                 raise AssertionError("a lease that was given has a name")
             return self._token
+
+    async def gone(self) -> None:
+        """The guest has gone: as `end`, and what it has commanded takes no control any more."""
+        self.visit += 1
+        await self.end()
 
     async def end(self) -> None:
         """Give control back; an axis that still moves does what its policy for the loss of a client says."""

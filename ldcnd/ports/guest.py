@@ -111,7 +111,7 @@ class Guest:
         self._line, self._free_at_s = asyncio.Lock(), 0.0
         self._refused: dict[tuple[str, str], float] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._closed = False
+        self._closed = self._here = False
         self.receive: Callable[[bytes], None] = lambda _: None
         self._control = GuestControl(port.name, host, port.idle_s) if port.access == "control" else None
         self._axes = tuple(drive.spec.name for drive in drives)
@@ -146,6 +146,10 @@ class Guest:
             return
         if self._control:
             self._control.heard()
+        if not self._here:
+            self._here = True
+            self.chain.unplug(self._loop.time())  # what the one before sent last may be on its way at that one's rate
+            self.chain.replug()
         self.chain.write(self._loop.time(), data)
         self._advance()
 
@@ -157,10 +161,11 @@ class Guest:
 
     async def gone(self) -> None:
         """The guest has gone: what it has commanded and has not begun is dropped, and control ends."""
+        self._here = False  # what it sent last comes to its modules yet: they stop by it and begin nothing
         for each in self._reached:
             each.waiting.clear()
         if self._control:
-            await self._control.end()
+            await self._control.gone()
 
     def _advance(self) -> None:
         """Do what is due on the guest's chain, and come back for what is due next."""
@@ -214,6 +219,8 @@ class Guest:
             self._relieve(module, found)
         elif self._control is None:
             self._refuse(module.name, command, f"the port {self._name} has access = read")
+        elif not self._here:
+            self._refuse(module.name, command, f"{self._name} has gone before it began")
         elif len(module.waiting) >= MOST_WAITING:
             self._refuse(module.name, command, f"{MOST_WAITING} commands wait already")
         else:
@@ -280,10 +287,11 @@ class Guest:
         if module.servo:
             await self._obey_servo(module.name, module.servo, self._control, command)
         elif module.outputs and (wanted := module.outputs.meaning(command)):
-            lease = await self._control.over(self._axes)
+            lease = await self._control.over(self._axes, self._control.visit)
             await self._host.carry_out(RIG_ITSELF, wanted.model_copy(update={"lease": lease}))
 
     async def _obey_servo(self, axis: str, servo: GuestServo, control: GuestControl, received: ReceivedCommand) -> None:
+        visit = control.visit
         meaning = servo.meaning(received)
         if meaning.from_rest:
             await self._come_to_rest(axis)
@@ -297,7 +305,7 @@ class Guest:
         if command is None:
             return
         if not command.takes_energy_out:
-            command = command.model_copy(update={"lease": await control.over((axis,))})
+            command = command.model_copy(update={"lease": await control.over((axis,), visit)})
         reply = await self._host.carry_out(axis, command)
         if isinstance(reply, CommandReply):
             servo.begun(command, reply.command_id, self._loop.time())

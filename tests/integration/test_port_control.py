@@ -8,7 +8,7 @@ from ldcnd.contract.commands import MoveRelative, Power, SetPosition, Stop
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders
-from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
 from tests.support.guest_program import guest
@@ -344,3 +344,33 @@ async def test_what_the_program_has_set_going_is_refused_to_nobody_who_stops_it(
         async with asyncio.timeout(5):
             while rig.daemon.rig.axes["rotor"].tracker.status.enabled:
                 await asyncio.sleep(0.02)
+
+
+async def test_a_motion_that_a_program_sends_before_it_ends_does_not_begin(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        program.send_bytes(encode_packet(Packet(1, NO_OPERATION)) * 20 + encode_packet(load(RUN_NOW)))
+        program.close()
+        await asyncio.sleep(2.0)
+        assert shaft(rig) == pytest.approx(0, abs=5)
+        assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)
+
+
+async def test_a_move_that_waits_for_rest_does_not_begin_once_its_program_has_ended(tmp_path):
+    async with guest(tmp_path, "control", modulo=1.0) as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=8.0))
+        async with asyncio.timeout(5):
+            while rig.speed() < 7.8:
+                await asyncio.sleep(0.01)
+        await program.send(load(GO_NOW, counts=30_000))
+        program.close()
+        async with asyncio.timeout(5):
+            while rig.speed() > 0.02:
+                await asyncio.sleep(0.01)
+        stands = shaft(rig)
+        await asyncio.sleep(2.0)
+        assert shaft(rig) == pytest.approx(stands, abs=20)
+        assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)

@@ -211,3 +211,16 @@ async def test_set_address_is_repeated_as_programs_do_and_the_next_module_keeps_
         kinds = [await program.send(Packet(address, READ_STATUS, b"\x20")) for address in (1, 2, 3)]
         assert kinds[0] == kinds[1] != kinds[2]
         assert all(kinds)
+
+
+@pytest.mark.parametrize("access", ["read", "control"])
+async def test_a_stop_that_a_program_sends_before_it_ends_goes_out(tmp_path, access):
+    async with guest(tmp_path, access) as (rig, program):
+        await turning(rig)
+        await program.begin()
+        program.send_bytes(encode_packet(Packet(1, NO_OPERATION)) * 20 + encode_packet(Packet(1, STOP, SMOOTH)))
+        program.close()
+
+        async with asyncio.timeout(3.0):
+            while rig.speed() > 0.01:
+                await asyncio.sleep(0.02)

@@ -28,6 +28,13 @@ def set_rate(descriptor: int, rate: int) -> None:
     termios.tcsetattr(descriptor, termios.TCSANOW, settings)
 
 
+def open_port(link: Path) -> "Program":
+    """Open the port as a program does, at the rate after power-up."""
+    descriptor = os.open(link, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+    set_rate(descriptor, termios.B19200)
+    return Program(descriptor)
+
+
 class Program:
     """The program, with the port open."""
 
@@ -59,6 +66,10 @@ class Program:
                     break  # it comes in one piece
         return reply.hex()
 
+    def set_rate(self, rate: int) -> None:
+        """Set the rate of the terminal, one of the codes of termios."""
+        set_rate(self._descriptor, rate)
+
     async def change_rate(self) -> None:
         """Change to 115,200 bits/s, as every program does that wants to be quick."""
         await self.send(Packet(0xFF, CommandCode.SET_BAUD_RATE, b"\x0a"), 0.05)
@@ -75,9 +86,7 @@ class Program:
 async def guest(tmp_path: Path, access: str = "read", **axis: object) -> AsyncIterator[tuple[Machine, Program]]:
     """Run the machine, and a program with its port open."""
     async with running_machine(with_port(tmp_path / "port", access, **axis)) as rig:
-        descriptor = os.open(tmp_path / "port", os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
-        set_rate(descriptor, termios.B19200)
-        program = Program(descriptor)
+        program = open_port(tmp_path / "port")
         try:
             yield rig, program
         finally:
