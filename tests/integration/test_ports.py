@@ -2,13 +2,14 @@
 
 import asyncio
 import random
+from itertools import product
 
 import pytest
 
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import MoveVelocity, Power
+from ldcnd.contract.commands import MoveVelocity, Power, Reset, Stop
 from ldcnd.contract.events import ReadEvents
-from ldcnd.contract.samples import LinkState
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
@@ -119,6 +120,33 @@ async def test_a_guest_that_reads_as_fast_as_it_can_leaves_polls_their_rate(tmp_
 
         assert replies > 20
         assert len(sent) - replies >= 0.85 * alone
+
+
+async def test_a_stop_waits_for_no_more_than_one_exchange_of_a_guest_that_reads_as_fast_as_it_can(tmp_path):
+    async with guest(tmp_path) as (rig, program):
+        loop, longest_s = asyncio.get_running_loop(), {False: 0.0, True: 0.0}
+        await program.begin()
+        await program.change_rate()
+        sent = record_packets(rig)
+        for greedy, delay_s in product((False, True), (0.0002 * count for count in range(20))):
+            await rig.client.ask(Reset(), "rotor")
+            await turning(rig)
+            until_s = loop.time() + 0.2
+            while loop.time() < until_s:
+                await (program.send(Packet(1, NO_OPERATION)) if greedy else asyncio.sleep(0.01))
+            if greedy:
+                program.send_bytes(encode_packet(Packet(1, NO_OPERATION)))
+            await asyncio.sleep(delay_s)
+            sent.clear()
+            asked_s, stopping = loop.time(), asyncio.create_task(rig.client.ask(Stop(), "rotor"))
+            while not any(each[1] == 1 and each[2] & 0x0F == STOP for each in sent):
+                await asyncio.sleep(0.0001)
+            longest_s[greedy] = max(longest_s[greedy], loop.time() - asked_s)
+            await stopping
+            async with asyncio.timeout(5.0):
+                while (await rig.client.state("rotor")).state is AxisState.STOPPING:
+                    await asyncio.sleep(0.02)
+        assert longest_s[True] < longest_s[False] + 0.003, longest_s  # an exchange at 115,200 bits/s takes 2 ms
 
 
 @pytest.mark.parametrize(
