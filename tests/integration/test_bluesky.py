@@ -193,7 +193,8 @@ def test_where_an_axis_was_sent_is_forgotten_once_something_else_has_stopped_or_
         located = lab.loop.run(x.locate())
         x.reset().wait(10)
 
-        assert located["setpoint"] == pytest.approx(lab.truth("x"), abs=IN_POSITION)
+        # the shaft may swing back by some hundredths after readings have shown it at rest
+        assert located["setpoint"] == pytest.approx(lab.truth("x"), abs=0.1)
         assert abs(located["setpoint"] - 40) > 1
 
 
