@@ -3,9 +3,9 @@
 from collections.abc import Awaitable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal, Protocol, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ldcnd.contract.commands import Command
 from ldcnd.contract.errors import ConfigError
@@ -15,19 +15,24 @@ from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.network import IoDriver
 from ldcnd.drives.toml import Name
 from ldcnd.line.bus import Bus
+from ldcnd.listen_address import parse_listen_address
 
 PORTS = "ldcnd.ports"
 
 
 class PortConfig(Frozen):
-    """A terminal on which a program that knows nothing of ldcnd uses a line of LDCN drives."""
+    """A terminal or a TCP address at which a program that knows nothing of ldcnd uses a line of LDCN drives."""
 
     name: Name
     """The guest's name in events."""
     bus: Name
     """The line; the guest finds its axes and named PIC-I/O modules in the order of their addresses."""
-    link: Path
+    link: Path | None = None
     """The link to the terminal that the program opens."""
+    listen: str | None = None
+    """Instead of `link`, HOST:PORT of a TCP address for raw bytes, as a serial device server has them."""
+    beyond_loopback: bool = False
+    """Other machines may reach `listen`: whoever does can use the port."""
     access: Literal["read", "control"] = "read"
     """What the guest may do: with "read" it reads, stops and switches motors off; all else is answered and not done.
     With "control" it moves axes as any client does, under a lease in its name."""
@@ -36,6 +41,17 @@ class PortConfig(Frozen):
     only reads loses it once its axes rest."""
     mode: str = Field(default="0600", pattern=r"^0[0-7]{3}$")
     """Permissions of the terminal, octal."""
+
+    @model_validator(mode="after")
+    def _one_way_in(self) -> Self:
+        if (self.link is None) is (self.listen is None):
+            raise ValueError(f"port {self.name}: give it either link or listen")
+        if self.listen is not None and not (parse_listen_address(self.listen).is_loopback or self.beyond_loopback):
+            raise ValueError(
+                f"port {self.name}: other machines could reach {self.listen}; "
+                "listen on 127.0.0.1, or set beyond_loopback = true"
+            )
+        return self
 
 
 class ScaleView(Protocol):

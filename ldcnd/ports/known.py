@@ -2,15 +2,17 @@
 
 import asyncio
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import AsyncExitStack
 
 from ldcnd.config.ports import GuestHost, PortConfig
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.network import IoDriver
 from ldcnd.line.bus import Bus
+from ldcnd.listen_address import parse_listen_address
 from ldcnd.log import get_logger
 from ldcnd.ports.guest import Guest
+from ldcnd.ports.tcp import Door, GuestSocket
 from ldcnd.ports.terminal import GuestTerminal
 
 log = get_logger("ports")
@@ -25,30 +27,37 @@ def check(port: PortConfig, line: BusConfig) -> None:
 
 
 async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequence[IoDriver], host: GuestHost) -> None:
-    """Serve a guest on a terminal until cancelled; a failure ends its port and nothing else."""
+    """Serve a guest on a terminal or a TCP address until cancelled; a failure ends its port and nothing else."""
     try:
-        async with asyncio.TaskGroup() as group:
-            with ExitStack() as stack:
-                terminal = GuestTerminal(port.link, int(port.mode, 8), stack)
-                guest = Guest(port, bus, drives, ios, host, group)
-                stack.callback(guest.close)
+        async with asyncio.TaskGroup() as group, AsyncExitStack() as stack:
+            door, where = await _open(port, stack)
+            guest = Guest(port, bus, drives, ios, host, group)
+            stack.callback(guest.close)
 
-                def take(data: bytes, baud: int | None) -> None:
-                    guest.chain.baud = baud or guest.chain.baud
-                    guest.send(data)
+            def take(data: bytes, baud: int | None) -> None:
+                # a program on TCP has no rate of its own: the server beside the drives has the one that they have
+                guest.chain.baud = baud or int(guest.chain.modules[0].baud)
+                guest.send(data)
 
-                def closed() -> None:
-                    group.create_task(guest.gone(), name=f"guest {port.name} gone")
+            def closed() -> None:
+                group.create_task(guest.gone(), name=f"guest {port.name} gone")
 
-                guest.receive, terminal.take, terminal.closed = terminal.write, take, closed
-                log.info(
-                    "port",
-                    guest=port.name,
-                    bus=port.bus,
-                    link=str(port.link),
-                    terminal=str(terminal.path),
-                    access=port.access,
-                )
-                await asyncio.Event().wait()
+            guest.receive, door.take, door.closed = door.write, take, closed
+            log.info("port", guest=port.name, bus=port.bus, access=port.access, **where)
+            if port.beyond_loopback:
+                log.warning("whoever reaches this address can use the port", guest=port.name, **where)
+            await asyncio.Event().wait()
     except Exception:
         log.exception("port ended", guest=port.name, bus=port.bus)
+
+
+async def _open(port: PortConfig, stack: AsyncExitStack) -> tuple[Door, dict[str, str]]:
+    """Open where the program comes in; return that, and what the log says of it."""
+    if port.link is not None:
+        terminal = GuestTerminal(port.link, int(port.mode, 8), stack)
+        return terminal, {"link": str(port.link), "terminal": str(terminal.path)}
+    door = GuestSocket()
+    server = await door.listen(parse_listen_address(port.listen or ""))
+    stack.callback(server.close)
+    stack.callback(door.close)
+    return door, {"listen": port.listen or ""}

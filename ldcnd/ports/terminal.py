@@ -4,7 +4,7 @@ import asyncio
 import os
 import select
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import AsyncExitStack, suppress
 from pathlib import Path
 
 READ_BYTES = 4096
@@ -21,7 +21,7 @@ class GuestTerminal:
         closed: called when the program has closed it.
     """
 
-    def __init__(self, link: Path, mode: int, stack: ExitStack) -> None:
+    def __init__(self, link: Path, mode: int, stack: AsyncExitStack) -> None:
         # a configuration with a port can be read where there are no terminals
         import tty  # noqa: PLC0415
 

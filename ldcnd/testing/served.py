@@ -116,7 +116,7 @@ def served_rig(
         if real.port:
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="ldcnd-")))
             ports = {port.name: folder / port.name for port in real.port}
-            own = tuple(port.model_copy(update={"link": ports[port.name]}) for port in real.port)
+            own = tuple(port.model_copy(update={"link": ports[port.name], "listen": None}) for port in real.port)
             settings = settings.model_copy(update={"port": own})
         thread = stack.enter_context(loop_thread())
         rig = stack.enter_context(thread.inside(_serving(settings, endpoint, state)))
