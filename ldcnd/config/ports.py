@@ -41,6 +41,9 @@ class PortConfig(Frozen):
     only reads loses it once its axes rest."""
     mode: str = Field(default="0600", pattern=r"^0[0-7]{3}$")
     """Permissions of the terminal, octal."""
+    group: str | None = Field(default=None, min_length=1, max_length=32)
+    """The group of the terminal, for a mode that lets it in; that of the daemon when missing. The daemon's user must be
+    a member."""
 
     @model_validator(mode="after")
     def _one_way_in(self) -> Self:

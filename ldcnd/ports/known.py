@@ -54,7 +54,7 @@ async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequen
 async def _open(port: PortConfig, stack: AsyncExitStack) -> tuple[Door, dict[str, str]]:
     """Open where the program comes in; return that, and what the log says of it."""
     if port.link is not None:
-        terminal = GuestTerminal(port.link, int(port.mode, 8), stack)
+        terminal = GuestTerminal(port.link, int(port.mode, 8), port.group, stack)
         return terminal, {"link": str(port.link), "terminal": str(terminal.path)}
     door = GuestSocket()
     server = await door.listen(parse_listen_address(port.listen or ""))

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import select
+import shutil
 from collections.abc import Callable
 from contextlib import AsyncExitStack, suppress
 from pathlib import Path
@@ -21,7 +22,7 @@ class GuestTerminal:
         closed: called when the program has closed it.
     """
 
-    def __init__(self, link: Path, mode: int, stack: AsyncExitStack) -> None:
+    def __init__(self, link: Path, mode: int, group: str | None, stack: AsyncExitStack) -> None:
         # a configuration with a port can be read where there are no terminals
         import tty  # noqa: PLC0415
 
@@ -35,6 +36,8 @@ class GuestTerminal:
         tty.setraw(slave)  # its settings stay while the master is open
         os.set_blocking(self._master, False)
         self.path = Path(os.ttyname(slave))
+        if group is not None:
+            shutil.chown(self.path, group=group)
         self.path.chmod(mode)
         os.close(slave)
         stack.callback(TerminalLink(link, self.path).close)

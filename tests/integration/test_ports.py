@@ -1,7 +1,10 @@
 """A program that knows nothing of ldcnd reads and stops drives on a port while clients move them."""
 
 import asyncio
+import grp
+import os
 import random
+import stat
 from contextlib import suppress
 from itertools import product
 
@@ -323,3 +326,13 @@ def test_a_port_has_one_way_in_and_none_for_other_machines_unless_it_says_so(way
     document = machine().model_dump(mode="json", exclude_defaults=True)
     with pytest.raises((ValueError, LdcndError), match=complaint):
         RigConfig.model_validate(document | {"port": [{"name": "old", "bus": "line"} | way]})
+
+
+async def test_the_terminal_has_the_group_and_the_mode_of_the_configuration(tmp_path):
+    mine = grp.getgrgid(max(os.getgroups(), default=os.getgid()))
+    config = with_port(tmp_path / "port")
+    (port,) = config.port
+    shared = config.model_copy(update={"port": (port.model_copy(update={"mode": "0660", "group": mine.gr_name}),)})
+    async with running_machine(shared):
+        found = (tmp_path / "port").stat()
+        assert (found.st_gid, stat.S_IMODE(found.st_mode)) == (mine.gr_gid, 0o660)
