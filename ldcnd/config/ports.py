@@ -21,7 +21,7 @@ PORTS = "ldcnd.ports"
 
 
 class PortConfig(Frozen):
-    """A terminal or a TCP address at which a program that knows nothing of ldcnd uses a line of LDCN drives."""
+    """A terminal or a TCP address at which a program that speaks the drives' protocol itself uses their line."""
 
     name: Name
     """The guest's name in events."""
@@ -30,9 +30,11 @@ class PortConfig(Frozen):
     link: Path | None = None
     """The link to the terminal that the program opens."""
     listen: str | None = None
-    """Instead of `link`, HOST:PORT of a TCP address for raw bytes, as a serial device server has them."""
+    """Instead of `link`, HOST:PORT of a TCP address, as a serial device server has it."""
+    rfc2217: bool = False
+    """Programs speak RFC 2217 at `listen`, which carries their serial settings, too; without, raw bytes."""
     beyond_loopback: bool = False
-    """Other machines may reach `listen`: whoever does can use the port."""
+    """Accept connections from other machines; every machine that reaches the address can then use the port."""
     access: Literal["read", "control"] = "read"
     """What the guest may do: with "read" it reads, stops and switches motors off; all else is answered and not done.
     With "control" it moves axes as any client does, under a lease in its name."""
@@ -49,6 +51,8 @@ class PortConfig(Frozen):
     def _one_way_in(self) -> Self:
         if (self.link is None) is (self.listen is None):
             raise ValueError(f"port {self.name}: give it either link or listen")
+        if self.listen is None and self.rfc2217:
+            raise ValueError(f"port {self.name}: rfc2217 is spoken at a TCP address; give it listen instead of link")
         if self.listen is not None and not (parse_listen_address(self.listen).is_loopback or self.beyond_loopback):
             raise ValueError(
                 f"port {self.name}: other machines could reach {self.listen}; "

@@ -3,6 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable, Iterable
 from contextlib import suppress
+from dataclasses import dataclass
 
 from ldcnd.config.ports import GuestHost
 from ldcnd.contract.commands import Command
@@ -16,17 +17,26 @@ LEASE_S = 2.0
 LOOKS_S = 0.5
 
 
+@dataclass(slots=True)
+class Visit:
+    """One time that the program is there, from its first byte until it closes its port or falls idle.
+
+    Attributes:
+        ended: what it has commanded and has not begun begins nothing any more.
+    """
+
+    ended: bool = False
+
+
 class GuestControl:
     """The lease of one guest.
 
     Attributes:
         axes: that it controls.
-        visit: number of the times that the guest has gone; what it commanded before begins nothing any more.
     """
 
     def __init__(self, name: str, host: GuestHost, idle_s: float) -> None:
         self.axes: frozenset[str] = frozenset()
-        self.visit = 0
         self._name, self._host, self._idle_s = name, host, idle_s
         self._token: str | None = None
         self._changing = asyncio.Lock()
@@ -37,19 +47,19 @@ class GuestControl:
         """The guest has sent something."""
         self._heard_s = self._loop.time()
 
-    async def over(self, axes: Iterable[str], visit: int) -> str:
+    async def over(self, axes: Iterable[str], visit: Visit) -> str:
         """Return the lease under which the guest commands these axes, and take it if need be.
 
         Args:
             axes: that it commands.
-            visit: when it sent the command.
+            visit: in which it sent the command.
 
         Raises:
             LdcndError: another client controls one of them, or the guest has gone since.
         """
         self._commanded_s = self._loop.time()
         async with self._changing:
-            if visit != self.visit:  # a command may have waited for its axis to come to rest
+            if visit.ended:  # a command may have waited for its axis to come to rest
                 raise LeaseExpired(f"{self._name} has gone before it began")
             wanted = self.axes.union(axes)
             if self._token is None or wanted != self.axes:
@@ -57,11 +67,6 @@ class GuestControl:
             if self._token is None:
                 raise AssertionError("a lease that was given has a name")
             return self._token
-
-    async def gone(self) -> None:
-        """The guest has gone: as `end`, and what it has commanded takes no control any more."""
-        self.visit += 1
-        await self.end()
 
     async def end(self) -> None:
         """Give control back; an axis that still moves does what its policy for the loss of a client says."""

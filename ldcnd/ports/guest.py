@@ -3,7 +3,7 @@
 import asyncio
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -28,7 +28,7 @@ from ldcnd.drives.network import IoDriver
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
 from ldcnd.log import get_logger
-from ldcnd.ports.control import GuestControl
+from ldcnd.ports.control import GuestControl, Visit
 from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.ports.outputs import GuestOutputs
 from ldcnd.ports.translate import GuestServo, name_of, relief
@@ -111,7 +111,8 @@ class Guest:
         self._line, self._free_at_s = asyncio.Lock(), 0.0
         self._refused: dict[tuple[str, str], float] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._closed = self._here = False
+        self._closed = False
+        self._visit: Visit | None = None
         self.receive: Callable[[bytes], None] = lambda _: None
         self._control = GuestControl(port.name, host, port.idle_s) if port.access == "control" else None
         self._axes = tuple(drive.spec.name for drive in drives)
@@ -146,8 +147,8 @@ class Guest:
             return
         if self._control:
             self._control.heard()
-        if not self._here:
-            self._here = True
+        if self._visit is None:
+            self._visit = Visit()
             self.chain.unplug(self._loop.time())  # what the one before sent last may be on its way at that one's rate
             self.chain.replug()
         self.chain.write(self._loop.time(), data)
@@ -161,11 +162,13 @@ class Guest:
 
     async def gone(self) -> None:
         """The guest has gone: what it has commanded and has not begun is dropped, and control ends."""
-        self._here = False  # what it sent last comes to its modules yet: they stop by it and begin nothing
+        if self._visit:
+            self._visit.ended = True
+        self._visit = None  # what it sent last comes to its modules yet: they stop by it and begin nothing
         for each in self._reached:
             each.waiting.clear()
         if self._control:
-            await self._control.gone()
+            await self._control.end()
 
     def _advance(self) -> None:
         """Do what is due on the guest's chain, and come back for what is due next."""
@@ -219,7 +222,7 @@ class Guest:
             self._relieve(module, found)
         elif self._control is None:
             self._refuse(module.name, command, f"the port {self._name} has access = read")
-        elif not self._here:
+        elif self._visit is None:
             self._refuse(module.name, command, f"{self._name} has gone before it began")
         elif len(module.waiting) >= MOST_WAITING:
             self._refuse(module.name, command, f"{MOST_WAITING} commands wait already")
@@ -268,9 +271,11 @@ class Guest:
                 if module.reliefs:
                     await asyncio.wait(tuple(module.reliefs.values()))
                     continue
-                module.at_work = module.waiting.popleft()
+                if self._visit is None or self._control is None:
+                    raise AssertionError("nothing waits without a program that may command")
+                visit, module.at_work = self._visit, module.waiting.popleft()
                 try:
-                    await self._obey(module, module.at_work)
+                    await self._obey(module, module.at_work, self._control, visit)
                 except LdcndError as error:
                     self._refuse(module.name, module.at_work, error.message)
                 except ValidationError as error:  # a packet holds values that no command has
@@ -281,17 +286,20 @@ class Guest:
             module.at_work = None
             module.idle.set()
 
-    async def _obey(self, module: _Reached, command: ReceivedCommand) -> None:
-        if self._control is None:
-            return
+    async def _obey(self, module: _Reached, command: ReceivedCommand, control: GuestControl, visit: Visit) -> None:
         if module.servo:
-            await self._obey_servo(module.name, module.servo, self._control, command)
+            await self._obey_servo(module.name, module.servo, command, partial(control.over, visit=visit))
         elif module.outputs and (wanted := module.outputs.meaning(command)):
-            lease = await self._control.over(self._axes, self._control.visit)
+            lease = await control.over(self._axes, visit)
             await self._host.carry_out(RIG_ITSELF, wanted.model_copy(update={"lease": lease}))
 
-    async def _obey_servo(self, axis: str, servo: GuestServo, control: GuestControl, received: ReceivedCommand) -> None:
-        visit = control.visit
+    async def _obey_servo(
+        self,
+        axis: str,
+        servo: GuestServo,
+        received: ReceivedCommand,
+        take_control: Callable[[Sequence[str]], Awaitable[str]],
+    ) -> None:
         meaning = servo.meaning(received)
         if meaning.from_rest:
             await self._come_to_rest(axis)
@@ -305,7 +313,7 @@ class Guest:
         if command is None:
             return
         if not command.takes_energy_out:
-            command = command.model_copy(update={"lease": await control.over((axis,), visit)})
+            command = command.model_copy(update={"lease": await take_control((axis,))})
         reply = await self._host.carry_out(axis, command)
         if isinstance(reply, CommandReply):
             servo.begun(command, reply.command_id, self._loop.time())

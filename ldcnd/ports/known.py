@@ -11,8 +11,9 @@ from ldcnd.drives.network import IoDriver
 from ldcnd.line.bus import Bus
 from ldcnd.listen_address import parse_listen_address
 from ldcnd.log import get_logger
+from ldcnd.ports.door import Door
 from ldcnd.ports.guest import Guest
-from ldcnd.ports.tcp import Door, GuestSocket
+from ldcnd.ports.tcp import GuestSocket
 from ldcnd.ports.terminal import GuestTerminal
 
 log = get_logger("ports")
@@ -30,12 +31,15 @@ async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequen
     """Serve a guest on a terminal or a TCP address until cancelled; a failure ends its port and nothing else."""
     try:
         async with asyncio.TaskGroup() as group, AsyncExitStack() as stack:
-            door, where = await _open(port, stack)
+            try:
+                door, where = await _open(port, stack)
+            except (OSError, LookupError) as error:
+                log.error("the port cannot be served; mend [[port]] and restart", guest=port.name, reason=str(error))
+                return
             guest = Guest(port, bus, drives, ios, host, group)
             stack.callback(guest.close)
 
             def take(data: bytes, baud: int | None) -> None:
-                # a program on TCP has no rate of its own: the server beside the drives has the one that they have
                 guest.chain.baud = baud or int(guest.chain.modules[0].baud)
                 guest.send(data)
 
@@ -45,7 +49,7 @@ async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequen
             guest.receive, door.take, door.closed = door.write, take, closed
             log.info("port", guest=port.name, bus=port.bus, access=port.access, **where)
             if port.beyond_loopback:
-                log.warning("whoever reaches this address can use the port", guest=port.name, **where)
+                log.warning("every machine that reaches this address can use the port", guest=port.name, **where)
             await asyncio.Event().wait()
     except Exception:
         log.exception("port ended", guest=port.name, bus=port.bus)
@@ -54,10 +58,11 @@ async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequen
 async def _open(port: PortConfig, stack: AsyncExitStack) -> tuple[Door, dict[str, str]]:
     """Open where the program comes in; return that, and what the log says of it."""
     if port.link is not None:
-        terminal = GuestTerminal(port.link, int(port.mode, 8), port.group, stack)
+        terminal = GuestTerminal(port.link, int(port.mode, 8), port.group)
+        stack.callback(terminal.close)
         return terminal, {"link": str(port.link), "terminal": str(terminal.path)}
-    door = GuestSocket()
+    door = GuestSocket(rfc2217=port.rfc2217)
     server = await door.listen(parse_listen_address(port.listen or ""))
     stack.callback(server.close)
-    stack.callback(door.close)
+    stack.callback(door.leave)
     return door, {"listen": port.listen or ""}

@@ -1,9 +1,11 @@
-"""The TCP address of a port: one program at a time, raw bytes, as a serial device server has them."""
+"""The TCP address of a port: one program at a time, raw bytes or RFC 2217, as serial device servers have them."""
 
 import asyncio
-from collections.abc import Callable
-from typing import Protocol
+from collections.abc import Callable, Iterable
+from typing import cast
 
+import serial
+from serial.rfc2217 import PortManager, Serial
 from typing_extensions import override
 
 from ldcnd.listen_address import ListenAddress
@@ -15,77 +17,128 @@ MOST_UNREAD_BYTES = 65_536
 """Replies that a program does not read are lost beyond this, as on a line."""
 
 
-class Door(Protocol):
-    """Where a program comes in.
-
-    Attributes:
-        take: called with what it has sent, and the rate that it has set; None where that is not known.
-        closed: called when it has gone.
-    """
-
-    take: Callable[[bytes, int | None], None]
-    closed: Callable[[], None]
-
-    def write(self, data: bytes) -> None:
-        """Send to the program; what it does not read is lost."""
-
-
 class GuestSocket:
-    """A `Door` at an address; whoever comes while a program is connected is sent away."""
+    """A `Door` at an address; a second program is refused while one is connected."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, rfc2217: bool) -> None:
         self.take: Callable[[bytes, int | None], None] = lambda _data, _baud: None
         self.closed: Callable[[], None] = lambda: None
-        self._transport: asyncio.Transport | None = None
+        self._rfc2217 = rfc2217
+        self._inside: _Connection | None = None
 
     async def listen(self, address: ListenAddress) -> asyncio.Server:
-        """Listen there, and return the server; closing it sends the program away, too."""
-        return await asyncio.get_running_loop().create_server(
-            lambda: _Connection(self), address.host, address.port, backlog=1
-        )
+        """Listen there, and return the server; closing it does not disconnect the program."""
+        make = _Rfc2217Connection if self._rfc2217 else _Connection
+        return await asyncio.get_running_loop().create_server(lambda: make(self), address.host, address.port, backlog=1)
 
     def write(self, data: bytes) -> None:
         """Send to the program."""
-        if self._transport and self._transport.get_write_buffer_size() < MOST_UNREAD_BYTES:
-            self._transport.write(data)
+        if self._inside:
+            self._inside.write(self._inside.as_sent(data))
 
-    def close(self) -> None:
-        """Send the program away."""
-        if self._transport:
-            self._transport.abort()
+    def leave(self) -> None:
+        """Disconnect the program."""
+        if self._inside:
+            self._inside.transport.abort()
 
-    def came(self, transport: asyncio.Transport) -> bool:
+    def enter(self, connection: "_Connection") -> None:
         """Let a program in, unless there is one."""
-        if self._transport:
-            log.warning("a second program was sent away", peer=str(transport.get_extra_info("peername")))
-            return False
-        self._transport = transport
-        return True
+        if self._inside:
+            peer = str(connection.transport.get_extra_info("peername"))
+            log.warning("a second program was refused: one is connected already", peer=peer)
+            connection.transport.abort()
+        else:
+            self._inside = connection
+            connection.begin()
 
-    def left(self, transport: asyncio.BaseTransport | None) -> None:
+    def received(self, connection: "_Connection", data: bytes) -> None:
+        """Take what a program has sent."""
+        if connection is self._inside and data:
+            self.take(data, connection.baud)
+
+    def left(self, connection: "_Connection") -> None:
         """A connection has ended."""
-        if transport is not None and transport is self._transport:
-            self._transport = None
+        if connection is self._inside:
+            self._inside = None
             self.closed()
 
 
 class _Connection(asyncio.Protocol):
+    """A program that sends raw bytes: it has no rate of its own, a server beside the drives has that of the drives."""
+
+    transport: asyncio.Transport
+    baud: int | None = None
+
     def __init__(self, door: GuestSocket) -> None:
         self._door = door
-        self._transport: asyncio.BaseTransport | None = None
+
+    def begin(self) -> None:
+        """The program is let in."""
+
+    def write(self, data: bytes) -> None:
+        """Send to the program."""
+        if self.transport.get_write_buffer_size() < MOST_UNREAD_BYTES:
+            self.transport.write(data)
+
+    def as_sent(self, data: bytes) -> bytes:
+        """Return replies as they go over the connection."""
+        return data
+
+    def received(self, data: bytes) -> bytes:
+        """Return what is for the modules of what came over the connection."""
+        return data
 
     @override
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        if isinstance(transport, asyncio.Transport) and self._door.came(transport):
-            self._transport = transport
-        elif isinstance(transport, asyncio.Transport):
-            transport.abort()
+        if not isinstance(transport, asyncio.Transport):
+            raise TypeError("a TCP connection can be written to")
+        self.transport = transport
+        self._door.enter(self)
 
     @override
     def data_received(self, data: bytes) -> None:
-        if self._transport:
-            self._door.take(data, None)
+        self._door.received(self, self.received(data))
 
     @override
     def connection_lost(self, exc: Exception | None) -> None:
-        self._door.left(self._transport)
+        self._door.left(self)
+
+
+class _Settings:
+    """The serial settings of a program, as `PortManager` reads and writes them: kept, and the rate is heeded."""
+
+    bytesize, parity, stopbits = serial.EIGHTBITS, serial.PARITY_NONE, serial.STOPBITS_ONE
+    xonxoff = rtscts = break_condition = ri = False
+    dtr = rts = cts = dsr = cd = True
+
+    def __init__(self) -> None:
+        self.baudrate = 19_200
+
+    def reset_input_buffer(self) -> None:
+        """Replies are sent at once: none waits here."""
+
+    def reset_output_buffer(self) -> None:
+        """What is written is taken at once: none waits here."""
+
+
+class _Rfc2217Connection(_Connection):
+    """A program that sets its rate over the connection, too."""
+
+    @override
+    def begin(self) -> None:
+        self._settings = _Settings()
+        self._manager = PortManager(cast("Serial", self._settings), cast("Serial", self))
+
+    @override
+    def as_sent(self, data: bytes) -> bytes:
+        return _joined(self._manager.escape(data))
+
+    @override
+    def received(self, data: bytes) -> bytes:
+        found = _joined(self._manager.filter(data))
+        self.baud = self._settings.baudrate
+        return found
+
+
+def _joined(pieces: Iterable[bytes]) -> bytes:
+    return b"".join(pieces)

@@ -5,7 +5,7 @@ import os
 import select
 import shutil
 from collections.abc import Callable
-from contextlib import AsyncExitStack, suppress
+from contextlib import suppress
 from pathlib import Path
 
 READ_BYTES = 4096
@@ -14,38 +14,62 @@ LOOK_S = 0.02
 
 
 class GuestTerminal:
-    """One terminal behind a link, until the stack closes.
+    """A `Door`: a terminal behind a link, until it is closed.
 
     Attributes:
         path: of the terminal itself.
-        take: called with what the program has sent, and the rate that it has set, None for one that is none.
-        closed: called when the program has closed it.
+        take, closed: see `Door`.
+
+    Raises:
+        OSError, LookupError: it cannot be made, or there is no such group.
     """
 
-    def __init__(self, link: Path, mode: int, group: str | None, stack: AsyncExitStack) -> None:
+    def __init__(self, link: Path, mode: int, group: str | None) -> None:
+        self.take: Callable[[bytes, int | None], None] = lambda _data, _baud: None
+        self.closed: Callable[[], None] = lambda: None
+        self._link, self._mode, self._group = link, mode, group
+        self._loop = asyncio.get_running_loop()
+        self._later: asyncio.TimerHandle | None = None
+        self._baud: int | None = None
+        self._open()
+
+    def _open(self) -> None:
         # a configuration with a port can be read where there are no terminals
         import tty  # noqa: PLC0415
 
         from ldcnd.line.terminal_link import TerminalLink  # noqa: PLC0415
 
-        self.take: Callable[[bytes, int | None], None] = lambda _data, _baud: None
-        self.closed: Callable[[], None] = lambda: None
-        self._loop = asyncio.get_running_loop()
         self._master, slave = os.openpty()
-        stack.callback(os.close, self._master)
-        tty.setraw(slave)  # its settings stay while the master is open
-        os.set_blocking(self._master, False)
-        self.path = Path(os.ttyname(slave))
-        if group is not None:
-            shutil.chown(self.path, group=group)
-        self.path.chmod(mode)
-        os.close(slave)
-        stack.callback(TerminalLink(link, self.path).close)
+        try:
+            tty.setraw(slave)  # its settings stay while the master is open
+            os.set_blocking(self._master, False)
+            self.path = Path(os.ttyname(slave))
+            if self._group is not None:
+                shutil.chown(self.path, group=self._group)
+            self.path.chmod(self._mode)
+            self._linked = TerminalLink(self._link, self.path)
+        except (OSError, LookupError):
+            os.close(self._master)
+            raise
+        finally:
+            os.close(slave)
         self._poll = select.poll()
         self._poll.register(self._master, select.POLLIN)
-        self._later: asyncio.TimerHandle | None = None
         self._look()
-        stack.callback(self._stop)
+
+    def close(self) -> None:
+        """Take the link away, and hang up on the program."""
+        self._loop.remove_reader(self._master)
+        if self._later:
+            self._later.cancel()
+        self._linked.close()
+        os.close(self._master)
+
+    def leave(self) -> None:
+        """Hang up on the program: its terminal is gone, and another one is behind the link."""
+        self.close()
+        self._open()
+        self.closed()
 
     def write(self, data: bytes) -> None:
         """Send to the program; what it does not read is lost, as on a line."""
@@ -72,9 +96,5 @@ class GuestTerminal:
             self.closed()
             self._look()
             return
-        self.take(data, actual_baud(self._master))
-
-    def _stop(self) -> None:
-        self._loop.remove_reader(self._master)
-        if self._later:
-            self._later.cancel()
+        self._baud = actual_baud(self._master) or self._baud
+        self.take(data, self._baud)

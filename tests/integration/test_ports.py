@@ -5,7 +5,6 @@ import grp
 import os
 import random
 import stat
-from contextlib import suppress
 from itertools import product
 
 import pytest
@@ -14,7 +13,6 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import MoveVelocity, Power, Reset, Stop
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
-from ldcnd.contract.leases import ListHolders
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
@@ -23,7 +21,6 @@ from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from tests.support.guest_program import guest, with_port
 from tests.support.machine_rig import COUNTS, Machine, machine, running_machine
-from tests.support.process import free_port
 
 SET_ADDRESS, STOP, NO_OPERATION = CommandCode.SET_ADDRESS, CommandCode.STOP_MOTOR, CommandCode.NO_OPERATION
 DEFINE_STATUS, READ_STATUS = CommandCode.DEFINE_STATUS, CommandCode.READ_STATUS
@@ -270,49 +267,6 @@ async def test_a_stop_that_a_program_sends_before_it_ends_goes_out(tmp_path, acc
                 await asyncio.sleep(0.02)
 
 
-async def connected(port: int, packets: list[Packet]) -> list[bytes]:
-    """Send packets by TCP, each once the reply to the one before has come; return the replies."""
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    replies = []
-    for packet in packets:
-        writer.write(encode_packet(packet))
-        if packet.address == 0xFF:
-            await asyncio.sleep(0.05)
-            continue
-        replies.append(await asyncio.wait_for(reader.read(100), 5))
-    writer.close()
-    await writer.wait_closed()
-    return replies
-
-
-@pytest.mark.real_time
-async def test_a_program_comes_in_by_tcp_one_at_a_time_and_what_it_moves_halts_when_it_goes(tmp_path):
-    port = free_port()
-    document = machine().model_dump(mode="json", exclude_defaults=True)
-    tcp = {"name": "old", "bus": "line", "listen": f"127.0.0.1:{port}", "access": "control"}
-    begins = [
-        Packet(0xFF, CommandCode.HARD_RESET),
-        *(Packet(0, SET_ADDRESS, bytes((each, 0xFF))) for each in (1, 2, 3)),
-    ]
-    async with running_machine(RigConfig.model_validate(document | {"port": [tcp]})) as rig:
-        _, writer = await asyncio.open_connection("127.0.0.1", port)
-        second, other = await asyncio.open_connection("127.0.0.1", port)
-        with suppress(ConnectionError):
-            assert await asyncio.wait_for(second.read(), 5) == b""
-        other.close()
-        writer.close()
-        replies: list[bytes] = []
-        async with asyncio.timeout(10):
-            while not replies or not all(replies):  # the first one may not have left yet
-                with suppress(ConnectionError):
-                    replies = await connected(port, [*begins, Packet(1, STOP, b"\x05"), load_velocity()])
-                await asyncio.sleep(0.05)
-        assert len(replies) == 5
-        async with asyncio.timeout(10):
-            while any(each.client for each in (await rig.client.ask(ListHolders())).holders) or rig.speed() > 0.02:
-                await asyncio.sleep(0.05)
-
-
 @pytest.mark.parametrize(
     ("way", "complaint"),
     [
@@ -320,6 +274,7 @@ async def test_a_program_comes_in_by_tcp_one_at_a_time_and_what_it_moves_halts_w
         ({"link": "x", "listen": "127.0.0.1:1"}, "give it either link or listen"),
         ({"listen": "0.0.0.0:4001"}, "other machines could reach 0.0.0.0:4001"),
         ({"listen": "4001"}, "is not HOST:PORT"),
+        ({"link": "x", "rfc2217": True}, "give it listen instead of link"),
     ],
 )
 def test_a_port_has_one_way_in_and_none_for_other_machines_unless_it_says_so(way, complaint):
