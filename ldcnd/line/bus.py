@@ -49,7 +49,7 @@ class Job(Transaction):
         condition: see `Transaction`.
     """
 
-    __slots__ = ("attempts", "attempts_left", "condition", "future", "timing")
+    __slots__ = ("_doubted", "attempts", "attempts_left", "condition", "future", "timing")
     proves = False
 
     def __init__(
@@ -65,11 +65,21 @@ class Job(Transaction):
         self.future: asyncio.Future[Any] = loop.create_future()
         self.timing: Timing | None = None
         self.attempts = self.attempts_left = attempts
+        self._doubted = False
 
     @property
     @override
     def abandoned(self) -> bool:
         return self.future.done()
+
+    @property
+    @override
+    def doubted(self) -> bool:
+        return self._doubted
+
+    @override
+    def doubt(self) -> None:
+        self._doubted = True
 
     @override
     def may_go(self, now_s: float) -> bool:
@@ -80,6 +90,7 @@ class Job(Transaction):
                 self.fail(error)
                 return False
         self.attempts_left -= 1  # what the condition forbids was no attempt
+        self._doubted = False
         return True
 
     def fail(self, error: LdcndError) -> None:

@@ -66,6 +66,14 @@ class Transaction:
         """Whether no caller waits for the outcome."""
         return False
 
+    @property
+    def doubted(self) -> bool:
+        """Whether the last time that it was sent, a reply came that may have been to something older."""
+        return False
+
+    def doubt(self) -> None:
+        """Note that the reply which has come may have been to something older."""
+
     def may_go(self, now_s: float) -> bool:  # noqa: ARG002 - the general answer
         """Check the condition directly before sending; if it fails, that is the outcome."""
         return True
@@ -367,6 +375,10 @@ class Line(Receiver):
         # One at a time: a second command would overwrite the first in the module's buffer, and every module drops the
         # reply that it is sending (PIC-SERVO manual, 4.1); a SmartStep is silent about it (SmartStep manual, 2.1).
         self._transaction, self._sent_at_s = transaction, now_s
+        if not self._in_step and not transaction.proves:
+            # a stop does not wait until no late reply can come any more, and a status packet that comes while it is on
+            # its way has no number: it would be taken for heard although it was lost
+            self._distrusted = True
         self.phase = Phase.REPLY if transaction.exchange.reply_bytes else Phase.QUIET
         try:
             self.transport.write(transaction.exchange.request)
@@ -495,6 +507,8 @@ class Line(Receiver):
     def _judge(self, transaction: Transaction, reply: bytes, verdict: ReplyVerdict, now_s: float) -> None:
         """Accept a whole reply, or wait whether another one follows."""
         if self._distrusted:
+            if verdict is ReplyVerdict.INTACT:
+                transaction.doubt()
             self._discard_reply(transaction, reply, _OLDER, now_s)
         elif not transaction.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(transaction)):
             # What could move a drive twice is not repeated, so its reply has to be its own: a status packet has neither
@@ -660,7 +674,7 @@ class Line(Receiver):
         self._probes_left, self._in_step = PROBE_ROUNDS, False
 
     def _begin_quarantine(self, now_s: float) -> None:
-        """Wait until no late reply can come any more; a stop waits for the flush alone."""
+        """Wait until no late reply can come any more; a stop that was not sent yet waits for the flush alone."""
         if self.phase is Phase.CLOSED:
             return
         self.phase, self._quarantined_s, self._distrusted = Phase.QUARANTINE, now_s, False

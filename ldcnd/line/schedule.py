@@ -28,6 +28,10 @@ class Queueable(Protocol):
     def abandoned(self) -> bool:
         """Whether no caller waits for this job any more."""
 
+    @property
+    def doubted(self) -> bool:
+        """Whether it was sent and answered on a line that was not in step: it waits for a line that is."""
+
 
 JobT = TypeVar("JobT", bound=Queueable)
 
@@ -63,7 +67,7 @@ class Schedule(Generic[JobT]):
     # -- jobs --------------------------------------------------------------------------------------------------------
 
     def push(self, job: JobT, lane: Lane) -> None:
-        """Queue a job behind its lane's others.
+        """Queue a job behind its lane's others, and before those that are doubted.
 
         Raises:
             BusBusy: the lane is full.
@@ -77,11 +81,15 @@ class Schedule(Generic[JobT]):
                 limit=LANE_LIMITS[lane],
                 remedy="send commands more slowly",
             )
-        waiting.append(job)
+        waiting.insert(len(waiting) - sum(other.doubted for other in waiting), job)
 
     def requeue(self, job: JobT, lane: Lane) -> None:
-        """Give a job that has to be sent again the next turn of its lane."""
-        self._jobs[lane].appendleft(job)
+        """Give a job that has to be sent again the next turn of its lane; one that is doubted, the last."""
+        waiting = self._jobs[lane]
+        if job.doubted:
+            waiting.append(job)
+        else:
+            waiting.appendleft(job)
 
     def takes_probe(self) -> bool:
         """Tell whether a probe would be alone: no stop waits, and no other probe."""
@@ -96,8 +104,8 @@ class Schedule(Generic[JobT]):
         return list(self._jobs.get(lane, ()))
 
     def stop_waits(self) -> bool:
-        """Tell whether a stop is queued whose caller still waits."""
-        return any(not stop.abandoned for stop in self._jobs[STOP])
+        """Tell whether a stop is queued whose caller still waits, and which does not wait for a line in step."""
+        return any(not stop.abandoned and not stop.doubted for stop in self._jobs[STOP])
 
     def take_job(self, now_s: float) -> JobT | None:
         """Remove and return the job that goes on the wire now, or None when it is a poll's turn or nothing is due."""

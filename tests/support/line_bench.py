@@ -26,9 +26,21 @@ class RecordingTransaction(Transaction):
     def __init__(self, exchange: Exchange[int], story: list[str], lane: Lane = Lane.COMMAND):
         super().__init__(exchange, lane, 0.0)
         self.story = story
-        self.send_again = False
+        self.send_again = 0
+        self._doubted = False
         self.timing: Timing | None = None
         self.error: BusError | None = None
+
+    @property
+    def doubted(self) -> bool:
+        return self._doubted
+
+    def doubt(self) -> None:
+        self._doubted = True
+
+    def may_go(self, now_s: float) -> bool:
+        self._doubted = False
+        return True
 
     def completed(self, reply: bytes, timing: Timing) -> None:
         self.timing = timing
@@ -37,13 +49,15 @@ class RecordingTransaction(Transaction):
     def lost(self, error: BusError) -> bool:
         self.error = error
         self.story.append(f"lost {toy.number_of(self.exchange.request)}")
-        again, self.send_again = self.send_again, False
-        return again
+        return self._again()
+
+    def _again(self) -> bool:
+        self.send_again -= 1
+        return self.send_again >= 0
 
     def rejected(self) -> bool:
         self.story.append(f"rejected {toy.number_of(self.exchange.request)}")
-        again, self.send_again = self.send_again, False
-        return again
+        return self._again()
 
 
 class Bench:

@@ -131,7 +131,7 @@ async def test_a_rejected_packet_is_sent_again_at_once_without_a_quarantine():
     bench.replies({1: [Say(toy.reply(1, kind=toy.REJECTED))]})
 
     turn = bench.add(1)
-    turn.send_again = True
+    turn.send_again = 1
     await settle()
 
     assert bench.story == ["rejected 1", "completed 1"]

@@ -134,13 +134,43 @@ async def test_a_stop_shortens_the_quarantine_to_flush_and_settle():
     await settle(0.001)
 
     bench.add(1)
-    bench.add(2, Lane.STOP)
+    bench.add(2, Lane.STOP).send_again = 1
     bench.wire.say(b"\x55")
     await settle()
 
     assert bench.wire.packets()[:2] == [toy.FLUSH, toy.request(1, 2)]
-    assert bench.sent(2) == pytest.approx([0.001 + len(toy.FLUSH) * BYTE_S + toy.RESYNC.settle_s])
-    assert bench.story == ["completed 2", "completed 1"]
+    assert bench.sent(2)[0] == pytest.approx(0.001 + len(toy.FLUSH) * BYTE_S + toy.RESYNC.settle_s)
+    assert bench.story == ["lost 2", "completed 2", "completed 1"]
+
+
+@pytest.mark.parametrize("late_s", [0.0005 * count for count in range(30)])
+async def test_a_late_reply_to_an_older_packet_does_not_confirm_a_stop(late_s: float):
+    """The stop is lost, and the reply to the command before it comes at any instant."""
+    bench = Bench()
+    bench.replies({1: [Say(toy.reply(1), after_s=late_s, unbidden=True)], 2: []})
+
+    bench.add(1)
+    await settle(0.001)
+    bench.add(2, Lane.STOP).send_again = 9
+    await settle()
+
+    assert bench.story[-1] == "completed 2"
+    assert bench.wire.packets()[-1] == toy.request(1, 2)
+    assert len(bench.sent(2)) >= 2
+
+
+async def test_a_stop_that_comes_while_another_one_waits_for_its_proof_goes_first():
+    bench = Bench()
+    bench.wire.say(b"\x55")
+    await settle(0.001)
+    bench.add(1, Lane.STOP).send_again = 1
+    await settle(bench.sent(1)[0] - 0.001 + REQUEST_S + REPLY_S + 0.001 if bench.sent(1) else 0.004)
+    bench.add(2, Lane.STOP).send_again = 1
+    await settle()
+
+    first, second, *_ = (each for each in bench.wire.packets() if each != toy.FLUSH)
+    assert (first, second) == (toy.request(1, 1), toy.request(1, 2))
+    assert bench.story == ["lost 1", "lost 2", "completed 1", "completed 2"]
 
 
 async def test_after_a_stop_the_line_is_proven_before_anything_else():
@@ -148,11 +178,11 @@ async def test_after_a_stop_the_line_is_proven_before_anything_else():
     bench.wire.say(b"\x55")
 
     bench.add(1)
-    bench.add(2, Lane.STOP)
+    bench.add(2, Lane.STOP).send_again = 1
     await settle()
 
-    probe = toy.request(toy.PROBE_NODE, toy.PROBE_NUMBER, toy.PROBE_BYTES)
-    assert bench.wire.packets() == [toy.FLUSH, toy.request(1, 2), toy.FLUSH, probe, toy.request(1, 1)]
+    probe, stop = toy.request(toy.PROBE_NODE, toy.PROBE_NUMBER, toy.PROBE_BYTES), toy.request(1, 2)
+    assert bench.wire.packets() == [toy.FLUSH, stop, toy.FLUSH, probe, stop, toy.request(1, 1)]
 
 
 async def test_a_stop_that_is_sent_again_waits_for_no_silence():
@@ -160,7 +190,7 @@ async def test_a_stop_that_is_sent_again_waits_for_no_silence():
     bench.replies({1: []})
 
     turn = bench.add(1, Lane.STOP)
-    turn.send_again = True
+    turn.send_again = 1
     await settle()
 
     first_s, second_s = bench.sent(1)
