@@ -3,16 +3,20 @@
 from collections.abc import Callable
 from typing import Protocol
 
+FLOOD_PAUSE_S = 0.02
+
 
 class Door(Protocol):
     """Where a program comes in.
 
     Attributes:
         take: called with what it has sent, and the rate at which it sends; None for the rate that its modules have.
+            Returns whether all of it could be taken: a program that sends more than its line carries is read from
+            again after `FLOOD_PAUSE_S`.
         closed: called when it has gone.
     """
 
-    take: Callable[[bytes, int | None], None]
+    take: Callable[[bytes, int | None], bool]
     closed: Callable[[], None]
 
     def write(self, data: bytes) -> None:

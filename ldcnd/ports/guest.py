@@ -32,7 +32,7 @@ from ldcnd.ports.control import GuestControl, Visit
 from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.ports.outputs import GuestOutputs
 from ldcnd.ports.translate import GuestServo, name_of, relief
-from ldcnd.sim.chain import Chain
+from ldcnd.sim.chain import BITS_PER_BYTE, Chain
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 
 log = get_logger("ports")
@@ -41,6 +41,8 @@ PAUSE_PER_EXCHANGE = 3.0
 """A guest's exchange is followed by a pause of so many times its length: others keep three quarters of the line."""
 SAME_REFUSAL_S = 1.0
 """The same refusal of an axis is one event in this time: old programs repeat themselves."""
+MOST_UNSENT_BYTES = 4096
+"""Bytes of a guest that are on their way to its modules, as much as a serial driver keeps; more are lost."""
 MOST_WAITING = 32
 """Commands of a guest that wait for their turn at one module; what comes beyond is refused."""
 REPLY_WAIT_S = 0.04
@@ -95,6 +97,7 @@ class Guest:
     Attributes:
         chain: as the guest sees the line.
         receive: takes what is for the guest.
+        ended: nothing begins any more: its port ends.
     """
 
     def __init__(
@@ -111,7 +114,7 @@ class Guest:
         self._line, self._free_at_s = asyncio.Lock(), 0.0
         self._refused: dict[tuple[str, str], float] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self._closed = False
+        self.ended = False
         self._visit: Visit | None = None
         self.receive: Callable[[bytes], None] = lambda _: None
         self._control = GuestControl(port.name, host, port.idle_s) if port.access == "control" else None
@@ -141,22 +144,25 @@ class Guest:
         if self._control:
             group.create_task(self._control.watch(self.gone), name=f"guest {self._name} control")
 
-    def send(self, data: bytes) -> None:
-        """Take bytes of the guest."""
-        if self._closed:
-            return
+    def send(self, data: bytes) -> bool:
+        """Take bytes of the guest; what its line would not carry in time is lost, and False is returned."""
+        if self.ended:
+            return True
         if self._control:
             self._control.heard()
         if self._visit is None:
             self._visit = Visit()
             self.chain.unplug(self._loop.time())  # what the one before sent last may be on its way at that one's rate
             self.chain.replug()
-        self.chain.write(self._loop.time(), data)
+        now_s = self._loop.time()
+        room = MOST_UNSENT_BYTES - math.ceil(self.chain.leaving_s(now_s) * self.chain.baud / BITS_PER_BYTE)
+        self.chain.write(now_s, data[: max(0, room)])
         self._advance()
+        return len(data) <= room
 
     def close(self) -> None:
         """Nothing begins any more: its port ends."""
-        self._closed = True
+        self.ended = True
         if self._timer:
             self._timer.cancel()
 
@@ -172,7 +178,7 @@ class Guest:
 
     def _advance(self) -> None:
         """Do what is due on the guest's chain, and come back for what is due next."""
-        if self._closed:
+        if self.ended:
             return
         if self._timer:
             self._timer.cancel()

@@ -39,11 +39,13 @@ async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequen
             guest = Guest(port, bus, drives, ios, host, group)
             stack.callback(guest.close)
 
-            def take(data: bytes, baud: int | None) -> None:
+            def take(data: bytes, baud: int | None) -> bool:
                 guest.chain.baud = baud or int(guest.chain.modules[0].baud)
-                guest.send(data)
+                return guest.send(data)
 
             def closed() -> None:
+                if guest.ended:
+                    return  # as its port does, which sends it away
                 group.create_task(guest.gone(), name=f"guest {port.name} gone")
 
             guest.receive, door.take, door.closed = door.write, take, closed

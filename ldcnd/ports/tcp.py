@@ -10,6 +10,7 @@ from typing_extensions import override
 
 from ldcnd.listen_address import ListenAddress
 from ldcnd.log import get_logger
+from ldcnd.ports.door import FLOOD_PAUSE_S
 
 log = get_logger("ports")
 
@@ -21,7 +22,7 @@ class GuestSocket:
     """A `Door` at an address; a second program is refused while one is connected."""
 
     def __init__(self, *, rfc2217: bool) -> None:
-        self.take: Callable[[bytes, int | None], None] = lambda _data, _baud: None
+        self.take: Callable[[bytes, int | None], bool] = lambda _data, _baud: True
         self.closed: Callable[[], None] = lambda: None
         self._rfc2217 = rfc2217
         self._inside: _Connection | None = None
@@ -53,8 +54,9 @@ class GuestSocket:
 
     def received(self, connection: "_Connection", data: bytes) -> None:
         """Take what a program has sent."""
-        if connection is self._inside and data:
-            self.take(data, connection.baud)
+        if connection is self._inside and data and not self.take(data, connection.baud):
+            connection.transport.pause_reading()
+            asyncio.get_running_loop().call_later(FLOOD_PAUSE_S, connection.transport.resume_reading)
 
     def left(self, connection: "_Connection") -> None:
         """A connection has ended."""

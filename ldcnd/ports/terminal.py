@@ -8,6 +8,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from ldcnd.ports.door import FLOOD_PAUSE_S
+
 READ_BYTES = 4096
 LOOK_S = 0.02
 """How often a terminal that nobody has open is looked at, seconds."""
@@ -25,7 +27,7 @@ class GuestTerminal:
     """
 
     def __init__(self, link: Path, mode: int, group: str | None) -> None:
-        self.take: Callable[[bytes, int | None], None] = lambda _data, _baud: None
+        self.take: Callable[[bytes, int | None], bool] = lambda _data, _baud: True
         self.closed: Callable[[], None] = lambda: None
         self._link, self._mode, self._group = link, mode, group
         self._loop = asyncio.get_running_loop()
@@ -97,4 +99,6 @@ class GuestTerminal:
             self._look()
             return
         self._baud = actual_baud(self._master) or self._baud
-        self.take(data, self._baud)
+        if not self.take(data, self._baud):
+            self._loop.remove_reader(self._master)
+            self._later = self._loop.call_later(FLOOD_PAUSE_S, self._look)

@@ -237,6 +237,10 @@ class Chain:
         if request.echoed:
             self._transmissions.append(_Transmission(data, starts_at_s, byte_s, on_wire=False, yields=False))
 
+    def leaving_s(self, now_s: float) -> float:
+        """Return how long the bytes that the host has written are still leaving, seconds."""
+        return max(0.0, self._host_free_s - now_s)
+
     def next_event_s(self) -> float | None:
         """Return when `advance` has something to do next, or None while all modules wait for the host."""
         at_s = self._next_inner_event_s()

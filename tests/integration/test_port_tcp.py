@@ -83,6 +83,7 @@ def drive_by_rfc2217(port: int) -> tuple[list[bytes], float]:
         return replies, line.baudrate
 
 
+@pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # of pyserial's client
 @pytest.mark.real_time
 async def test_a_program_that_speaks_rfc_2217_sets_its_rate_by_it():
     port = free_port()
@@ -99,4 +100,22 @@ async def test_a_port_whose_address_is_in_use_says_so_and_leaves_the_daemon_as_i
     async with running_machine(with_tcp_port(port)) as rig:
         await rig.client.state("rotor")
     other.close()
-    assert "address already in use" in capfd.readouterr().err
+    assert "address already in use" in capfd.readouterr().out
+
+
+@pytest.mark.real_time
+async def test_what_a_program_sends_beyond_its_rate_is_lost_and_delays_nothing():
+    port = free_port()
+    async with running_machine(with_tcp_port(port)):
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        writer.write(bytes(1_000_000))  # nine minutes at 19,200 bits/s
+        await writer.drain()
+        async with asyncio.timeout(30):
+            while True:
+                writer.write(encode_packet(RESET))
+                await asyncio.sleep(0.05)
+                writer.write(encode_packet(Packet(0, SET_ADDRESS, b"\x01\xff")))
+                with suppress(TimeoutError):
+                    assert len(await asyncio.wait_for(reader.read(100), 1)) == 2
+                    break
+        writer.close()
