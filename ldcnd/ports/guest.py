@@ -33,7 +33,7 @@ from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.ports.outputs import GuestOutputs
 from ldcnd.ports.translate import GuestServo, name_of, relief
 from ldcnd.sim.chain import BITS_PER_BYTE, Chain
-from ldcnd.sim.ldcn.quirks import ModuleSettings
+from ldcnd.sim.ldcn.chain import model
 
 log = get_logger("ports")
 
@@ -120,13 +120,14 @@ class Guest:
         self._control = GuestControl(port.name, host, port.idle_s) if port.access == "control" else None
         self._axes = tuple(drive.spec.name for drive in drives)
         self._reached: list[_Reached] = []
-        settings = ModuleSettings(reset_dead_s=0.0)  # programs take a terminal for drained at once
         modules: dict[int, GuestModule] = {}
 
         def add(address: int, reached: _Reached) -> None:
             reached.idle.set()
             self._reached.append(reached)
             ask, command = partial(self._ask, reached), partial(self._command, reached)
+            # a reset takes no time: programs take a terminal for drained as soon as they have written
+            settings = model(reached.profile.name)[1].model_copy(update={"reset_dead_s": 0.0})
             modules[address] = GuestModule(reached.profile, settings, ask, command, partial(self._reset, reached))
 
         for drive in drives:
@@ -138,9 +139,10 @@ class Guest:
             if isinstance(io, IoModule):
                 outputs = GuestOutputs(io.name, io.outputs, host.levels)
                 add(io.node, _Reached(io.name, PIC_IO, partial(_read_io, io.node), outputs=outputs))
-        self.chain = Chain([modules[address] for address in sorted(modules)])
-        for each in modules.values():
-            each.neighbours = tuple(modules.values())
+        self._modules = tuple(modules[address] for address in sorted(modules))
+        self.chain = Chain(self._modules)
+        for each in self._modules:
+            each.neighbours = self._modules
         if self._control:
             group.create_task(self._control.watch(self.gone), name=f"guest {self._name} control")
 
@@ -154,6 +156,8 @@ class Guest:
             self._visit = Visit()
             self.chain.unplug(self._loop.time())  # what the one before sent last may be on its way at that one's rate
             self.chain.replug()
+            for module in self._modules:
+                module.drop_half_packets()
         now_s = self._loop.time()
         room = MOST_UNSENT_BYTES - math.ceil(self.chain.leaving_s(now_s) * self.chain.baud / BITS_PER_BYTE)
         self.chain.write(now_s, data[: max(0, room)])
@@ -173,6 +177,8 @@ class Guest:
         self._visit = None  # what it sent last comes to its modules yet: they stop by it and begin nothing
         for each in self._reached:
             each.waiting.clear()
+            if each.servo:
+                each.servo.restart()  # the next program does not begin what this one has loaded
         if self._control:
             await self._control.end()
 

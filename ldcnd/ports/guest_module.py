@@ -83,6 +83,11 @@ class GuestModule(SimulatedModule):
                     return named.obey_again(packet, self._due_cycle, at_s)
         return super()._obey(packet, at_s)
 
+    def drop_half_packets(self) -> None:
+        """Take the next byte for the first one of a packet: another program sends it."""
+        self._reader.reset()
+        self._missed.reset()
+
     def obey_again(self, packet: Packet, due_cycle: int, at_s: float) -> bytes | None:
         """Obey a packet that came to the module behind this one and is for this one."""
         self._answers, self._intact, self._due_cycle = True, True, due_cycle

@@ -265,7 +265,7 @@ class GuestServo:
         velocity, acceleration = self._rates(loaded)
         here = self.drive.state.counts if status.target_counts is None else status.target_counts
         if loaded.position is None:
-            raise NotSupported("no position was loaded since the program has reset its chain")
+            raise NotSupported("the program has loaded no position since it opened its port or reset its modules")
         target = here + loaded.position if loaded.relative else loaded.position + self.zero
         if not status.enabled and target == self.drive.state.counts:
             return NOTHING  # how a program initialises a drive: where it stands, with its motor off

@@ -11,7 +11,7 @@ from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
-from tests.support.guest_program import guest
+from tests.support.guest_program import guest, open_port
 from tests.support.machine_rig import COUNTS, GAINS
 
 LOAD, START, STOP = CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION, CommandCode.STOP_MOTOR
@@ -374,3 +374,47 @@ async def test_a_move_that_waits_for_rest_does_not_begin_once_its_program_has_en
         await asyncio.sleep(2.0)
         assert shaft(rig) == pytest.approx(stands, abs=20)
         assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)
+
+
+@pytest.mark.parametrize(
+    ("begun", "rest"),
+    [
+        (encode_packet(load(GO_LATER, counts=50_000)), encode_packet(Packet(1, START))),
+        (encode_packet(load(RUN_NOW))[:5], encode_packet(load(RUN_NOW))[5:]),
+    ],
+    ids=["loaded", "half a packet"],
+)
+async def test_what_a_program_has_loaded_is_not_begun_by_the_next_one(tmp_path, begun, rest):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        program.send_bytes(begun)
+        await asyncio.sleep(0.1)
+        program.close()
+        await asyncio.sleep(0.2)
+
+        following, before = open_port(tmp_path / "port"), shaft(rig)
+        following.send_bytes(rest)
+        await asyncio.sleep(2.0)
+        assert abs(shaft(rig) - before) < 20
+        following.close()
+        await asyncio.sleep(0.2)
+
+
+async def test_hard_reset_reaches_modules_that_the_program_has_put_into_another_group(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        for address in (1, 2):
+            assert await program.send(Packet(address, CommandCode.SET_ADDRESS, bytes((address, 0x80))))
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW))
+        async with asyncio.timeout(5):
+            while rig.speed() < 3.0:
+                await asyncio.sleep(0.02)
+
+        await program.send(Packet(0xFF, CommandCode.HARD_RESET), 0.05)
+
+        assert await program.send(Packet(0, CommandCode.SET_ADDRESS, b"\x01\xff"))
+        async with asyncio.timeout(10):
+            while rig.speed() > 0.02 or rig.daemon.rig.axes["rotor"].tracker.status.enabled:
+                await asyncio.sleep(0.02)
