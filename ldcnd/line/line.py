@@ -507,7 +507,7 @@ class Line(Receiver):
     def _judge(self, transaction: Transaction, reply: bytes, verdict: ReplyVerdict, now_s: float) -> None:
         """Accept a whole reply, or wait whether another one follows."""
         if self._distrusted:
-            if verdict is ReplyVerdict.INTACT:
+            if verdict is ReplyVerdict.INTACT and transaction.lane is Lane.STOP:
                 transaction.doubt()
             self._discard_reply(transaction, reply, _OLDER, now_s)
         elif not transaction.exchange.repeatable and now_s < (until_s := self._true_reply_by_s(transaction)):
@@ -627,7 +627,8 @@ class Line(Receiver):
     def _lose(self, transaction: Transaction, error: BusError, now_s: float) -> None:
         """End the transaction whose reply cannot be valid any more, and resynchronise the line."""
         self.deliver()
-        self._schedule.record_loss(transaction.exchange.node)
+        if not transaction.doubted:  # its node has most likely answered
+            self._schedule.record_loss(transaction.exchange.node)
         if poller := transaction.poller:
             lost_s = transaction.exchange.longest_s(self.byte_s) + self._settings.margin_s
             lost_s += self._resync.longest_s(self.byte_s, self._schedule.mute.failing())

@@ -14,6 +14,7 @@ from tests.support.toy_family import ToyPoller
 class Ticket:
     name: str
     abandoned: bool = False
+    doubted: bool = False
 
 
 def filled(**lanes: int) -> Schedule[Ticket]:
