@@ -32,7 +32,7 @@ function Power({ axis }) {
   const reasons = useId();
   const way = obstacle(axis, on ? "disable" : "enable");
   const toReset = obstacle(axis, "reset");
-  return html`<${Action} key=${on} act=${() => command(axis, "power", { on: !on })} obstacle=${way} reason=${`${reasons}-power`}
+  return html`<${Action} key=${on} calms=${on} act=${() => command(axis, "power", { on: !on })} obstacle=${way} reason=${`${reasons}-power`}
         title=${on ? "Open the loop: the motor coasts, a hanging load falls" : "Close the loop at the present position; nothing moves"}
       >${on ? "Disable" : "Enable"}<//>
       <${Action} act=${() => command(axis, "reset")} obstacle=${toReset} reason=${`${reasons}-reset`}

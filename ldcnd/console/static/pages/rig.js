@@ -8,7 +8,7 @@ import { problems } from "../parts/problems.js";
 import { Mark } from "../parts/state.js";
 import { ask } from "../session/api.js";
 import { command, controls, release, take } from "../session/control.js";
-import { isUseless, obstacle } from "../session/obstacles.js";
+import { calms, isUseless, obstacle } from "../session/obstacles.js";
 import { axesOf, changed, endpoints, useRigs } from "../session/rigs.js";
 import { AxesOf, refused, ShortAction } from "./rig_axes.js";
 import { GroupMoves } from "./rig_groups.js";
@@ -147,7 +147,7 @@ function RigCommands({ rig }) {
     const failed = axes.filter((axis) => axis.refusal);
     setTold(failed.length ? `${words(verb)}: refused by ${failed.map(({ name }) => name).join(", ")}; the reasons are in their rows.` : `${verb === "power" ? (body.on ? "enabled" : "disabled") : verb}: ${asked.map(({ name }) => name).join(", ")}`);
   };
-  const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" act=${each(act, verb, body)}
+  const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" calms=${calms(axes[0], act)} act=${each(act, verb, body)}
     obstacle=${ready(act).length ? null : (obstacle(axes[0], act) ?? "No axis can do that now.")} />`;
   return html`<div class="rig-commands" role="group" aria-label=${`Commands for all axes of ${rig.name}`}>
     <div class="row">

@@ -7,7 +7,7 @@ import { shownQuantity } from "../parts/number_text.js";
 import { inPageTerms } from "../parts/remedies.js";
 import { Homed, Mark, Meter, Place, StateWord } from "../parts/state.js";
 import { command, controls, take } from "../session/control.js";
-import { obstacle } from "../session/obstacles.js";
+import { calms, obstacle } from "../session/obstacles.js";
 import { changed } from "../session/rigs.js";
 
 const COLUMNS = ["Axis", "State", "Position", "Homed", "Velocity", "Target", "Following error", "Control", "Commands"];
@@ -128,14 +128,14 @@ function AxisCommands({ axis }) {
   };
   return html`<span class="row" role="group" aria-label=${`Commands for ${axis.name}`}>
     ${(controls(axis) ? [power, second, halt] : [taking, halt]).map(([title, act, run]) => html`<${ShortAction} key=${act} title=${title}
-      name=${axis.name} act=${begin(run)} onRefused=${refuse(title)} obstacle=${obstacle(axis, act) ?? (act === "none" ? held : null)} />`)}
+      name=${axis.name} calms=${calms(axis, act)} act=${begin(run)} onRefused=${refuse(title)} obstacle=${obstacle(axis, act) ?? (act === "none" ? held : null)} />`)}
   </span>`;
 }
 
 /** A small button for what `name` says; what is in its way is in the title and read to screen readers. */
-export function ShortAction({ title, name, act, onRefused, obstacle: way }) {
+export function ShortAction({ title, name, act, calms: relieves, onRefused, obstacle: way }) {
   const reason = useId();
-  return html`<${Action} act=${act} onRefused=${onRefused} obstacle=${way} reason=${reason} title=${way ?? `${title} ${name}`}
+  return html`<${Action} calms=${relieves} act=${act} onRefused=${onRefused} obstacle=${way} reason=${reason} title=${way ?? `${title} ${name}`}
     >${title}<span class="unseen"> ${name}</span><//>${way && html`<span class="unseen" id=${reason}>${way}</span>`}`;
 }
 

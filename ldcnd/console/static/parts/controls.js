@@ -3,21 +3,28 @@
 import { html, useId, useLayoutEffect, useRef, useState } from "../html.js";
 import { inPageTerms } from "./remedies.js";
 import { faultPage } from "./state.js";
+import { cameUnderHand } from "./under_hand.js";
 
 /** A button that carries out `act`, shows what came of it, and cannot act while `obstacle` is a text.
 
  * It stays in the tab order then, so that everybody can reach the reason. A double click and a key that repeats are one
  * press: what is sent may move something, and the button may be another one by the second.
- * With `reason` the id of an element that shows the obstacle already.
+ * With `reason` the id of an element that shows the obstacle already. What only `calms` is done by every press; all else
+ * by none that meets a button which has just come under the hand.
  */
-export function Action({ act, obstacle = null, reason = null, kind = "", onDone, onRefused, title, children }) {
+export function Action({ act, obstacle = null, reason = null, kind = "", calms = false, onDone, onRefused, title, children }) {
   const own = useId();
   const [underWay, setUnderWay] = useState(false);
   const pressed = useRef(false); // a second press comes before the first is drawn
   const [refusal, setRefusal] = useState(null);
 
   async function press(event) {
+    const came = cameUnderHand(event);
     if (obstacle || pressed.current || event.detail > 1) return;
+    if (came && !calms) {
+      const said = { message: came, nearest: null };
+      return onRefused ? onRefused(said) : setRefusal(said);
+    }
     pressed.current = true;
     setUnderWay(true);
     setRefusal(null);

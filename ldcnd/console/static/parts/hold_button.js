@@ -1,6 +1,7 @@
 /** A button that lets something move while it is held, whatever ends that: finger, key, focus, window or page. */
 
 import { html, useEffect, useRef } from "../html.js";
+import { cameUnderHand } from "./under_hand.js";
 
 /** `begin` and `end` come in turn; `keys` are held like the space bar; `obstacle` says why it cannot be held now. */
 export function HoldButton({ begin, end, keys = [], obstacle = null, reason = null, kind = "", children }) {
@@ -35,7 +36,7 @@ export function HoldButton({ begin, end, keys = [], obstacle = null, reason = nu
   return html`<button type="button" class=${`hold ${kind}`} aria-disabled=${obstacle ? "true" : null}
     aria-describedby=${obstacle ? reason : null}
     onPointerDown=${(event) => {
-      if (event.button !== 0) return;
+      if (event.button !== 0 || cameUnderHand(event)) return;
       event.target.setPointerCapture(event.pointerId);
       press();
     }}

@@ -22,10 +22,10 @@ export function AxisStrip({ axis }) {
     <span class="where"><b>${axis.name}</b> <${PlaceAndTarget} axis=${axis} /></span>
     <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /></span>
     ${axis.can("stop") && html`<span class="endings" role="group" aria-label=${`End a motion of ${axis.name}`}>
-      <${Action} act=${() => command(axis, "halt")} obstacle=${toHalt} reason="halt-way"
+      <${Action} calms act=${() => command(axis, "halt")} obstacle=${toHalt} reason="halt-way"
         title=${toHalt ?? "Decelerate and hold; no latch"}>Halt<//><span class="unseen" id="halt-way">${toHalt ?? ""}</span>
-      <${Action} act=${() => stopAxis(axis)} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
-      <${Action} act=${() => command(axis, "quick_stop")} kind="warn"
+      <${Action} calms act=${() => stopAxis(axis)} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
+      <${Action} calms act=${() => command(axis, "quick_stop")} kind="warn"
         title="Hold at once, without a ramp, and latch until reset">Quick stop<//>
     </span>`}
   </div>`;

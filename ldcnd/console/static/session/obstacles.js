@@ -44,6 +44,11 @@ export function isUseless(axis, act) {
   return Boolean(USELESS[act]?.(axis));
 }
 
+/** Whether an act only takes energy out, as the daemon says of its command. */
+export function calms(axis, act) {
+  return act === "disable" || axis.rig.commands.get(act)?.effect === "rest";
+}
+
 function inWords(cause) {
   return `${cause.text}${cause.remedy ? `: ${inPageTerms(cause)}` : ""}.`;
 }
