@@ -37,8 +37,10 @@ from ldcnd.sim.ldcn.chain import model
 
 log = get_logger("ports")
 
-PAUSE_PER_EXCHANGE = 3.0
-"""A guest's exchange is followed by a pause of so many times its length: others keep three quarters of the line."""
+LINE_SHARE = 0.25
+"""A guest that reads without a pause has so much of the line; others keep three quarters."""
+UNPAUSED_S = 0.05
+"""Time of the line that a guest which has paused may use without a pause, seconds: its replies come at once."""
 SAME_REFUSAL_S = 1.0
 """The same refusal of an axis is one event in this time: old programs repeat themselves."""
 MOST_UNSENT_BYTES = 4096
@@ -207,7 +209,7 @@ class Guest:
             async with asyncio.timeout(REPLY_WAIT_S):
                 await module.idle.wait()
         async with self._line:
-            await asyncio.sleep(self._free_at_s - self._loop.time())
+            await asyncio.sleep(max(0.0, self._free_at_s - self._loop.time()))
             if not answer.wanted() or not self._host.is_up():
                 return
             began_s = self._loop.time()
@@ -218,7 +220,8 @@ class Guest:
                 return
             finally:
                 now_s = self._loop.time()
-                self._free_at_s = now_s + PAUSE_PER_EXCHANGE * (now_s - began_s)
+                earned_s = max(self._free_at_s, now_s - UNPAUSED_S / LINE_SHARE)
+                self._free_at_s = earned_s + (now_s - began_s) / LINE_SHARE
         answer.give(_as_guest(module, items, status, self._loop.time()), self._loop.time())
         self._advance()
 

@@ -204,7 +204,7 @@ async def test_limits_hold_for_the_program_and_its_move_is_not_done(tmp_path):
 
         await program.send(load(GO_NOW, counts=1500))
         await finished(program)
-        assert shaft(rig) == pytest.approx(1500, abs=5)
+        assert shaft(rig) == pytest.approx(1500, abs=20)  # its profile is over, the shaft follows
 
 
 async def test_a_zero_that_the_program_sets_is_its_own_counter_and_the_position_of_everybody(tmp_path):
