@@ -10,6 +10,7 @@ from pydantic import Field, model_validator
 from ldcnd.contract.commands import Command
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.network import IoDriver
@@ -51,9 +52,17 @@ class PortConfig(Frozen):
     def _one_way_in(self) -> Self:
         if (self.link is None) is (self.listen is None):
             raise ValueError(f"port {self.name}: give it either link or listen")
-        if self.listen is None and self.rfc2217:
-            raise ValueError(f"port {self.name}: rfc2217 is spoken at a TCP address; give it listen instead of link")
-        if self.listen is not None and not (parse_listen_address(self.listen).is_loopback or self.beyond_loopback):
+        if self.listen is None:
+            if self.rfc2217 or self.beyond_loopback:
+                raise ValueError(f"port {self.name}: rfc2217 and beyond_loopback are of an address; give it listen")
+            return self
+        if self.group is not None or self.model_fields_set & {"mode"}:
+            raise ValueError(f"port {self.name}: mode and group are of a terminal; give it link, or delete them")
+        try:
+            address = parse_listen_address(self.listen)
+        except ConfigError as error:
+            raise ValueError(f"port {self.name}: listen {error.message}; write it like 127.0.0.1:4001") from error
+        if not (address.is_loopback or self.beyond_loopback):
             raise ValueError(
                 f"port {self.name}: other machines could reach {self.listen}; "
                 "listen on 127.0.0.1, or set beyond_loopback = true"
@@ -86,6 +95,10 @@ class StatusView(Protocol):
     @property
     def enabled(self) -> bool:
         """Its position loop is closed."""
+
+    @property
+    def state(self) -> AxisState:
+        """As PLCopen has it."""
 
     @property
     def referenced(self) -> bool:
@@ -168,7 +181,12 @@ def check_ports(configured: Sequence[PortConfig], lines: Sequence[BusConfig]) ->
     if not configured:
         return
     by_name = {line.name: line for line in lines}
+    taken = {line.port: f"bus {line.name}" for line in lines}
     for port in configured:
+        place = str(port.link or port.listen)
+        if place in taken:
+            raise ValueError(f"port {port.name}: {place} is that of {taken[place]} already")
+        taken[place] = f"port {port.name}"
         if port.bus not in by_name:
             raise ValueError(f"port {port.name}: there is no bus {port.bus!r}; there are: {', '.join(by_name)}")
         try:

@@ -16,6 +16,7 @@ from ldcnd.contract.codec import explained
 from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, MoveRelative, Power
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.keys import RIG_ITSELF
+from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.ldcn.commands import Node, read_status
 from ldcnd.drives.ldcn.io_module import IoModule
@@ -278,6 +279,8 @@ class Guest:
             module.servo.restart()
             if self._control and module.name in self._control.axes:
                 self._relieve(module, Power(on=False, client=self._name))
+            if self._control and self._visit and self._host.status(module.name).state is AxisState.ERROR_STOP:
+                self._command(module, PlainCommand(CommandCode.CLEAR_STICKY_BITS))  # a drive has no fault afterwards
 
     async def _work(self, module: _Reached) -> None:
         """Carry out what waits, one after another."""

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from contextlib import AsyncExitStack
 
 from ldcnd.config.ports import GuestHost, PortConfig
+from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.network import IoDriver
@@ -18,6 +19,9 @@ from ldcnd.ports.terminal import GuestTerminal
 
 log = get_logger("ports")
 
+TRIED_AGAIN_S = 5.0
+"""How often a port that cannot be opened is tried again, seconds."""
+
 
 def check(port: PortConfig, line: BusConfig) -> None:
     """Refuse a port of another family; raises ValueError."""
@@ -29,13 +33,33 @@ def check(port: PortConfig, line: BusConfig) -> None:
 
 async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequence[IoDriver], host: GuestHost) -> None:
     """Serve a guest on a terminal or a TCP address until cancelled; a failure ends its port and nothing else."""
-    try:
+    said = ""
+    while True:
+        try:
+            await _serve_once(port, bus, drives, ios, host)
+        except (OSError, LookupError) as error:
+            if (reason := str(error)) != said:
+                said = reason
+                log.error("the port cannot be served and is tried again", guest=port.name, reason=reason)
+                host.refuse(RIG_ITSELF, f"the port {port.name} is not served and is tried again: {reason}", port.name)
+            await asyncio.sleep(TRIED_AGAIN_S)
+        except Exception:
+            log.exception("port ended", guest=port.name, bus=port.bus)
+            host.refuse(RIG_ITSELF, f"the port {port.name} has ended by a fault of its own", port.name)
+            return
+
+
+async def _serve_once(
+    port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequence[IoDriver], host: GuestHost
+) -> None:
+    """Open a port and serve it until cancelled.
+
+    Raises:
+        OSError, LookupError: it cannot be opened.
+    """
+    async with AsyncExitStack() as opened:
+        door, where = await _open(port, opened)
         async with asyncio.TaskGroup() as group, AsyncExitStack() as stack:
-            try:
-                door, where = await _open(port, stack)
-            except (OSError, LookupError) as error:
-                log.error("the port cannot be served; mend [[port]] and restart", guest=port.name, reason=str(error))
-                return
             guest = Guest(port, bus, drives, ios, host, group)
             stack.callback(guest.close)
 
@@ -44,17 +68,14 @@ async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequen
                 return guest.send(data)
 
             def closed() -> None:
-                if guest.ended:
-                    return  # as its port does, which sends it away
-                group.create_task(guest.gone(), name=f"guest {port.name} gone")
+                if not guest.ended:
+                    group.create_task(guest.gone(), name=f"guest {port.name} gone")
 
             guest.receive, door.take, door.closed = door.write, take, closed
             log.info("port", guest=port.name, bus=port.bus, access=port.access, **where)
             if port.beyond_loopback:
                 log.warning("every machine that reaches this address can use the port", guest=port.name, **where)
             await asyncio.Event().wait()
-    except Exception:
-        log.exception("port ended", guest=port.name, bus=port.bus)
 
 
 async def _open(port: PortConfig, stack: AsyncExitStack) -> tuple[Door, dict[str, str]]:

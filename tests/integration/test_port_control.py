@@ -8,6 +8,7 @@ from ldcnd.contract.commands import MoveRelative, Power, SetPosition, Stop
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.samples import AxisState
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
@@ -418,3 +419,28 @@ async def test_hard_reset_reaches_modules_that_the_program_has_put_into_another_
         async with asyncio.timeout(10):
             while rig.speed() > 0.02 or rig.daemon.rig.axes["rotor"].tracker.status.enabled:
                 await asyncio.sleep(0.02)
+
+
+async def test_a_program_that_begins_anew_after_a_fault_moves_the_axis_as_on_the_bare_line(tmp_path):
+    """Hard Reset, Stop Motor, Clear Sticky Bits, and a move: as after a jam, when its program is started again."""
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW))
+        await asyncio.sleep(0.5)
+        rig.chain.modules[0].shaft.stalled = True
+        await rig.until("rotor", lambda state: state.state is AxisState.ERROR_STOP)
+        rig.chain.modules[0].shaft.stalled = False
+        await asyncio.sleep(0.5)
+        program.close()
+        await asyncio.sleep(0.5)
+
+        again, before = open_port(tmp_path / "port"), shaft(rig)
+        await again.begin()
+        await again.send(ENABLE)
+        await again.send(Packet(1, CommandCode.CLEAR_STICKY_BITS))
+        await again.send(load(0x97 | 0x40, counts=3000))  # relative to where it is
+        await finished(again)
+        assert shaft(rig) - before == pytest.approx(3000, abs=30)
+        again.close()
+        await asyncio.sleep(0.2)

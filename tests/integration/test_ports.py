@@ -220,9 +220,25 @@ async def test_replies_have_the_form_that_they_have_on_the_bare_line(tmp_path):
             assert len(reply) // 2 == len(expected), packet
 
 
-async def test_a_port_that_cannot_be_made_leaves_the_daemon_as_it_is(tmp_path):
-    async with running_machine(with_port(tmp_path / "no" / "such" / "folder")) as rig:
+async def test_a_port_that_cannot_be_made_is_an_event_and_is_served_once_it_can_be(tmp_path):
+    folder = tmp_path / "run"
+    async with running_machine(with_port(folder / "port")) as rig:
         await turning(rig)
+        told = (await rig.client.ask(ReadEvents())).events
+        assert any(f"No such file or directory: '{folder}" in (each.reason or "") for each in told)
+        folder.mkdir()
+        async with asyncio.timeout(20):
+            while not (folder / "port").is_symlink():
+                await asyncio.sleep(0.1)
+
+
+@pytest.mark.parametrize("second", ["x", "sim:"])
+def test_no_two_have_one_place(second):
+    document = machine().model_dump(mode="json", exclude_defaults=True)
+    document["bus"][0]["port"] = "sim:"
+    ports = [{"name": name, "bus": "line", "link": link} for name, link in (("old", "x"), ("other", second))]
+    with pytest.raises(ValueError, match="is that of"):
+        RigConfig.model_validate(document | {"port": ports})
 
 
 async def test_while_the_line_is_lost_a_guest_hears_nothing_and_afterwards_it_reads_again(tmp_path):
@@ -274,7 +290,8 @@ async def test_a_stop_that_a_program_sends_before_it_ends_goes_out(tmp_path, acc
         ({"link": "x", "listen": "127.0.0.1:1"}, "give it either link or listen"),
         ({"listen": "0.0.0.0:4001"}, "other machines could reach 0.0.0.0:4001"),
         ({"listen": "4001"}, "is not HOST:PORT"),
-        ({"link": "x", "rfc2217": True}, "give it listen instead of link"),
+        ({"link": "x", "rfc2217": True}, "give it listen"),
+        ({"listen": "127.0.0.1:4001", "mode": "0660"}, "mode and group are of a terminal"),
     ],
 )
 def test_a_port_has_one_way_in_and_none_for_other_machines_unless_it_says_so(way, complaint):
