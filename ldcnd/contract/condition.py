@@ -321,15 +321,14 @@ def assess(
     if state is None:
         lost = (_silent(silence),) if silence else () if line_up else (_ON_DEAD_LINE,)
         return _unanswered("unknown", lost or (_NEVER_SEEN,), lost[0].short if lost else "no data")
-    word = state.state.words
+    presumed = state.link is LinkState.DOWN and state.state is AxisState.ERROR_STOP  # that only says that it is lost
+    word, last = state.state.words, "unknown, may move" if presumed else f"unknown, was {state.state.words}"
     holder = UNKNOWN_HOLDER if silence else state.holder
     control = _control(holder, moves=state.moving is Moving.YES and state.command is not None)
     gone = _unreachable(state, faults, silence=silence, line_up=line_up)
     pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
     if gone:
-        return replace(
-            _unanswered(f"unknown, was {word}", (*pending, gone), gone.short), holder=holder, control=control
-        )
+        return replace(_unanswered(last, (*pending, gone), gone.short), holder=holder, control=control)
     place, mark = _place(state, faults, is_old=_is_old(age_s, health))
     troubles = (*pending, *_found(state, faults, health, place), *_slowed(state))
     worst = max((trouble.severity for trouble in troubles), default=_FINE)

@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from ldcnd.contract.commands import MoveRelative, MoveVelocity, Power
+from ldcnd.contract.commands import MoveRelative, MoveVelocity, Power, SetPosition
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.parameters import ReadParameter
@@ -336,3 +336,24 @@ async def test_a_button_that_has_come_under_a_resting_hand_does_nothing_before_i
         await desk.page.keyboard.press("Escape")
         await house.sim.until("y", lambda state: state.stop_latched)
         await house.sim.quiet("y")
+
+
+async def test_no_place_and_no_word_about_it_is_cut_at_1280_pixels(house):
+    await house.sim.quiet("y")
+    await house.sim.rig.command("y", SetPosition(position=-90.0))
+    async with house.desk(width=1280) as desk:
+        await desk.open("rig")
+        row = desk.page.locator("tr[data-axis=y]")
+        await expect(row.locator("td.main")).to_contain_text("90.000")
+        cut = """(words) => {
+          const row = document.querySelector("tr[data-axis=y]");
+          const homed = row.querySelector("td.homed");
+          const mark = document.createElement("span");
+          homed.replaceChildren(mark);
+          return words.filter((word) => {
+            [mark.className, mark.textContent] = ["mark unhomed", word];
+            return homed.scrollWidth > homed.clientWidth;
+          }).concat([...row.querySelectorAll("td.number")].filter((each) => each.scrollWidth > each.clientWidth)
+            .map((each) => each.textContent));
+        }"""
+        assert await desk.page.evaluate(cut, ["reference lost", "not homed", "line down", "no answer"]) == []

@@ -17,7 +17,7 @@ export function AuthorityPanel({ axis }) {
       ${
         mine
           ? html`<${Action} key="release" act=${() => release([axis])} title="An axis that moves is halted first">Release control<//>`
-          : html`<${Action} key="take" act=${() => take([axis], force)} kind="main"
+          : html`<${Action} key="take" act=${() => take([axis], force)} onDone=${() => setFrom(null)} kind="main"
             obstacle=${obstacle(axis, "none") ?? (others && !force ? `Control is held by ${axis.holder}: tick to take it from there.` : null)}>Take control<//>`
       }
       ${others && html`<${Tick} label=${`Take it from ${axis.holder}`} checked=${force}

@@ -151,7 +151,7 @@ function RigCommands({ rig }) {
     obstacle=${ready(act).length ? null : (obstacle(axes[0], act) ?? "No axis can do that now.")} />`;
   return html`<div class="rig-commands" role="group" aria-label=${`Commands for all axes of ${rig.name}`}>
     <div class="row">
-      ${mine.length < axes.length && html`<${Action} key="take" kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)}
+      ${mine.length < axes.length && html`<${Action} key="take" kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)} onDone=${() => setFrom(null)}
         obstacle=${obstacle(axes[0], "none") ?? (others.length && !force ? `${held}: tick to take it from there.` : null)}
         >Take control of all<//>`}
       ${mine.length > 0 && html`<${Action} key="release" act=${() => release(mine)} title="Axes that move are halted first">Release control<//>`}

@@ -77,7 +77,7 @@ function AxisRow({ axis }) {
   const decimals = decimalsOf(info);
   const { live, mark, troubles } = axis.condition;
   const velocity = shownQuantity(live ? axis.velocity : null, info, "velocity");
-  const said = troubles.filter(({ short }) => short !== mark);
+  const said = troubles.filter(({ short }) => short !== mark && short !== axis.condition.state);
   const cell = (label, content, kind = "", title = null) => html`<td role="cell" data-label=${label} class=${kind} title=${title}>${content}</td>`;
   return html`<tr role="row" data-axis=${axis.name} data-stale=${live ? "no" : "yes"}>
     <th role="rowheader" scope="row"><a href=${`#/axis/${axis.rig.name}/${axis.name}`}>${axis.name}</a>

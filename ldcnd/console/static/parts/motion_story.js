@@ -32,7 +32,9 @@ function restOf(axis, event) {
   const after = axis.rig.events.slice(axis.rig.events.indexOf(event) + 1).filter((each) => each.axis === axis.name);
   const ending = after.find((each) => each.position != null);
   if (ending) return axis.rig.mayMove(ending.verb) ? null : ending.position;
-  return axis.condition.live && axis.state?.moving === "no" && axis.ended() === event ? (axis.samples.position?.value ?? null) : null;
+  // what it ended at before the daemon was started again, or before it lost its reference, nobody knows any more
+  const since = event.t >= (axis.rig.daemon?.started ?? Infinity) && axis.condition.live && axis.condition.known;
+  return since && axis.state?.moving === "no" && axis.ended() === event ? (axis.samples.position?.value ?? null) : null;
 }
 
 /** What becomes of a command that this page has sent; `sent` is its reply, with the run of the daemon it was sent to. */

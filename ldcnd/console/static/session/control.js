@@ -1,5 +1,6 @@
 /** Control over axes: the console process holds it for this page for as long as the page's web socket is open. */
 
+import { clock } from "../parts/format.js";
 import { ask, asJson, axisPath, nameThisPage, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
 import { changed, rigs } from "./rigs.js";
@@ -159,14 +160,14 @@ function forget({ rig, axis: name, message, taken_by: taker }) {
 
 function noteLost(axis, why, taker) {
   const key = taker ? `${taker} ` : why;
-  lost.set(key, { taker, why, axes: [...(lost.get(key)?.axes ?? []), axis] });
+  lost.set(key, { taker, why, at: Date.now() * 1e6, axes: [...(lost.get(key)?.axes ?? []), axis] });
 }
 
 /** Return what was lost, a sentence for each reason. */
 export function lostInWords() {
-  return [...lost.values()].map(({ taker, why, axes }) => {
-    const names = axes.map(({ name }) => name).join(", ");
-    return taker ? `${taker} took control of ${names}.` : `Control of ${names} is lost: ${why}`;
+  return [...lost.values()].map(({ taker, why, at, axes }) => {
+    const [names, when] = [axes.map(({ name }) => name).join(", "), clock(at).slice(0, -4)];
+    return taker ? `At ${when} ${taker} took control of ${names}.` : `At ${when} control of ${names} was lost: ${why}`;
   });
 }
 
