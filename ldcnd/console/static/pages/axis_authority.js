@@ -1,7 +1,7 @@
 /** Who controls an axis, and its power; what ends a motion is in the strip above. */
 
 import { html, useId, useState } from "../html.js";
-import { Action, Panel, Reason, Tick } from "../parts/controls.js";
+import { Action, Panel, Reason, Swap, Tick } from "../parts/controls.js";
 import { command, controls, release, take } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { HolderWord } from "./rig_axes.js";
@@ -14,12 +14,12 @@ export function AuthorityPanel({ axis }) {
   return html`<${Panel} title="Control">
     <p>${mine ? "Held by " : ""}<${HolderWord} axis=${axis} />${mine ? ". When this page closes, the console halts what it moved and ends control." : "."}</p>
     <div class="row">
-      ${
+      <${Swap}>${
         mine
           ? html`<${Action} key="release" act=${() => release([axis])} title="An axis that moves is halted first">Release control<//>`
           : html`<${Action} key="take" act=${() => take([axis], force)} onDone=${() => setFrom(null)} kind="main"
             obstacle=${obstacle(axis, "none") ?? (others && !force ? `Control is held by ${axis.holder}: tick to take it from there.` : null)}>Take control<//>`
-      }
+      }<//>
       ${others && html`<${Tick} label=${`Take it from ${axis.holder}`} checked=${force}
         onChange=${(on) => setFrom(on ? axis.holder : null)} />`}
       ${axis.can("power") && html`<${Power} axis=${axis} />`}
@@ -32,9 +32,9 @@ function Power({ axis }) {
   const reasons = useId();
   const way = obstacle(axis, on ? "disable" : "enable");
   const toReset = obstacle(axis, "reset");
-  return html`<${Action} key=${on} calms=${on} act=${() => command(axis, "power", { on: !on })} obstacle=${way} reason=${`${reasons}-power`}
+  return html`<${Swap}><${Action} key=${on} calms=${on} act=${() => command(axis, "power", { on: !on })} obstacle=${way} reason=${`${reasons}-power`}
         title=${on ? "Open the loop: the motor coasts, a hanging load falls" : "Close the loop at the present position; nothing moves"}
-      >${on ? "Disable" : "Enable"}<//>
+      >${on ? "Disable" : "Enable"}<//><//>
       <${Action} act=${() => command(axis, "reset")} obstacle=${toReset} reason=${`${reasons}-reset`}
         title="Clear the stop latch and the drive's faults; nothing moves">Reset<//>
     <div class="power-ways">${

@@ -1,7 +1,7 @@
 /** The rig page: faults and warnings first, then every axis of every rig, one line each, and what can be asked of them. */
 
 import { html, useState } from "../html.js";
-import { Action, Choice, Facts, Tick } from "../parts/controls.js";
+import { Action, Choice, Facts, Swap, Tick } from "../parts/controls.js";
 import { dateAndClock, words } from "../parts/format.js";
 import { TextField } from "../parts/number_field.js";
 import { problems } from "../parts/problems.js";
@@ -151,10 +151,10 @@ function RigCommands({ rig }) {
     obstacle=${ready(act).length ? null : (obstacle(axes[0], act) ?? "No axis can do that now.")} />`;
   return html`<div class="rig-commands" role="group" aria-label=${`Commands for all axes of ${rig.name}`}>
     <div class="row">
-      ${mine.length < axes.length && html`<${Action} key="take" kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)} onDone=${() => setFrom(null)}
+      <${Swap}>${mine.length < axes.length && html`<${Action} key="take" kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)} onDone=${() => setFrom(null)}
         obstacle=${obstacle(axes[0], "none") ?? (others.length && !force ? `${held}: tick to take it from there.` : null)}
         >Take control of all<//>`}
-      ${mine.length > 0 && html`<${Action} key="release" act=${() => release(mine)} title="Axes that move are halted first">Release control<//>`}
+      ${mine.length > 0 && html`<${Action} key="release" act=${() => release(mine)} title="Axes that move are halted first">Release control<//>`}<//>
       ${others.length > 0 && html`<${Tick} label="Take it from the others" checked=${force}
         onChange=${(on) => setFrom(on ? held : null)} />`}
       ${button("Enable", "enable", "power", { on: true })}

@@ -51,6 +51,11 @@ export function Action({ act, obstacle = null, reason = null, kind = "", calms =
   </span>`;
 }
 
+/** A place in which one control takes the turn of another: those beside it stay where they are, and keep the focus. */
+export function Swap({ children }) {
+  return html`<span class="swap">${children}</span>`;
+}
+
 const ONCE_MS = 1_000;
 
 /** Keep typed motions from being sent twice by a second Enter or a double click.
