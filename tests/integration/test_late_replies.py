@@ -49,7 +49,10 @@ async def ended(rig: Machine, command: Stop | Halt | Power) -> bool:
     return isinstance(reply, CommandReply) or "rotor" in reply.confirmed
 
 
-@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(100, 200))])
+SOAK = tuple(pytest.param(seed, marks=pytest.mark.soak) for seed in range(100, 200) if seed != 120)
+
+
+@pytest.mark.parametrize("seed", [120, *range(3), *SOAK])  # 120 has failed
 async def test_what_is_confirmed_has_been_heard(seed: int):
     """Judged by the simulated shaft: it comes to rest within the time that it needs."""
     dice, confirmed = random.Random(seed), 0
@@ -59,6 +62,7 @@ async def test_what_is_confirmed_has_been_heard(seed: int):
         await asyncio.sleep(FROM_S)
         for _ in range(25):
             if not await ready(rig):
+                await asyncio.sleep(0.5)
                 continue
             begin = asyncio.create_task(moving(rig))
             await asyncio.sleep(dice.choice((0.0, 0.01, 0.02, 0.03, 0.05, 0.3)))
@@ -72,4 +76,4 @@ async def test_what_is_confirmed_has_been_heard(seed: int):
                 await asyncio.sleep(1.0)  # from 5 rev/s at 20 rev/s2, and what coasts
                 assert rig.speed() < 0.05, seed
         await ended(rig, Power(on=False))
-    assert confirmed > 0
+    assert confirmed > 5
