@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 FLOOD_PAUSE_S = 0.02
+"""How long a program that sends more than its line carries is not read from, seconds."""
 
 
 class Door(Protocol):
@@ -21,6 +22,3 @@ class Door(Protocol):
 
     def write(self, data: bytes) -> None:
         """Send to the program; what it does not read is lost."""
-
-    def leave(self) -> None:
-        """Have the program leave, where that can be done."""

@@ -67,12 +67,6 @@ class GuestTerminal:
         self._linked.close()
         os.close(self._master)
 
-    def leave(self) -> None:
-        """Hang up on the program: its terminal is gone, and another one is behind the link."""
-        self.close()
-        self._open()
-        self.closed()
-
     def write(self, data: bytes) -> None:
         """Send to the program; what it does not read is lost, as on a line."""
         with suppress(BlockingIOError):

@@ -32,7 +32,7 @@ function restOf(axis, event) {
   const after = axis.rig.events.slice(axis.rig.events.indexOf(event) + 1).filter((each) => each.axis === axis.name);
   const ending = after.find((each) => each.position != null);
   if (ending) return axis.rig.mayMove(ending.verb) ? null : ending.position;
-  // what it ended at before the daemon was started again, or before it lost its reference, nobody knows any more
+  // where it ended before a restart of the daemon or the loss of its reference is not known any more
   const since = event.t >= (axis.rig.daemon?.started ?? Infinity) && axis.condition.live && axis.condition.known;
   return since && axis.state?.moving === "no" && axis.ended() === event ? (axis.samples.position?.value ?? null) : null;
 }
