@@ -202,6 +202,27 @@ def test_where_an_axis_was_sent_is_forgotten_once_something_else_has_stopped_or_
         assert abs(located["setpoint"] - 40) > 1
 
 
+def test_a_move_that_begins_before_its_caller_goes_on_ends_as_any_other(lab: Laboratory, monkeypatch):
+    def start(self, work):
+        future = began(self, work)
+        if threading.current_thread() is threading.main_thread():
+            for _ in range(3):
+                began(self, asyncio.sleep(0)).result(10)
+        return future
+
+    began = LoopThread.start
+    with lab.powered("x") as (x,):
+        x.set(0.0).wait(60)
+        monkeypatch.setattr(LoopThread, "start", start)
+        moves = [x.set(40.0), x.set(30.0)]
+        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
+        lab.loop.run(lab.running.client.stop("x"))
+        ended = [type(move.exception(20)) for move in moves]
+        x.reset().wait(10)
+
+    assert ended == [StopLatched, StopLatched]
+
+
 def test_the_limits_of_a_description_follow_a_reload(lab: Laboratory):
     with lab.powered("x") as (x,), configured(lab, limits={"position_min": -3, "position_max": 6}):
         described = lab.loop.run(x.describe())["x"]

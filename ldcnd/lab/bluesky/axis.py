@@ -220,7 +220,7 @@ class PlanAxis(ReadableAxis):
         self.acceleration = Setting(self, "acceleration", lambda: self._info.limits.acceleration)
         self._under_way = 0
         self._stopped: bool | None = None
-        self._newest: Status | None = None  # of the moves that were set
+        self._newest: asyncio.Task[object] | None = None  # of the moves that were set
         self._flight = Flight(self.name, (self,), loop)
 
     # -- moving ------------------------------------------------------------------------------------------------------
@@ -234,8 +234,7 @@ class PlanAxis(ReadableAxis):
             value: the position.
             timeout: halt the axis and fail after so long, in seconds.
         """
-        self._newest = self._begin(f"move to {value:g}", lambda: self._move_or_halt(value, timeout))
-        return self._newest
+        return self._begin(f"move to {value:g}", lambda: self._move_or_halt(value, timeout))
 
     def home(self) -> Status:
         """Find the reference position, as the axis's configuration says."""
@@ -391,11 +390,15 @@ class PlanAxis(ReadableAxis):
     # -- inside the loop ---------------------------------------------------------------------------------------------
 
     def _begin(self, name: str, work: Callable[[], Awaitable[None]]) -> Status:
-        """Start a motion; from now on `stop` has something to halt."""
-        self._under_way += 1
-        self._stopped = None
+        """Start a motion; from now on `stop` has something to halt.
+
+        What is known of the motions changes on the loop alone: the one that is started here is under way, or over,
+        before its caller goes on as often as it is not.
+        """
 
         async def moving() -> None:
+            self._under_way += 1
+            self._stopped = None
             try:
                 await work()
             except (CommandAborted, DriveFault, RequestRefused) as error:
@@ -421,7 +424,7 @@ class PlanAxis(ReadableAxis):
 
     async def _move_or_halt(self, target: float, within_s: float | None) -> None:
         """Move, or wait for the move that was set after it; halt what takes too long."""
-        own = self._newest
+        own = self._newest = asyncio.current_task()
         try:
             async with asyncio.timeout(within_s):
                 try:
@@ -429,7 +432,7 @@ class PlanAxis(ReadableAxis):
                 except CommandAborted:
                     if self._newest is own or self._newest is None or self.is_stopped():
                         raise
-                    await asyncio.shield(self._newest.wrapped())
+                    await asyncio.shield(self._newest)
         except TimeoutError:
             await at_rest(self._axis)  # what a plan does next may move another axis into its way
             raise SessionError(
