@@ -404,7 +404,7 @@ class PlanAxis(ReadableAxis):
             except (CommandAborted, DriveFault, RequestRefused) as error:
                 with suppress(LdcndError):  # why it ended matters more than what its standstill took
                     await self._rest(is_news=isinstance(error, StopLatched))
-                if not (self._stopped and isinstance(error, CommandAborted | RequestRefused)):
+                if not (self._is_stop_a_success() and isinstance(error, CommandAborted | RequestRefused)):
                     raise
             finally:
                 self._not_before_ns = self._axis.state.sample.t
@@ -462,6 +462,9 @@ class PlanAxis(ReadableAxis):
     def is_stopped(self) -> bool:
         """Tell whether what was begun last was stopped by `stop`."""
         return self._stopped is not None
+
+    def _is_stop_a_success(self) -> bool:
+        return self._stopped is True
 
     async def _halt(self, *, success: bool) -> None:
         if not self._under_way:
