@@ -203,6 +203,21 @@ class StopSent:
 
 
 @dataclass(frozen=True, slots=True)
+class StopHeard:
+    """The drive has confirmed a stop, which the readings requested from now on are to show.
+
+    Attributes:
+        mode: how it was stopped.
+        now_s: when, in loop time.
+        deceleration_counts_per_s2: that the drive holds for it; None while it is not known.
+    """
+
+    mode: StopMode
+    now_s: float
+    deceleration_counts_per_s2: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class StopUnconfirmed:
     """No drive has confirmed a stop, or it is yet to be sent."""
 
@@ -269,6 +284,7 @@ AxisEvent = (
     | ControlChanged
     | StopLatch
     | StopSent
+    | StopHeard
     | StopUnconfirmed
     | StopConfirmed
     | LatchRecalled

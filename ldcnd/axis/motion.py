@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted
+from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopHeard
 from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.quiet_drive import QuietDrive
@@ -504,6 +504,12 @@ class AxisMotion:
         if self.tracker.status.energised and self.tracker.status.state is not AxisState.ERROR_STOP:
             self.begin(command_id, verb, state, completion)
             self.tracker.take(MotionStarted(self.clock.now_s()))
+        self.heard(StopMode.SMOOTH)
+
+    def heard(self, mode: StopMode) -> None:
+        """The drive acknowledged a stop: readings are to show it, and it is sent again if they show that it is not."""
+        if self.tracker.status.energised or mode is StopMode.OFF:
+            self.tracker.take(StopHeard(mode, self.clock.now_s(), self.driver.deceleration_counts_per_s2))
 
     async def end(self, permit: Permit, failure: str = "") -> None:
         """Bring the motion of a command to rest; an axis that has lost its loop meanwhile is switched off instead.

@@ -1,9 +1,10 @@
-"""When a shaft stands, and when a motion has settled: decided from readings. Pure; time is an input."""
+"""When a shaft stands, brakes, and when a motion has settled: decided from readings. Pure; time is an input."""
 
+import math
 from dataclasses import dataclass, replace
 
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import AxisReading
+from ldcnd.drives.driver import AxisReading, StopMode
 
 REST_S = 0.25
 """Shortest time within `REST_COUNTS` that proves rest of a shaft without a profile of this daemon, seconds."""
@@ -14,6 +15,14 @@ MOST_REST_S = 2.0
 """A shaft that crept out of that band must stay in it for twice as long as it took, at most this."""
 LEAST_WINDOW_COUNTS = 5.0
 """A closed loop hunts by some counts."""
+LAG_S = 0.1
+"""A shaft that brakes follows its profile by less than this: no loop in use is softer."""
+ROOM_COUNTS = 50
+"""Room for a shaft that swings when its profile has ended."""
+ROOM_SHARE = 1.25
+"""Most that a braking distance may be of what velocity and deceleration make it."""
+UNKNOWN_BRAKING_S = 1.0
+"""A shaft whose deceleration is not known is given as long at its velocity, seconds."""
 WINDOW_OF_EL = 1 / 400
 """Settle window as a fraction of the position error limit: that is some hundred times the error at rest."""
 
@@ -75,6 +84,69 @@ NOTHING_SEEN = RestEvidence()
 def shows_velocity(reading: AxisReading) -> bool:
     """Tell whether a reading shows a velocity that is not within the resolution of its drive."""
     return abs(reading.velocity_counts_per_s) > reading.velocity_resolution_counts_per_s
+
+
+@dataclass(frozen=True, slots=True)
+class Braking:
+    """A stop that a drive has confirmed, and that readings have not shown yet.
+
+    A reply has no number: one that comes late to something older can pass for the confirmation of a stop that was lost.
+    So a stop is over when the shaft is seen to rest, and was not heard by a drive whose shaft goes farther than it
+    needs for braking, or whose loop is still closed after it was switched off.
+
+    Attributes:
+        mode: how.
+        heard_at_s: when it was confirmed, in loop time.
+        deceleration_counts_per_s2: that the drive holds for it; None while it is not known.
+        from_counts: where the first reading after it has found the shaft; None before that.
+        room_counts: how far from there it may go.
+        still_counts: the place by which it stands, if it does.
+        still_since_s: since when, in loop time.
+    """
+
+    mode: StopMode
+    heard_at_s: float
+    deceleration_counts_per_s2: float | None = None
+    from_counts: int | None = None
+    room_counts: float = math.inf
+    still_counts: int = 0
+    still_since_s: float = math.inf
+
+    def observe(self, reading: AxisReading, at_s: float) -> "Braking | bool":
+        """Take a reading; return what is still awaited, True once the stop is seen, or False: it was not heard.
+
+        Args:
+            reading: what the drive shows.
+            at_s: when it was requested, in loop time.
+        """
+        if at_s < self.heard_at_s:
+            return self
+        if self.mode is StopMode.OFF or not reading.enabled:
+            return not reading.enabled
+        position = reading.position_counts
+        if self.from_counts is None:
+            return replace(
+                self,
+                from_counts=position,
+                room_counts=self._room_counts(reading),
+                still_counts=position,
+                still_since_s=at_s,
+            )
+        if abs(position - self.from_counts) > self.room_counts:
+            return False
+        if abs(position - self.still_counts) > REST_COUNTS:
+            return replace(self, still_counts=position, still_since_s=at_s)
+        return True if at_s - self.still_since_s >= REST_S else self
+
+    def _room_counts(self, reading: AxisReading) -> float:
+        speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
+        if self.mode is StopMode.ABRUPT:
+            braking = 0.0
+        elif self.deceleration_counts_per_s2:
+            braking = speed**2 / (2 * self.deceleration_counts_per_s2)
+        else:
+            braking = speed * UNKNOWN_BRAKING_S
+        return ROOM_SHARE * braking + speed * LAG_S + ROOM_COUNTS
 
 
 @dataclass(frozen=True, slots=True)

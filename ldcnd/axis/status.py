@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Any
 
 from ldcnd.axis.faults import READINGS_CONTRADICT, REPLIES_UNUSABLE
-from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling
+from ldcnd.axis.rest import NOTHING_SEEN, Braking, RestEvidence, SettleProgress, Settling
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -117,6 +117,7 @@ class AxisStatus:
         position_lost: a fault says that what the drive counts is not where the axis is.
         stop_latched: a stop is latched; only a reset clears it.
         stop: the stop that the drive has not confirmed; None without one.
+        braking: the stop that it has confirmed and that readings are yet to show; None without one.
         link: whether its drive answers.
         misses: polls in a row without a reply.
         in_vain: replies in a row that could not be used.
@@ -151,6 +152,7 @@ class AxisStatus:
     position_lost: bool = False
     stop_latched: bool = False
     stop: OpenStop | None = None
+    braking: Braking | None = None
     link: LinkState = LinkState.DOWN
     misses: int = 0
     in_vain: int = 0

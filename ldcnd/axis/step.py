@@ -35,6 +35,7 @@ from ldcnd.axis.events import (
     SpeedChanged,
     SpeedOverridden,
     StopConfirmed,
+    StopHeard,
     StopLatch,
     StopSent,
     StopUnconfirmed,
@@ -53,7 +54,7 @@ from ldcnd.axis.faults import (
     entry_again,
     entry_of,
 )
-from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, shows_velocity
+from ldcnd.axis.rest import NOTHING_SEEN, Braking, RestEvidence, SettleProgress, shows_velocity
 from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, CommandEnd, Completion, OpenStop
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -83,6 +84,8 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
         faults = (*faults, DRIVE_CHANGED)
     if status.misses or status.in_vain or status.link is not LinkState.UP:
         status = replace(status, misses=0, in_vain=0, link=LinkState.UP)
+    if status.braking:
+        status = _watch_braking(status, status.braking, event)
     if faults or status.faults or status.stop:
         lost = any(fault.loses_position for fault in faults)
         status = _with(_with_faults(status, faults, now_ns), position_lost=lost)
@@ -93,6 +96,14 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     if status.target is None and status.enabled and _came_to_rest(status):
         return replace(status, target=status.scale.shown_at(reading.position_counts))
     return status
+
+
+def _watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) -> AxisStatus:
+    seen = braking.observe(event.reading, event.sent_at_s)
+    if isinstance(seen, Braking):
+        return status if seen is braking else replace(status, braking=seen)
+    status = replace(status, braking=None)
+    return status if seen else _keep_stop(status, StopUnconfirmed(event.now_ns, braking.mode))
 
 
 def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -257,6 +268,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         target=None if command.state is AxisState.CONTINUOUS_MOTION else command.target,
         target_counts=None,
         approached=False,
+        braking=None,
         rest=RestEvidence(rests=False, commanded=status.rest.commanded),
     )
 
@@ -300,6 +312,7 @@ def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
         enabled=on,
         effective_from_s=event.now_s,
         target_counts=None,
+        braking=None,
         rest=RestEvidence(rests=True if on else None, commanded=on),
     )
 
@@ -336,6 +349,10 @@ def _keep_stop(status: AxisStatus, event: StopUnconfirmed) -> AxisStatus:
     if stop is None or stop.fault:
         return status
     return replace(status, stop=OpenStop(stop.mode, entry_of(STOP_UNCONFIRMED, event.now_ns)))
+
+
+def _hear_stop(status: AxisStatus, event: StopHeard) -> AxisStatus:
+    return replace(status, braking=Braking(event.mode, event.now_s, event.deceleration_counts_per_s2))
 
 
 def _confirm_stop(status: AxisStatus, event: StopConfirmed) -> AxisStatus:
@@ -390,6 +407,7 @@ STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType
         ControlChanged: _change_control,
         StopLatch: _latch,
         StopSent: _send_stop,
+        StopHeard: _hear_stop,
         StopUnconfirmed: _keep_stop,
         StopConfirmed: _confirm_stop,
         LatchRecalled: _recall_latch,

@@ -1,8 +1,8 @@
 """How one axis is brought to rest, whatever its state, its link, a latch or what waits: nothing in here may refuse it.
 
 A stop never waits for commands: it makes their permits void, withdraws what is still queued, and whatever a command
-does next finds that the epoch has moved on. A stop that no drive has confirmed stays to be sent: its line sends it
-again, before anything else to this drive.
+does next finds that the epoch has moved on. A stop that no drive has confirmed, or that its readings do not show, stays
+to be sent: its line sends it again, before anything else to this drive.
 """
 
 import asyncio
@@ -14,6 +14,7 @@ from ldcnd.axis.latches import LatchKeeper
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Gate, Permit
 from ldcnd.axis.rest import REST_COUNTS
+from ldcnd.axis.status import AxisStatus
 from ldcnd.axis.telemetry import Note
 from ldcnd.axis.turns import CommandQueue
 from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Power, QuickStop, Stop, Verb
@@ -31,6 +32,9 @@ STOP_ROUNDS = 5
 """Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
 SETTLES_WITHIN_S = 0.25
 """Time within which a shaft follows its finished profile, seconds."""
+CONFIRMED_LATE = "confirmed late, when the drive answered again"
+FOUND_OPEN = "switched off when its line was taken over"
+NOT_SEEN = "sent again, because the drive went on after it was confirmed: a late reply was taken for its own"
 OVERTAKES = {Verb.POWER: "power off"}
 """What is said of a command that overtakes others, where it is not its name."""
 UNDERSTOOD_NO_MORE = {LossPolicy.QUICK_STOP: StopMode.ABRUPT, LossPolicy.POWER_OFF: StopMode.OFF}
@@ -87,7 +91,9 @@ class AxisStops:
         self._commands = commands
         self._next_command_id = next_command_id
         self._note = note
-        self._found_open = False  # a stop waits only because its loop was open when its line was taken over
+        self._resent = CONFIRMED_LATE  # how a stop was confirmed that its line has sent again
+        self._heard = motion.heard
+        motion.tracker.watch(self._watch, "braking")
         self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
 
     async def stop(self, mode: StopMode) -> bool:
@@ -160,12 +166,9 @@ class AxisStops:
         stop = self._tracker.status.stop
         if stop is None:
             return  # such a stop was confirmed while the axis was read
+        how = self._resent
         if await self._send(stop.mode, Verb.STOP, rounds=1):
-            if self._found_open:
-                how = "switched off when its line was taken over"
-            else:
-                how = "confirmed late, when the drive answered again"
-            self._found_open = False
+            self._resent = CONFIRMED_LATE
             log.warning("stop confirmed", axis=self._name, how=how)
             self._note(self._name, Verb.STOP, CommandStatus.DONE, how, None)
         self._publish()
@@ -173,7 +176,7 @@ class AxisStops:
     def switch_off(self) -> None:
         """Have the motor switched off by the first packet to its drive."""
         if self.possible:
-            self._found_open = True
+            self._resent = FOUND_OPEN
             self._tracker.take(StopUnconfirmed(self._clock.now_ns(), StopMode.OFF))
 
     def inherit(self) -> None:
@@ -182,7 +185,7 @@ class AxisStops:
 
     def note_power_loss(self) -> None:
         """Note that the drive was reset or had no power: the motion to be stopped has ended."""
-        self.inherited = self._found_open = False
+        self.inherited, self._resent = False, CONFIRMED_LATE
         self._tracker.take(StopConfirmed())
 
     def watch_inherited(self, reading: AxisReading, at_s: float) -> None:
@@ -228,9 +231,18 @@ class AxisStops:
                 tracker.take(PowerSwitched(on=False, now_s=self._clock.now_s()))
             elif not stands:  # what was proven to stand is not watched coming to rest, and keeps its target
                 self._commands.brought_to_rest(command_id or self._next_command_id(), verb)
+            if not stands:
+                self._heard(mode)
             tracker.take(StopConfirmed(mode))
             return True
         return False
+
+    def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
+        """Have a stop sent again that the drive has confirmed and not carried out."""
+        if before.braking and after.stop_pending and not before.stop_pending:
+            log.error("drive goes on after a stop that was confirmed", axis=self._name)
+            self._resent = NOT_SEEN
+            self.wanted.set()
 
     def _publish(self) -> None:
         self._telemetry.publish_state(self._tracker.status, self._clock.now_ns())

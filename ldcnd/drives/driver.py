@@ -350,6 +350,7 @@ class Moves(Readable):
         home_methods: what can mark the reference position; none for a drive that captures nothing.
         capture_s: sampling period of the capture inputs: a shorter pulse can be missed, and the captured position
             lags by up to the distance moved in this time.
+        deceleration_counts_per_s2: at which a smooth stop would brake now; None while that is not known.
         path_period_s: between two points of a path; 0 for a drive that walks none.
         path_packet: maximum number of points in one packet.
         path_most_counts: largest step from one point to the next.
@@ -363,6 +364,7 @@ class Moves(Readable):
     holds_gains: bool = True
     home_methods: frozenset[HomeMethod] = frozenset()
     capture_s: float = 0.0
+    deceleration_counts_per_s2: float | None = None
     path_period_s: float = 0.0
     path_packet: int = 0
     path_most_counts: int = 0

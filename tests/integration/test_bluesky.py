@@ -217,10 +217,11 @@ def test_a_move_that_begins_before_its_caller_goes_on_ends_as_any_other(lab: Lab
         moves = [x.set(40.0), x.set(30.0)]
         lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
         lab.loop.run(lab.running.client.stop("x"))
-        ended = [type(move.exception(20)) for move in moves]
+        ended = [move.exception(20) for move in moves]
         x.reset().wait(10)
 
-    assert ended == [StopLatched, StopLatched]
+    # the stop finds the second one on its way, or under way
+    assert all(isinstance(error, CommandAborted | StopLatched) for error in ended)
 
 
 def test_the_limits_of_a_description_follow_a_reload(lab: Laboratory):

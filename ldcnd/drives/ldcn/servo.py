@@ -65,6 +65,7 @@ from ldcnd.drives.ldcn.trajectory import (
     ProfileMode,
     Trajectory,
     TrajectoryControl,
+    acceleration_counts_per_s2,
     most_step,
     quantised,
     trajectory_of,
@@ -236,6 +237,14 @@ class LdcnAxis(Moves):
     def capture_s(self) -> float:  # type: ignore[override]
         """One servo cycle (LS-182AP manual, "Encoder Input")."""
         return self.profile.servo_cycle_s * (self._book.next_divisor or 1)
+
+    @property
+    def deceleration_counts_per_s2(self) -> float | None:  # type: ignore[override]
+        """See `Moves`. It is that of the last profile (PIC-SERVO manual, 5.2, "Stop Motor")."""
+        held, divisor = self._book.known("acceleration"), self._book.divisor
+        if held is None or divisor is None:
+            return None
+        return acceleration_counts_per_s2(held, divisor, self.profile)
 
     @property
     def gains(self) -> Gains | None:
@@ -410,9 +419,13 @@ class LdcnAxis(Moves):
         # register
         self._book.forget("some firmware clears it with a stop", ("velocity",))
         off = mode is StopMode.OFF
+        control, was_off = self._book.known(TRAJECTORY_CONTROL), self.switched_off
         self._switching_off += off
         try:
             await self._stop_motor(STOP_CONTROLS[mode])
+            # with an open loop no reading shows whether the drive has heard it: one late reply does not stand for two
+            if control is not None and not control & TrajectoryControl.SERVO and not was_off:
+                await self._stop_motor(STOP_CONTROLS[mode])
         finally:
             self._switching_off -= off
         # an armed capture would stop a later motion, and end it as if it had found its home
