@@ -37,6 +37,7 @@ class QuietDrive(Protocol):
     holds_gains: bool
     home_methods: frozenset[HomeMethod]
     capture_s: float
+    deceleration_counts_per_s2: float | None
     path_period_s: float
     path_packet: int
     path_most_counts: int
