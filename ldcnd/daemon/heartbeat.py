@@ -24,7 +24,10 @@ from ldcnd.log import get_logger
 log = get_logger("heartbeat")
 
 HOLDING = frozenset({TroubleKind.NO_ANSWER, TroubleKind.STOP_PENDING})
-"""Troubles of an axis that hold the level; faults and latched stops are the drive's own and the machine's business."""
+"""Troubles of an axis that hold the level, as a stop does that is on its way; faults and latched stops are the drive's
+own and the machine's business."""
+HELD_S = 0.005
+"""Pause before a change that is held is tried again: a stop that is confirmed at once costs no change."""
 REOPEN_S = 1.0
 """Pause between two attempts to open an output that is gone."""
 
@@ -104,7 +107,7 @@ class Heartbeat:
                 self._level = not self._level
                 await loop.run_in_executor(thread, output.set, self._level)
                 self._changes += 1
-            await asyncio.sleep(self._config.half_period_ms / 1000)
+            await asyncio.sleep(HELD_S if self._why else self._config.half_period_ms / 1000)
 
     def _trouble(self, now_s: float) -> str:
         """Return why the level must stay as it is, or nothing."""
@@ -127,6 +130,8 @@ class Heartbeat:
         if not line.bus.on_time(now_s):
             return f"{name}: the line does not keep to its plan"
         for axis in line.axes:
+            if axis.tracker.status.stop:
+                return f"{axis.config.name}: a stop is not confirmed"
             for trouble in assess(axis.tracker.status).troubles:
                 if trouble.kind in HOLDING:
                     return f"{axis.config.name}: {trouble.text}"

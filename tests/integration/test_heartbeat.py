@@ -132,8 +132,8 @@ async def test_it_stops_when_one_drive_is_lost(tmp_path, changes_s):
 async def test_it_stops_while_a_stop_is_not_confirmed(tmp_path, changes_s):
     async with beating_rig(tmp_path, changes_s) as (rig, chain):
         chain.modules[3].power(on=False, at_s=asyncio.get_running_loop().time())
-        reply = await rig.client.stop("c")
         asked_s = asyncio.get_running_loop().time()
+        reply = await rig.client.stop("c")
         await asyncio.sleep(2.0)
 
     assert reply.confirmed == ()

@@ -176,7 +176,7 @@ def test_the_polls_of_modules_are_part_of_the_plan():
     (poll,) = [poll for poll in with_io.polls if poll.axis == "cabinet"]
     silent = plan_bus(config(name=None, outputs=[]).bus[0])
 
-    assert (poll.address, poll.rate_hz, poll.request_bytes, poll.reply_bytes) == (2, 50, 5, 11)
+    assert (poll.address, poll.rate_hz, poll.request_bytes, poll.reply_bytes) == (2, 50, 5, 13)
     assert [item.item for item in poll.items] == ["io"]
     assert with_io.load == pytest.approx(alone.load + 50 * poll.longest_s)
     assert alone.load < silent.load < with_io.load

@@ -10,6 +10,7 @@ from ldcnd.contract.commands import (
     CommandReply,
     Halt,
     MoveAbsolute,
+    MoveRelative,
     MoveVelocity,
     Power,
     QuickStop,
@@ -19,6 +20,7 @@ from ldcnd.contract.commands import (
 )
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.samples import LinkState
+from ldcnd.drives.ldcn.pic_io import LINES
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
@@ -89,6 +91,39 @@ async def test_what_is_confirmed_has_been_heard(seed: int):
                 assert rig.speed() < 0.05, seed
         await ended(rig, Power(on=False))
     assert confirmed > 5
+
+
+NO_DOOR = {"name": "no_door", "of": "rotor", "requires": [{"input": "door_closed"}]}
+
+
+@pytest.mark.promise("inputs-of-their-module")
+@pytest.mark.parametrize("seed", range(4))
+async def test_a_late_reply_of_another_module_shows_no_input_that_permits_motion(seed: int):
+    """The door is open all the time; the low bytes of the table's position, and the inputs of the store, look shut."""
+    late = FaultPlan((LineFault(FaultKind.REPLY_DELAYED, 0.03, from_s=FROM_S, longest_s=0.1),), seed)
+    modules = (ModuleSpec(MODEL, plant=ENDLESS), ModuleSpec(MODEL), ModuleSpec("pic-io"), ModuleSpec("pic-io"))
+    chain = build_chain(ChainSpec(modules, faults=late))
+    cabinet, store = chain.modules[2:]
+    for line in range(1, LINES + 1):
+        cabinet.drive_line(line, high=False, at_s=0.0)
+        store.drive_line(line, high=True, at_s=0.0)
+    others = [{"name": "store", "address": 4, "model": "pic-io", "rate": 50}]
+    async with running_machine(machine(NO_DOOR, more=others), chain) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("table", Power(on=True))
+        await rig.client.command("table", MoveRelative(distance=0.006))
+        stood_at = chain.modules[0].shaft.position_counts
+        await asyncio.sleep(FROM_S)
+        refused = 0
+        for _ in range(2000):
+            try:
+                await rig.client.command("rotor", MoveRelative(distance=2.0))
+            except LdcndError:
+                refused += 1
+            await asyncio.sleep(0.01)
+
+        assert refused == 2000
+        assert chain.modules[0].shaft.position_counts == pytest.approx(stood_at, abs=5)
 
 
 CREEPING = MoveVelocity(velocity=0.1)

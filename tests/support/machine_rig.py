@@ -1,7 +1,7 @@
 """A small machine: a rotor and a table on one line, a door with two contacts and its lock on a PIC-I/O."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
 from ldcnd.config.rig import RigConfig
@@ -37,9 +37,10 @@ def machine(
     *rules: dict[str, object],
     axis: dict[str, object] | None = None,
     module: dict[str, object] | None = None,
+    more: Sequence[dict[str, object]] = (),
     **bus: object,
 ) -> RigConfig:
-    """Return its configuration with these interlocks and other settings."""
+    """Return its configuration with these interlocks, more modules and other settings."""
     axes = [
         {"name": name, "address": place, "model": MODEL, "unit": "rev", "counts_per_unit": COUNTS, "gains": GAINS}
         | {"velocity": 10.0, "acceleration": 20.0, "rates": {"position": 20, "velocity": 20, "adc": 0, "state": 20}}
@@ -47,8 +48,14 @@ def machine(
         for place, name in ((1, "rotor"), (2, "table"))
     ]
     cabinet = {"name": "cabinet", "address": 3, "model": "pic-io", "rate": 50, "inputs": INPUTS, "outputs": OUTPUTS}
-    line = {"name": "line", "port": "sim:line", "baud": 115_200, "axis": axes, "module": [cabinet | (module or {})]}
-    modules = [{"model": MODEL}, {"model": MODEL}, {"model": "pic-io"}]
+    line = {
+        "name": "line",
+        "port": "sim:line",
+        "baud": 115_200,
+        "axis": axes,
+        "module": [cabinet | (module or {}), *more],
+    }
+    modules = [{"model": MODEL}, {"model": MODEL}, {"model": "pic-io"}, *({"model": each["model"]} for each in more)]
     return RigConfig.model_validate(
         {
             "rig": "machine",

@@ -4,6 +4,7 @@ The sizes of exchanges are those of the packets themselves. Sources: LS-182AP ma
 manual, 4.1 (the wait of one servo cycle), 5.2.
 """
 
+import itertools
 import math
 from collections.abc import Mapping
 from dataclasses import replace
@@ -184,11 +185,11 @@ def _polls(bus: LdcnBusConfig, timing: LineTiming, prices: Mapping[str, PriceLis
 
 def _module_polls(bus: LdcnBusConfig, timing: LineTiming) -> list[Poll]:
     """Return the polls of modules that are no axes: of all inputs for a PIC-I/O with a name, of one byte for others."""
-    polls = []
+    polls, nth = [], itertools.count()
     for module in bus.module:
         exchange: Exchange[Any]
         if module.name:
-            exchange, item, rate_hz = poll_io(module.address), TelemetryItem.IO.value, module.rate
+            exchange, item, rate_hz = poll_io(module, next(nth)), TelemetryItem.IO.value, module.rate
         else:
             exchange, item, rate_hz = watch_module(module.address), "status byte", 1.0 / PERIOD_S
         cost = cost_of(exchange, timing)

@@ -10,6 +10,8 @@ then and stay so until a request changes them. Source: PIC-I/O data sheet, 2.2, 
 
 import asyncio
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import partial
 
 from typing_extensions import override
 
@@ -17,6 +19,7 @@ from ldcnd.contract.errors import BusError, RegisterUnknown, ValueOutOfRange
 from ldcnd.contract.meta import Provenance
 from ldcnd.contract.samples import IoReading
 from ldcnd.drives.ldcn.config import ModuleConfig
+from ldcnd.drives.ldcn.packet import check_status
 from ldcnd.drives.ldcn.pic_io import (
     ALL_LINES,
     LINES,
@@ -34,10 +37,12 @@ from ldcnd.drives.ldcn.pic_io import (
     send_io_command,
     timer_control,
 )
+from ldcnd.drives.ldcn.profiles import PIC_IO, identify
 from ldcnd.drives.ldcn.registers import TAKEN_OVER, RegisterBook
 from ldcnd.drives.network import IoDriver
+from ldcnd.drives.toml import DeviceIdentity
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, Poller, Timing, next_on_grid
+from ldcnd.line.exchange import Exchange, Poller, ReplyVerdict, Timing, next_on_grid
 
 CAPTURED = IoItem.CAPTURED_LEVELS | IoItem.CAPTURED_COUNTER
 DIRECTIONS = {line: f"direction {line}" for line in range(1, LINES + 1)}
@@ -46,12 +51,34 @@ LEVELS = {line: f"output {line}" for line in range(1, LINES + 1)}
 """By line: the level that it has, or would have, as an output."""
 PWM = ("pwm 1", "pwm 2")
 TIMER = "timer"
-ITEMS = IoItem.LEVELS | IoItem.ADC1 | IoItem.ADC2 | IoItem.ADC3 | IoItem.COUNTER
+ITEMS = IoItem.LEVELS | IoItem.ADC1 | IoItem.ADC2 | IoItem.ADC3 | IoItem.COUNTER | IoItem.IDENTITY
+TELLING_APART = (IoItem(0), IoItem.CAPTURED_LEVELS, IoItem.CAPTURED_COUNTER, CAPTURED)
+"""What the first, second, third and fourth of these modules on a line send besides: it makes the lengths differ."""
+IDENTITY_AT = 10
+"""Where the identity stands among the bytes of a reply."""
 
 
-def poll_io(address: int) -> Exchange[IoStatus]:
-    """Return the question for all inputs of a PIC-I/O."""
-    return read_io_status(IoNode(address), ITEMS)
+def poll_io(entry: ModuleConfig, nth: int) -> Exchange[IoStatus]:
+    """Return the question for all inputs of a PIC-I/O.
+
+    A status packet does not say of whom it is, and inputs may permit motion: so that the reply of a drive or of another
+    such module, which comes late, is none of this one, a reply has its identity, and a length of its own.
+
+    Args:
+        entry: of the module.
+        nth: it is the nth of these modules on its line, from 0.
+    """
+    exchange = read_io_status(IoNode(entry.address), ITEMS | TELLING_APART[nth % len(TELLING_APART)])
+    return replace(exchange, check=partial(_check_is_of, entry.identity))
+
+
+def _check_is_of(identity: DeviceIdentity | None, data: bytes) -> ReplyVerdict:
+    verdict = check_status(data)
+    if verdict is not ReplyVerdict.INTACT:
+        return verdict
+    device_id, version = data[IDENTITY_AT : IDENTITY_AT + 2]
+    is_of = identify(device_id, version) is PIC_IO if identity is None else (device_id, version) == identity
+    return verdict if is_of else ReplyVerdict.CORRUPT
 
 
 class IoModule(Poller[IoStatus], IoDriver):
@@ -61,7 +88,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         status: the latest status byte; None while it does not answer.
     """
 
-    def __init__(self, bus: Bus, entry: ModuleConfig) -> None:
+    def __init__(self, bus: Bus, entry: ModuleConfig, nth: int) -> None:
         self.name = entry.name or ""
         self.node = entry.address
         self.inputs, self.outputs = entry.inputs, entry.outputs
@@ -76,7 +103,7 @@ class IoModule(Poller[IoStatus], IoDriver):
         self._node = IoNode(entry.address)
         self.period_s = 1.0 / entry.rate
         self._allowed = _mask(each.line for each in entry.outputs.values())
-        self._exchange = poll_io(entry.address)
+        self._exchange = poll_io(entry, nth)
         names = (*DIRECTIONS.values(), *LEVELS.values(), *PWM, TIMER)
         self._book = RegisterBook(names, lambda: asyncio.get_running_loop().time())
         self.forget()

@@ -137,7 +137,10 @@ class LdcnNetwork(Network):
         self._placed: set[int] = set()
         self._expected = _expected(specs, line)
         plan = GroupPlan(line.groups, self._names)
-        self._io = {entry.address: IoModule(bus, entry) for entry in line.modules if entry.name}
+        self._io = {
+            entry.address: IoModule(bus, entry, nth)
+            for nth, entry in enumerate(each for each in line.modules if each.name)
+        }
         self._proofs = {
             each.address: bus.proofs.expect(each.address, each.what, self._names.get(each.address))
             for each in self._expected
