@@ -13,7 +13,7 @@ from ldcnd.contract.samples import IoReading, Quality, TelemetryItem
 from ldcnd.drives.line_config import InputConfig, OutputConfig, OutputLevel
 from ldcnd.drives.network import IoDriver
 from ldcnd.line.exchange import Timing
-from ldcnd.line.proof import Condition, only_while, until_begun
+from ldcnd.line.proof import Condition, only_while
 from ldcnd.log import get_logger
 from ldcnd.net.publisher import Publisher
 
@@ -257,7 +257,7 @@ class ModuleService:
             self._unread_until_s |= dict.fromkeys(asked, math.inf)
             self.before = {name: (values[name], self.read_at_s) for name in asked} | self.before
             try:
-                with only_while(until_begun(permitted)):
+                with only_while(permitted):
                     return await self._driver.set_outputs(levels, inputs, pwm)
             finally:
                 self._unread_until_s |= dict.fromkeys(asked, asyncio.get_running_loop().time())

@@ -34,6 +34,7 @@ FIRST_REOPEN_S = 0.1
 LONGEST_REOPEN_S = 2.0
 STAYS_S = 3.0
 """A port that is lost sooner than this was not really open: as of a serial server that accepts and closes, seconds."""
+SENT_IN_VAIN = "the packet was sent in vain, or its reply was lost, and is not sent again:"
 LONGEST_OPENING_S = 10.0
 """Upper bound of closing a lost port and opening it again, seconds; both are bounded by themselves."""
 
@@ -87,7 +88,7 @@ class Job(Transaction):
             try:
                 self.condition()
             except LdcndError as error:
-                self.fail(error)
+                self.fail(error if self.attempts_left == self.attempts else error.although(SENT_IN_VAIN))
                 return False
         self.attempts_left -= 1  # what the condition forbids was no attempt
         self._doubted = False

@@ -41,23 +41,6 @@ class only_while:  # noqa: N801 - read as a statement
         _condition.reset(self._token)
 
 
-def until_begun(condition: Condition) -> Condition:
-    """Return a condition that is checked until its first packet is sent: what has begun is carried out whole.
-
-    For several packets that only make sense together, and of which none moves a motor: outputs that have become outputs
-    get their levels.
-    """
-    begun = False
-
-    def check() -> None:
-        nonlocal begun
-        if not begun:
-            condition()
-            begun = True
-
-    return check
-
-
 class bringing_up:  # noqa: N801 - read as a statement
     """Let what hands out addresses, groups and rates, when queued in this context, be sent to any node.
 

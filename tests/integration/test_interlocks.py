@@ -19,12 +19,13 @@ from ldcnd.contract.commands import (
     Stop,
     Why,
 )
-from ldcnd.contract.errors import InterlockViolated, LeaseHeld, LeaseUnknown
+from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseHeld, LeaseUnknown
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.rig_commands import OverrideInterlock, SetIo
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.ldcn.packet import StatusItem
+from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
+from ldcnd.sim.faults import FaultInjector, FaultyRequest
 from tests.support.chain_rig import rig_on
 from tests.support.machine_rig import (
     CLOSED,
@@ -456,3 +457,34 @@ async def test_a_machine_that_is_taken_over_with_its_door_open_is_brought_to_res
     async with running_machine(machine(DOOR_SHUT, start="adopt"), chain) as rig:
         await asyncio.sleep(1.0)
         assert rig.speed() == 0
+
+
+@pytest.mark.promise("outputs-by-command")
+@pytest.mark.parametrize("lost", [1, 2])
+@pytest.mark.parametrize("end", ["stop", "force"])
+async def test_an_output_whose_packet_was_lost_is_not_written_again_after_what_forbids_it(lost, end, monkeypatch):
+    def request(self, data, at_s):
+        if data[1:2] == b"\x03" and data[2] & 0x0F == CommandCode.SET_GAIN and left:
+            left.pop()
+            if not left:
+                last_lost.set()
+            return FaultyRequest((None,) * len(data))
+        return sent(self, data, at_s)
+
+    sent, left, last_lost = FaultInjector.request, [], asyncio.Event()
+    async with running_machine(machine()) as rig:
+        held = await rig.client.ask(Acquire(client="ann", axes=("rotor", "table"), lease_s=60.0))
+        await rig.client.ask(UNLOCKED.model_copy(update={"lease": held.lease}))  # it is an output from now on
+        monkeypatch.setattr(FaultInjector, "request", request)
+        left += [True] * lost
+        writing = asyncio.create_task(rig.client.ask(LOCKED.model_copy(update={"lease": held.lease})))
+        await last_lost.wait()
+        if end == "stop":
+            await rig.client.stop()
+        else:
+            await rig.client.ask(Acquire(client="bob", axes=("rotor", "table"), lease_s=60.0, force=True))
+        with pytest.raises(LdcndError, match="is not sent again"):
+            await writing
+        await asyncio.sleep(1.0)
+
+        assert rig.io.latch == 0

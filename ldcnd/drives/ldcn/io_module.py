@@ -10,6 +10,7 @@ then and stay so until a request changes them. Source: PIC-I/O data sheet, 2.2, 
 
 import asyncio
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
 
@@ -43,6 +44,7 @@ from ldcnd.drives.network import IoDriver
 from ldcnd.drives.toml import DeviceIdentity
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, Poller, ReplyVerdict, Timing, next_on_grid
+from ldcnd.line.proof import only_while
 
 CAPTURED = IoItem.CAPTURED_LEVELS | IoItem.CAPTURED_COUNTER
 DIRECTIONS = {line: f"direction {line}" for line in range(1, LINES + 1)}
@@ -70,6 +72,10 @@ def poll_io(entry: ModuleConfig, nth: int) -> Exchange[IoStatus]:
     """
     exchange = read_io_status(IoNode(entry.address), ITEMS | TELLING_APART[nth % len(TELLING_APART)])
     return replace(exchange, check=partial(_check_is_of, entry.identity))
+
+
+def _nothing_forbids() -> None:
+    """Let packets pass to a module that is known to be this one."""
 
 
 def _check_is_of(identity: DeviceIdentity | None, data: bytes) -> ReplyVerdict:
@@ -178,11 +184,13 @@ class IoModule(Poller[IoStatus], IoDriver):
                 with self._book.writing(asked):
                     await self._bus.execute(send_io_command(self._node, turned))
             written = {LEVELS[line]: int(level) for line, level in levels.items()}
-            if pwm_after:
-                await self._switch_together(latch, pwm_after, written)
-            else:
-                with self._book.writing(written):
-                    await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
+            # what has become an output gets its level, whatever has come meanwhile: it has another one until then
+            with only_while(_nothing_forbids) if turned else nullcontext():
+                if pwm_after:
+                    await self._switch_together(latch, pwm_after, written)
+                else:
+                    with self._book.writing(written):
+                        await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
         elif pwm_after:
             with self._book.writing(dict(zip(PWM, pwm_after, strict=True))):
                 await self._bus.execute(send_io_command(self._node, SetPwmOutputs(*pwm_after)))
