@@ -523,6 +523,23 @@ async def test_limits_and_velocities_follow_a_reload():
             await put(made, "T:x.VELO", 20.0)
 
 
+async def test_what_was_put_stays_where_others_follow_new_defaults():
+    async with records() as (running, made):
+        await put(made, "T:x.TWV", 0.25)
+        await put(made, "T:x.VELO", 3.0)
+        config = two_axes()
+        (bus,) = config.bus
+        x = bus.axis[0].model_copy(update={"velocity": 4.0})
+        changed = config.model_copy(update={"bus": (bus.model_copy(update={"axis": (x, *bus.axis[1:])}),)})
+        running.daemon.reconfigure(changed, plan_rig(changed))
+        async with asyncio.timeout(30):
+            while made.variables["T:x.JVEL"].value != pytest.approx(4, rel=0.01):
+                await asyncio.sleep(0.1)
+
+        shown = [made.variables[f"T:x.{name}"].value for name in ("TWV", "VELO", "BVEL")]
+        assert shown == [0.25, 3.0, 3.0]
+
+
 async def test_a_daemon_with_another_unit_is_not_moved_by_numbers_of_the_former_one():
     broker = MemoryBroker()
     loop = asyncio.get_running_loop()

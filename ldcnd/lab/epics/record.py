@@ -79,6 +79,9 @@ PLACES = (
 STEPS = ("MRES", "ERES", "RRES", "UREV")
 VELOCITIES = ("VELO", "BVEL", "JVEL", "HVEL", "VMAX", "VBAS")
 MEASURED = {Dimension.POSITION: PLACES, Dimension.VELOCITY: VELOCITIES, Dimension.ACCELERATION: ("JAR",)}
+SPEEDS = (("VELO", "BVEL", "S", "SBAK"), ("ACCL", "BACC"), ("JVEL",), ("JAR",), ("HVEL",), ("TWV",))
+"""Fields that follow the defaults of the axis until a client puts another value to the first of them."""
+TO_BE_LIMITED = frozenset({"VELO", "JVEL", "HVEL"})
 DURATIONS = ("ACCL", "BACC", "DLY")
 MSTA_PLUS, MSTA_DONE, MSTA_HIGH_SWITCH, MSTA_POSITION = 0x1, 0x2, 0x4, 0x20
 MSTA_HOME, MSTA_ENCODER, MSTA_PROBLEM, MSTA_MOVING = 0x80, 0x100, 0x200, 0x400
@@ -229,7 +232,7 @@ class MotorRecord:
 
         What a client has put into a field stays, unless it cannot be: after a change of unit, or above a limit.
         """
-        before, is_new = self.info, defaults != self.defaults
+        before, speeds_before = self.info, self._speeds()
         self.info, self.defaults = info, defaults
         is_other_unit = info.unit != before.unit
         if is_other_unit:
@@ -237,8 +240,13 @@ class MotorRecord:
             await self.grow_old()  # what is shown is of the former daemon
         for field in self._set_metadata():
             await field.write_metadata()
-        is_too_fast = float(self["VELO"].value) > (info.limits.velocity or NO_LIMIT)
-        speeds = self._speeds() if is_other_unit or is_new or is_too_fast else {}
+        speeds, most = self._speeds(), info.limits.velocity or NO_LIMIT
+        for first, *others in SPEEDS:
+            held = self[first].value
+            was_put = held != speeds_before[first] and not (first in TO_BE_LIMITED and float(held) > most)
+            if was_put and not is_other_unit:
+                for name in (first, *others):
+                    del speeds[name]
         for name, value in {**self._described(), **speeds}.items():
             await self[name].show(value)
 
