@@ -9,12 +9,14 @@ import pytest
 from ldcnd.contract.commands import (
     CommandReply,
     Halt,
+    Home,
     MoveAbsolute,
     MoveRelative,
     MoveVelocity,
     Power,
     QuickStop,
     Reset,
+    SetPosition,
     SetPwm,
     Stop,
 )
@@ -24,7 +26,7 @@ from ldcnd.drives.ldcn.pic_io import LINES
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
-from tests.support.dialect_rig import V4, dialect_rig
+from tests.support.dialect_rig import LS_182AP, SC, V4, dialect_rig
 from tests.support.machine_rig import ENDLESS, MODEL, Machine, machine, running_machine
 
 FROM_S = 5.0
@@ -166,3 +168,34 @@ async def test_a_stop_that_was_confirmed_and_not_carried_out_is_sent_again(motio
         state = await rig.rig.client.state("x")
         assert not state.stop_pending
         assert state.enabled is (not isinstance(ending, Power))
+
+
+@pytest.mark.promise("told-twice")
+@pytest.mark.parametrize("command", ["_load", "_arm_homing"])
+@pytest.mark.parametrize("dialect", [V4, LS_182AP, SC], ids=lambda each: each.name)
+async def test_a_late_reply_does_not_stand_for_that_to_what_a_motion_needs(dialect, command, monkeypatch):
+    """The drive answers and takes nothing, once: the motion goes where it was sent, and ends on its mark."""
+    deaf, taking = [True], getattr(SimulatedDrive, command)
+
+    def take(self, *args):
+        if deaf:
+            deaf.pop()
+        else:
+            taking(self, *args)
+
+    home = {"method": "index", "velocity": 1.4, "distance": 30.0}
+    async with dialect_rig(dialect, home=home) as rig:
+        await rig.power_on()
+        await rig.send(SetPosition(position=0.0))
+        await rig.done(MoveAbsolute(position=4.0))
+        began_at = rig.position_mm
+        monkeypatch.setattr(SimulatedDrive, command, take)
+        if command == "_arm_homing":
+            state = await rig.done(Home())
+            assert (state.referenced, state.last_error) == (True, None)
+            assert abs(rig.position_mm - began_at) > 0.05
+        else:
+            await rig.done(MoveAbsolute(position=-2.0))
+            assert rig.position_mm == pytest.approx(began_at - 6.0, abs=0.02)
+
+        assert not deaf

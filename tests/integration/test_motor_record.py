@@ -170,9 +170,10 @@ async def test_a_stop_of_all_halts_each_axis():
             await running.until(axis, lambda state: state.moving is Moving.YES)
         await put(made, "T:allstop", 1)
         await asyncio.gather(*moving)
-        states = await running.client.states()
+        states = [await running.until(axis, lambda state: state.moving is Moving.NO) for axis in ("x", "y")]
 
-        assert {(state.moving, state.stop_latched) for state in states.values()} == {(Moving.NO, False)}
+        assert not any(state.stop_latched for state in states)
+        assert all(abs(made.variables[f"T:{axis}.RBV"].value) < 25 for axis in ("x", "y"))
         assert made.variables["T:y.VAL"].value == pytest.approx(made.variables["T:y.RBV"].value, abs=0.05)
 
 

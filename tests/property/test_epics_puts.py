@@ -14,7 +14,7 @@ from caproto import CaprotoError, Forbidden
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.config.plan import plan_rig
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.errors import LdcndError, StopLatched
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.lab.epics.gateway import WHO, Gateway, gateway
@@ -127,7 +127,15 @@ class Campaign:
             self.begin()
             await self.running.client.stop("x")
             await self.running.until("x", lambda state: state.moving is Moving.NO)
+            while await self.refuses_reset():  # the stop of a put that has begun meanwhile is on its way
+                await asyncio.sleep(0.01)
+
+    async def refuses_reset(self) -> bool:
+        try:
             await put(self.made, "T:x-ErrRst", 1)
+        except StopLatched:
+            return True
+        return False
 
     async def reload(self) -> None:
         """Have the daemon read a configuration with other velocities."""

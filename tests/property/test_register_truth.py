@@ -211,6 +211,7 @@ class History:
         dice, io = self.dice, self.io
         line, use = dice.choice(LINES), dice.choice(("high", "low", "inputs"))
         pwm = dice.choice(({}, {"pwm1": 0.5}, {"pwm2": 1.0}))
+        await asyncio.sleep(0.02)  # the last packet of a command whose outcome is unknown may be on the wire
         before = io.outputs, io.outputs & io.latch, io.pwm
         with contextlib.suppress(LdcndError):
             await rig.client.ask(SetIo(module="io", **{use: [line]}, **pwm), timeout_s=2.0)

@@ -306,9 +306,10 @@ class LdcnAxis(Moves):
         if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
             first, offset = (commands.reset_position(self._node),), self.state.counts
         if self.state.known.closed and self._book.gains and not self._book.loaded:
-            first = (commands.set_gain(self._node, self._book.gains), *first)
+            first = (*2 * (commands.set_gain(self._node, self._book.gains),), *first)
         trajectory = trajectory_of(_shifted(motion, offset), self._next_divisor(), self.profile)
-        return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
+        load = commands.load_trajectory(self._node, trajectory)
+        return *first, load, load, commands.start_motion(self._node)
 
     async def power(self, *, on: bool) -> None:
         """See `Moves`. Closing the loop is verified; it takes effect at the present position.
@@ -419,12 +420,11 @@ class LdcnAxis(Moves):
         # register
         self._book.forget("some firmware clears it with a stop", ("velocity",))
         off = mode is StopMode.OFF
-        control, was_off = self._book.known(TRAJECTORY_CONTROL), self.switched_off
+        shows_nothing = self.state.loop_may_open and not self.switched_off
         self._switching_off += off
         try:
             await self._stop_motor(STOP_CONTROLS[mode])
-            # with an open loop no reading shows whether the drive has heard it: one late reply does not stand for two
-            if control is not None and not control & TrajectoryControl.SERVO and not was_off:
+            if shows_nothing:  # with its loop open no reading tells whether it has heard it: see `_tell`
                 await self._stop_motor(STOP_CONTROLS[mode])
         finally:
             self._switching_off -= off
@@ -603,7 +603,7 @@ class LdcnAxis(Moves):
             control, guard = await self._guard(motion, active=self.spec.limit_stop)
         if control or self.state.homing_armed:
             self.state.homing_armed = True  # before it is, so that a stop in between disarms it
-            await self._bus.execute(commands.set_homing(self._node, control))
+            await self._tell(commands.set_homing(self._node, control))
         self.state.homing_armed = bool(control)
         self.state.guard = guard
 
@@ -652,6 +652,15 @@ class LdcnAxis(Moves):
     async def _load(self, trajectory: Trajectory) -> None:
         exchange = commands.load_trajectory(self._node, trajectory)
         with self._book.writing(trajectory_values(trajectory)):
+            await self._tell(exchange)
+
+    async def _tell(self, exchange: Exchange[StatusPacket]) -> None:
+        """Send what no reading shows that the drive has taken it: twice, so that one late reply does not stand for it.
+
+        Without that a motion could begin towards the target of the one before, or with its gains.
+        """
+        await self._bus.execute(exchange)
+        if exchange.repeatable:
             await self._bus.execute(exchange)
 
     async def _put_acceleration_in_force(self, trajectory: Trajectory) -> None:
@@ -841,7 +850,7 @@ class LdcnAxis(Moves):
             )
         # a lost reply leaves each register the old or the new value, and the next motion loads them again
         with self._book.writing(asdict(gains)):
-            await self._bus.execute(exchange)
+            await self._tell(exchange)
         self._book.gains = gains
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
@@ -859,7 +868,7 @@ class LdcnAxis(Moves):
             values[name] = int(value)
         exchange = commands.io_control(self._node, LimitPins(sum(values.values())))
         with self._book.writing(values):
-            await self._bus.execute(exchange)
+            await self._tell(exchange)
 
 
 def _capabilities(profile: Profile) -> frozenset[Verb]:
