@@ -333,7 +333,8 @@ def assess(
     troubles = (*pending, *_found(state, faults, health, place), *_slowed(state))
     worst = max((trouble.severity for trouble in troubles), default=_FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
-    return Condition(place, mark, word, place is not Place.OLD, alarm, troubles, holder, control)
+    live = place is not Place.OLD
+    return Condition(place, mark, word if live else last, live, alarm, troubles, holder, control)
 
 
 def _unanswered(state: str, troubles: tuple[Trouble, ...], mark: str) -> Condition:

@@ -338,6 +338,26 @@ async def test_a_button_that_has_come_under_a_resting_hand_does_nothing_before_i
         await house.sim.quiet("y")
 
 
+async def test_home_of_all_leaves_an_axis_that_is_homed_where_it_is(house):
+    """Homed again away from its mark, it would stand at another origin and say that all is well."""
+    await house.sim.quiet("x", "y")
+    await house.sim.rig.command("x", SetPosition(position=12.5))
+    async with house.desk() as desk:
+        await desk.open("rig")
+        await desk.panel("Rig sim").get_by_role("button", name="Take control of all").click()
+        row = desk.page.get_by_role("group", name="Commands for all axes of sim")
+        await row.get_by_role("button", name="Enable all").click()
+        for axis in ("x", "y"):
+            await house.sim.until(axis, lambda state: state.enabled)
+        await row.get_by_role("button", name="Home all").click()
+        await house.sim.until("y", lambda state: state.state == "homing")
+        await desk.page.keyboard.press("Escape")
+
+        assert await house.sim.position("x") == pytest.approx(12.5, abs=0.02)
+        assert (await house.sim.rig.state("x")).referenced
+    await house.sim.quiet("x", "y")
+
+
 async def test_no_place_and_no_word_about_it_is_cut_at_1280_pixels(house):
     await house.sim.quiet("y")
     await house.sim.rig.command("y", SetPosition(position=-90.0))

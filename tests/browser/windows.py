@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.async_api import Page
+from playwright.async_api import CDPSession, Page
 
 from tests.browser.house import House, console
 from tests.support.marionette import CONTROL, DELETE, ENTER, ESCAPE, SHIFT, TAB, Firefox, firefox, open_firefox
@@ -28,6 +28,8 @@ class Chromium:
 
     def __init__(self, page: Page) -> None:
         self._page = page
+        self._touching: CDPSession | None = None
+        self._fingers = 0
 
     async def open(self, url: str) -> None:
         """Open a page."""
@@ -73,6 +75,16 @@ class Chromium:
         for step in range(1, 11):
             await self._page.mouse.move(*(a + (b - a) * step / 10 for a, b in zip(start, end, strict=True)))
         await self._page.mouse.up()
+
+    async def touch(self, *fingers: tuple[float, float]) -> None:
+        """Have fingers at these points and nowhere else: each that is new comes down, each that is missing is lifted."""
+        tools = self._touching = self._touching or await self._page.context.new_cdp_session(self._page)
+        points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(fingers)]
+        for count in range(self._fingers + 1, len(fingers) + 1):
+            await tools.send("Input.dispatchTouchEvent", {"type": "touchStart", "touchPoints": points[:count]})
+        if len(fingers) < self._fingers:
+            await tools.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": points})
+        self._fingers = len(fingers)
 
     async def wheel(self, x: float, y: float, by: int) -> None:
         """Turn the wheel over a point."""

@@ -58,6 +58,7 @@ class Firefox:
         self._reader = reader
         self._writer = writer
         self._numbers = itertools.count(1)
+        self._fingers = 0
 
     async def reload(self) -> None:
         """Load the page again."""
@@ -117,6 +118,18 @@ class Firefox:
         held = [{**_move(*step), "duration": 20} for step in steps]
         down, up = ({"type": f"pointer{way}", "button": 0} for way in ("Down", "Up"))
         await self._perform("pointer", [_move(*start), down, *held, up])
+
+    async def touch(self, *fingers: tuple[float, float]) -> None:
+        """Have fingers at these points and nowhere else: each that is new comes down, each that is missing is lifted."""
+        for number in range(self._fingers, len(fingers)):
+            await self._finger(number, [_move(*fingers[number]), {"type": "pointerDown", "button": 0}])
+        for number in reversed(range(len(fingers), self._fingers)):
+            await self._finger(number, [{"type": "pointerUp", "button": 0}])
+        self._fingers = len(fingers)
+
+    async def _finger(self, number: int, actions: list[dict[str, object]]) -> None:
+        touch = {"type": "pointer", "id": f"finger {number}", "parameters": {"pointerType": "touch"}}
+        await self.command("WebDriver:PerformActions", actions=[{**touch, "actions": actions}])
 
     async def wheel(self, x: float, y: float, by: int) -> None:
         """Turn the wheel over a point."""

@@ -131,24 +131,26 @@ function RigCommands({ rig }) {
   const others = axes.filter((axis) => !controls(axis) && axis.holder);
   const held = others.map(({ name, holder }) => `${name} is controlled by ${holder}`).join(", ");
   const force = others.length > 0 && from === held;
-  const ready = (act) => axes.filter((axis) => obstacle(axis, act) === null);
+  // an axis that is homed gets another origin by homing it again: on an index mark whole turns away, where it is not near its own
+  const wants = (axis, act) => act !== "home" || !(axis.condition.known && axis.state?.referenced);
+  const ready = (act) => axes.filter((axis) => wants(axis, act) && obstacle(axis, act) === null);
   const each = (act, verb, body) => async () => {
     // what forbade it before this page had control may not be told anew yet: the daemon refuses what it must
-    const asked = axes.filter((axis) => obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth && !isUseless(axis, act)));
+    const asked = axes.filter((axis) => wants(axis, act) && (obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth && !isUseless(axis, act))));
     for (const axis of axes) axis.refusal = null;
     const outcomes = await Promise.allSettled(asked.map((axis) => command(axis, verb, body)));
     outcomes.forEach(({ reason }, at) => {
       if (reason) asked[at].refusal = refused(asked[at], verb, reason);
     });
     for (const axis of axes) {
-      const way = act === "home" && !asked.includes(axis) && obstacle(axis, act);
+      const way = act === "home" && wants(axis, act) && !asked.includes(axis) && obstacle(axis, act);
       if (way) axis.refusal = `${words(verb)} refused: ${way}`;
     }
     const failed = axes.filter((axis) => axis.refusal);
     setTold(failed.length ? `${words(verb)}: refused by ${failed.map(({ name }) => name).join(", ")}; the reasons are in their rows.` : `${verb === "power" ? (body.on ? "enabled" : "disabled") : verb}: ${asked.map(({ name }) => name).join(", ")}`);
   };
   const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" calms=${calms(axes[0], act)} act=${each(act, verb, body)}
-    obstacle=${ready(act).length ? null : (obstacle(axes[0], act) ?? "No axis can do that now.")} />`;
+    obstacle=${ready(act).length ? null : axes.some((axis) => wants(axis, act)) ? (obstacle(axes[0], act) ?? "No axis can do that now.") : "Every axis is homed: home one again on its page."} />`;
   return html`<div class="rig-commands" role="group" aria-label=${`Commands for all axes of ${rig.name}`}>
     <div class="row">
       <${Swap}>${mine.length < axes.length && html`<${Action} key="take" kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)} onDone=${() => setFrom(null)}

@@ -40,15 +40,36 @@ export function Action({ act, obstacle = null, reason = null, kind = "", calms =
     }
   }
 
+  const presses = useAtOnce(press);
   return html`<span class="action">
     <button
       type="button" class=${kind} aria-disabled=${obstacle ? "true" : null} aria-busy=${underWay ? "true" : null}
-      aria-describedby=${obstacle ? (reason ?? own) : null} title=${title} onClick=${press}
+      aria-describedby=${obstacle ? (reason ?? own) : null} title=${title} ...${calms ? presses : { onClick: press }}
       onKeyDown=${(event) => event.repeat && event.key === "Enter" && event.preventDefault()}
     >${children}</button>
     ${obstacle && !reason && html`<small class="reason" id=${own}>${obstacle}</small>`}
     <${RefusalText} refusal=${refusal} />
   </span>`;
+}
+
+/** Presses of a button that takes energy out: done when a finger comes down.
+ *
+ * A browser makes no click of a second finger, such as beside one that holds a jog, nor of a button that has moved away
+ * from under the first.
+ */
+export function useAtOnce(press) {
+  const down = useRef(false);
+  return {
+    onPointerDown: (event) => {
+      if (event.button !== 0) return;
+      down.current = true;
+      press(event);
+    },
+    onClick: (event) => {
+      if (!down.current || event.detail === 0) press(event); // by key, or by what helps a person to press
+      down.current = false;
+    },
+  };
 }
 
 /** A place in which one control takes the turn of another: those beside it stay where they are, and keep the focus. */

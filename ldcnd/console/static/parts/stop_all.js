@@ -5,7 +5,7 @@ import { askAtOnce, rigPath } from "../session/api.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { rigs } from "../session/rigs.js";
-import { Action } from "./controls.js";
+import { Action, useAtOnce } from "./controls.js";
 import { clock } from "./format.js";
 
 const KEY = "Escape";
@@ -48,8 +48,9 @@ export function StopAll() {
     if (left) setReport((last) => last && { ...last, lines: last.lines.filter(isNews) });
   }, [left]);
   const shown = Boolean(report?.text) || lines.length > 0;
+  const presses = useAtOnce(stop);
   return html`<div class="stop-all">
-    <button type="button" class="stop" aria-keyshortcuts=${KEY} onClick=${stop}>
+    <button type="button" class="stop" aria-keyshortcuts=${KEY} ...${presses}>
       <b>Stop all axes</b> <kbd>Esc</kbd><small>software stop, not an emergency stop</small>
     </button>
     <div class="stop-report" role="alert" data-shown=${shown ? "yes" : "no"}>

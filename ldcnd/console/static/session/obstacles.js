@@ -32,16 +32,21 @@ export function obstacle(axis, act, joins = false) {
   const verb = VERBS[act] === undefined ? act : VERBS[act];
   // a trace moves nothing: who only looks may take one where the daemon asks for no lease
   const isControlled = act === "trace" || !axis.rig.commands.get(verb)?.needs_lease || controls(axis);
-  const here = (!isControlled && notControlled(axis)) || USELESS[act]?.(axis);
+  const here = (!isControlled && notControlled(axis)) || useless(axis, act);
   if (here) return here;
   const causes = act === "disable" ? [] : (axis.samples.obstacles?.[verb] ?? []); // nothing refuses what takes energy out
   const cause = causes.find(({ passes }) => !(joins && passes));
   return cause ? inWords(cause) : null;
 }
 
+/** Why an act would change nothing on an axis as it is; of one whose readings are old nobody knows. */
+function useless(axis, act) {
+  return axis.condition.live && USELESS[act]?.(axis);
+}
+
 /** Whether an act would change nothing on an axis as it is. */
 export function isUseless(axis, act) {
-  return Boolean(USELESS[act]?.(axis));
+  return Boolean(useless(axis, act));
 }
 
 /** Whether an act only takes energy out, as the daemon says of its command. */

@@ -1,0 +1,69 @@
+"""What fingers do on the page of an axis: no browser makes a click of a second one."""
+
+import pytest
+
+from ldcnd.contract.commands import SetPosition
+
+windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
+until = windows.until
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.real_time,
+    pytest.mark.asyncio(loop_scope="package"),
+    pytest.mark.timeout(240),
+]
+
+PLACE = """(text) => {
+  const found = [...document.querySelectorAll("button")].find((each) => each.textContent.trim().startsWith(text));
+  if (!found || found.getAttribute("aria-disabled")) return null;
+  const { x, y, width, height } = found.getBoundingClientRect();
+  return [x + width / 2, y + height / 2];
+}"""
+TO_JOG = """() => {
+  const found = [...document.querySelectorAll("button.hold")][0];
+  found?.scrollIntoView({ block: "center" });
+  return Boolean(found);
+}"""
+PRESS = """(text) => {
+  const found = [...document.querySelectorAll("main button")].find((each) => each.textContent.trim() === text);
+  if (!found || found.getAttribute("aria-disabled")) return false;
+  found.click();
+  return true;
+}"""
+
+
+async def ready(window, house):
+    await house.sim.quiet("x")
+    await house.sim.rig.command("x", SetPosition(position=0.0))
+    await window.open(f"{house.url}/#/axis/sim/x")
+    await window.reload()
+    await until(window, PRESS, "Take control")
+    await until(window, PRESS, "Enable")
+    await house.sim.until("x", lambda state: state.enabled)
+    await until(window, windows.PRESSABLE, "Hold to run + ▶")
+    await until(window, TO_JOG)
+
+
+@pytest.mark.parametrize("button", ["Stop all axes", "Stop x", "Quick stop", "Halt"])
+async def test_a_second_finger_ends_the_jog_that_the_first_one_holds(house, window, button):
+    await ready(window, house)
+    hold = await until(window, PLACE, "Hold to run +")
+    try:
+        await window.touch(hold)
+        await house.sim.until("x", lambda state: state.moving == "yes")
+        await window.touch(hold, await until(window, PLACE, button))
+        await window.touch(hold)
+        state = await house.sim.until("x", lambda state: state.moving == "no")
+    finally:
+        await window.touch()
+
+    assert state.stop_latched is (button != "Halt")
+    assert await house.sim.position("x") < 60
+
+
+async def test_a_finger_that_comes_down_on_a_stop_has_stopped_though_it_slides_off(house, window):
+    await ready(window, house)
+    await window.touch(await until(window, PLACE, "Stop x"))
+    await house.sim.until("x", lambda state: state.stop_latched)
+    await window.touch()
