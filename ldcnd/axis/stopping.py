@@ -223,7 +223,8 @@ class AxisStops:
             except BusError as error:
                 known = status.stop and status.stop.fault  # while a line is down this comes again with every try
                 (log.debug if known else log.error)("stop not confirmed", axis=self._name, reason=error.message)
-                if self._bus.is_open:
+                # to nobody who is known to be there its line sends it, beside the search for who has lost power
+                if self._bus.is_open and tracker.proof.holds:
                     continue
                 return False
             if mode is StopMode.OFF:

@@ -77,7 +77,7 @@ class Chromium:
         await self._page.mouse.up()
 
     async def touch(self, *fingers: tuple[float, float]) -> None:
-        """Have fingers at these points and nowhere else: each that is new comes down, each that is missing is lifted."""
+        """Have fingers at these points and nowhere else: new ones come down, missing ones are lifted."""
         tools = self._touching = self._touching or await self._page.context.new_cdp_session(self._page)
         points = [{"x": x, "y": y, "id": number} for number, (x, y) in enumerate(fingers)]
         for count in range(self._fingers + 1, len(fingers) + 1):

@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.client.overview import overview
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import MoveAbsolute, Power, Reset, Why
+from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power, Reset, Why
 from ldcnd.contract.errors import WrongState
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
@@ -235,6 +235,25 @@ async def test_stops_of_a_dark_axis_do_not_disturb_the_search_for_it():
         back = await rig.until("y", lambda state: state.link is LinkState.UP, 3.0)
 
     assert (back.state, back.enabled, back.stop_latched) == (AxisState.ERROR_STOP, False, True)
+
+
+async def test_axes_that_are_out_of_reach_and_to_be_stopped_come_back_as_soon_as_others():
+    """A drive behind one without power hears nothing either: each stop of theirs is sent in vain until they are back."""
+    chain = chain_of()
+    async with rig_on(chain, simulated_config(margin_ms=50)) as rig:
+        await power_all(rig)
+        for axis in ("y", "z"):
+            await rig.client.command(axis, MoveVelocity(velocity=2.0))
+        set_power(chain, 2, on=False)
+        await rig.until("y", lambda state: state.link is LinkState.DOWN)
+        async with asyncio.TaskGroup() as group:
+            for axis in ("y", "z"):
+                for number in range(3):
+                    group.create_task(rig.client.stop(axis), name=f"stop {number} of {axis}")
+            await asyncio.sleep(0.5)
+            set_power(chain, 2, on=True)
+            for axis in ("y", "z"):
+                await rig.until(axis, lambda state: state.link is LinkState.UP and not state.stop_pending, 3.0)
 
 
 async def test_a_foreign_module_in_place_of_the_old_one_gets_no_address():

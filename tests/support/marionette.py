@@ -120,7 +120,7 @@ class Firefox:
         await self._perform("pointer", [_move(*start), down, *held, up])
 
     async def touch(self, *fingers: tuple[float, float]) -> None:
-        """Have fingers at these points and nowhere else: each that is new comes down, each that is missing is lifted."""
+        """Have fingers at these points and nowhere else: new ones come down, missing ones are lifted."""
         for number in range(self._fingers, len(fingers)):
             await self._finger(number, [_move(*fingers[number]), {"type": "pointerDown", "button": 0}])
         for number in reversed(range(len(fingers), self._fingers)):
