@@ -238,7 +238,7 @@ async def test_stops_of_a_dark_axis_do_not_disturb_the_search_for_it():
 
 
 async def test_axes_that_are_out_of_reach_and_to_be_stopped_come_back_as_soon_as_others():
-    """A drive behind one without power hears nothing either: each stop of theirs is sent in vain until they are back."""
+    """A drive behind one without power hears nothing either: each stop is sent in vain until they are back."""
     chain = chain_of()
     async with rig_on(chain, simulated_config(margin_ms=50)) as rig:
         await power_all(rig)
