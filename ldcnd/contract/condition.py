@@ -27,6 +27,8 @@ EDGE_HZ = 1.0
 """A report is about one second, at whose edges it sees a sample more or less."""
 OLD_S = 1.5
 """Age from which a position is old, seconds, besides `OLD_PERIODS`."""
+MISSED_S = 0.2
+"""The same while its drive misses polls: of one that has lost power in motion the last place is soon not its own."""
 OLD_PERIODS = 4
 """Periods of a position's rate that may pass besides: a poll may be lost or late."""
 SILENT_S = 3.0
@@ -329,7 +331,7 @@ def assess(
     pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
     if gone:
         return replace(_unanswered(last, (*pending, gone), gone.short), holder=holder, control=control)
-    place, mark = _place(state, faults, is_old=_is_old(age_s, health))
+    place, mark = _place(state, faults, is_old=_is_old(state, age_s, health))
     troubles = (*pending, *_found(state, faults, health, place), *_slowed(state))
     worst = max((trouble.severity for trouble in troubles), default=_FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
@@ -359,9 +361,10 @@ def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line
     return replace(_NO_ANSWER, text=lost.text) if lost else _NO_ANSWER
 
 
-def _is_old(age_s: float | None, health: AxisHealth | None) -> bool:
+def _is_old(state: KnownState, age_s: float | None, health: AxisHealth | None) -> bool:
     rate_hz = (health.rate_wanted_hz if health else 0.0) or 1.0
-    return age_s is not None and age_s > OLD_S + OLD_PERIODS / rate_hz
+    longest_s = MISSED_S if state.link is LinkState.DEGRADED else OLD_S
+    return age_s is not None and age_s > longest_s + OLD_PERIODS / rate_hz
 
 
 def _place(state: KnownState, faults: Faults | None, *, is_old: bool) -> tuple[Place, str]:

@@ -78,7 +78,16 @@ def configured(lab: Laboratory, **changes: dict[str, float]):
 def test_devices_satisfy_the_protocols_without_a_base_class(lab: Laboratory):
     wanted = {
         ReadableAxis: ("Readable", "Triggerable", "Configurable", "Subscribable", "HasHints", "HasName", "HasParent"),
-        PlanAxis: ("Movable", "Locatable", "Stoppable", "Checkable", "Preparable", "Flyable", "EventPageCollectable"),
+        PlanAxis: (
+            "Movable",
+            "Locatable",
+            "Stoppable",
+            "Checkable",
+            "Preparable",
+            "Flyable",
+            "EventPageCollectable",
+            "Pausable",
+        ),
         Signal: ("Readable", "Triggerable", "Subscribable", "HasHints"),
         TraceDetector: ("Readable", "Triggerable", "HasHints"),
     }
@@ -549,6 +558,42 @@ def test_an_aborted_plan_halts_without_the_latch(lab: Laboratory):
 
     assert (state.stop_latched, state.moving) == (False, Moving.NO)
     assert lab.documents.exit_status == "abort"
+
+
+@pytest.mark.parametrize("ending", ["resume", "abort", "stop"])
+@pytest.mark.parametrize("several", [False, True])
+def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes_on(lab: Laboratory, several, ending):
+    def pause_in_flight():
+        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
+        lab.engine.request_pause()
+
+    def plan(device, flight):
+        yield from bps.open_run()
+        yield from bps.prepare(device, flight, wait=True)
+        yield from bps.checkpoint()
+        yield from bps.prepare(device, flight, wait=True)
+        yield from bps.declare_stream(device, name="flight", collect=True)
+        yield from bps.kickoff(device, wait=True)
+        pausing.start()
+        yield from bps.complete(device, wait=True)
+        yield from bps.close_run()
+
+    with lab.powered("x", "y") as (x, y):
+        x.set(0.0).wait(60)
+        pausing = threading.Thread(target=pause_in_flight)
+        device = lab.devices.flight(x, y) if several else x
+        flights = {"x": Fly(0, 30, velocity=5), "y": Fly(0, 4, velocity=5)} if several else Fly(0, 30, velocity=5)
+        with pytest.raises(RunEngineInterrupted):
+            lab.engine(plan(device, flights))
+        pausing.join()
+        paused_at = lab.truth("x")
+        assert stands(lab, "x")
+        assert stands(lab, "y")
+        assert 0 < paused_at < 29
+        getattr(lab.engine, ending)()
+
+        assert stands(lab, "x")
+        assert lab.truth("x") == pytest.approx(30 if ending == "resume" else paused_at, abs=0.1)
 
 
 def test_a_stop_that_was_meant_is_a_success(lab: Laboratory):

@@ -146,3 +146,13 @@ def test_an_axis_that_does_not_answer_may_move_and_is_not_said_to_be_in_error_st
     gone = state(state=AxisState.ERROR_STOP, link=LinkState.DOWN, moving=Moving.UNKNOWN)
     assert {assess(gone, line_up=up).state for up in (True, False)} == {"unknown, may move"}
     assert assess(state(state=AxisState.DISABLED, link=LinkState.DOWN)).state == "unknown, was disabled"
+
+
+@pytest.mark.parametrize(
+    ("link", "place", "word"), [("up", "known", "standstill"), ("degraded", "old", "unknown, was standstill")]
+)
+def test_of_a_drive_that_misses_polls_the_last_place_is_soon_not_its_own(link, place, word):
+    """It may have lost its power in motion: a second in which all looks well is too long."""
+    condition = assess(state(link=LinkState(link)), faults(), health(20.0), age_s=0.5)
+
+    assert (condition.place, condition.state) == (place, word)

@@ -259,6 +259,17 @@ class PlanAxis(ReadableAxis):
         """
         await self._there(self._halt(success=success))
 
+    async def pause(self) -> None:
+        """Halt what this device has begun: nothing moves while a plan is paused; the plan begins it anew.
+
+        Raises:
+            LdcndError: see `stop`.
+        """
+        await self.stop(success=True)
+
+    async def resume(self) -> None:
+        """Move nothing."""
+
     async def locate(self) -> "Location[float]":
         """Return where the axis was sent last, or stands since anything else stopped or moved it, and where it is."""
         position = (await self._there(self.measured())).value

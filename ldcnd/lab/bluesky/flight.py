@@ -117,6 +117,13 @@ class Flight:
         for axis in self._axes:
             await axis.stop(success)
 
+    async def pause(self) -> None:
+        """Halt what is under way, if anything; see `PlanAxis.pause`."""
+        await self.stop(success=True)
+
+    async def resume(self) -> None:
+        """Move nothing."""
+
     async def describe_collect(self) -> "dict[str, DataKey]":
         """Return what the events hold; the plan names the stream."""
         keys: dict[str, DataKey] = {}
