@@ -602,7 +602,7 @@ def test_a_stop_that_was_meant_is_a_success(lab: Laboratory):
         for success, ends in ((True, meant), (False, unmeant)):
             status = x.set(50 if lab.truth("x") < 0 else -50)
             lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
-            lab.loop.run(x.stop(success=success))
+            x.stop(success=success).wait(20)
             ends.append(status.exception(20))
 
     assert meant == [None]
@@ -612,7 +612,7 @@ def test_a_stop_that_was_meant_is_a_success(lab: Laboratory):
 def test_a_stop_that_overtakes_its_move_leaves_the_axis_at_rest(lab: Laboratory):
     with lab.powered("x") as (x,):
         status = x.set(40)
-        lab.loop.run(x.stop(success=True))
+        x.stop(success=True).wait(20)
         ended = status.exception(20)
 
         assert ended is None
@@ -636,10 +636,25 @@ def test_a_stop_while_a_flight_is_checked_begins_no_motion(lab: Laboratory):
     assert [event.verb for event in events if event.verb == "move_absolute"] == []
 
 
+@pytest.mark.parametrize("several", [False, True])
+def test_a_stop_at_the_prompt_halts_without_anybody_who_awaits_it(lab: Laboratory, several):
+    with lab.powered("x") as (x,):
+        x.set(0.0).wait(60)
+        device = lab.devices.flight(x) if several else x
+        moving = x.set(40.0)
+        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
+        said = device.stop()
+
+        moving.wait(60)
+        said.wait(20)
+        assert lab.truth("x") < 39
+        assert stands(lab, "x")
+
+
 def test_a_stop_of_a_standing_axis_sends_nothing(lab: Laboratory):
     with lab.powered("x") as (x,):
         before = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
-        lab.loop.run(x.stop())
+        x.stop().wait(20)
         after = lab.loop.run(lab.running.client.ask(ReadEvents(count=1)))
 
     assert after.end_number == before.end_number

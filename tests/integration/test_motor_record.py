@@ -5,9 +5,9 @@ from contextlib import suppress
 from itertools import pairwise
 
 import pytest
-from caproto import AccessRights, ChannelType
+from caproto import AccessRights, AlarmSeverity, ChannelType
 
-from ldcnd.contract.errors import CommandAborted, PositionLimit, StopLatched, WrongState
+from ldcnd.contract.errors import CommandAborted, LdcndError, PositionLimit, StopLatched, WrongState
 from ldcnd.contract.samples import Moving
 from tests.support.epics_records import monitored, put, records, shows
 from tests.support.rig import two_axes
@@ -161,6 +161,26 @@ async def test_puts_are_disabled_and_a_stop_is_not():
 
 
 @pytest.mark.record("STOP", "`allstop` is one for all records of the gateway")
+@pytest.mark.parametrize("refusal", ["disabled", "paused", "beyond"])
+async def test_a_motion_that_is_refused_ends_with_an_alarm_until_a_put_is_taken(refusal):
+    """A client that waits for DMOV alone looks at the alarm of RBV then, and would say that it has arrived."""
+    async with records() as (_, made):
+        if refusal == "disabled":
+            await put(made, "T:x.CNEN", "Disable")
+            await shows(made, "T:x.CNEN", "Disable")
+        elif refusal == "paused":
+            await put(made, "T:x.SPMG", "Pause")
+        await asyncio.sleep(1.0)
+        sent = await monitored(made, "T:x.DMOV")
+        with pytest.raises(LdcndError):
+            await put(made, "T:x", 3.0 if refusal != "beyond" else 1000.0)
+
+        assert [sent.get_nowait().values[0] for _ in range(sent.qsize())][-2:] == [0, 1]
+        assert made.variables["T:x.RBV"].alarm.severity == AlarmSeverity.MINOR_ALARM
+        await put(made, "T:x.TWV", 2.0)
+        assert made.variables["T:x.RBV"].alarm.severity == AlarmSeverity.NO_ALARM
+
+
 async def test_a_stop_of_all_halts_each_axis():
     async with records() as (running, made):
         await put(made, "T:y.CNEN", "Enable")

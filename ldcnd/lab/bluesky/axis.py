@@ -248,16 +248,16 @@ class PlanAxis(ReadableAxis):
         """Clear the stop latch and the drive's faults; nothing moves."""
         return self._start("reset", _discard(self._axis.reset()))
 
-    async def stop(self, success: bool = True) -> None:  # noqa: FBT001, FBT002 - the protocol's signature
+    def stop(self, success: bool = True) -> Status:  # noqa: FBT001, FBT002 - the protocol's signature
         """Halt what this device has begun, if anything: a deceleration to standstill, never the latch.
+
+        It is sent at once, whether anybody waits for the status or not; that fails if the daemon refused it or did not
+        answer: the axis may go on then.
 
         Args:
             success: whether the status of what was halted then is a success.
-
-        Raises:
-            LdcndError: the daemon refused it, or did not answer; the axis may go on.
         """
-        await self._there(self._halt(success=success))
+        return self._start("stop", self._halt(success=success))
 
     async def pause(self) -> None:
         """Halt what this device has begun: nothing moves while a plan is paused; the plan begins it anew.
@@ -265,7 +265,7 @@ class PlanAxis(ReadableAxis):
         Raises:
             LdcndError: see `stop`.
         """
-        await self.stop(success=True)
+        await self.stop()
 
     async def resume(self) -> None:
         """Move nothing."""

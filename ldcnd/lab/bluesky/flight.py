@@ -112,14 +112,19 @@ class Flight:
             raise WrongState(f"{self.name}: no fly scan is under way")
         return self._under_way
 
-    async def stop(self, success: bool = True) -> None:  # noqa: FBT001, FBT002 - the protocol's signature
+    def stop(self, success: bool = True) -> Status:  # noqa: FBT001, FBT002 - the protocol's signature
         """Halt what is under way, if anything; see `PlanAxis.stop`."""
-        for axis in self._axes:
-            await axis.stop(success)
+        halts = [axis.stop(success) for axis in self._axes]
+
+        async def halted() -> None:
+            for each in halts:
+                await each
+
+        return self._start("stop", halted())
 
     async def pause(self) -> None:
         """Halt what is under way, if anything; see `PlanAxis.pause`."""
-        await self.stop(success=True)
+        await self.stop()
 
     async def resume(self) -> None:
         """Move nothing."""

@@ -2,11 +2,11 @@
 
 import asyncio
 import concurrent.futures
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 
 
 class Status:
-    """The state of some work, as `bluesky.protocols.Status` has it; may be used from any thread.
+    """The state of some work, as `bluesky.protocols.Status` has it; may be used from any thread, or awaited.
 
     Attributes:
         name: what it is the status of, for people.
@@ -47,6 +47,10 @@ class Status:
     def wrapped(self) -> "asyncio.Future[None]":
         """Return the work as a future of the running loop."""
         return asyncio.wrap_future(self._work)
+
+    def __await__(self) -> Generator[object, None, None]:
+        """Wait for the end of the work on the running loop."""
+        return self.wrapped().__await__()
 
     def cancel(self) -> None:
         """Give the work up."""

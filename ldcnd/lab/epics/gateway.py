@@ -215,4 +215,6 @@ async def _defaults(rig: Rig, name: str) -> tuple[float, float] | None:
             preview = await axis.preview(distance=0)
     except LdcndError:
         return None
-    return preview.velocity or MOTIONLESS[0], preview.acceleration or MOTIONLESS[1]
+    if preview.velocity is None or preview.acceleration is None:
+        return None
+    return preview.velocity, preview.acceleration

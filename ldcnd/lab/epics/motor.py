@@ -8,6 +8,8 @@ from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
 from functools import partial
 
+from caproto import AlarmSeverity, AlarmStatus
+
 from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion, Sent
 from ldcnd.contract.commands import BufferMode, Verb
@@ -22,9 +24,11 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import Moving, Sample, StateSample
 from ldcnd.lab.borrowed_control import BorrowedControl
-from ldcnd.lab.epics.fields import Action, Number, Put, RecordField, Value
+from ldcnd.lab.epics.fields import Action, Number, Put, RecordAlarm, RecordField, Value
 from ldcnd.lab.epics.record import NO_LIMIT, MotorRecord
 
+MOTIONS = frozenset({".VAL", ".RLV", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR"})
+REFUSED = RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM)
 REST_S = 10.0
 """Longest wait for the standstill after a motion that was ended early, in seconds."""
 
@@ -60,6 +64,7 @@ class MovedRecord(MotorRecord):
         self._changed = asyncio.Event()
         self._released = asyncio.Event()  # the jog under way is to end
         self._jogging: asyncio.Future[None] | None = None
+        self._refused = False  # the motion that was put last: an alarm until the next put that is taken
         self._take_puts()
 
     def _take_puts(self) -> None:
@@ -102,7 +107,7 @@ class MovedRecord(MotorRecord):
         for name, action in {**always, **others}.items():
             field = self.beside(name)
             if field is not None:
-                field.action = self._explained(action, is_always=name in always)
+                field.action = self._explained(action, is_always=name in always, is_motion=name in MOTIONS)
                 field.explain = partial(self.show_beside, ":message")
 
     # -- what the axis says ------------------------------------------------------------------------------------------
@@ -147,7 +152,29 @@ class MovedRecord(MotorRecord):
 
     # -- puts --------------------------------------------------------------------------------------------------------
 
-    def _explained(self, action: Action, *, is_always: bool) -> Action:
+    def alarm(self) -> RecordAlarm:
+        """Return the alarm of the record: a motion that was refused is one, as clients look for it when DMOV is 1."""
+        alarm = super().alarm()
+        return max(alarm, REFUSED, key=lambda each: each.severity) if self._refused else alarm
+
+    async def _show_refusal(self) -> None:
+        """Show a motion that was refused as one that has ended with an alarm: many clients wait for DMOV alone."""
+        if self._refused:
+            return
+        self._refused = True
+        await self.show_alarm()
+        self._pending += 1
+        await self.show_motion()
+        self._pending -= 1
+        await self.show_motion()
+
+    async def _show_taken(self) -> None:
+        if self._refused:
+            self._refused = False
+            await self.show_alarm()
+            await self.show_motion()
+
+    def _explained(self, action: Action, *, is_always: bool, is_motion: bool) -> Action:
         """Show why a put was refused beside the record: Channel Access says only that it was."""
 
         async def explained(asked: Value) -> Put:
@@ -159,8 +186,11 @@ class MovedRecord(MotorRecord):
                 put = await action(asked)
             except (LdcndError, ValueError) as error:
                 await self.show_beside(":message", str(error))
+                if is_motion:
+                    await self._show_refusal()
                 raise
             await self.show_beside(":message", "")
+            await self._show_taken()
             return put
 
         return explained
@@ -334,19 +364,21 @@ class MovedRecord(MotorRecord):
         return Put(0)
 
     async def _put_velo(self, asked: Value) -> Put:
-        highest = self.info.limits.velocity or NO_LIMIT
-        if float(asked) > highest:
+        velocity, highest = float(asked), self.info.limits.velocity or NO_LIMIT
+        if velocity > highest:
             raise ValueOutOfRange(
-                f"axis {self.info.axis}: {asked} {self.info.unit}/s is above its limit",
+                f"axis {self.info.axis}: {velocity:.12g} {self.info.unit}/s is above its limit",
                 axis=self.info.axis,
-                value=asked,
+                value=velocity,
                 limit=highest,
             )
         return await self._put_positive(asked)
 
     async def _put_positive(self, asked: Value) -> Put:
         if not 0 < float(asked) < NO_LIMIT:
-            raise ValueOutOfRange(f"axis {self.info.axis}: {asked} is not above 0", axis=self.info.axis, value=asked)
+            raise ValueOutOfRange(
+                f"axis {self.info.axis}: {float(asked):.12g} is not above 0", axis=self.info.axis, value=float(asked)
+            )
         return Put(asked)
 
     async def _put_with(self, action: Action, asked: Value, approach: str, turns: tuple[str, ...]) -> Put:
@@ -384,6 +416,8 @@ class MovedRecord(MotorRecord):
                 raise
             motion = None  # a halt was put while the motion was on its way to the daemon
         except BaseException as error:
+            self._refused = self._halts == halts
+            await self.show_alarm()
             self._pending -= 1
             await self["LVIO"].show(int(getattr(error, "code", "") == "position_limit"))
             await self.show_motion()

@@ -307,18 +307,24 @@ class MotorRecord:
     async def _take_state(self, sample: StateSample) -> None:
         self.moving, self.state = sample.moving, sample
         self.condition = assess(sample, self._faults)
-        before, self._alarm = self._alarm, ALARMS[self.condition.alarm]
-        if sample.moving is Moving.UNKNOWN:
-            self._alarm = SILENT
-        if self._alarm != before:  # no position may come that would carry it
-            for field in ("RBV", "RRBV"):
-                await self[field].show(self[field].value, self._alarm)
+        await self.show_alarm()
         await self._show_condition()
         await self.show_beside("-Err", int(sample.stop_latched or sample.state is AxisState.ERROR_STOP))
         await self.show_beside(":state", sample.state.value + (", stop latched" if sample.stop_latched else ""))
         await self["CNEN"].show("Enable" if sample.enabled else "Disable")
         await self.show_target()
         await self.show_motion()
+
+    def alarm(self) -> RecordAlarm:
+        """Return the alarm of the record."""
+        return SILENT if self.moving is Moving.UNKNOWN else ALARMS[self.condition.alarm]
+
+    async def show_alarm(self) -> None:
+        """Show the alarm of the record on its position: no sample may come that would carry it."""
+        before, self._alarm = self._alarm, self.alarm()
+        if self._alarm != before:
+            for field in ("RBV", "RRBV"):
+                await self[field].show(self[field].value, self._alarm)
 
     async def _take_inputs(self, sample: InputsSample, alarm: RecordAlarm, at_s: float) -> None:
         """Show inputs, and the switches at both ends of the axis; a drive may not show them for a while."""
