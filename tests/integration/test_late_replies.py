@@ -64,7 +64,7 @@ async def ended(rig: Machine, command: Stop | Halt | Power) -> bool:
 SOAK = tuple(pytest.param(seed, marks=pytest.mark.soak) for seed in range(100, 200) if seed != 120)
 
 
-@pytest.mark.parametrize("seed", [120, *range(5), *SOAK])
+@pytest.mark.parametrize("seed", [120, *range(3), *SOAK])
 async def test_what_is_confirmed_has_been_heard(seed: int):
     """Judged by the simulated shaft: it comes to rest within the time that it needs."""
     dice, confirmed = random.Random(seed), 0
@@ -99,7 +99,7 @@ NO_DOOR = {"name": "no_door", "of": "rotor", "requires": [{"input": "door_closed
 
 
 @pytest.mark.promise("inputs-of-their-module")
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(3))
 async def test_a_late_reply_of_another_module_shows_no_input_that_permits_motion(seed: int):
     """The door is open all the time; the low bytes of the table's position, and the inputs of the store, look shut."""
     late = FaultPlan((LineFault(FaultKind.REPLY_DELAYED, 0.03, from_s=FROM_S, longest_s=0.1),), seed)
@@ -117,14 +117,14 @@ async def test_a_late_reply_of_another_module_shows_no_input_that_permits_motion
         stood_at = chain.modules[0].shaft.position_counts
         await asyncio.sleep(FROM_S)
         refused = 0
-        for _ in range(2000):
+        for _ in range(1000):
             try:
                 await rig.client.command("rotor", MoveRelative(distance=2.0))
             except LdcndError:
                 refused += 1
             await asyncio.sleep(0.01)
 
-        assert refused == 2000
+        assert refused == 1000
         assert chain.modules[0].shaft.position_counts == pytest.approx(stood_at, abs=5)
 
 
