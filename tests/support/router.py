@@ -2,9 +2,11 @@
 
 import asyncio
 import contextlib
+import os
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 from tests.support.process import START_TIME_S
 
@@ -20,11 +22,18 @@ session.close()
 
 
 @asynccontextmanager
-async def router(endpoint: str) -> AsyncIterator[asyncio.subprocess.Process]:
-    """Run a router until the context ends; it listens when the context begins."""
+async def router(endpoint: str, path: Path | None = None) -> AsyncIterator[asyncio.subprocess.Process]:
+    """Run a router until the context ends; it listens when the context begins.
+
+    Args:
+        endpoint: where.
+        path: a folder with another version of Zenoh; that of this environment when missing.
+    """
+    environment = {**os.environ, **({"PYTHONPATH": str(path)} if path else {})}
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-c", PROGRAM, endpoint, stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
-    )
+        sys.executable, "-c", PROGRAM, endpoint, env=environment,
+        stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE,
+    )  # fmt: skip
     try:
         assert process.stdout
         async with asyncio.timeout(START_TIME_S):
