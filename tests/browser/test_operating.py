@@ -338,6 +338,25 @@ async def test_a_button_that_has_come_under_a_resting_hand_does_nothing_before_i
         await house.sim.quiet("y")
 
 
+async def test_a_refusal_goes_with_what_was_refused(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        panel = desk.panel("Move")
+        await panel.get_by_label("Move", exact=True).select_option("move_velocity")
+        await panel.get_by_label("Velocity mm/s").fill("0")
+        await desk.button("Move").click()
+        refusal = panel.locator(".refusal", has_text="not a motion")
+        await expect(refusal).to_be_visible()
+
+        await panel.get_by_label("Velocity mm/s").fill("1")
+        await expect(refusal).to_have_count(0)
+    await house.sim.quiet("x")
+
+
 async def test_home_of_all_leaves_an_axis_that_is_homed_where_it_is(house):
     """Homed again away from its mark, it would stand at another origin and say that all is well."""
     await house.sim.quiet("x", "y")

@@ -37,7 +37,7 @@ export function HomePanel({ axis }) {
       ${field("Longest search", "s", "timeout_s")}
       ${field("Longest search", "position", "distance")}
     </div>
-    <p class="row"><${Action} act=${() => command(axis, "home", values)} obstacle=${way} reason=${toHome}
+    <p class="row"><${Action} act=${() => command(axis, "home", values)} of=${[JSON.stringify(values), axis.state?.state].join()} obstacle=${way} reason=${toHome}
       kind="main">Home<//></p>
     ${way && html`<${Reason} id=${toHome} text=${way} />`}
     ${
@@ -45,7 +45,7 @@ export function HomePanel({ axis }) {
       html`<h3>Or set current position</h3>
       <div class="fields"><${NumberField} label="Current position is" units=${unitsOf(axis.info, "position")} value=${name} onChange=${setName}
         meaning=${(text) => `${axis.name} then stands at ${text}`} /></div>
-      <p class="row"><${Action} act=${() => command(axis, "set_position", { position: name })} obstacle=${naming}
+      <p class="row"><${Action} act=${() => command(axis, "set_position", { position: name })} of=${[name, axis.state?.state].join()} obstacle=${naming}
         reason=${toSet} title="Nothing moves; afterwards the axis counts as homed">Set position<//></p>
       ${naming && html`<${Reason} id=${toSet} text=${naming} />`}`
     }

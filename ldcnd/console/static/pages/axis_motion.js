@@ -117,7 +117,7 @@ function Move({ axis, kinds }) {
         value=${values.buffer_mode ?? "refuse"} onChange=${set("buffer_mode")} />`}
     </div>
     ${previewed && html`<${Preview} axis=${axis} body=${body} field=${field} onNearest=${set(field)} />`}
-    <p class="row"><${Action} act=${move} obstacle=${way} reason=${reason}
+    <p class="row"><${Action} act=${move} of=${[verb, JSON.stringify(body), axis.state?.state].join()} obstacle=${way} reason=${reason}
       kind="main" onDone=${noteSent}>Move<//>
       <span class="story" role="status">${sent && html`<${StoryOf} axis=${axis} sent=${sent} />`}</span></p>
     ${way && html`<${Reason} id=${reason} text=${way} />`}

@@ -1,6 +1,6 @@
 /** Controls: a button says in visible text why it cannot act now; a choice and a tick have labels. */
 
-import { html, useId, useLayoutEffect, useRef, useState } from "../html.js";
+import { html, useEffect, useId, useLayoutEffect, useRef, useState } from "../html.js";
 import { inPageTerms } from "./remedies.js";
 import { faultPage } from "./state.js";
 import { cameUnderHand } from "./under_hand.js";
@@ -9,14 +9,16 @@ import { cameUnderHand } from "./under_hand.js";
 
  * It stays in the tab order then, so that everybody can reach the reason. A double click and a key that repeats are one
  * press: what is sent may move something, and the button may be another one by the second.
+ * With `of` a refusal is about that and goes when it is another: what would be sent, and what the axis does.
  * With `reason` the id of an element that shows the obstacle already. What only `calms` is done by every press; all else
  * by none that meets a button which has just come under the hand.
  */
-export function Action({ act, obstacle = null, reason = null, kind = "", calms = false, onDone, onRefused, title, children }) {
+export function Action({ act, of = null, obstacle = null, reason = null, kind = "", calms = false, onDone, onRefused, title, children }) {
   const own = useId();
   const [underWay, setUnderWay] = useState(false);
   const pressed = useRef(false); // a second press comes before the first is drawn
   const [refusal, setRefusal] = useState(null);
+  useEffect(() => setRefusal(null), [of]);
 
   async function press(event) {
     const came = cameUnderHand(event);
