@@ -489,8 +489,15 @@ class AxisMotion:
         target, settle = plan.motion.target_counts, self.config.settle
         if target is None:
             return None
+        gains = self.driver.gains
         return Settling(
-            target, self._window_counts, settle.time_s, settle.timeout_s, faults=settle.unsettled == "fault"
+            target,
+            self._window_counts,
+            settle.time_s,
+            settle.timeout_s,
+            faults=settle.unsettled == "fault",
+            stray_counts=gains.el + self._window_counts if gains and gains.el else math.inf,
+            deceleration_counts_per_s2=plan.motion.acceleration_counts_per_s2,
         )
 
     def stopping(

@@ -139,14 +139,19 @@ class Braking:
         return True if at_s - self.still_since_s >= REST_S else self
 
     def _room_counts(self, reading: AxisReading) -> float:
-        speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
-        if self.mode is StopMode.ABRUPT:
-            braking = 0.0
-        elif self.deceleration_counts_per_s2:
-            braking = speed**2 / (2 * self.deceleration_counts_per_s2)
-        else:
-            braking = speed * UNKNOWN_BRAKING_S
-        return ROOM_SHARE * braking + speed * LAG_S + ROOM_COUNTS
+        return room_to_rest(reading, math.inf if self.mode is StopMode.ABRUPT else self.deceleration_counts_per_s2)
+
+
+def room_to_rest(reading: AxisReading, deceleration_counts_per_s2: float | None) -> float:
+    """Return how far a shaft goes at most that brakes from what a reading shows, counts.
+
+    Args:
+        reading: of the shaft.
+        deceleration_counts_per_s2: None while it is not known.
+    """
+    speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
+    braking_s = speed / (2 * deceleration_counts_per_s2) if deceleration_counts_per_s2 else UNKNOWN_BRAKING_S
+    return ROOM_SHARE * speed * braking_s + speed * LAG_S + ROOM_COUNTS
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,6 +164,9 @@ class Settling:
         time_s: for how long it must have stayed within the window.
         timeout_s: longest time for that, from the end of the profile.
         faults: an axis that does not settle has a fault.
+        stray_counts: how far from the way to its target a shaft may be: beyond the position error limit its drive would
+            have switched it off if the way was its own.
+        deceleration_counts_per_s2: of the profile.
     """
 
     target_counts: int
@@ -166,6 +174,36 @@ class Settling:
     time_s: float
     timeout_s: float
     faults: bool = False
+    stray_counts: float = math.inf
+    deceleration_counts_per_s2: float = math.inf
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """Where a shaft may be that goes to a target: between it and where it was, and not far beside.
+
+    A drive can hold another target than the one that it was told: a late reply passes for its acknowledgement. It then
+    goes where nobody has sent it, without a fault of its own.
+
+    Attributes:
+        low: lowest position, counts.
+        high: highest.
+    """
+
+    low: float
+    high: float
+
+    @staticmethod
+    def to(settling: Settling, reading: AxisReading) -> "Way":
+        """Return the way from the first reading of a motion on."""
+        here, target = reading.position_counts, settling.target_counts
+        # a motion that follows another one may have to turn round
+        room = settling.stray_counts + room_to_rest(reading, settling.deceleration_counts_per_s2)
+        return Way(min(here, target) - room, max(here, target) + room)
+
+    def has(self, reading: AxisReading) -> bool:
+        """Tell whether a shaft is on it."""
+        return self.low <= reading.position_counts <= self.high
 
 
 @dataclass(frozen=True, slots=True)

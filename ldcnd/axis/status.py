@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Any
 
 from ldcnd.axis.faults import READINGS_CONTRADICT, REPLIES_UNUSABLE
-from ldcnd.axis.rest import NOTHING_SEEN, Braking, RestEvidence, SettleProgress, Settling
+from ldcnd.axis.rest import NOTHING_SEEN, Braking, RestEvidence, SettleProgress, Settling, Way
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -123,6 +123,7 @@ class AxisStatus:
         in_vain: replies in a row that could not be used.
         command: what is under way.
         failure: why that will fail once the axis has come to rest.
+        way: where it may be until then; None before the first reading, and without a target.
         settle: how far it has settled; None before the end of its profile, and without a target.
         ends_at_s: when its profile should end, in loop time.
         effective_from_s: only readings requested from then on show the latest command, in loop time; infinite until the
@@ -158,6 +159,7 @@ class AxisStatus:
     in_vain: int = 0
     command: ActiveCommand | None = None
     failure: str | None = None
+    way: Way | None = None
     settle: SettleProgress | None = None
     ends_at_s: float | None = None
     effective_from_s: float = 0.0

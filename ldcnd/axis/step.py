@@ -54,7 +54,7 @@ from ldcnd.axis.faults import (
     entry_again,
     entry_of,
 )
-from ldcnd.axis.rest import NOTHING_SEEN, Braking, RestEvidence, SettleProgress, shows_velocity
+from ldcnd.axis.rest import NOTHING_SEEN, Braking, RestEvidence, SettleProgress, Way, shows_velocity
 from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, CommandEnd, Completion, OpenStop
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -120,10 +120,26 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         lost = "; its position is lost" if status.position_lost else ""
         return _fail(status, f"the drive reports a fault{lost}")
     if enabled:
+        if command and command.settling:
+            way = status.way
+            if way is None:
+                status = replace(status, way=Way.to(command.settling, reading))
+            elif not way.has(reading):
+                return _stray(status, event)
         return _take_enabled(status, event, faults)
     if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
         return status
     return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
+
+
+def _stray(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
+    """Have a shaft stopped that is not on the way to its target."""
+    here = status.scale.shown_at(event.reading.position_counts)
+    return _fail(
+        _keep_stop(status, StopUnconfirmed(event.now_ns)),
+        f"it is at {here:.12g} {status.scale.unit}, where no way to its target leads, and was stopped: look at the"
+        " machine before you send it again",
+    )
 
 
 def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -269,6 +285,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         target_counts=None,
         approached=False,
         braking=None,
+        way=None,
         rest=RestEvidence(rests=False, commanded=status.rest.commanded),
     )
 

@@ -35,6 +35,7 @@ SETTLES_WITHIN_S = 0.25
 CONFIRMED_LATE = "confirmed late, when the drive answered again"
 FOUND_OPEN = "switched off when its line was taken over"
 NOT_SEEN = "sent again, because the drive went on after it was confirmed: a late reply was taken for its own"
+STRAYED = "sent because the axis was not on the way to its target"
 OVERTAKES = {Verb.POWER: "power off"}
 """What is said of a command that overtakes others, where it is not its name."""
 UNDERSTOOD_NO_MORE = {LossPolicy.QUICK_STOP: StopMode.ABRUPT, LossPolicy.POWER_OFF: StopMode.OFF}
@@ -93,7 +94,7 @@ class AxisStops:
         self._note = note
         self._resent = CONFIRMED_LATE  # how a stop was confirmed that its line has sent again
         self._heard = motion.heard
-        motion.tracker.watch(self._watch, "braking")
+        motion.tracker.watch(self._watch, "stop")
         self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
 
     async def stop(self, mode: StopMode) -> bool:
@@ -239,11 +240,16 @@ class AxisStops:
         return False
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
-        """Have a stop sent again that the drive has confirmed and not carried out."""
-        if before.braking and after.stop_pending and not before.stop_pending:
+        """Have a stop sent that readings call for."""
+        if before.stop_pending or not after.stop_pending:
+            return
+        if before.braking:
             log.error("drive goes on after a stop that was confirmed", axis=self._name)
             self._resent = NOT_SEEN
-            self.wanted.set()
+        elif after.last_end is not before.last_end:
+            log.error("axis is not on the way to its target", axis=self._name)
+            self._resent = STRAYED
+        self.wanted.set()
 
     def _publish(self) -> None:
         self._telemetry.publish_state(self._tracker.status, self._clock.now_ns())

@@ -21,7 +21,7 @@ from ldcnd.contract.commands import (
     Stop,
 )
 from ldcnd.contract.errors import LdcndError
-from ldcnd.contract.samples import LinkState
+from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.ldcn.pic_io import LINES
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -199,3 +199,25 @@ async def test_a_late_reply_does_not_stand_for_that_to_what_a_motion_needs(diale
             assert rig.position_mm == pytest.approx(began_at - 6.0, abs=0.02)
 
         assert not deaf
+
+
+@pytest.mark.promise("on-its-way")
+@pytest.mark.parametrize("mid_motion", [False, True])
+async def test_a_shaft_that_goes_elsewhere_than_it_was_sent_is_stopped(mid_motion, monkeypatch):
+    """The drive has taken neither of both packets: it goes to the target of the motion before."""
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await rig.send(SetPosition(position=0.0))
+        await rig.send(MoveAbsolute(position=18.0, velocity=4.0))
+        await asyncio.sleep(0.8)
+        if not mid_motion:
+            await rig.done(Halt())
+        turned_at = rig.position_mm
+        monkeypatch.setattr(SimulatedDrive, "_load", lambda *_: None)
+        with suppress(LdcndError):
+            await rig.done(MoveAbsolute(position=-5.0, velocity=4.0, buffer_mode="aborting"))
+        state = await rig.until(lambda state: state.moving is Moving.NO and not state.stop_pending)
+
+        assert rig.position_mm < turned_at + 7
+        assert state.state is AxisState.ERROR_STOP
+        assert "no way to its target" in state.last_error
