@@ -14,9 +14,10 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.async_api import Browser, ConsoleMessage, Locator, Page, async_playwright, expect
 
-from ldcnd.client.lease import control
+from ldcnd.client.lease import Control, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import Halt, Power, Reset
+from ldcnd.contract.errors import StopLatched
 from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
 from tests.support.process import ROOT, answering, client, free_port, process
 
@@ -105,13 +106,21 @@ class DaemonUnderTest:
         info = next(each for each in await self.rig.axes() if each.axis == axis)
         return {each.name: each.value for each in info.registers}
 
+    async def _is_reset(self, held: Control, axis: str) -> bool:
+        await self.until(axis, lambda state: state.moving == "no")
+        try:
+            await held.command(axis, Reset())
+        except StopLatched:
+            return False  # the stop of a page that has gone is on its way
+        return True
+
     async def quiet(self, *axes: str) -> None:
         """Leave axes disabled, without a latch, a fault or a holder, whatever was done to them before."""
         async with control(self.rig, "the test", *axes, lease_s=60, force=True) as held:
             for axis in axes:
                 await held.command(axis, Halt())
-                await self.until(axis, lambda state: state.moving == "no")
-                await held.command(axis, Reset())
+                while not await self._is_reset(held, axis):
+                    await asyncio.sleep(LOOKED_EACH_S)
                 await held.command(axis, Power(on=False))
 
 

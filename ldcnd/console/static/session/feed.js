@@ -25,7 +25,7 @@ export class Feed {
   #silence = 0;
   #pauseMs = FIRST_PAUSE_MS;
 
-  /** Call `listener(rig, topic, sample, sentNs)` for every entry; returns what ends that. */
+  /** Call `listener(rig, topic, sample)` for every entry; returns what ends that. */
   listen(listener) {
     this.#listeners.add(listener);
     return () => this.#listeners.delete(listener);
@@ -72,7 +72,7 @@ export class Feed {
     this.dropped = dropped;
     this.offsetMs = Math.max(this.offsetMs - FORGOTTEN_MS, sentNs / 1e6 - performance.now());
     for (const [rig, topic, sample] of entries) {
-      for (const listener of this.#listeners) listener(rig, topic, sample, sentNs);
+      for (const listener of this.#listeners) listener(rig, topic, sample);
     }
   }
 
@@ -87,7 +87,7 @@ export class Feed {
     this.live = false;
     clearTimeout(this.#silence);
     this.offsetMs = -Infinity;
-    for (const listener of this.#listeners) listener(null, "lost", null, 0);
+    for (const listener of this.#listeners) listener(null, "lost", null);
     setTimeout(() => this.open(), this.#pauseMs);
     this.#pauseMs = Math.min(2 * this.#pauseMs, LONGEST_PAUSE_MS);
   }

@@ -87,7 +87,7 @@ export class Axis {
     return this.bus?.health?.axes.find((each) => each.axis === this.name) ?? null;
   }
 
-  take(item, sample, sentNs) {
+  take(item, sample) {
     const [kind, monitor] = item.split("/");
     if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
     else if (item === "trace") this.trace = sample;
@@ -95,7 +95,7 @@ export class Axis {
     if (item === "position") this.#remember(sample);
     if (item === "state" && sample) this.#noteMotion(sample);
     if (item === "shadow" && sample) this.shadows = [...this.shadows, sample].slice(-SHADOWS_KEPT);
-    if (sample?.t) this.#arrived.set(item, { atMs: performance.now(), ageS: Math.max(0, (sentNs - sample.t) / 1e9) });
+    if (sample?.t) this.#arrived.set(item, { atMs: performance.now(), ageS: Math.max(0, this.rig.nowNs() - sample.t) / 1e9 });
   }
 
   /** Age of a sample in seconds; null before the first. */
@@ -204,6 +204,7 @@ export class Rig {
   /** What the daemon says of each command, by its verb. */
   commands = new Map();
   heardAtMs = performance.now();
+  #newest = { ns: 0, atMs: 0 };
 
   constructor(name) {
     this.name = name;
@@ -238,6 +239,7 @@ export class Rig {
     this.endpoint = told.endpoint;
     this.connected = told.connected;
     this.problem = told.problem;
+    if (told.daemon?.instance !== this.daemon?.instance) this.#newest = { ns: 0, atMs: 0 }; // its clock may be another
     this.daemon = told.daemon ?? this.daemon;
     this.plan = told.plan ?? this.plan;
     const described = Boolean(told.daemon);
@@ -255,12 +257,18 @@ export class Rig {
     );
   }
 
-  take(topic, sample, sentNs) {
+  take(topic, sample) {
     this.heardAtMs = performance.now();
+    if (sample?.t > this.nowNs()) this.#newest = { ns: sample.t, atMs: this.heardAtMs };
     const [root, name, ...rest] = topic.split("/");
-    if (root === "tele") this.#telemetry(name, rest.join("/"), sample, sentNs);
+    if (root === "tele") this.#telemetry(name, rest.join("/"), sample);
     else if (topic === "meta/health") this.health = sample;
     else if (root === "meta" && name === "health") this.bus(rest[0]).report(sample);
+  }
+
+  /** The time by the daemon's own clock, as late as its news are here: that of another host may differ. */
+  nowNs() {
+    return this.#newest.ns + (performance.now() - this.#newest.atMs) * 1e6;
   }
 
   /** Add an event unless it is known. */
@@ -271,10 +279,10 @@ export class Rig {
     if (this.events.length > EVENTS_KEPT) this.events.shift();
   }
 
-  #telemetry(name, item, sample, sentNs) {
+  #telemetry(name, item, sample) {
     if (item === "event") {
       if (sample) this.happened(sample);
-    } else this.axis(name).take(item, sample, sentNs);
+    } else this.axis(name).take(item, sample);
   }
 }
 
@@ -370,10 +378,10 @@ export function describeSoon() {
 
 /** Begin to watch; once for a page. */
 export function watch() {
-  feed.listen((rig, topic, sample, sentNs) => {
+  feed.listen((rig, topic, sample) => {
     if (rig !== null) {
       if (topic === "rig") joined(rigNamed(rig), sample);
-      else rigNamed(rig).take(topic, sample, sentNs);
+      else rigNamed(rig).take(topic, sample);
     }
     changed();
   });
