@@ -436,7 +436,8 @@ class AxisCommands:
         rest_s = rest_of_profile_s(
             way, motion.velocity_counts_per_s, changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
         )
-        tracker.take(SpeedChanged(rest_s, self._motion.clock.now_s(), self._motion.clock.now_ns()))
+        clock, pace = self._motion.clock, self._motion.pace(permit)
+        tracker.take(SpeedChanged(rest_s, clock.now_s(), clock.now_ns(), pace))
         return True
 
     # -- registers ---------------------------------------------------------------------------------------------------

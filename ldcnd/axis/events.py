@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 
+from ldcnd.axis.rest import Pace
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand
 from ldcnd.contract.samples import PastFault
@@ -127,20 +128,23 @@ class MotionStarted:
         now_s: when, in loop time.
         target_counts: where it ends, counts; None when it has no end of its own, or when that is not certain.
         approached: it comes from the side that the configuration names.
+        pace: of one that another motion goes over into; None for one that begins at rest.
     """
 
     now_s: float
     target_counts: int | None = None
     approached: bool = False
+    pace: Pace | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedChanged:
-    """The motion under way goes on at another speed, and ends after `rest_s`."""
+    """The motion under way goes on at another speed, and ends after `rest_s`; `pace` is what is to be seen of it."""
 
     rest_s: float
     now_s: float
     now_ns: int
+    pace: Pace | None = None
 
 
 @dataclass(frozen=True, slots=True)

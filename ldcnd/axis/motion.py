@@ -15,7 +15,7 @@ from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.reference import ReferenceKeeper
-from ldcnd.axis.rest import Settling, window_counts
+from ldcnd.axis.rest import Pace, Settling, pace_of, window_counts
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, Completion
 from ldcnd.axis.straight import LineAxis
@@ -453,7 +453,15 @@ class AxisMotion:
         ends = plan and completion is Completion.PROFILE and state is not AxisState.CONTINUOUS_MOTION
         target_counts = plan.motion.target_counts if plan and ends else None
         approached = state is AxisState.DISCRETE_MOTION
-        self.tracker.take(MotionStarted(self.clock.now_s(), target_counts, approached))
+        pace = self.pace(permit) if in_motion else None
+        self.tracker.take(MotionStarted(self.clock.now_s(), target_counts, approached, pace))
+
+    def pace(self, permit: Permit) -> Pace | None:
+        """Return how fast the axis may be whose motion was given the speed of a permit; None if that is not known."""
+        reading, deceleration = self.tracker.reading, self.driver.deceleration_counts_per_s2
+        if reading is None or not deceleration or math.isinf(permit.most_counts_per_s):
+            return None
+        return pace_of(permit.most_counts_per_s, deceleration, reading, self.clock.now_s())
 
     async def _end_what_went_before(self, permit: Permit, error: BusError | RequestRefused) -> None:
         """The motion that was to be replaced still runs, and no command stands for it any more: bring it to rest."""

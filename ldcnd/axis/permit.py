@@ -90,6 +90,11 @@ class Permit:
         self._kind = InterlockKind(kind_of(verb))
         self._counts_per_s = 0.0  # of what it has last loaded, or is about to
 
+    @property
+    def most_counts_per_s(self) -> float:
+        """The speed of what it has loaded last; infinite where that has none of its own."""
+        return self._counts_per_s
+
     def still_wanted(self) -> None:
         """Raise when the command was overtaken.
 

@@ -206,6 +206,55 @@ class Way:
         return self.low <= reading.position_counts <= self.high
 
 
+PACE_S = 0.2
+"""A speed is measured over this time: positions are exact, and the velocity of a status packet is coarse."""
+PACE_SHARE = 1.1
+"""Most that it may be of what was asked for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pace:
+    """How fast a shaft may be from an instant on, after the motion under way was given another speed or target.
+
+    A drive that has not heard of it goes on as before, at a speed from which a person has just turned it down.
+
+    Attributes:
+        most_counts_per_s: that it was told.
+        from_s: when it has slowed down from what it had, in loop time.
+        at_counts: where it was then; None before a reading shows it.
+        at_s: when that was.
+    """
+
+    most_counts_per_s: float
+    from_s: float
+    at_counts: int | None = None
+    at_s: float = math.inf
+
+    def observe(self, reading: AxisReading, at_s: float) -> "Pace | bool":
+        """Take a reading; return what is still to be seen, or whether the shaft is as slow as it was told.
+
+        Args:
+            reading: what the drive shows.
+            at_s: when it was requested, in loop time.
+        """
+        if at_s < self.from_s:
+            return self
+        if self.at_counts is None:
+            return replace(self, at_counts=reading.position_counts, at_s=at_s)
+        took_s = at_s - self.at_s
+        if took_s < PACE_S:
+            return self
+        way = abs(reading.position_counts - self.at_counts)
+        return way <= PACE_SHARE * self.most_counts_per_s * took_s + ROOM_COUNTS
+
+
+def pace_of(most_counts_per_s: float, deceleration_counts_per_s2: float, reading: AxisReading, now_s: float) -> Pace:
+    """Return how fast a shaft may be that has a speed and was told another one, both in either direction."""
+    speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
+    slowing_s = (speed + most_counts_per_s) / deceleration_counts_per_s2
+    return Pace(most_counts_per_s, now_s + ROOM_SHARE * slowing_s + LAG_S)
+
+
 @dataclass(frozen=True, slots=True)
 class SettleProgress:
     """How far an axis has settled, from the end of its profile on.

@@ -11,7 +11,7 @@ from enum import Enum
 from typing import Any
 
 from ldcnd.axis.faults import READINGS_CONTRADICT, REPLIES_UNUSABLE
-from ldcnd.axis.rest import NOTHING_SEEN, Braking, RestEvidence, SettleProgress, Settling, Way
+from ldcnd.axis.rest import NOTHING_SEEN, Braking, Pace, RestEvidence, SettleProgress, Settling, Way
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -124,6 +124,7 @@ class AxisStatus:
         command: what is under way.
         failure: why that will fail once the axis has come to rest.
         way: where it may be until then; None before the first reading, and without a target.
+        pace: how fast it may be, once it has taken a new speed or target in motion; None otherwise.
         settle: how far it has settled; None before the end of its profile, and without a target.
         ends_at_s: when its profile should end, in loop time.
         effective_from_s: only readings requested from then on show the latest command, in loop time; infinite until the
@@ -160,6 +161,7 @@ class AxisStatus:
     command: ActiveCommand | None = None
     failure: str | None = None
     way: Way | None = None
+    pace: Pace | None = None
     settle: SettleProgress | None = None
     ends_at_s: float | None = None
     effective_from_s: float = 0.0

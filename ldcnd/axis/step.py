@@ -54,7 +54,7 @@ from ldcnd.axis.faults import (
     entry_again,
     entry_of,
 )
-from ldcnd.axis.rest import NOTHING_SEEN, Braking, RestEvidence, SettleProgress, Way, shows_velocity
+from ldcnd.axis.rest import NOTHING_SEEN, Braking, Pace, RestEvidence, SettleProgress, Way, shows_velocity
 from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, CommandEnd, Completion, OpenStop
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -120,16 +120,28 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         lost = "; its position is lost" if status.position_lost else ""
         return _fail(status, f"the drive reports a fault{lost}")
     if enabled:
-        if command and command.settling:
-            way = status.way
-            if way is None:
-                status = replace(status, way=Way.to(command.settling, reading))
-            elif not way.has(reading):
-                return _stray(status, event)
-        return _take_enabled(status, event, faults)
+        before = status
+        if command and (command.settling or status.pace):
+            status = _watch_course(status, command, event)
+        return _take_enabled(status, event, faults) if status.stop is before.stop else status
     if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
         return status
     return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
+
+
+def _watch_course(status: AxisStatus, command: ActiveCommand, event: ReadingTaken) -> AxisStatus:
+    """Have a shaft stopped that goes elsewhere than it was sent, or faster than it was told."""
+    reading, way, pace = event.reading, status.way, status.pace
+    if command.settling and way is None:
+        status = replace(status, way=Way.to(command.settling, reading))
+    elif way and not way.has(reading):
+        return _stray(status, event)
+    if pace is None:
+        return status
+    seen = pace.observe(reading, event.sent_at_s)
+    if seen is False:
+        return _outrun(status, pace, event)
+    return status if seen is pace else replace(status, pace=seen if isinstance(seen, Pace) else None)
 
 
 def _stray(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
@@ -139,6 +151,15 @@ def _stray(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
         _keep_stop(status, StopUnconfirmed(event.now_ns)),
         f"it is at {here:.12g} {status.scale.unit}, where no way to its target leads, and was stopped: look at the"
         " machine before you send it again",
+    )
+
+
+def _outrun(status: AxisStatus, pace: Pace, event: ReadingTaken) -> AxisStatus:
+    """Have a shaft stopped that is faster than it was told in mid-motion."""
+    most = pace.most_counts_per_s / abs(status.scale.counts_per_unit)
+    return _fail(
+        _keep_stop(replace(status, pace=None), StopUnconfirmed(event.now_ns)),
+        f"it is faster than {most:.4g} {status.scale.unit}/s, to which its speed was changed, and was stopped",
     )
 
 
@@ -286,6 +307,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         approached=False,
         braking=None,
         way=None,
+        pace=None,
         rest=RestEvidence(rests=False, commanded=status.rest.commanded),
     )
 
@@ -298,6 +320,7 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
         status,
         effective_from_s=event.now_s,
         ends_at_s=ends_at_s,
+        pace=event.pace,
         rest=RestEvidence(rests=False, commanded=True),
     )
     if event.target_counts is None:
@@ -310,7 +333,8 @@ def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
     if command is None:
         return status
     duration_s = (event.now_ns - command.since_ns) / 1e9 + event.rest_s
-    return replace(status, command=replace(command, duration_s=duration_s), ends_at_s=event.now_s + event.rest_s)
+    command = replace(command, duration_s=duration_s)
+    return replace(status, command=command, ends_at_s=event.now_s + event.rest_s, pace=event.pace)
 
 
 def _note_failure(status: AxisStatus, event: CommandFailing) -> AxisStatus:

@@ -21,6 +21,7 @@ from ldcnd.contract.commands import (
     Stop,
 )
 from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.ldcn.pic_io import LINES
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
@@ -221,3 +222,27 @@ async def test_a_shaft_that_goes_elsewhere_than_it_was_sent_is_stopped(mid_motio
         assert rig.position_mm < turned_at + 7
         assert state.state is AxisState.ERROR_STOP
         assert "no way to its target" in state.last_error
+
+
+@pytest.mark.promise("as-slow-as-told")
+@pytest.mark.parametrize("change", ["override", "move_velocity", "another target"])
+async def test_a_shaft_that_goes_on_faster_than_it_was_told_is_stopped(change, monkeypatch):
+    """The drive has not taken the start by which its speed was to change in mid-motion."""
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        await rig.send(SetPosition(position=0.0))
+        await rig.send(MoveAbsolute(position=18.0, velocity=4.0))
+        await asyncio.sleep(0.5)
+        monkeypatch.setattr(SimulatedDrive, "_start", lambda *_: None)
+        if change == "override":
+            await rig.rig.client.ask(SetSpeedOverride(percent=25.0, client="test"))
+        elif change == "move_velocity":
+            await rig.send(MoveVelocity(velocity=1.0, buffer_mode="aborting"))
+        else:
+            await rig.send(MoveAbsolute(position=17.0, velocity=1.0, buffer_mode="aborting"))
+        await asyncio.sleep(1.2)
+        state = await rig.until(lambda state: state.moving is Moving.NO and not state.stop_pending)
+
+        assert rig.position_mm < 10
+        assert state.state is AxisState.ERROR_STOP
+        assert "faster than 1" in state.last_error
