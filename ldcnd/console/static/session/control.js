@@ -146,7 +146,7 @@ function open() {
     endJog();
     client = null;
     nameThisPage(null);
-    for (const axis of held) noteLost(axis, "this page has lost its connection to the console. What it moved is halted.");
+    for (const axis of held) noteLost(axis, "this page has lost its connection to the console. What it moved is halted within 3 s, and may move until then.");
     held.clear();
     changed();
     setTimeout(open, OPEN_AGAIN_MS);

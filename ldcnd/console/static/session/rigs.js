@@ -89,6 +89,7 @@ export class Axis {
 
   take(item, sample) {
     const [kind, monitor] = item.split("/");
+    if (item === "state" && sample?.state !== this.state?.state) this.refusal = null; // of a state that is over
     if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
     else if (item === "trace") this.trace = sample;
     else if (kind !== "trace" && kind !== "event") this.#keep(this.samples, item, sample);
