@@ -188,6 +188,11 @@ class AxisStatus:
         return self.commanded
 
     @property
+    def is_braking(self) -> bool:
+        """Whether readings are yet to show a stop that the drive has confirmed."""
+        return self.braking is not None and self.link is not LinkState.DOWN
+
+    @property
     def stop_pending(self) -> bool:
         """Whether a stop was sent in vain, or is yet to be sent: nothing moves until the drive confirms it."""
         return self.stop is not None and self.stop.fault is not None

@@ -251,7 +251,8 @@ class Daemon:
 
     async def _bring_to_rest(self, axis: AxisService) -> None:
         await apply_policy(axis, axis.config.loss.daemon, "the daemon ends")
-        while axis.tracker.status.stop_pending:  # as long as there is time for it: after that nothing sends it again
+        # as long as there is time for it, and until it is seen: after that nothing sends it again
+        while axis.tracker.status.stop_pending or axis.tracker.status.is_braking:
             await axis.send_pending_stop()
             await asyncio.sleep(STOP_AGAIN_S)
         await axis.take_gains_back()

@@ -246,3 +246,27 @@ async def test_a_shaft_that_goes_on_faster_than_it_was_told_is_stopped(change, m
         assert rig.position_mm < 10
         assert state.state is AxisState.ERROR_STOP
         assert "faster than 1" in state.last_error
+
+
+@pytest.mark.promise("stop-seen")
+@pytest.mark.parametrize("policy", ["power_off", "halt", "quick_stop"])
+async def test_a_daemon_does_not_end_before_the_stop_of_an_axis_is_seen(policy, monkeypatch):
+    deaf, stopping = [True], SimulatedDrive._stop
+
+    def stop(self, *args):
+        if deaf:
+            deaf.pop()
+        else:
+            stopping(self, *args)
+
+    async with dialect_rig(V4, loss={"daemon": policy}) as rig:
+        await rig.power_on()
+        await rig.send(MoveVelocity(velocity=3.0))
+        await asyncio.sleep(0.3)
+        monkeypatch.setattr(SimulatedDrive, "_stop", stop)
+    ended_at = rig.position_mm
+    rig.chain.advance(asyncio.get_running_loop().time() + 2.0)
+    rig.drive.catch_up(asyncio.get_running_loop().time() + 2.0)
+
+    assert not deaf
+    assert rig.position_mm == pytest.approx(ended_at, abs=0.5)
