@@ -8,7 +8,7 @@ from typing_extensions import override
 
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
+from ldcnd.axis.procedures.endless import LATENCY_S, WATCH_S, EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import CommandReply, SetPwm
@@ -50,10 +50,13 @@ class PwmRun(EndlessMotion):
     @override
     def fastest(self, velocity: float) -> tuple[float, float]:
         """See `EndlessMotion`: what a duty leads to depends on motor and load, so its readings tell."""
-        now_s = self._motion.clock.now_s()
-        if self._seen and now_s > self._seen[1]:
-            self._gains = abs(velocity - self._seen[0]) / (now_s - self._seen[1])
-        self._seen = velocity, now_s
+        read_at_s = self._motion.tracker.read_at_s
+        if self._seen is None:
+            self._seen = velocity, read_at_s
+        # a velocity is coarse: two readings that follow each other closely would make any acceleration of it
+        elif (took_s := read_at_s - self._seen[1]) >= WATCH_S / 2:
+            self._gains = abs(velocity - self._seen[0]) / took_s
+            self._seen = velocity, read_at_s
         most = abs(velocity) + self._gains * LATENCY_S
         return (most, 0.0) if self._request.duty > 0 else (0.0, most)
 
