@@ -27,7 +27,7 @@ HOLDING = frozenset({TroubleKind.NO_ANSWER, TroubleKind.STOP_PENDING})
 """Troubles of an axis that hold the level, as a stop does that is on its way; faults and latched stops are the drive's
 own and the machine's business."""
 HELD_S = 0.005
-"""Pause before a change that is held is tried again: a stop that is confirmed at once costs no change."""
+"""Pause before a change that a stop on its way holds is tried again: one that is confirmed at once costs no change."""
 REOPEN_S = 1.0
 """Pause between two attempts to open an output that is gone."""
 
@@ -107,7 +107,9 @@ class Heartbeat:
                 self._level = not self._level
                 await loop.run_in_executor(thread, output.set, self._level)
                 self._changes += 1
-            await asyncio.sleep(HELD_S if self._why else self._config.half_period_ms / 1000)
+            stops = (axis.tracker.status for line in self._lines for axis in line.axes if axis.tracker.status.stop)
+            is_soon_over = bool(self._why) and any(not status.stop_pending for status in stops)
+            await asyncio.sleep(HELD_S if is_soon_over else self._config.half_period_ms / 1000)
 
     def _trouble(self, now_s: float) -> str:
         """Return why the level must stay as it is, or nothing."""
