@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ldcnd.axis.rest import Pace
+from ldcnd.axis.course import Pace
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand
 from ldcnd.contract.samples import PastFault
@@ -207,8 +207,8 @@ class StopSent:
 
 
 @dataclass(frozen=True, slots=True)
-class StopHeard:
-    """The drive has confirmed a stop, which the readings requested from now on are to show.
+class StopAcknowledged:
+    """The drive has acknowledged a stop, which the readings requested from now on are to show.
 
     Attributes:
         mode: how it was stopped.
@@ -223,10 +223,11 @@ class StopHeard:
 
 @dataclass(frozen=True, slots=True)
 class StopUnconfirmed:
-    """No drive has confirmed a stop, or it is yet to be sent."""
+    """No drive has confirmed a stop, or it is yet to be sent; `how` is said once it was."""
 
     now_ns: int
     mode: StopMode = StopMode.SMOOTH
+    how: str = "confirmed late, when the drive answered again"
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,7 +289,7 @@ AxisEvent = (
     | ControlChanged
     | StopLatch
     | StopSent
-    | StopHeard
+    | StopAcknowledged
     | StopUnconfirmed
     | StopConfirmed
     | LatchRecalled

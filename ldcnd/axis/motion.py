@@ -10,12 +10,13 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopHeard
+from ldcnd.axis.course import Pace, Way, pace_of
+from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
 from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.reference import ReferenceKeeper
-from ldcnd.axis.rest import Pace, Settling, pace_of, window_counts
+from ldcnd.axis.rest import Settling, window_counts
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, Completion
 from ldcnd.axis.straight import LineAxis
@@ -488,25 +489,22 @@ class AxisMotion:
         """Say what the axis is about to do; readings count again once it has started, see `MotionStarted`."""
         target, duration_s = (self.shown(plan.position), plan.duration_s) if plan else (None, None)
         now_ns = self.clock.now_ns()
-        settling = self._settling(plan) if plan and completion is Completion.PROFILE else None
-        command = ActiveCommand(command_id, verb, now_ns, state, completion, opens_loop, target, duration_s, settling)
+        settling, way = self._ends(plan.motion) if plan and completion is Completion.PROFILE else (None, None)
+        command = ActiveCommand(
+            command_id, verb, now_ns, state, completion, opens_loop, target, duration_s, settling, way
+        )
         self.tracker.take(CommandBegun(command))
         self.publish_state()
 
-    def _settling(self, plan: MotionPlan) -> Settling | None:
-        target, settle = plan.motion.target_counts, self.config.settle
+    def _ends(self, motion: CountsMotion) -> tuple[Settling | None, Way | None]:
+        """Return when a motion has settled, and the way that leads there; None of one without an end of its own."""
+        target, settle, window, gains = motion.target_counts, self.config.settle, self._window_counts, self.driver.gains
         if target is None:
-            return None
-        gains = self.driver.gains
-        return Settling(
-            target,
-            self._window_counts,
-            settle.time_s,
-            settle.timeout_s,
-            faults=settle.unsettled == "fault",
-            stray_counts=gains.el + self._window_counts if gains and gains.el else math.inf,
-            deceleration_counts_per_s2=plan.motion.acceleration_counts_per_s2,
-        )
+            return None, None
+        settling = Settling(target, window, settle.time_s, settle.timeout_s, faults=settle.unsettled == "fault")
+        # without a limit its drive follows no way, and nothing says how far beside is too far
+        way = Way(target, gains.el + window, motion.acceleration_counts_per_s2) if gains and gains.el else None
+        return settling, way
 
     def stopping(
         self,
@@ -519,12 +517,12 @@ class AxisMotion:
         if self.tracker.status.energised and self.tracker.status.state is not AxisState.ERROR_STOP:
             self.begin(command_id, verb, state, completion)
             self.tracker.take(MotionStarted(self.clock.now_s()))
-        self.heard(StopMode.SMOOTH)
+        self.stop_acknowledged(StopMode.SMOOTH)
 
-    def heard(self, mode: StopMode) -> None:
+    def stop_acknowledged(self, mode: StopMode) -> None:
         """The drive acknowledged a stop: readings are to show it, and it is sent again if they show that it is not."""
         if self.tracker.status.energised or mode is StopMode.OFF:
-            self.tracker.take(StopHeard(mode, self.clock.now_s(), self.driver.deceleration_counts_per_s2))
+            self.tracker.take(StopAcknowledged(mode, self.clock.now_s(), self.driver.deceleration_counts_per_s2))
 
     async def end(self, permit: Permit, failure: str = "") -> None:
         """Bring the motion of a command to rest; an axis that has lost its loop meanwhile is switched off instead.

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
+from ldcnd.axis.course import Braking, Pace, Way
 from ldcnd.axis.faults import READINGS_CONTRADICT, REPLIES_UNUSABLE
-from ldcnd.axis.rest import NOTHING_SEEN, Braking, Pace, RestEvidence, SettleProgress, Settling, Way
+from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -55,6 +56,7 @@ class ActiveCommand:
         target: where it ends, in axis units; None when it has no end of its own.
         duration_s: of its profile, without settling; None when it has no end of its own.
         settling: when it counts as settled; None when the end of its profile is its end.
+        way: to its target; None when it has no end of its own.
     """
 
     command_id: str
@@ -66,6 +68,7 @@ class ActiveCommand:
     target: float | None = None
     duration_s: float | None = None
     settling: Settling | None = None
+    way: Way | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,10 +96,12 @@ class OpenStop:
         mode: the strongest of those that were sent or are to be.
         fault: what is published of it, from when on it was sent in vain, or is yet to be sent: nothing moves then until
             it is confirmed. None while it is on its way for the first time.
+        how: why its line sends it, for the event that it was confirmed.
     """
 
     mode: StopMode
     fault: FaultEntry | None = None
+    how: str = ""
 
 
 @dataclass(frozen=True, slots=True)

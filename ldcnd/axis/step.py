@@ -10,6 +10,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
+from ldcnd.axis.course import Braking, Pace, Way
 from ldcnd.axis.events import (
     AxisEvent,
     CommandBegun,
@@ -34,8 +35,8 @@ from ldcnd.axis.events import (
     ResetDone,
     SpeedChanged,
     SpeedOverridden,
+    StopAcknowledged,
     StopConfirmed,
-    StopHeard,
     StopLatch,
     StopSent,
     StopUnconfirmed,
@@ -54,7 +55,7 @@ from ldcnd.axis.faults import (
     entry_again,
     entry_of,
 )
-from ldcnd.axis.rest import NOTHING_SEEN, Braking, Pace, RestEvidence, SettleProgress, Way, shows_velocity
+from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, shows_velocity
 from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, CommandEnd, Completion, OpenStop
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
@@ -64,6 +65,10 @@ from ldcnd.drives.driver import Fault
 MISSES_UNTIL_DOWN = 3
 """Consecutive polls without a reply after which the drive counts as lost, or with replies that cannot be used after
 which what it does is not understood."""
+
+WENT_ON = "sent again, because the drive went on after it was confirmed: a late reply was taken for its own"
+STRAYED = "sent because the axis was not on the way to its target"
+OUTRUN = "sent because the axis stayed faster than it was told"
 
 
 def step(status: AxisStatus, event: AxisEvent) -> AxisStatus:
@@ -103,7 +108,7 @@ def _watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) ->
     if isinstance(seen, Braking):
         return status if seen is braking else replace(status, braking=seen)
     status = replace(status, braking=None)
-    return status if seen else _keep_stop(status, StopUnconfirmed(event.now_ns, braking.mode))
+    return status if seen else _keep_stop(status, StopUnconfirmed(event.now_ns, braking.mode, WENT_ON))
 
 
 def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -121,21 +126,22 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         return _fail(status, f"the drive reports a fault{lost}")
     if enabled:
         before = status
-        if command and (command.settling or status.pace):
-            status = _watch_course(status, command, event)
+        if command and (status.way or status.pace):
+            status = _watch_course(status, event)
         return _take_enabled(status, event, faults) if status.stop is before.stop else status
     if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
         return status
     return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
 
 
-def _watch_course(status: AxisStatus, command: ActiveCommand, event: ReadingTaken) -> AxisStatus:
+def _watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     """Have a shaft stopped that goes elsewhere than it was sent, or faster than it was told."""
     reading, way, pace = event.reading, status.way, status.pace
-    if command.settling and way is None:
-        status = replace(status, way=Way.to(command.settling, reading))
-    elif way and not way.has(reading):
+    on_way = way.observe(reading) if way else True
+    if on_way is False:
         return _stray(status, event)
+    if isinstance(on_way, Way):
+        status = replace(status, way=on_way)
     if pace is None:
         return status
     seen = pace.observe(reading, event.sent_at_s)
@@ -148,7 +154,7 @@ def _stray(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     """Have a shaft stopped that is not on the way to its target."""
     here = status.scale.shown_at(event.reading.position_counts)
     return _fail(
-        _keep_stop(status, StopUnconfirmed(event.now_ns)),
+        _keep_stop(status, StopUnconfirmed(event.now_ns, how=STRAYED)),
         f"it is at {here:.12g} {status.scale.unit}, where no way to its target leads, and was stopped: look at the"
         " machine before you send it again",
     )
@@ -158,7 +164,7 @@ def _outrun(status: AxisStatus, pace: Pace, event: ReadingTaken) -> AxisStatus:
     """Have a shaft stopped that is faster than it was told in mid-motion."""
     most = pace.most_counts_per_s / abs(status.scale.counts_per_unit)
     return _fail(
-        _keep_stop(replace(status, pace=None), StopUnconfirmed(event.now_ns)),
+        _keep_stop(replace(status, pace=None), StopUnconfirmed(event.now_ns, how=OUTRUN)),
         f"it is faster than {most:.4g} {status.scale.unit}/s, to which its speed was changed, and was stopped",
     )
 
@@ -306,7 +312,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         target_counts=None,
         approached=False,
         braking=None,
-        way=None,
+        way=command.way,
         pace=None,
         rest=RestEvidence(rests=False, commanded=status.rest.commanded),
     )
@@ -389,10 +395,10 @@ def _keep_stop(status: AxisStatus, event: StopUnconfirmed) -> AxisStatus:
     stop = status.stop
     if stop is None or stop.fault:
         return status
-    return replace(status, stop=OpenStop(stop.mode, entry_of(STOP_UNCONFIRMED, event.now_ns)))
+    return replace(status, stop=OpenStop(stop.mode, entry_of(STOP_UNCONFIRMED, event.now_ns), event.how))
 
 
-def _hear_stop(status: AxisStatus, event: StopHeard) -> AxisStatus:
+def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus:
     return replace(status, braking=Braking(event.mode, event.now_s, event.deceleration_counts_per_s2))
 
 
@@ -448,7 +454,7 @@ STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType
         ControlChanged: _change_control,
         StopLatch: _latch,
         StopSent: _send_stop,
-        StopHeard: _hear_stop,
+        StopAcknowledged: _acknowledge_stop,
         StopUnconfirmed: _keep_stop,
         StopConfirmed: _confirm_stop,
         LatchRecalled: _recall_latch,

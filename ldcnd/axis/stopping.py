@@ -32,10 +32,7 @@ STOP_ROUNDS = 5
 """Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
 SETTLES_WITHIN_S = 0.25
 """Time within which a shaft follows its finished profile, seconds."""
-CONFIRMED_LATE = "confirmed late, when the drive answered again"
 FOUND_OPEN = "switched off when its line was taken over"
-NOT_SEEN = "sent again, because the drive went on after it was confirmed: a late reply was taken for its own"
-STRAYED = "sent because the axis was not on the way to its target"
 OVERTAKES = {Verb.POWER: "power off"}
 """What is said of a command that overtakes others, where it is not its name."""
 UNDERSTOOD_NO_MORE = {LossPolicy.QUICK_STOP: StopMode.ABRUPT, LossPolicy.POWER_OFF: StopMode.OFF}
@@ -92,8 +89,7 @@ class AxisStops:
         self._commands = commands
         self._next_command_id = next_command_id
         self._note = note
-        self._resent = CONFIRMED_LATE  # how a stop was confirmed that its line has sent again
-        self._heard = motion.heard
+        self._acknowledged = motion.stop_acknowledged
         motion.tracker.watch(self._watch, "stop")
         self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
 
@@ -167,18 +163,15 @@ class AxisStops:
         stop = self._tracker.status.stop
         if stop is None:
             return  # such a stop was confirmed while the axis was read
-        how = self._resent
         if await self._send(stop.mode, Verb.STOP, rounds=1):
-            self._resent = CONFIRMED_LATE
-            log.warning("stop confirmed", axis=self._name, how=how)
-            self._note(self._name, Verb.STOP, CommandStatus.DONE, how, None)
+            log.warning("stop confirmed", axis=self._name, how=stop.how)
+            self._note(self._name, Verb.STOP, CommandStatus.DONE, stop.how, None)
         self._publish()
 
     def switch_off(self) -> None:
         """Have the motor switched off by the first packet to its drive."""
         if self.possible:
-            self._resent = FOUND_OPEN
-            self._tracker.take(StopUnconfirmed(self._clock.now_ns(), StopMode.OFF))
+            self._tracker.take(StopUnconfirmed(self._clock.now_ns(), StopMode.OFF, FOUND_OPEN))
 
     def inherit(self) -> None:
         """Its drive is as another host has left it: what moves in it without an end is to be brought to rest."""
@@ -186,7 +179,7 @@ class AxisStops:
 
     def note_power_loss(self) -> None:
         """Note that the drive was reset or had no power: the motion to be stopped has ended."""
-        self.inherited, self._resent = False, CONFIRMED_LATE
+        self.inherited = False
         self._tracker.take(StopConfirmed())
 
     def watch_inherited(self, reading: AxisReading, at_s: float) -> None:
@@ -234,22 +227,15 @@ class AxisStops:
             elif not stands:  # what was proven to stand is not watched coming to rest, and keeps its target
                 self._commands.brought_to_rest(command_id or self._next_command_id(), verb)
             if not stands:
-                self._heard(mode)
+                self._acknowledged(mode)
             tracker.take(StopConfirmed(mode))
             return True
         return False
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
         """Have a stop sent that readings call for."""
-        if before.stop_pending or not after.stop_pending:
-            return
-        if before.braking:
-            log.error("drive goes on after a stop that was confirmed", axis=self._name)
-            self._resent = NOT_SEEN
-        elif after.last_end is not before.last_end:
-            log.error("axis is not on the way to its target", axis=self._name)
-            self._resent = STRAYED
-        self.wanted.set()
+        if after.stop_pending and not before.stop_pending:
+            self.wanted.set()
 
     def _publish(self) -> None:
         self._telemetry.publish_state(self._tracker.status, self._clock.now_ns())

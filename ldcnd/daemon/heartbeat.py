@@ -23,9 +23,6 @@ from ldcnd.log import get_logger
 
 log = get_logger("heartbeat")
 
-HOLDING = frozenset({TroubleKind.NO_ANSWER, TroubleKind.STOP_PENDING})
-"""Troubles of an axis that hold the level, as a stop does that is on its way; faults and latched stops are the drive's
-own and the machine's business."""
 HELD_S = 0.005
 """Pause before a change that a stop on its way holds is tried again: one that is confirmed at once costs no change."""
 REOPEN_S = 1.0
@@ -135,7 +132,8 @@ class Heartbeat:
             if axis.tracker.status.stop:
                 return f"{axis.config.name}: a stop is not confirmed"
             for trouble in assess(axis.tracker.status).troubles:
-                if trouble.kind in HOLDING:
+                # faults and latched stops are the drive's own and the machine's business
+                if trouble.kind is TroubleKind.NO_ANSWER:
                     return f"{axis.config.name}: {trouble.text}"
         return ""
 

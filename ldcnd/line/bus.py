@@ -34,7 +34,7 @@ FIRST_REOPEN_S = 0.1
 LONGEST_REOPEN_S = 2.0
 STAYS_S = 3.0
 """A port that is lost sooner than this was not really open: as of a serial server that accepts and closes, seconds."""
-SENT_IN_VAIN = "the packet was sent in vain, or its reply was lost, and is not sent again:"
+SENT_IN_VAIN = "sent once, in vain or with its reply lost, and not again; look at what it was to do before you go on:"
 LONGEST_OPENING_S = 10.0
 """Upper bound of closing a lost port and opening it again, seconds; both are bounded by themselves."""
 
@@ -192,7 +192,7 @@ class Bus:
         """Run one exchange in its lane's turn and return the decoded reply.
 
         With `once` it is not sent again when the node reports that the packet was damaged: the damage may be in that
-        report, and then the packet was executed.
+        report, and then the packet was executed. What no reading shows is told twice (`Exchange.unseen`).
 
         When its turn comes, an exchange that changes anything is sent only to who is proven to be who is meant
         (`Proofs`), and only if the condition of the caller's context (`only_while`) holds. Cancelling the caller never
@@ -208,8 +208,9 @@ class Bus:
             AxisUnreachable, NotIdentified: not proven to be who is meant; nothing was sent.
             LdcndError: as the condition refused it; nothing was sent.
         """
-        job = self._submit(exchange, lane, 1 if once else self.settings.attempts)
-        reply: ReplyT = await job.future
+        for _ in range(exchange.times):
+            job = self._submit(exchange, lane, 1 if once else self.settings.attempts)
+            reply: ReplyT = await job.future
         return reply
 
     async def execute_timed(self, exchange: Exchange[ReplyT]) -> tuple[ReplyT, Timing]:

@@ -68,6 +68,8 @@ class Exchange(Generic[ReplyT]):
             None when it is not known yet. When absent the length is `reply_bytes`.
         effect: a codec that does not say what its packet does gets the strictest treatment: see `Proofs` and
             `only_while` of the bus.
+        unseen: no reading shows whether the node has taken it, and a late reply to something older can pass for its
+            acknowledgement: `Bus.execute` sends it twice, if it may be repeated.
     """
 
     node: int
@@ -79,6 +81,12 @@ class Exchange(Generic[ReplyT]):
     repeatable: bool
     total_bytes: Callable[[bytes], int | None] | None = None
     effect: PacketEffect = PacketEffect.CHANGES
+    unseen: bool = False
+
+    @property
+    def times(self) -> int:
+        """How often it is sent when nothing is lost."""
+        return 2 if self.unseen and self.repeatable else 1
 
     def longest_s(self, byte_s: float) -> float:
         """Return how long it occupies the line at most when nothing is lost, first bit to last, in seconds.

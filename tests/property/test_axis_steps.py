@@ -12,6 +12,7 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.axis import events, faults, guards
+from ldcnd.axis.course import Way
 from ldcnd.axis.rest import Settling
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import MOTION_STATES, STRENGTH, ActiveCommand, AxisStatus, Completion, new_faults
@@ -101,12 +102,13 @@ class History:
         dice = self.dice
         self._number += dice.choice((0, 1, 1))
         state, completion = dice.choice(STATES), dice.choice(list(Completion))
-        settling = None
+        settling = way = None
         if completion is Completion.PROFILE and dice.random() < 0.5:
             settling = Settling(self._position, 5.0, 0.05, 0.5, dice.random() < 0.5)
+            way = dice.choice((None, Way(self._position, 40.0, 1000.0)))
         command = ActiveCommand(
             f"c{self._number}", dice.choice((Verb.HOME, Verb.MOVE_ABSOLUTE, Verb.HALT)), self._now_ns, state,
-            completion, dice.random() < 0.2, dice.choice((None, 4.0)), dice.choice((None, 0.5)), settling,
+            completion, dice.random() < 0.2, dice.choice((None, 4.0)), dice.choice((None, 0.5)), settling, way,
         )  # fmt: skip
         self.begun.append(command.command_id)
         return events.CommandBegun(command)

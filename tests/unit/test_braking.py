@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from ldcnd.axis.rest import Braking
+from ldcnd.axis.course import Braking
 from ldcnd.drives.driver import AxisReading, StopMode
 from tests.support.axis_bench import AT_REST
 

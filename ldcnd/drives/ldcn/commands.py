@@ -10,7 +10,7 @@ data sheets.
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Generic, TypeVar
 
@@ -229,6 +229,10 @@ EFFECTS = {
     CommandCode.HARD_RESET: PacketEffect.ARRANGES,
 }
 """All others change something; Stop Motor, which does not only stop, by its control byte."""
+UNSEEN = frozenset(
+    {CommandCode.LOAD_TRAJECTORY, CommandCode.SET_GAIN, CommandCode.SET_HOMING_MODE, CommandCode.IO_CONTROL}
+)
+"""What no status item reads back."""
 RELIEVING = frozenset(
     {
         StopControl(0),
@@ -503,7 +507,10 @@ def _exchange(
         raise NotSupported(f"{to.profile.title} is only identified: it takes no {command.name}")
     request = encode_packet(Packet(to.address, command, data))
     effect = effect or EFFECTS.get(command, PacketEffect.CHANGES)
-    return to.exchange(request, items, repeatable=repeatable, effect=effect)
+    exchange = to.exchange(request, items, repeatable=repeatable, effect=effect)
+    # a motion could begin towards the target of the one before or with its gains, and a home that nothing looks for
+    # be found where the axis stands
+    return replace(exchange, unseen=True) if command in UNSEEN else exchange
 
 
 def _dialect(to: Destination[ReplyT]) -> Profile:

@@ -182,9 +182,10 @@ class IoModule(Poller[IoStatus], IoDriver):
             latch = await self._levels_after(levels, directions)
             if turned:
                 with self._book.writing(asked):
-                    exchange = send_io_command(self._node, turned)
+                    # told twice, as all of them; the second time whatever has come meanwhile, see below
+                    exchange = replace(send_io_command(self._node, turned), unseen=False)
                     await self._bus.execute(exchange)
-                    with only_while(_nothing_forbids):  # see below
+                    with only_while(_nothing_forbids):
                         await self._bus.execute(exchange)
             written = {LEVELS[line]: int(level) for line, level in levels.items()}
             # what has become an output gets its level, whatever has come meanwhile: it has another one until then
@@ -193,10 +194,10 @@ class IoModule(Poller[IoStatus], IoDriver):
                     await self._switch_together(latch, pwm_after, written)
                 else:
                     with self._book.writing(written):
-                        await self._tell(send_io_command(self._node, SetOutput(latch)))
+                        await self._bus.execute(send_io_command(self._node, SetOutput(latch)))
         elif pwm_after:
             with self._book.writing(dict(zip(PWM, pwm_after, strict=True))):
-                await self._tell(send_io_command(self._node, SetPwmOutputs(*pwm_after)))
+                await self._bus.execute(send_io_command(self._node, SetPwmOutputs(*pwm_after)))
         return self._reading(await self._bus.execute(self._exchange))
 
     def _mask_after(self, asked: Mapping[str, int]) -> int:
@@ -257,14 +258,8 @@ class IoModule(Poller[IoStatus], IoDriver):
         Only this module is addressed: in a group with servos Synch Output is Start Motion.
         """
         with self._book.writing({**written, **dict(zip(PWM, pwm, strict=True))}):
-            await self._tell(send_io_command(self._node, SetSynchOutput(latch, *pwm)))
-            await self._tell(send_io_command(self._node, SynchOutput()))
-
-    async def _tell(self, exchange: Exchange[IoStatus]) -> None:
-        """Send what an acknowledgement alone shows that the module has taken it: twice, see `LdcnAxis`."""
-        await self._bus.execute(exchange)
-        if exchange.repeatable:
-            await self._bus.execute(exchange)
+            await self._bus.execute(send_io_command(self._node, SetSynchOutput(latch, *pwm)))
+            await self._bus.execute(send_io_command(self._node, SynchOutput()))
 
     async def captured(self) -> IoStatus:
         """Return the levels and the count that the latest Synch Input has captured."""
@@ -274,7 +269,7 @@ class IoModule(Poller[IoStatus], IoDriver):
     async def set_timer(self, *, enabled: bool, counts_edges: bool, prescale: int) -> None:
         mode = SetTimerMode(enabled, counts_edges, prescale)
         with self._book.writing({TIMER: timer_control(mode)}):
-            await self._tell(send_io_command(self._node, mode))
+            await self._bus.execute(send_io_command(self._node, mode))
 
     def _check(self, levels: Mapping[int, bool], inputs: frozenset[int]) -> None:
         for line in (*levels, *inputs):

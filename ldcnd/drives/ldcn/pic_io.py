@@ -8,7 +8,7 @@ Line n of the data sheet, 1 to 12, is bit n - 1 of every word here.
 Source: PIC-I/O data sheet, 2.2, 3.1, 3.2.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntFlag
 from functools import partial
 
@@ -301,7 +301,9 @@ def send_io_command(to: IoNode, command: IoCommand) -> Exchange[IoStatus]:
         ValueOutOfRange: see `encode_io_command`.
     """
     repeatable = not isinstance(command, SynchOutput | SynchInput)
-    return to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable)
+    exchange = to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable)
+    # what its lines read is not what it was told: an output shows the level of its pin, and a direction nothing
+    return replace(exchange, unseen=True)
 
 
 def define_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:

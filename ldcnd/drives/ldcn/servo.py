@@ -306,10 +306,9 @@ class LdcnAxis(Moves):
         if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
             first, offset = (commands.reset_position(self._node),), self.state.counts
         if self.state.known.closed and self._book.gains and not self._book.loaded:
-            first = (*2 * (commands.set_gain(self._node, self._book.gains),), *first)
+            first = (commands.set_gain(self._node, self._book.gains), *first)
         trajectory = trajectory_of(_shifted(motion, offset), self._next_divisor(), self.profile)
-        load = commands.load_trajectory(self._node, trajectory)
-        return *first, load, load, commands.start_motion(self._node)
+        return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
 
     async def power(self, *, on: bool) -> None:
         """See `Moves`. Closing the loop is verified; it takes effect at the present position.
@@ -424,7 +423,7 @@ class LdcnAxis(Moves):
         self._switching_off += off
         try:
             await self._stop_motor(STOP_CONTROLS[mode])
-            if shows_nothing:  # with its loop open no reading tells whether it has heard it: see `_tell`
+            if shows_nothing:  # with its loop open no reading tells whether it has heard it: see `Exchange.unseen`
                 await self._stop_motor(STOP_CONTROLS[mode])
         finally:
             self._switching_off -= off
@@ -603,7 +602,7 @@ class LdcnAxis(Moves):
             control, guard = await self._guard(motion, active=self.spec.limit_stop)
         if control or self.state.homing_armed:
             self.state.homing_armed = True  # before it is, so that a stop in between disarms it
-            await self._tell(commands.set_homing(self._node, control))
+            await self._bus.execute(commands.set_homing(self._node, control))
         self.state.homing_armed = bool(control)
         self.state.guard = guard
 
@@ -652,15 +651,6 @@ class LdcnAxis(Moves):
     async def _load(self, trajectory: Trajectory) -> None:
         exchange = commands.load_trajectory(self._node, trajectory)
         with self._book.writing(trajectory_values(trajectory)):
-            await self._tell(exchange)
-
-    async def _tell(self, exchange: Exchange[StatusPacket]) -> None:
-        """Send what no reading shows that the drive has taken it: twice, so that one late reply does not stand for it.
-
-        Without that a motion could begin towards the target of the one before, or with its gains.
-        """
-        await self._bus.execute(exchange)
-        if exchange.repeatable:
             await self._bus.execute(exchange)
 
     async def _put_acceleration_in_force(self, trajectory: Trajectory) -> None:
@@ -850,7 +840,7 @@ class LdcnAxis(Moves):
             )
         # a lost reply leaves each register the old or the new value, and the next motion loads them again
         with self._book.writing(asdict(gains)):
-            await self._tell(exchange)
+            await self._bus.execute(exchange)
         self._book.gains = gains
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
@@ -868,7 +858,7 @@ class LdcnAxis(Moves):
             values[name] = int(value)
         exchange = commands.io_control(self._node, LimitPins(sum(values.values())))
         with self._book.writing(values):
-            await self._tell(exchange)
+            await self._bus.execute(exchange)
 
 
 def _capabilities(profile: Profile) -> frozenset[Verb]:

@@ -7,7 +7,6 @@ import { shownQuantity } from "../parts/number_text.js";
 import { EndOfMotion } from "../parts/motion_story.js";
 import { Lamp, Mark, QualityWord, StateWord } from "../parts/state.js";
 import { readSignals, signalsOf } from "../session/captures.js";
-import { feed } from "../session/feed.js";
 import { obstacle } from "../session/obstacles.js";
 
 export function NowPanel({ axis }) {
@@ -33,7 +32,7 @@ export function NowPanel({ axis }) {
       ["left to go", html`${number(left, decimals)} <span class="unit">${info.unit}</span>`],
       ["encoder", html`${number(position?.counts, 0)} <span class="unit">count</span>`],
       ["A/D input", adc ? html`${number(adc.volts, 3)} <span class="unit">V</span> (${adc.counts})` : "none"],
-      ["command", state?.command ? `${words(state.command.verb)}, ${remaining(state.command)}` : "none"],
+      ["command", state?.command ? `${words(state.command.verb)}, ${remaining(state.command, axis.rig.nowNs())}` : "none"],
       ["last motion", axis.ended() ? html`<${EndOfMotion} axis=${axis} event=${axis.ended()} />` : "none yet"],
     ]} />
     <h3>Status</h3>
@@ -44,9 +43,9 @@ export function NowPanel({ axis }) {
   <//>`;
 }
 
-function remaining(command) {
-  if (!command.expected_end) return `for ${age((feed.nowNs() - command.since) / 1e9)}`;
-  return `ends in ${age(Math.max(0, (command.expected_end - feed.nowNs()) / 1e9))}`;
+function remaining(command, nowNs) {
+  if (!command.expected_end) return `for ${age((nowNs - command.since) / 1e9)}`;
+  return `ends in ${age(Math.max(0, (command.expected_end - nowNs) / 1e9))}`;
 }
 
 function StatusLamps({ state, live }) {

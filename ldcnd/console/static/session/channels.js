@@ -47,9 +47,9 @@ export function look(index) {
 
 /** Gathers the samples of some channels for as long as it is not closed. */
 export class Recording {
-  /** Instant of second 0, ns since 1970. */
-  zeroNs = feed.nowNs();
-
+  #zeroMs = performance.now();
+  /** Second 0 by the clock of each rig, ns since 1970. */
+  #zeroNs = new Map();
   #byTopic = new Map();
   #leave;
 
@@ -59,7 +59,8 @@ export class Recording {
       const { label, unit, pane, gapS } = channel;
       const curve = new GrowingCurve({ label, unit, pane, gapS, ...look(index) }, KEPT);
       const topic = `${channel.axis.rig.name}/tele/${channel.axis.name}/${channel.item}`;
-      this.#byTopic.set(topic, [...(this.#byTopic.get(topic) ?? []), { curve, field: channel.field }]);
+      const { field, axis } = channel;
+      this.#byTopic.set(topic, [...(this.#byTopic.get(topic) ?? []), { curve, field, rig: axis.rig }]);
       return curve;
     });
     this.#leave = feed.listen((rig, topic, sample) => this.#take(`${rig}/${topic}`, sample));
@@ -68,7 +69,7 @@ export class Recording {
 
   /** Seconds since second 0. */
   now() {
-    return (feed.nowNs() - this.zeroNs) / 1e9;
+    return (performance.now() - this.#zeroMs) / 1000;
   }
 
   close() {
@@ -77,9 +78,11 @@ export class Recording {
   }
 
   #take(topic, sample) {
-    for (const { curve, field } of this.#byTopic.get(topic) ?? []) {
+    for (const { curve, field, rig } of this.#byTopic.get(topic) ?? []) {
       const good = sample && sample.quality !== "bad" && sample[field] !== null;
-      if (sample) curve.push((sample.t - this.zeroNs) / 1e9, good ? sample[field] : NaN);
+      if (!sample) continue;
+      if (!this.#zeroNs.has(rig)) this.#zeroNs.set(rig, rig.nowNs() - this.now() * 1e9);
+      curve.push((sample.t - this.#zeroNs.get(rig)) / 1e9, good ? sample[field] : NaN);
     }
   }
 }

@@ -7,8 +7,6 @@ const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 4_000;
 /** A frame comes at least once a second: so much silence means that the console process, or the way to it, is gone. */
 const SILENCE_MS = 3_500;
-/** Clocks drift: the fastest frame counts so much less with every frame after it. */
-const FORGOTTEN_MS = 0.01;
 
 /** A feed hands entries on as they come; who listens decides what is kept. */
 export class Feed {
@@ -16,8 +14,6 @@ export class Feed {
   dropped = 0;
   /** Whether a socket is open and has brought a frame. */
   live = false;
-  /** Console clock minus performance.now(), in ms, as the fastest frame had it. */
-  offsetMs = -Infinity;
 
   #listeners = new Set();
   #streams = [];
@@ -36,12 +32,6 @@ export class Feed {
     if (keys.join() === this.#streams.join()) return;
     this.#streams = keys;
     this.open();
-  }
-
-  /** The console's clock, in ns since 1970. */
-  nowNs() {
-    const offsetMs = Number.isFinite(this.offsetMs) ? this.offsetMs : Date.now() - performance.now();
-    return (performance.now() + offsetMs) * 1e6;
   }
 
   /** Connect; an older socket is kept until the new one speaks. */
@@ -64,13 +54,12 @@ export class Feed {
     };
   }
 
-  #take([sentNs, dropped, entries]) {
+  #take([_sentNs, dropped, entries]) {
     this.live = true;
     clearTimeout(this.#silence);
     this.#silence = setTimeout(() => this.#giveUp(), SILENCE_MS);
     this.#pauseMs = FIRST_PAUSE_MS;
     this.dropped = dropped;
-    this.offsetMs = Math.max(this.offsetMs - FORGOTTEN_MS, sentNs / 1e6 - performance.now());
     for (const [rig, topic, sample] of entries) {
       for (const listener of this.#listeners) listener(rig, topic, sample);
     }
@@ -86,7 +75,6 @@ export class Feed {
   #lost() {
     this.live = false;
     clearTimeout(this.#silence);
-    this.offsetMs = -Infinity;
     for (const listener of this.#listeners) listener(null, "lost", null);
     setTimeout(() => this.open(), this.#pauseMs);
     this.#pauseMs = Math.min(2 * this.#pauseMs, LONGEST_PAUSE_MS);
