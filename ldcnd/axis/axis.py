@@ -502,7 +502,7 @@ class AxisService:
 
     async def send_pending_stop(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
-        if not self.tracker.status.stop_pending:
+        if not (self.tracker.status.stop_pending or self.tracker.status.off_again):
             return
         try:
             # a stop would close an open loop: see how a drive was left, or what became of it while it was out of reach

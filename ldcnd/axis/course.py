@@ -18,6 +18,8 @@ ROOM_SHARE = 1.25
 """Most that a braking distance may be of what velocity and deceleration make it."""
 UNKNOWN_BRAKING_S = 1.0
 """A shaft whose deceleration is not known is given as long at its velocity, seconds."""
+AGAIN_S = 0.25
+"""A motor that may be driven with its loop open is switched off again after this time while it turns, seconds."""
 PACE_S = 0.2
 """A speed is measured over this time: positions are exact, and the velocity of a status packet is coarse."""
 PACE_SHARE = 1.1
@@ -49,15 +51,19 @@ class Braking:
     still_counts: int = 0
     still_since_s: float = math.inf
 
-    def observe(self, reading: AxisReading, at_s: float) -> "Braking | bool":
+    def observe(self, reading: AxisReading, at_s: float, *, driven_open: bool = False) -> "Braking | bool":
         """Take a reading; return what is still awaited, True once the stop is seen, or False: it was not heard.
 
         Args:
             reading: what the drive shows.
             at_s: when it was requested, in loop time.
+            driven_open: the motor may have voltage with its loop open, which no flag shows: a stop that holds closes
+                the loop, and of one that switches off only a shaft at rest shows that it was heard.
         """
         if at_s < self.heard_at_s:
             return self
+        if driven_open and not reading.enabled:
+            return self._observe_open(reading.position_counts, at_s) if self.mode is StopMode.OFF else False
         if self.mode is StopMode.OFF or not reading.enabled:
             return not reading.enabled
         position = reading.position_counts
@@ -73,6 +79,11 @@ class Braking:
             return False
         if abs(position - self.still_counts) > REST_COUNTS:
             return replace(self, still_counts=position, still_since_s=at_s)
+        return True if at_s - self.still_since_s >= REST_S else self
+
+    def _observe_open(self, position: int, at_s: float) -> "Braking | bool":
+        if abs(position - self.still_counts) > REST_COUNTS or math.isinf(self.still_since_s):
+            return at_s - self.heard_at_s < AGAIN_S and replace(self, still_counts=position, still_since_s=at_s)
         return True if at_s - self.still_since_s >= REST_S else self
 
     def _room_counts(self, reading: AxisReading) -> float:

@@ -88,6 +88,7 @@ class AxisMotion:
 
     Attributes:
         config: of the axis, as it is now.
+        window_counts: how far from its target an axis may be that has settled.
         driver: its drive.
         tracker: of its state.
         telemetry: publishes it.
@@ -119,7 +120,7 @@ class AxisMotion:
         """
         self.reference = reference
         self.config = config
-        self._window_counts = window_counts(config)
+        self.window_counts = window_counts(config)
         self.driver = driver
         self.tracker = tracker
         self.telemetry = telemetry
@@ -130,7 +131,7 @@ class AxisMotion:
     def reconfigure(self, config: AxisConfig) -> None:
         """Plan with other limits and speeds from now on."""
         self.config = config
-        self._window_counts = window_counts(config)
+        self.window_counts = window_counts(config)
 
     async def check_does_not_coast(self, within_s: float = 0.0) -> None:
         """Refuse to close the loop of a shaft that turns; where its rest is not proven, by a reading of now.
@@ -498,7 +499,7 @@ class AxisMotion:
 
     def _ends(self, motion: CountsMotion) -> tuple[Settling | None, Way | None]:
         """Return when a motion has settled, and the way that leads there; None of one without an end of its own."""
-        target, settle, window, gains = motion.target_counts, self.config.settle, self._window_counts, self.driver.gains
+        target, settle, window, gains = motion.target_counts, self.config.settle, self.window_counts, self.driver.gains
         if target is None:
             return None, None
         settling = Settling(target, window, settle.time_s, settle.timeout_s, faults=settle.unsettled == "fault")
@@ -521,7 +522,8 @@ class AxisMotion:
 
     def stop_acknowledged(self, mode: StopMode) -> None:
         """The drive acknowledged a stop: readings are to show it, and it is sent again if they show that it is not."""
-        if self.tracker.status.energised or mode is StopMode.OFF:
+        status = self.tracker.status
+        if status.energised or status.driven_open or mode is StopMode.OFF:
             self.tracker.take(StopAcknowledged(mode, self.clock.now_s(), self.driver.deceleration_counts_per_s2))
 
     async def end(self, permit: Permit, failure: str = "") -> None:

@@ -123,6 +123,9 @@ class AxisStatus:
         stop_latched: a stop is latched; only a reset clears it.
         stop: the stop that the drive has not confirmed; None without one.
         braking: the stop that it has confirmed and that readings are yet to show; None without one.
+        driven_open: its motor may have voltage while its loop is open: from a raw duty on until a reading shows a
+            closed loop, or rest after a stop.
+        off_again: its line is to switch such a motor off again, because its shaft still turns.
         link: whether its drive answers.
         misses: polls in a row without a reply.
         in_vain: replies in a row that could not be used.
@@ -160,6 +163,8 @@ class AxisStatus:
     stop_latched: bool = False
     stop: OpenStop | None = None
     braking: Braking | None = None
+    driven_open: bool = False
+    off_again: bool = False
     link: LinkState = LinkState.DOWN
     misses: int = 0
     in_vain: int = 0
@@ -195,7 +200,7 @@ class AxisStatus:
     @property
     def is_braking(self) -> bool:
         """Whether readings are yet to show a stop that the drive has confirmed."""
-        return self.braking is not None and self.link is not LinkState.DOWN
+        return (self.braking is not None or self.off_again) and self.link is not LinkState.DOWN
 
     @property
     def stop_pending(self) -> bool:

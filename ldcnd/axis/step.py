@@ -60,7 +60,7 @@ from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, CommandEnd, C
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState
-from ldcnd.drives.driver import Fault
+from ldcnd.drives.driver import Fault, StopMode
 
 MISSES_UNTIL_DOWN = 3
 """Consecutive polls without a reply after which the drive counts as lost, or with replies that cannot be used after
@@ -104,11 +104,14 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
 
 
 def _watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) -> AxisStatus:
-    seen = braking.observe(event.reading, event.sent_at_s)
+    seen = braking.observe(event.reading, event.sent_at_s, driven_open=status.driven_open)
     if isinstance(seen, Braking):
         return status if seen is braking else replace(status, braking=seen)
-    status = replace(status, braking=None)
-    return status if seen else _keep_stop(status, StopUnconfirmed(event.now_ns, braking.mode, WENT_ON))
+    if seen:
+        return replace(status, braking=None, driven_open=False)
+    if status.driven_open and braking.mode is StopMode.OFF:
+        return replace(status, braking=None, off_again=True)  # a rotor that coasts for a minute is no fault
+    return _keep_stop(replace(status, braking=None), StopUnconfirmed(event.now_ns, braking.mode, WENT_ON))
 
 
 def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -125,6 +128,8 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         lost = "; its position is lost" if status.position_lost else ""
         return _fail(status, f"the drive reports a fault{lost}")
     if enabled:
+        if status.driven_open:
+            status = replace(status, driven_open=False)
         before = status
         if command and (status.way or status.pace):
             status = _watch_course(status, event)
@@ -327,6 +332,7 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
         effective_from_s=event.now_s,
         ends_at_s=ends_at_s,
         pace=event.pace,
+        driven_open=status.driven_open or (command is not None and command.opens_loop),
         rest=RestEvidence(rests=False, commanded=True),
     )
     if event.target_counts is None:
@@ -399,7 +405,8 @@ def _keep_stop(status: AxisStatus, event: StopUnconfirmed) -> AxisStatus:
 
 
 def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus:
-    return replace(status, braking=Braking(event.mode, event.now_s, event.deceleration_counts_per_s2))
+    braking = Braking(event.mode, event.now_s, event.deceleration_counts_per_s2)
+    return replace(status, braking=braking, off_again=False)
 
 
 def _confirm_stop(status: AxisStatus, event: StopConfirmed) -> AxisStatus:

@@ -90,7 +90,7 @@ class AxisStops:
         self._next_command_id = next_command_id
         self._note = note
         self._acknowledged = motion.stop_acknowledged
-        motion.tracker.watch(self._watch, "stop")
+        motion.tracker.watch(self._watch, "stop", "off_again")
         self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
 
     async def stop(self, mode: StopMode) -> bool:
@@ -161,8 +161,10 @@ class AxisStops:
     async def send_pending(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
         stop = self._tracker.status.stop
-        if stop is None:
-            return  # such a stop was confirmed while the axis was read
+        if stop is None:  # such a stop was confirmed while the axis was read
+            if self._tracker.status.off_again and not await self._send(StopMode.OFF, Verb.STOP, rounds=1):
+                self.require(StopMode.OFF)
+            return
         if await self._send(stop.mode, Verb.STOP, rounds=1):
             log.warning("stop confirmed", axis=self._name, how=stop.how)
             self._note(self._name, Verb.STOP, CommandStatus.DONE, stop.how, None)
@@ -234,7 +236,7 @@ class AxisStops:
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
         """Have a stop sent that readings call for."""
-        if after.stop_pending and not before.stop_pending:
+        if (after.stop_pending and not before.stop_pending) or (after.off_again and not before.off_again):
             self.wanted.set()
 
     def _publish(self) -> None:

@@ -214,7 +214,7 @@ class BusService:
     async def _send_pending_stops(self) -> None:
         """Send what no drive has confirmed, to all axes that wait for it at once."""
         self._stop_wanted.clear()
-        waiting = [axis for axis in self.axes if axis.tracker.status.stop_pending]
+        waiting = [axis for axis in self.axes if axis.tracker.status.stop_pending or axis.tracker.status.off_again]
         if not waiting:
             return
         async with asyncio.TaskGroup() as stops:

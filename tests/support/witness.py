@@ -16,8 +16,9 @@ from ldcnd.drives.ldcn.trajectory import ProfileMode
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 
-MOST_STARTS = {Verb.HOME: 4, Verb.JOG: 3}
-"""Packets that begin a motion, of one command; every other verb has one. A jog begins again with another velocity."""
+MOST_STARTS = {Verb.HOME: 4, Verb.JOG: 3, Verb.TRACK: 2}
+"""Packets that begin a motion, of one command; every other verb has one. A jog begins again with another velocity, and
+a set-point, which is a place, is told twice."""
 STANDING_COUNTS = 10
 """A shaft that stands moves by less within `LOOK_S`: a closed loop settles and hunts."""
 LOOK_S = 0.2

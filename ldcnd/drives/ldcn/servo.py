@@ -755,7 +755,10 @@ class LdcnAxis(Moves):
         exchange = commands.stop_motor(self._node, control, counter)
         self.state.loaded(absolute=False, opens_loop=False)
         # harmless to repeat by itself, but a repetition could come after the stop that has overtaken it
-        await self._bus.execute(replace(exchange, repeatable=False))
+        told = replace(exchange, repeatable=False)
+        await self._bus.execute(told)
+        # a late reply can stand for its own (`Exchange.unseen`): had it been lost, the next step would be twice as far
+        await self._bus.execute(told)
 
     # -- path mode ---------------------------------------------------------------------------------------------------
 
