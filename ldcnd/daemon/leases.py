@@ -389,8 +389,8 @@ async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> Non
     tracker = axis.tracker
     if tracker.status.stop_pending:
         return  # it is sent again until the drive confirms it, whatever the policy
-    if tracker.status.stop_latched and policy is LossPolicy.RUN_TO_TARGET:
-        policy = LossPolicy.HALT
+    if policy is LossPolicy.RUN_TO_TARGET and (tracker.status.stop_latched or tracker.status.driven_open):
+        policy = LossPolicy.HALT  # a raw duty has no target, and no drive ends it
     if policy is LossPolicy.RUN_TO_TARGET or tracker.status.moving is Moving.NO:
         return
     log.warning("loss policy", axis=axis.config.name, policy=policy.value, cause=cause)

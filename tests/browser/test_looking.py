@@ -278,3 +278,23 @@ async def test_a_page_is_added_by_its_list(house, tmp_path):
         await desk.page.reload()  # the first browser that is let in has the scripts already
         await desk.page.get_by_role("link", name="Lamp", exact=True).click()
         await desk.page.get_by_role("heading", name="The lamp is on").wait_for()
+
+
+async def test_the_velocity_of_a_turning_axis_is_that_of_its_turns(house):
+    """Its position begins again with each turn: at 5 turns a second and ten positions, every other one seems the same."""
+    async with house.desk() as desk:
+        await desk.open("")
+        velocity = await desk.page.evaluate(
+            """async () => {
+              const { Axis } = await import("/static/session/rigs.js");
+              const axis = new Axis({ nowNs: () => 0, worth: null }, "rotor");
+              axis.info = { modulo: 1.0 };
+              axis.take("state", { t: 1, state: "continuous_motion", moving: "yes" });
+              for (let n = 1; n <= 9; n += 1) {
+                const turned = 5.13 * n / 10;
+                axis.take("position", { t: n * 1e8, value: turned % 1, turns: Math.floor(turned), quality: "good" });
+              }
+              return axis.velocity;
+            }"""
+        )
+        assert velocity == pytest.approx(5.13)

@@ -5,7 +5,8 @@ import asyncio
 import pytest
 
 from ldcnd.contract.commands import SetPwm
-from ldcnd.drives.ldcn.received import AddPathPoints
+from ldcnd.drives.ldcn.received import AddPathPoints, LoadTrajectory
+from ldcnd.drives.ldcn.trajectory import Trajectory
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, DialectRig, adopting_rig, dialect_rig
 
 PWM = {"duty": 0.5, "duration_s": 60.0}
@@ -26,10 +27,14 @@ async def true_speed(rig: DialectRig) -> float:
 @pytest.mark.promise("motions-without-end")
 @pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
 async def test_a_duty_that_a_daemon_has_left_is_ended_by_the_next_one(dialect):
+    """A daemon that ends halts it, whatever its policy: it was killed here, or another program has begun the duty."""
     async with dialect_rig(dialect, pwm=PWM, acceleration=2000, loss=RUN_ON) as rig:
         await rig.power_on()
         await rig.send(SetPwm(duty=0.02, duration_s=60.0))
         await asyncio.sleep(0.3)
+    assert abs(await true_speed(rig)) < 0.1
+    rig.drive.execute(LoadTrajectory(Trajectory(pwm_or_target=6, servo=False, start_now=True)))
+    await asyncio.sleep(0.3)
     assert abs(await true_speed(rig)) > 0.1
 
     async with adopting_rig(dialect, rig, pwm=PWM, acceleration=2000, loss=RUN_ON) as again:

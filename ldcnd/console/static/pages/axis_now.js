@@ -16,7 +16,7 @@ export function NowPanel({ axis }) {
   const { known, live, mark } = axis.condition;
   const velocity = shownQuantity(live ? axis.velocity : null, info, "velocity");
   const target = live ? state?.command?.target : null;
-  const left = target == null || !position ? null : target - position.value;
+  const left = target == null || !position || info.modulo ? null : target - position.value; // a turn may lie between
   return html`<${Panel} title="Now" of=${axis.rig} data-stale=${live ? "no" : "yes"}>
     <div class="now">
       <p class="big" data-known=${known ? "yes" : "no"}><output aria-label="Position"

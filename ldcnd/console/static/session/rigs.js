@@ -79,7 +79,7 @@ export class Axis {
     const told = sample && sample.t >= sinceNs && !AT_REST.has(this.state?.state) ? sample.value : null;
     const [first, last] = [this.#positions[0], this.#positions.at(-1)];
     if (!first || last.t === first.t) return told;
-    return ((last.value - first.value) * 1e9) / (last.t - first.t);
+    return ((this.#unwound(last) - this.#unwound(first)) * 1e9) / (last.t - first.t);
   }
 
   /** The health report of its line says how often it is published, and how often that was wanted. */
@@ -119,6 +119,11 @@ export class Axis {
     if (!live) return { word: mark, level: "bad" };
     const sample = this.samples.position ?? this.samples.state;
     return { word: sample?.quality ?? mark, level: { good: "", uncertain: "warn" }[sample?.quality] ?? "bad" };
+  }
+
+  /** A position counted on through all turns: on an axis with a modulo the value begins again with each. */
+  #unwound({ value, turns }) {
+    return value + (turns ?? 0) * (this.info?.modulo ?? 0);
   }
 
   #remember(sample) {
