@@ -158,8 +158,8 @@ class LossPolicy(StrEnum):
     """Reaction of an axis to the loss of a client, the line or the daemon."""
 
     RUN_TO_TARGET = "run_to_target"
-    """Let the motion end by itself; every motion of a referenced axis with limits ends in the drive. A raw duty does not:
-    it is halted."""
+    """Let the motion end by itself; every motion of a referenced axis with limits ends in the drive. A raw duty does
+    not: it is halted."""
     HALT = "halt"
     """Decelerate, then hold."""
     QUICK_STOP = "quick_stop"

@@ -281,7 +281,7 @@ async def test_a_page_is_added_by_its_list(house, tmp_path):
 
 
 async def test_the_velocity_of_a_turning_axis_is_that_of_its_turns(house):
-    """Its position begins again with each turn: at 5 turns a second and ten positions, every other one seems the same."""
+    """Its position begins again with each turn, so at 5 turns a second every other one of ten seems the same."""
     async with house.desk() as desk:
         await desk.open("")
         velocity = await desk.page.evaluate(
