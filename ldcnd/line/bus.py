@@ -20,7 +20,7 @@ from ldcnd.line.adapter import LineErrors
 from ldcnd.line.exchange import Exchange, Lane, Poller, Resync, Timing
 from ldcnd.line.flight_recorder import BusStatistics, LatencyHistogram, WireEvent, WireLog
 from ldcnd.line.line import Line, Phase, Transaction
-from ldcnd.line.proof import ALWAYS_SENT, Condition, Proofs
+from ldcnd.line.proof import ALWAYS_SENT, MISSES_UNTIL_LOST, Condition, Proofs
 from ldcnd.line.schedule import Schedule
 from ldcnd.line.settings import BusSettings
 from ldcnd.line.transport import Opener, Transport
@@ -209,7 +209,9 @@ class Bus:
             LdcndError: as the condition refused it; nothing was sent.
         """
         for _ in range(exchange.times):
-            job = self._submit(exchange, lane, 1 if once else self.settings.attempts)
+            # of a node that has not answered for long each attempt costs the others a resynchronisation, too
+            gone = self.misses(exchange.node) > MISSES_UNTIL_LOST
+            job = self._submit(exchange, lane, 1 if once or gone else self.settings.attempts)
             reply: ReplyT = await job.future
         return reply
 
@@ -255,8 +257,10 @@ class Bus:
         Raises:
             BusDown, ReplyTimeout, PacketRejected, BadReply: as `execute`; the probe is not repeated.
         """
-        exchange = self._resync.probe(self._schedule.mute.failing())
-        if exchange is None or self._line is None or not self._schedule.takes_probe():
+        mute = self._schedule.mute
+        exchange = self._resync.probe(mute.failing())
+        # a line without any reply has better to do: each loss costs it a resynchronisation
+        if exchange is None or exchange.node in mute.misses or self._line is None or not self._schedule.takes_probe():
             return
         probe = StopProbe(exchange, self._loop, self.statistics.stop_wait)
         self._schedule.push_probe(probe)

@@ -712,8 +712,11 @@ class Line(Receiver):
         if self._in_step or self._schedule.stop_waits():
             self._next()
             return
-        exchange = self._resync.probe(self._schedule.mute.failing())
-        self._probes_left = self._probes_left - 1 if exchange else 0
+        mute = self._schedule.mute
+        exchange = self._resync.probe(mute.failing())
+        # where nobody has answered for long, one that could is asked once: the search for the lost must go on
+        gone = exchange is None or mute.misses.get(exchange.node, 0) > PROBE_ROUNDS
+        self._probes_left = 0 if gone else self._probes_left - 1
         self._in_step = self._probes_left == 0  # silence and flush have to do where no node proves it
         if exchange:
             self._send(Transaction(exchange, Lane.STOP, now_s), now_s, "probe")

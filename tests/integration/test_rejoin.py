@@ -1,14 +1,15 @@
 """Drives that lose power and come back, while the others work on."""
 
 import asyncio
+from contextlib import suppress
 from itertools import pairwise
 
 import pytest
 
 from ldcnd.client.overview import overview
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power, Reset, Why
-from ldcnd.contract.errors import WrongState
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveVelocity, Power, Reset, Why
+from ldcnd.contract.errors import LdcndError, WrongState
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
@@ -16,6 +17,7 @@ from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, FaultyReply, FaultyRequest, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import UNSEEN_MOTIONS_END, drive, rig_on, simulated_config
+from tests.support.machine_rig import ENDLESS, MODEL, machine, running_machine
 
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
 NAMES = ("x", "y", "z", "c")
@@ -388,3 +390,23 @@ class FailingModule(FaultInjector):
             return FaultyReply(data[:-1] + bytes((data[-1] ^ 0x55,)))
         identity = bytes((data[1] ^ 0x55,))
         return FaultyReply(data[:1] + identity + data[2:-1] + bytes(((sum(data[:1] + identity + data[2:-1])) & 0xFF,)))
+
+
+@pytest.mark.promise("address-only-of-its-place")
+@pytest.mark.parametrize(("margin_ms", "within_s"), [(50, 8.0), (300, 20.0), (1000, 60.0)])
+async def test_a_drive_whose_stop_waits_comes_back_though_nobody_answers(margin_ms, within_s):
+    """It turned when it lost its power, and the module behind it is deaf: each question to either costs a time-out."""
+    chain = build_chain(ChainSpec((ModuleSpec(MODEL, plant=ENDLESS), ModuleSpec(MODEL), ModuleSpec("pic-io"))))
+    async with running_machine(machine(margin_ms=margin_ms), chain) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", MoveVelocity(velocity=5.0))
+        await asyncio.sleep(3.0)
+        set_power(chain, 1, on=False)
+        with suppress(LdcndError, TimeoutError):
+            await rig.client.command("rotor", Halt())
+        await asyncio.sleep(3.0)
+        set_power(chain, 1, on=True)
+
+        async with asyncio.timeout(within_s):
+            await rig.until("rotor", lambda state: state.link is LinkState.UP and not state.stop_pending)
+        assert rig.speed() == 0
