@@ -129,12 +129,14 @@ class MotionStarted:
         target_counts: where it ends, counts; None when it has no end of its own, or when that is not certain.
         approached: it comes from the side that the configuration names.
         pace: of one that another motion goes over into; None for one that begins at rest.
+        unsure: why it is not known whether it has begun; empty when the drive shows it.
     """
 
     now_s: float
     target_counts: int | None = None
     approached: bool = False
     pace: Pace | None = None
+    unsure: str = ""
 
 
 @dataclass(frozen=True, slots=True)

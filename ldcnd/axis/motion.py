@@ -441,8 +441,8 @@ class AxisMotion:
         self.begin(permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan)
         try:
             await permit.start()
-        except OutcomeUnknown:
-            self.tracker.take(MotionStarted(self.clock.now_s()))  # the next readings tell
+        except OutcomeUnknown as error:
+            self.tracker.take(MotionStarted(self.clock.now_s(), unsure=error.message))  # the next readings tell
             raise
         except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent
             if in_motion:

@@ -125,6 +125,7 @@ class AxisStatus:
         braking: the stop that it has confirmed and that readings are yet to show; None without one.
         driven_open: its motor may have voltage while its loop is open: from a raw duty on until a reading shows a
             closed loop, or rest after a stop.
+        unsure: why it is not known whether the motion has begun; empty when the drive has shown it.
         off_again: its line is to switch such a motor off again, because its shaft still turns.
         link: whether its drive answers.
         misses: polls in a row without a reply.
@@ -165,6 +166,7 @@ class AxisStatus:
     braking: Braking | None = None
     driven_open: bool = False
     off_again: bool = False
+    unsure: str = ""
     link: LinkState = LinkState.DOWN
     misses: int = 0
     in_vain: int = 0

@@ -200,6 +200,8 @@ def _take_profile_end(
     progress, settled = (status.settle or SettleProgress(at_s + settling.timeout_s)).observe(settling, reading, at_s)
     if settled is None:
         return _with(status, settle=progress)
+    if not settled and status.unsure:
+        return _finished(status, status.unsure, settled=False)
     if settled or not settling.faults:
         return _finished(status, settled=settled)
     status = replace(status, own=_own_and(status, NOT_SETTLED))
@@ -332,6 +334,7 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
         effective_from_s=event.now_s,
         ends_at_s=ends_at_s,
         pace=event.pace,
+        unsure=event.unsure,
         driven_open=status.driven_open or (command is not None and command.opens_loop),
         rest=RestEvidence(rests=False, commanded=True),
     )

@@ -20,7 +20,8 @@ from ldcnd.contract.commands import (
     SetPwm,
     Stop,
 )
-from ldcnd.contract.errors import LdcndError
+from ldcnd.contract.errors import LdcndError, WrongState
+from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.ldcn.pic_io import LINES
@@ -271,3 +272,41 @@ async def test_a_daemon_does_not_end_before_the_stop_of_an_axis_is_seen(policy, 
 
     assert not deaf
     assert rig.position_mm == pytest.approx(ended_at, abs=0.5)
+
+
+@pytest.mark.promise("on-its-way")
+@pytest.mark.parametrize("dialect", [V4, LS_182AP, SC], ids=lambda each: each.name)
+async def test_a_search_that_was_never_armed_is_not_begun(dialect, monkeypatch):
+    """Both packets are acknowledged and not taken: what was captured before would pass for the mark."""
+    home = {"method": "index", "velocity": 1.4, "distance": 30.0}
+    async with dialect_rig(dialect, home=home) as rig:
+        await rig.power_on()
+        began_at = rig.position_mm
+        monkeypatch.setattr(SimulatedDrive, "_arm_homing", lambda *_: None)
+        with pytest.raises(WrongState, match="nothing was started"):
+            await rig.done(Home())
+
+        await rig.until(lambda state: state.moving is Moving.NO)
+        assert rig.position_mm == pytest.approx(began_at, abs=0.01)
+
+
+@pytest.mark.promise("on-its-way")
+async def test_a_home_whose_last_leg_never_begins_says_so(monkeypatch):
+    home = {"method": "index", "velocity": 1.4, "distance": 30.0, "move_to": -4.0}
+    starts, starting = [], SimulatedDrive._start
+
+    def start(self, *args):
+        starts.append(self)
+        if len(starts) != 2:  # the second one begins the leg behind the mark
+            starting(self, *args)
+
+    async with dialect_rig(SC, home=home) as rig:
+        await rig.power_on()
+        monkeypatch.setattr(SimulatedDrive, "_start", start)
+        sent = await rig.send(Home())
+        await rig.until(lambda state: state.command is None)
+        ended = await rig.rig.client.ask(ReadOutcome(command_id=sent.command_id))
+
+        assert len(starts) == 2
+        assert ended.status is CommandStatus.FAILED
+        assert "no sign of it" in ended.reason

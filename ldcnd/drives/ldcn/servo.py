@@ -603,8 +603,26 @@ class LdcnAxis(Moves):
         if control or self.state.homing_armed:
             self.state.homing_armed = True  # before it is, so that a stop in between disarms it
             await self._bus.execute(commands.set_homing(self._node, control))
+        if control:
+            await self._check_armed()
         self.state.homing_armed = bool(control)
         self.state.guard = guard
+
+    async def _check_armed(self) -> None:
+        """Refuse a motion that its drive would not end: what was captured before would pass for its home.
+
+        Raises:
+            WrongState: the drive does not show that it looks for its home.
+        """
+        # "the home_in_progress bit in the status byte is set when this command is issued" (PIC-SERVO manual, 5.2)
+        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        if not status.flags & StatusFlag.HOME_IN_PROGRESS:
+            raise WrongState(
+                f"axis {self.spec.name}: the drive has acknowledged that it looks for its home, and does not show it;"
+                " nothing was started",
+                axis=self.spec.name,
+                remedy="send it again; if that repeats, look whether the signal changes while the axis stands",
+            )
 
     async def _guard(
         self, motion: CountsMotion | AnalogMotion | PwmOutput, *, active: bool
