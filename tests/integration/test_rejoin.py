@@ -53,7 +53,8 @@ async def arrivals(rig, axis, item):
 
 def moved_since(rig, seen):
     """Return the packets sent since `seen` that are not known to move and reset nothing."""
-    harmless = {CommandCode.READ_STATUS, CommandCode.NO_OPERATION, CommandCode.SET_BAUD_RATE, CommandCode.SET_ADDRESS}
+    arranging = {CommandCode.SET_BAUD_RATE, CommandCode.SET_ADDRESS, CommandCode.DEFINE_STATUS}
+    harmless = {CommandCode.READ_STATUS, CommandCode.NO_OPERATION, *arranging}
     return [packet for packet in rig.sent[seen:] if packet.command not in harmless]
 
 

@@ -523,10 +523,24 @@ class LdcnNetwork(Network):
             if different := each.differs(identity):
                 proof.lose(different, silent=False)
                 continue
+            if not await self._answers_plainly(each):
+                continue
             self._identities[each.address] = identity
             proof.prove()
             found.add(each.address)
         return frozenset(found)
+
+    async def _answers_plainly(self, each: Expected) -> bool:
+        """Have a module add nothing to its replies; return whether it has acknowledged that.
+
+        Another program may have told it to: its answers to reads are understood then, and nothing else that it says.
+        """
+        try:
+            with bringing_up():
+                await self._bus.execute(commands.define_status(Node(each.address, each.profile), STATUS_BYTE_ONLY))
+        except BusError:
+            return False
+        return True
 
     @override
     async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
