@@ -124,8 +124,38 @@ class StatusView(Protocol):
         """Target of its last motion, counts; None when it had no end or was followed by something else."""
 
 
+class GuestView(Protocol):
+    """A guest as those see it who look after the rig; see `ldcnd.ports.presence.Presence`."""
+
+    @property
+    def since_s(self) -> float | None:
+        """When the program that is there sent its first byte, in loop time; None without one."""
+
+    @property
+    def axes(self) -> frozenset[str]:
+        """The axes that it controls."""
+
+    @property
+    def packets(self) -> int:
+        """How many of its packets it was to get a reply to, since the port is served."""
+
+    @property
+    def refused(self) -> int:
+        """How many of its commands were answered and not done, likewise."""
+
+    def send_away(self) -> Awaitable[None]:
+        """Close its terminal or connection, and end its control.
+
+        Raises:
+            OSError: it cannot be done.
+        """
+
+
 class GuestHost(Protocol):
     """What a daemon does for a guest."""
+
+    def show(self, port: str, guest: GuestView | None) -> None:
+        """Show a guest to those who look after the rig, from now on; None once its port has ended."""
 
     def is_up(self) -> bool:
         """Tell whether every module of the line has its address, so that a guest's reading disturbs nothing."""

@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 from pydantic import ValidationError
+from typing_extensions import override
 
 from ldcnd.config.ports import GuestHost, PortConfig
 from ldcnd.contract.codec import explained
@@ -32,6 +33,7 @@ from ldcnd.log import get_logger
 from ldcnd.ports.control import GuestControl, Visit
 from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.ports.outputs import GuestOutputs
+from ldcnd.ports.presence import Presence
 from ldcnd.ports.translate import GuestServo, name_of, relief
 from ldcnd.sim.chain import BITS_PER_BYTE, Chain
 from ldcnd.sim.ldcn.chain import model
@@ -42,8 +44,6 @@ LINE_SHARE = 0.25
 """A guest that reads without a pause has so much of the line; others keep three quarters."""
 UNPAUSED_S = 0.05
 """Time of the line that a guest which has paused may use without a pause, seconds: its replies come at once."""
-SAME_REFUSAL_S = 1.0
-"""The same refusal of an axis is one event in this time: old programs repeat themselves."""
 MOST_UNSENT_BYTES = 4096
 """Bytes of a guest that are on their way to its modules, as much as a serial driver keeps; more are lost."""
 MOST_WAITING = 32
@@ -94,13 +94,11 @@ def _moves(command: ReceivedCommand | None) -> bool:
     return False
 
 
-class Guest:
+class Guest(Presence):
     """A guest on one line: takes its bytes, returns what the modules answer.
 
     Attributes:
         chain: as the guest sees the line.
-        receive: takes what is for the guest.
-        ended: nothing begins any more: its port ends.
     """
 
     def __init__(
@@ -112,15 +110,10 @@ class Guest:
         host: GuestHost,
         group: asyncio.TaskGroup,
     ) -> None:
-        self._name, self._bus, self._host, self._group = port.name, bus, host, group
-        self._loop = asyncio.get_running_loop()
+        super().__init__(port, host, group)
+        self._bus = bus
         self._line, self._free_at_s = asyncio.Lock(), 0.0
-        self._refused: dict[tuple[str, str], float] = {}
         self._timer: asyncio.TimerHandle | None = None
-        self.ended = False
-        self._visit: Visit | None = None
-        self.receive: Callable[[bytes], None] = lambda _: None
-        self._control = GuestControl(port.name, host, port.idle_s) if port.access == "control" else None
         self._axes = tuple(drive.spec.name for drive in drives)
         self._reached: list[_Reached] = []
         modules: dict[int, GuestModule] = {}
@@ -146,17 +139,12 @@ class Guest:
         self.chain = Chain(self._modules)
         for each in self._modules:
             each.neighbours = self._modules
-        if self._control:
-            group.create_task(self._control.watch(self.gone), name=f"guest {self._name} control")
 
     def send(self, data: bytes) -> bool:
         """Take bytes of the guest; what its line would not carry in time is lost, and False is returned."""
         if self.ended:
             return True
-        if self._control:
-            self._control.heard()
-        if self._visit is None:
-            self._visit = Visit()
+        if self._heard():
             self.chain.unplug(self._loop.time())  # what the one before sent last may be on its way at that one's rate
             self.chain.replug()
             for module in self._modules:
@@ -167,23 +155,20 @@ class Guest:
         self._advance()
         return len(data) <= room
 
+    @override
     def close(self) -> None:
-        """Nothing begins any more: its port ends."""
-        self.ended = True
+        super().close()
         if self._timer:
             self._timer.cancel()
 
+    @override
     async def gone(self) -> None:
-        """The guest has gone: what it has commanded and has not begun is dropped, and control ends."""
-        if self._visit:
-            self._visit.ended = True
-        self._visit = None  # what it sent last comes to its modules yet: they stop by it and begin nothing
+        # what it sent last comes to its modules yet: they stop by it and begin nothing
         for each in self._reached:
             each.waiting.clear()
             if each.servo:
                 each.servo.restart()  # the next program does not begin what this one has loaded
-        if self._control:
-            await self._control.end()
+        await super().gone()
 
     def _advance(self) -> None:
         """Do what is due on the guest's chain, and come back for what is due next."""
@@ -200,6 +185,7 @@ class Guest:
     # -- reading -----------------------------------------------------------------------------------------------------
 
     def _ask(self, module: _Reached, items: StatusItem, answer: PendingReply) -> None:
+        self.packets += 1
         self._group.create_task(self._read(module, items, answer), name=f"guest {self._name} reads {module.name}")
 
     async def _read(self, module: _Reached, items: StatusItem, answer: PendingReply) -> None:
@@ -237,11 +223,11 @@ class Guest:
             module.waiting.clear()
             self._relieve(module, found)
         elif self._control is None:
-            self._refuse(module.name, command, f"the port {self._name} has access = read")
+            self._refuse(module.name, name_of(command), f"the port {self._name} has access = read")
         elif self._visit is None:
-            self._refuse(module.name, command, f"{self._name} has gone before it began")
+            self._refuse(module.name, name_of(command), f"{self._name} has gone before it began")
         elif len(module.waiting) >= MOST_WAITING:
-            self._refuse(module.name, command, f"{MOST_WAITING} commands wait already")
+            self._refuse(module.name, name_of(command), f"{MOST_WAITING} commands wait already")
         else:
             if found is not None and not module.idle.is_set():
                 self._relieve(module, found)  # whatever is on its way may move it by then
@@ -295,11 +281,11 @@ class Guest:
                 try:
                     await self._obey(module, module.at_work, self._control, visit)
                 except LdcndError as error:
-                    self._refuse(module.name, module.at_work, error.message)
+                    self._refuse(module.name, name_of(module.at_work), error.message)
                 except ValidationError as error:  # a packet holds values that no command has
-                    self._refuse(module.name, module.at_work, explained(error).message)
+                    self._refuse(module.name, name_of(module.at_work), explained(error).message)
                 except TimeoutError:
-                    self._refuse(module.name, module.at_work, "the axis does not come to rest")
+                    self._refuse(module.name, name_of(module.at_work), "the axis does not come to rest")
         finally:
             module.at_work = None
             module.idle.set()
@@ -365,12 +351,6 @@ class Guest:
         status = await self._bus.execute(read_status(Node(drive.spec.address, drive.profile), StatusItem.HOME))
         if status.home is not None:
             servo.set_zero(status.home + drive.state.offset_counts, 0)
-
-    def _refuse(self, about: str, command: ReceivedCommand, why: str) -> None:
-        what, now_s = name_of(command), self._loop.time()
-        if now_s - self._refused.get((about, what), -SAME_REFUSAL_S) >= SAME_REFUSAL_S:
-            self._refused[about, what] = now_s
-            self._host.refuse(about, f"{what}: {why}; the guest has its answer, nothing was done", self._name)
 
 
 def _read_io(address: int, items: StatusItem) -> Exchange[IoStatus]:

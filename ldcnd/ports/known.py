@@ -62,6 +62,7 @@ async def _serve_once(
         async with asyncio.TaskGroup() as group, AsyncExitStack() as stack:
             guest = Guest(port, bus, drives, ios, host, group)
             stack.callback(guest.close)
+            stack.callback(host.show, port.name, None)
 
             def take(data: bytes, baud: int | None) -> bool:
                 guest.chain.baud = baud or int(guest.chain.modules[0].baud)
@@ -71,7 +72,8 @@ async def _serve_once(
                 if not guest.ended:
                     group.create_task(guest.gone(), name=f"guest {port.name} gone")
 
-            guest.receive, door.take, door.closed = door.write, take, closed
+            guest.receive, guest.hang_up, door.take, door.closed = door.write, door.leave, take, closed
+            host.show(port.name, guest)
             log.info("port", guest=port.name, bus=port.bus, access=port.access, **where)
             if port.beyond_loopback:
                 log.warning("every machine that reaches this address can use the port", guest=port.name, **where)
