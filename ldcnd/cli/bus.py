@@ -260,7 +260,8 @@ async def _fetch(client: RigClient, bus: str, seconds: float) -> tuple[WireLogRe
 def _word_lines(_header: CaptureHeader, records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:
     for record in records:
         words = record.data.decode() if record.event is WireEvent.COMMAND else describe(record)
-        yield f"{record.at_s:.6f} {record.event:<8} {words or record.note}".rstrip()
+        guest = f" for {record.guest}" if record.guest and words else ""
+        yield f"{record.at_s:.6f} {record.event:<8} {words or record.note}{guest}".rstrip()
 
 
 def _json_lines(_header: CaptureHeader, records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:

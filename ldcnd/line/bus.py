@@ -1,6 +1,7 @@
 """One bus: owns the port, reopens it after a loss, and queues the exchanges of its users for the line."""
 
 import asyncio
+from contextvars import ContextVar
 from typing import Any, TypeVar
 
 from typing_extensions import override
@@ -39,6 +40,24 @@ LONGEST_OPENING_S = 10.0
 """Upper bound of closing a lost port and opening it again, seconds; both are bounded by themselves."""
 
 
+_guest: ContextVar[str] = ContextVar("guest", default="")
+
+
+class caused_by:  # noqa: N801 - read as a statement
+    """Mark in the wire log what is sent for this context, and for the tasks that begin in it, as caused by a guest."""
+
+    __slots__ = ("_name", "_token")
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __enter__(self) -> None:
+        self._token = _guest.set(self._name)
+
+    def __exit__(self, *_raised: object) -> None:
+        _guest.reset(self._token)
+
+
 class Job(Transaction):
     """An exchange that a caller waits for; its future gets exactly one outcome, `timing` says when that was.
 
@@ -50,7 +69,7 @@ class Job(Transaction):
         condition: see `Transaction`.
     """
 
-    __slots__ = ("_doubted", "attempts", "attempts_left", "condition", "future", "timing")
+    __slots__ = ("_doubted", "attempts", "attempts_left", "condition", "future", "guest", "timing")
     proves = False
 
     def __init__(
@@ -63,6 +82,7 @@ class Job(Transaction):
     ) -> None:
         super().__init__(exchange, lane, loop.time())
         self.condition: Condition | None = condition
+        self.guest = _guest.get()
         self.future: asyncio.Future[Any] = loop.create_future()
         self.timing: Timing | None = None
         self.attempts = self.attempts_left = attempts

@@ -19,7 +19,7 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, BusError, LdcndError, PacketRejected, ReplyTimeout, TransportLost
 from ldcnd.line.exchange import Exchange, Lane, PacketEffect, Poller, ReplyVerdict, Resync, Timing
-from ldcnd.line.flight_recorder import AT_ONCE_REMARK, BusStatistics, WireEvent, WireLog
+from ldcnd.line.flight_recorder import AT_ONCE_REMARK, GUEST_REMARK, BusStatistics, WireEvent, WireLog
 from ldcnd.line.proof import Condition
 from ldcnd.line.schedule import POLL, Schedule
 from ldcnd.line.settings import LINGER_S, BusSettings
@@ -46,12 +46,14 @@ class Transaction:
         condition: raises what forbids to send it, when its turn has come; None where nothing can.
         poller: whose poll it is; None for all else.
         proves: the content of the reply proves that the line is in step.
+        guest: who has caused it, by the name of a port; empty for clients and the daemon.
     """
 
     __slots__ = ("at_baud", "exchange", "lane", "slow_to_deliver", "then_baud", "wanted_at_s")
     condition: Condition | None = None
     poller: Poller[Any] | None = None
     proves = True
+    guest = ""
 
     def __init__(self, exchange: Exchange[Any], lane: Lane, wanted_at_s: float) -> None:
         self.exchange = exchange
@@ -412,6 +414,7 @@ class Line(Receiver):
         self._watchdog.set(over_s)
         statistics.exchanges += 1
         statistics.bytes_out += len(request)
+        remark = f"{transaction.guest}{GUEST_REMARK}{remark}" if transaction.guest else remark
         self._log.add(sent_at_s, WireEvent.SENT, request, remark)
         if settings.echo:
             self._echo += request

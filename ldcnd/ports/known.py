@@ -9,7 +9,7 @@ from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.network import IoDriver
-from ldcnd.line.bus import Bus
+from ldcnd.line.bus import Bus, caused_by
 from ldcnd.listen_address import parse_listen_address
 from ldcnd.log import get_logger
 from ldcnd.ports.door import Door
@@ -58,6 +58,7 @@ async def _serve_once(
         OSError, LookupError: it cannot be opened.
     """
     async with AsyncExitStack() as opened:
+        opened.enter_context(caused_by(port.name))
         door, where = await _open(port, opened)
         async with asyncio.TaskGroup() as group, AsyncExitStack() as stack:
             guest = Guest(port, bus, drives, ios, host, group)

@@ -2,18 +2,22 @@
 
 import asyncio
 import json
+import re
 import threading
 import time
 
 import pytest
 import serial
 
+from ldcnd.client.events import fetch_wire_log
 from ldcnd.client.overview import last_bus_health, last_health
+from ldcnd.contract.commands import Power
 from ldcnd.contract.errors import ValueOutOfRange, WrongState
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.health import GuestHealth
 from ldcnd.contract.leases import ListHolders, SendGuestAway
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
+from ldcnd.line.flight_recorder import WireEvent, parse_records
 from tests.integration.test_port_tcp import BEGINS, with_tcp_port
 from tests.integration.test_ports import load_velocity
 from tests.support.command_line import virtual_rig
@@ -145,6 +149,46 @@ def test_the_command_line_lists_guests_and_sends_them_away(tmp_path, monkeypatch
         assert "no program uses the port old" in again.errors
         program.close()
         assert (tmp_path / "port").is_symlink()
+
+
+async def test_the_wire_log_says_which_packets_a_program_has_caused(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(HOLDS)
+        await program.send(load_velocity())
+        async with asyncio.timeout(5):
+            while rig.speed() < 3.0:
+                await asyncio.sleep(0.02)
+        await rig.client.ask(Power(on=True), "table")
+        await program.send(Packet(2, NO_OPERATION))
+        program.close()
+        async with asyncio.timeout(5):
+            while rig.speed() > 0.02:
+                await asyncio.sleep(0.02)
+
+        wire_log = await fetch_wire_log(rig.client, "line", 60)
+        sent = [each for each in parse_records(wire_log.lines) if each.event is WireEvent.SENT]
+        found = {(each.guest, CommandCode(each.data[2] & 0x0F), each.data[1]) for each in sent}
+
+        codes = {CommandCode.LOAD_TRAJECTORY, CommandCode.STOP_MOTOR}
+        assert {each for each in found if each[1] in codes and each[2] < 3} == {
+            ("old", CommandCode.LOAD_TRAJECTORY, 1),
+            ("old", CommandCode.STOP_MOTOR, 1),
+            ("", CommandCode.STOP_MOTOR, 2),
+        }
+        assert ("old", CommandCode.READ_STATUS, 2) in found
+        assert ("", CommandCode.READ_STATUS, 2) in found
+
+
+def test_the_words_of_a_wire_log_name_the_program(tmp_path, monkeypatch):
+    with virtual_rig(monkeypatch, with_port(tmp_path / "port"), {"line": chain_of_machine()}) as rig:
+        rig.wait(asyncio.sleep(1))
+        program = open_port(tmp_path / "port")
+        rig.wait(program.begin())
+        words = rig.run("bus wire-log line --format words").printed
+        program.close()
+        assert re.search(r"sent +node 1: ReadStatus\(items=.*\) for old$", words, re.MULTILINE)
+        assert re.search(r"sent +node 1: ReadStatus\(items=.*\)$", words, re.MULTILINE)
 
 
 def test_a_rig_without_ports_says_so(monkeypatch):
