@@ -27,7 +27,8 @@ class PortConfig(Frozen):
     name: Name
     """The guest's name in events."""
     bus: Name
-    """The line; the guest finds its axes and named PIC-I/O modules in the order of their addresses."""
+    """The line; the guest finds its axes and named PIC-I/O modules in the order of their addresses, SmartSteps at their
+    unit numbers."""
     link: Path | None = None
     """The link to the terminal that the program opens."""
     listen: str | None = None

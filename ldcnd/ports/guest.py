@@ -34,14 +34,13 @@ from ldcnd.ports.control import GuestControl, Visit
 from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.ports.outputs import GuestOutputs
 from ldcnd.ports.presence import Presence
+from ldcnd.ports.share import LineShare
 from ldcnd.ports.translate import GuestServo, name_of, relief
 from ldcnd.sim.chain import BITS_PER_BYTE, Chain
 from ldcnd.sim.ldcn.chain import model
 
 log = get_logger("ports")
 
-LINE_SHARE = 0.25
-"""A guest that reads without a pause has so much of the line; others keep three quarters."""
 UNPAUSED_S = 0.05
 """Time of the line that a guest which has paused may use without a pause, seconds: its replies come at once."""
 MOST_UNSENT_BYTES = 4096
@@ -112,7 +111,7 @@ class Guest(Presence):
     ) -> None:
         super().__init__(port, host, group)
         self._bus = bus
-        self._line, self._free_at_s = asyncio.Lock(), 0.0
+        self._share = LineShare(UNPAUSED_S)
         self._timer: asyncio.TimerHandle | None = None
         self._axes = tuple(drive.spec.name for drive in drives)
         self._reached: list[_Reached] = []
@@ -140,8 +139,9 @@ class Guest(Presence):
         for each in self._modules:
             each.neighbours = self._modules
 
-    def send(self, data: bytes) -> bool:
-        """Take bytes of the guest; what its line would not carry in time is lost, and False is returned."""
+    def send(self, data: bytes, baud: int | None) -> bool:
+        """Take bytes of the guest, see `Door`; what its line would not carry in time is lost, and False is returned."""
+        self.chain.baud = baud or int(self.chain.modules[0].baud)
         if self.ended:
             return True
         if self._heard():
@@ -195,20 +195,14 @@ class Guest(Presence):
         with suppress(TimeoutError):
             async with asyncio.timeout(REPLY_WAIT_S):
                 await module.idle.wait()
-        async with self._line:
-            await asyncio.sleep(max(0.0, self._free_at_s - self._loop.time()))
+        async with self._share.turn():
             if not answer.wanted() or not self._host.is_up():
                 return
-            began_s = self._loop.time()
             try:
                 status = await self._bus.execute(_as_sent(module.read(items)))
             except LdcndError as error:
                 log.debug("not read", guest=self._name, axis=module.name, reason=error.message)
                 return
-            finally:
-                now_s = self._loop.time()
-                earned_s = max(self._free_at_s, now_s - UNPAUSED_S / LINE_SHARE)
-                self._free_at_s = earned_s + (now_s - began_s) / LINE_SHARE
         answer.give(_as_guest(module, items, status, self._loop.time()), self._loop.time())
         self._advance()
 

@@ -86,6 +86,18 @@ class GuestTerminal:
         self._watch()
         self.closed()
 
+    def _let_be_set(self) -> None:
+        """Leave something that the next program sets: CLOCAL, which says nothing of a terminal without a modem.
+
+        A terminal has no parity, and a program that wants one and sets nothing else has an error (tried with glibc 2.36
+        of Debian 12): it could open the port only once.
+        """
+        import termios  # noqa: PLC0415 - as above
+
+        settings = termios.tcgetattr(self._master)
+        settings[2] &= ~termios.CLOCAL
+        termios.tcsetattr(self._master, termios.TCSANOW, settings)
+
     def _drop(self) -> None:
         self._loop.remove_reader(self._master)
         if self._later:
@@ -114,6 +126,7 @@ class GuestTerminal:
             return
         except OSError:  # EIO: nobody has it open any more
             self._loop.remove_reader(self._master)
+            self._let_be_set()
             self.closed()
             self._look()
             return
