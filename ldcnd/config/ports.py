@@ -43,6 +43,9 @@ class PortConfig(Frozen):
     idle_s: float = Field(default=60.0, gt=0, le=86_400)
     """A guest that has sent nothing for so long, in seconds, loses control, as one that has closed its port; one that
     only reads loses it once its axes rest."""
+    fresh_ms: float = Field(default=0.0, ge=0, le=1000)
+    """A read is answered with a reading that is no older than this, in milliseconds, if there is one that has all it
+    asks for; with 0 always with one of its own. Readings from before a command of the guest are none."""
     mode: str = Field(default="0600", pattern=r"^0[0-7]{3}$")
     """Permissions of the terminal, octal."""
     group: str | None = Field(default=None, min_length=1, max_length=32)

@@ -20,7 +20,7 @@ from ldcnd.contract.errors import (
 from ldcnd.line.adapter import LineErrors
 from ldcnd.line.exchange import Exchange, Lane, Poller, Resync, Timing
 from ldcnd.line.flight_recorder import BusStatistics, LatencyHistogram, WireEvent, WireLog
-from ldcnd.line.line import Line, Phase, Transaction
+from ldcnd.line.line import Line, Listener, Phase, Transaction
 from ldcnd.line.proof import ALWAYS_SENT, Condition, Proofs
 from ldcnd.line.schedule import Schedule
 from ldcnd.line.settings import BusSettings
@@ -188,6 +188,7 @@ class Bus:
 
     Attributes:
         proofs: who is known to be at which address; what changes anything is sent to no other.
+        listeners: hear each intact reply; see `Listener`.
     """
 
     def __init__(self, settings: BusSettings, opener: Opener, resync: Resync | None = None) -> None:
@@ -196,6 +197,7 @@ class Bus:
         self.wire_log = WireLog(settings.recorded_s, settings.recorded_bytes)
         self._resync = resync or Resync()
         self.proofs = Proofs()
+        self.listeners: list[Listener] = []
         self._opener = opener
         self._loop = asyncio.get_running_loop()
         self._schedule: Schedule[Transaction] = Schedule(settings.cycle, self.proofs)
@@ -455,7 +457,14 @@ class Bus:
         self.wire_log.add(self._loop.time(), WireEvent.OPENED)
         self._schedule.mute.forget()
         self._line = line = Line(
-            self.settings, transport, self._schedule, self._resync, self.statistics, self.wire_log, self._note_loss
+            self.settings,
+            transport,
+            self._schedule,
+            self._resync,
+            self.statistics,
+            self.wire_log,
+            self._note_loss,
+            self.listeners,
         )
         self._closed.clear()
         self._opened.set()

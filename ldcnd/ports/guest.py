@@ -21,8 +21,8 @@ from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.ldcn.commands import Node, read_status
 from ldcnd.drives.ldcn.io_module import IoModule
-from ldcnd.drives.ldcn.packet import POSITION, CommandCode, StatusFlag, StatusItem, item_bytes
-from ldcnd.drives.ldcn.pic_io import IoItem, IoNode, IoStatus, read_io_status
+from ldcnd.drives.ldcn.packet import POSITION, CommandCode, StatusFlag, StatusItem, decode_packet, item_bytes
+from ldcnd.drives.ldcn.pic_io import ITEM_BYTES, IoItem, IoNode, IoStatus, read_io_status
 from ldcnd.drives.ldcn.profiles import PIC_IO, Profile
 from ldcnd.drives.ldcn.received import LoadTrajectory, PlainCommand, ReceivedCommand, StopMotor
 from ldcnd.drives.ldcn.servo import LdcnAxis
@@ -31,6 +31,7 @@ from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
 from ldcnd.log import get_logger
 from ldcnd.ports.control import GuestControl, Visit
+from ldcnd.ports.fresh import FreshReplies
 from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.ports.outputs import GuestOutputs
 from ldcnd.ports.presence import Presence
@@ -59,6 +60,8 @@ class _Reached:
     """An axis or another module as a guest reaches it, with what it has set going.
 
     Attributes:
+        node: its address on the line.
+        width: returns how many bytes of its status packets an item of the mask takes.
         servo: its drive as the guest commands it; None of a module that is none.
         outputs: of a module, likewise.
         reliefs: what takes energy out and is on its way, by its kind.
@@ -70,7 +73,9 @@ class _Reached:
 
     name: str
     profile: Profile
+    node: int
     read: Callable[[StatusItem], Exchange[Any]]
+    width: Callable[[int], int]
     servo: GuestServo | None = None
     outputs: GuestOutputs | None = None
     reliefs: "dict[type, asyncio.Task[None]]" = field(default_factory=dict)
@@ -112,6 +117,7 @@ class Guest(Presence):
         super().__init__(port, host, group)
         self._bus = bus
         self._share = LineShare(UNPAUSED_S)
+        self._fresh = FreshReplies(bus, port.fresh_ms)
         self._timer: asyncio.TimerHandle | None = None
         self._axes = tuple(drive.spec.name for drive in drives)
         self._reached: list[_Reached] = []
@@ -129,11 +135,13 @@ class Guest(Presence):
             if isinstance(drive, LdcnAxis):
                 name, node = drive.spec.name, Node(drive.spec.address, drive.profile)
                 servo = GuestServo(drive, partial(host.status, name), port.name)
-                add(node.address, _Reached(name, drive.profile, partial(read_status, node), servo))
+                read, width = partial(read_status, node), partial(_servo_width, drive.profile)
+                add(node.address, _Reached(name, drive.profile, node.address, read, width, servo))
         for io in ios:
             if isinstance(io, IoModule):
                 outputs = GuestOutputs(io.name, io.outputs, host.levels)
-                add(io.node, _Reached(io.name, PIC_IO, partial(_read_io, io.node), outputs=outputs))
+                read_io = partial(_read_io, io.node)
+                add(io.node, _Reached(io.name, PIC_IO, io.node, read_io, _io_width, outputs=outputs))
         self._modules = tuple(modules[address] for address in sorted(modules))
         self.chain = Chain(self._modules)
         for each in self._modules:
@@ -158,6 +166,7 @@ class Guest(Presence):
     @override
     def close(self) -> None:
         super().close()
+        self._fresh.close()
         if self._timer:
             self._timer.cancel()
 
@@ -195,16 +204,26 @@ class Guest(Presence):
         with suppress(TimeoutError):
             async with asyncio.timeout(REPLY_WAIT_S):
                 await module.idle.wait()
-        async with self._share.turn():
-            if not answer.wanted() or not self._host.is_up():
-                return
-            try:
-                status = await self._bus.execute(_as_sent(module.read(items)))
-            except LdcndError as error:
-                log.debug("not read", guest=self._name, axis=module.name, reason=error.message)
-                return
+        status = self._fresh_status(module, int(items)) if self._host.is_up() else None
+        if status is None:
+            async with self._share.turn():
+                if not answer.wanted() or not self._host.is_up():
+                    return
+                try:
+                    status = await self._bus.execute(_as_sent(module.read(items)))
+                except LdcndError as error:
+                    log.debug("not read", guest=self._name, axis=module.name, reason=error.message)
+                    return
         answer.give(_as_guest(module, items, status, self._loop.time()), self._loop.time())
         self._advance()
+
+    def _fresh_status(self, module: _Reached, items: int) -> bytes | None:
+        """Return a status packet with these items that is made of a fresh one; None without one that has them all."""
+        for request, reply in self._fresh.of(module.node):
+            packet = decode_packet(request)
+            if packet.command is CommandCode.READ_STATUS and not items & ~packet.data[0]:
+                return _narrowed(reply, packet.data[0], items, module.width)
+        return None
 
     # -- commanding --------------------------------------------------------------------------------------------------
 
@@ -247,6 +266,7 @@ class Guest(Presence):
         while again:
             with suppress(LdcndError):  # the daemon has entered it among the events
                 await self._host.carry_out(module.name, command)
+            self._fresh.changed(module.node)
             again = type(command) in module.again
             module.again.discard(type(command))
 
@@ -281,6 +301,7 @@ class Guest(Presence):
                 except TimeoutError:
                     self._refuse(module.name, name_of(module.at_work), "the axis does not come to rest")
         finally:
+            self._fresh.changed(module.node)
             module.at_work = None
             module.idle.set()
 
@@ -349,6 +370,26 @@ class Guest(Presence):
 
 def _read_io(address: int, items: StatusItem) -> Exchange[IoStatus]:
     return read_io_status(IoNode(address), IoItem(int(items)))
+
+
+def _servo_width(profile: Profile, item: int) -> int:
+    return item_bytes(profile, StatusItem(item))
+
+
+def _io_width(item: int) -> int:
+    return ITEM_BYTES[item.bit_length() - 1]
+
+
+def _narrowed(status: bytes, mask: int, items: int, width: Callable[[int], int]) -> bytes:
+    """Return the status packet with fewer items: they come in the order of the bits of the mask.
+
+    Source: PIC-SERVO manual, 5.2, "Define Status"; PIC-I/O data sheet, 3.1.
+    """
+    body, at = bytearray(status[:1]), 1
+    for item in (1 << bit for bit in range(8) if mask & 1 << bit):
+        body += status[at : at + width(item)] if items & item else b""
+        at += width(item)
+    return bytes(body) + bytes((sum(body) & 0xFF,))
 
 
 def _as_sent(exchange: Exchange[Any]) -> Exchange[bytes]:

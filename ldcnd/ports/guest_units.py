@@ -33,9 +33,11 @@ from ldcnd.drives.smartstep.packet import (
     strip_parity,
 )
 from ldcnd.drives.smartstep.profiles import CountUnit, SmartStepProfile
+from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
 from ldcnd.log import get_logger
 from ldcnd.ports.control import Visit
+from ldcnd.ports.fresh import FreshReplies
 from ldcnd.ports.guest_unit import GuestUnit
 from ldcnd.ports.presence import Presence
 from ldcnd.ports.share import LineShare
@@ -60,8 +62,11 @@ class _Asked:
 class UnitsGuest(Presence):
     """A guest on one line: takes its bytes, returns what the drives answer."""
 
-    def __init__(self, port: PortConfig, drives: Sequence[Drive], host: GuestHost, group: asyncio.TaskGroup) -> None:
+    def __init__(
+        self, port: PortConfig, bus: Bus, drives: Sequence[Drive], host: GuestHost, group: asyncio.TaskGroup
+    ) -> None:
         super().__init__(port, host, group)
+        self._fresh = FreshReplies(bus, port.fresh_ms)
         self._units = {drive.spec.address: GuestUnit(drive) for drive in drives if isinstance(drive, SmartStepAxis)}
         self._share = LineShare(UNPAUSED_S)
         self._line = bytearray()
@@ -84,6 +89,11 @@ class UnitsGuest(Presence):
                 self._take(bytes(self._line))
                 self._line.clear()
         return True
+
+    @override
+    def close(self) -> None:
+        super().close()
+        self._fresh.close()
 
     @override
     async def gone(self) -> None:
@@ -109,19 +119,32 @@ class UnitsGuest(Presence):
             await self._came.wait()
             self._came.clear()
             while asked := self._latest:
-                async with self._share.turn():
-                    reply = await self._answer(asked) if asked is self._latest and self._host.is_up() else None
+                reply = self._fresh_reply(asked.command)
+                if reply is None:
+                    async with self._share.turn():
+                        reply = await self._answer(asked) if asked is self._latest and self._host.is_up() else None
                 if asked is self._latest:
                     self._latest = None
                     if reply is not None:
                         self.receive(add_parity(reply) if _has_parity(asked.frame) else reply)
+
+    def _fresh_reply(self, command: CommandPacket) -> bytes | None:
+        """Return what the drive has just replied to the same frame; None where the guest has changed that."""
+        kept = self._units[command.unit].kept(command.address) is not None
+        if kept or command.function is Function.SETTING or not self._host.is_up():
+            return None
+        request = command.encode()
+        return next((reply for frame, reply in self._fresh.of(command.unit) if frame == request), None)
 
     async def _answer(self, asked: _Asked) -> bytes | None:
         """Return the reply; None where the drive is silent."""
         unit, command = self._units[asked.command.unit], asked.command
         try:
             if command.function is Function.SETTING:
-                return _answered(command, await self._set(unit, asked))
+                try:
+                    return _answered(command, await self._set(unit, asked))
+                finally:
+                    self._fresh.changed(command.unit)
             return await self._read(unit, command)
         except (BusError, AxisUnreachable) as error:
             log.debug("not answered", guest=self._name, axis=unit.drive.spec.name, reason=error.message)

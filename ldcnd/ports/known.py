@@ -68,7 +68,7 @@ async def _serve_once(
         async with asyncio.TaskGroup() as group, AsyncExitStack() as stack:
             guest: Guest | UnitsGuest
             if any(isinstance(drive, SmartStepAxis) for drive in drives):
-                guest = UnitsGuest(port, drives, host, group)
+                guest = UnitsGuest(port, bus, drives, host, group)
             else:
                 guest = Guest(port, bus, drives, ios, host, group)
             stack.callback(guest.close)
