@@ -98,7 +98,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import CommandEvent, CommandOutcome, CommandStatus, EventList
 from ldcnd.contract.history import AxisInstant, Within
-from ldcnd.contract.leases import Holder, HolderList, LeaseReply, LeaseRequest
+from ldcnd.contract.leases import GuestSentAway, Holder, HolderList, LeaseReply, LeaseRequest
 from ldcnd.contract.meta import (
     AxisInfo,
     AxisLimits,
@@ -257,6 +257,7 @@ __all__ = [
     "FigureRange",
     "FrozenPosition",
     "GroupMoves",
+    "GuestSentAway",
     "Hindered",
     "Holder",
     "HolderList",

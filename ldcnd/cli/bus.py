@@ -2,16 +2,21 @@
 
 import json
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 
 import click
 
 from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
-from ldcnd.cli.sending import Shown, derived_question
+from ldcnd.cli.output import show_lines
+from ldcnd.cli.sending import NAME, Shown, derived_question
 from ldcnd.cli.typed import Finite, NewFile, force_option
 from ldcnd.client.events import fetch_wire_log
+from ldcnd.client.overview import last_bus_health
 from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.health import GuestHealth
+from ldcnd.contract.leases import SendGuestAway
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, read_whole
 from ldcnd.contract.rig_commands import (
@@ -141,6 +146,37 @@ def list_buses(target: Target) -> None:
         )
 
 
+@command.command("guests")
+@with_target
+def list_guests(target: Target) -> None:
+    """Show every port of a line, and the program that uses it: what it controls, how much it asks."""
+    reports = target.run(last_bus_health)
+    for bus in reports:
+        for guest in bus.guests:
+            target.show(guest, f"{guest.port:10} {bus.bus:10} {_doing(guest)}; {guest.refused} refused")
+    if not (target.as_json or any(bus.guests for bus in reports)):
+        show_lines("no port is served", err=True)
+
+
+def _doing(guest: GuestHealth) -> str:
+    if guest.since is None:
+        return "no program"
+    holds = f"controls {', '.join(guest.axes)}" if guest.axes else "controls nothing"
+    since = datetime.fromtimestamp(guest.since / 1e9, UTC).isoformat(timespec="seconds")
+    return f"since {since}; {holds}; {guest.packets_hz:.1f} packets/s"
+
+
+@command.command("send-away")
+@click.argument("port")
+@with_target
+def send_away(target: Target, port: str) -> None:
+    """Close the terminal or the connection of the program at PORT; its axes do what `loss.client` says."""
+    request = of_options(SendGuestAway, port=port, client=NAME)
+    reply = target.run(lambda client: client.ask(request))
+    controlled = f"; it controlled {', '.join(reply.axes)}" if reply.axes else ""
+    target.show(reply, f"the program at {reply.port} was sent away{controlled}")
+
+
 @command.command("wire-log")
 @click.argument("bus")
 @click.option(
@@ -224,7 +260,8 @@ async def _fetch(client: RigClient, bus: str, seconds: float) -> tuple[WireLogRe
 def _word_lines(_header: CaptureHeader, records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:
     for record in records:
         words = record.data.decode() if record.event is WireEvent.COMMAND else describe(record)
-        yield f"{record.at_s:.6f} {record.event:<8} {words or record.note}".rstrip()
+        guest = f" for {record.guest}" if record.guest and words else ""
+        yield f"{record.at_s:.6f} {record.event:<8} {words or record.note}{guest}".rstrip()
 
 
 def _json_lines(_header: CaptureHeader, records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:

@@ -181,6 +181,7 @@ class BlockingRig(Facade[rig.Rig]):
     set_io = _waiting(rig.Rig.set_io)
     set_io_timer = _waiting(rig.Rig.set_io_timer)
     override_interlock = _waiting(rig.Rig.override_interlock)
+    send_guest_away = _waiting(rig.Rig.send_guest_away)
 
     @property
     def name(self) -> str:

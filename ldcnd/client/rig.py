@@ -19,7 +19,7 @@ from ldcnd.contract.commands import StopReply
 from ldcnd.contract.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
 from ldcnd.contract.events import FINAL, CommandEvent, CommandOutcome, ReadOutcome
 from ldcnd.contract.history import AxisInstant
-from ldcnd.contract.leases import HolderList, ListHolders
+from ldcnd.contract.leases import GuestSentAway, HolderList, ListHolders, SendGuestAway
 from ldcnd.contract.meta import AxisInfo, BusInfo, DaemonInfo
 from ldcnd.contract.rig_commands import (
     AxisMove,
@@ -431,6 +431,18 @@ class Rig:
             raise LeaseRequired("nothing is controlled here", remedy="use Rig.control")
         return await self._client.ask(
             OverrideInterlock(interlock=interlock, seconds=seconds, reason=reason, lease=leases[0])
+        )
+
+    async def send_guest_away(self, port: str) -> GuestSentAway:
+        """Close the terminal or the connection of the program at a port, and end its control.
+
+        Raises:
+            WrongState: no program uses it.
+        """
+        return await self._client.ask(
+            SendGuestAway(
+                port=port,
+            )
         )
 
     async def outcome(self, command_id: str) -> CommandOutcome:

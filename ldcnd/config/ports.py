@@ -27,7 +27,8 @@ class PortConfig(Frozen):
     name: Name
     """The guest's name in events."""
     bus: Name
-    """The line; the guest finds its axes and named PIC-I/O modules in the order of their addresses."""
+    """The line; the guest finds its axes and named PIC-I/O modules in the order of their addresses, SmartSteps at their
+    unit numbers."""
     link: Path | None = None
     """The link to the terminal that the program opens."""
     listen: str | None = None
@@ -42,6 +43,9 @@ class PortConfig(Frozen):
     idle_s: float = Field(default=60.0, gt=0, le=86_400)
     """A guest that has sent nothing for so long, in seconds, loses control, as one that has closed its port; one that
     only reads loses it once its axes rest."""
+    fresh_ms: float = Field(default=0.0, ge=0, le=1000)
+    """A read is answered with a reading that is no older than this, in milliseconds, if there is one that has all it
+    asks for; with 0 always with one of its own. Readings from before a command of the guest are none."""
     mode: str = Field(default="0600", pattern=r"^0[0-7]{3}$")
     """Permissions of the terminal, octal."""
     group: str | None = Field(default=None, min_length=1, max_length=32)
@@ -124,8 +128,38 @@ class StatusView(Protocol):
         """Target of its last motion, counts; None when it had no end or was followed by something else."""
 
 
+class GuestView(Protocol):
+    """A guest as those see it who look after the rig; see `ldcnd.ports.presence.Presence`."""
+
+    @property
+    def since_s(self) -> float | None:
+        """When the program that is there sent its first byte, in loop time; None without one."""
+
+    @property
+    def axes(self) -> frozenset[str]:
+        """The axes that it controls."""
+
+    @property
+    def packets(self) -> int:
+        """How many of its packets it was to get a reply to, since the port is served."""
+
+    @property
+    def refused(self) -> int:
+        """How many of its commands were answered and not done, likewise."""
+
+    def send_away(self) -> Awaitable[None]:
+        """Close its terminal or connection, and end its control.
+
+        Raises:
+            OSError: it cannot be done.
+        """
+
+
 class GuestHost(Protocol):
     """What a daemon does for a guest."""
+
+    def show(self, port: str, guest: GuestView | None) -> None:
+        """Show a guest to those who look after the rig, from now on; None once its port has ended."""
 
     def is_up(self) -> bool:
         """Tell whether every module of the line has its address, so that a guest's reading disturbs nothing."""

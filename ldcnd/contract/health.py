@@ -76,6 +76,21 @@ class AxisHealth(Frozen):
     """How often its drive's EEPROM was written, ever; null for drives without one and where no ledger is kept."""
 
 
+class GuestHealth(Frozen):
+    """A port on the line, and the program that uses it."""
+
+    port: str
+    """Its configured name, under which the program holds leases."""
+    since: int | None
+    """Instant of the program's first byte, UTC in ns since 1970; null without a program."""
+    axes: tuple[str, ...]
+    """The axes that it controls."""
+    packets_hz: float = Field(ge=0)
+    """Its packets that wanted a reply, each second, in the last period."""
+    refused: int = Field(ge=0)
+    """Number of its commands that were answered and not done, since the daemon started; events have the reasons."""
+
+
 CountT = TypeVar("CountT", bound=int)
 
 
@@ -119,6 +134,8 @@ class BusHealth(LineCounters[Annotated[int, Field(ge=0)]]):
     """How long a stop would have to wait."""
     axes: tuple[AxisHealth, ...]
     """The axes on the line."""
+    guests: tuple[GuestHealth, ...] = ()
+    """Its ports that are served."""
 
 
 class HeartbeatHealth(Frozen):

@@ -92,5 +92,32 @@ class ListHolders(Command[HolderList]):
     effect = Effect.QUESTION
 
 
-COMMANDS: tuple[type[Command[Frozen]], ...] = (Acquire, Renew, Release, ListHolders)
+class GuestSentAway(Frozen):
+    """The program has gone: the reply to `@cmd/_/send_guest_away`."""
+
+    port: str
+    """Name of the port; it is served on."""
+    axes: tuple[str, ...]
+    """Axes that the program controlled; one that still moves does what its policy for the loss of a client says."""
+
+
+class SendGuestAway(Command[GuestSentAway]):
+    """Close the terminal or the connection of the program at a port, and end its control."""
+
+    verb = "send_guest_away"
+    about = About.RIG
+
+    port: str
+    """Name of the port."""
+    client: str | None = Field(default=None, max_length=64)
+    """The requester, for events and log."""
+
+
+COMMANDS: tuple[type[Command[Frozen]], ...] = (
+    Acquire,
+    Renew,
+    Release,
+    ListHolders,
+    SendGuestAway,
+)
 """The commands of this file."""

@@ -13,7 +13,7 @@ from ldcnd.axis.clock import Clock
 from ldcnd.axis.kept import KeptFiles
 from ldcnd.axis.latches import LatchKeeper
 from ldcnd.config.plan import demand_of
-from ldcnd.config.ports import StatusView, ports
+from ldcnd.config.ports import GuestView, StatusView, ports
 from ldcnd.config.rig import RigConfig
 from ldcnd.config.simulated import simulator
 from ldcnd.contract.codec import Encoding
@@ -161,6 +161,11 @@ class _GuestHost:
 
     def __init__(self, line: BusService, rig: OwnedRig, dispatcher: Dispatcher) -> None:
         self._line, self._rig, self._dispatcher = line, rig, dispatcher
+
+    def show(self, port: str, guest: GuestView | None) -> None:
+        self._line.guests.pop(port, None)
+        if guest:
+            self._line.guests[port] = guest
 
     def is_up(self) -> bool:
         return self._line.report is not None

@@ -5,10 +5,12 @@ from collections.abc import Callable, Mapping
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
+from ldcnd.config.ports import GuestView
 from ldcnd.contract.health import (
     AxisHealth,
     BusHealth,
     DaemonHealth,
+    GuestHealth,
     HeartbeatHealth,
     ItemHealth,
     LaneHealth,
@@ -104,6 +106,7 @@ class HealthWatch:
         self._seq = 0
         self._missed = 0
         self._busy_s: dict[str, float] = {}
+        self._packets: dict[str, int] = {}
         self._topics: dict[tuple[str, TelemetryItem], Topic] = {}
         self._rates: dict[Topic, _Rate] = {}
 
@@ -170,6 +173,16 @@ class HealthWatch:
             lanes=tuple(_lane(service, lane) for lane in Lane),
             stop_wait=self._stop_wait(service),
             axes=tuple(self._axis(axis, service.asked_hz(axis.config.name), t) for axis in service.axes),
+            guests=tuple(self._guest(port, guest, period_s) for port, guest in service.guests.items()),
+        )
+
+    def _guest(self, port: str, guest: GuestView, period_s: float) -> GuestHealth:
+        return GuestHealth(
+            port=port,
+            since=None if guest.since_s is None else self._clock.wall_ns(guest.since_s),
+            axes=tuple(sorted(guest.axes)),
+            packets_hz=max(0, guest.packets - self._packets.get(port, 0)) / period_s,  # a port may be served anew
+            refused=guest.refused,
         )
 
     def _stop_wait(self, service: BusService) -> StopWaitHealth:
@@ -217,6 +230,7 @@ class HealthWatch:
 
     def _note_counters(self) -> None:
         self._busy_s = {bus.bus.settings.name: bus.bus.statistics.wire_busy_s for bus in self._rig.buses}
+        self._packets = {port: guest.packets for bus in self._rig.buses for port, guest in bus.guests.items()}
 
 
 def _lane(service: BusService, lane: Lane) -> LaneHealth:

@@ -9,6 +9,7 @@ from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.events import PowerSwitched
 from ldcnd.axis.polling import AxisPoller
+from ldcnd.config.ports import GuestView
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch, WrongState
 from ldcnd.contract.rig_commands import CapturedInputs, SnapshotReply
@@ -45,6 +46,7 @@ class BusService:
         family: the drive family on it.
         report: how the line came up; None while it is not up.
         problem: why it is not up; empty while it is.
+        guests: of its ports, by their names; of one that cannot be opened there is none.
     """
 
     def __init__(
@@ -64,6 +66,7 @@ class BusService:
         self.axes = axes
         self.report: BringUpReport | None = None
         self.problem = "not opened yet"
+        self.guests: dict[str, GuestView] = {}
         self._pollers: dict[str, Poller[Any]] = {}
         self._stop_probe_hz = stop_probe_hz
         self._was_up = False

@@ -4,6 +4,7 @@ import asyncio
 from collections.abc import Callable, Mapping
 from typing import TypeVar
 
+from ldcnd.config.ports import GuestView
 from ldcnd.contract.errors import LdcndError, UnknownAxis, ValueOutOfRange
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.modules import ModuleService
@@ -66,6 +67,20 @@ class OwnedRig:
                 f"rig {name} has no module {module!r}; it has {known}", value=module, remedy="configure its name"
             ),
         )
+
+    def guest(self, port: str) -> GuestView:
+        """Return the guest of a port.
+
+        Raises:
+            ValueOutOfRange: no such port is served.
+        """
+        served = {name: guest for bus in self.buses for name, guest in bus.guests.items()}
+        return Named(
+            served,
+            lambda name, known: ValueOutOfRange(
+                f"rig {self.name} serves no port {name!r}; it serves {known}", value=name
+            ),
+        )[port]
 
     def members(self, names: tuple[str, ...]) -> tuple[str, ...]:
         """Return the axes that are meant by names of axes and of groups."""

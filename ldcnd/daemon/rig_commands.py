@@ -31,13 +31,16 @@ from ldcnd.contract.errors import (
     LeaseHeld,
     MalformedRequest,
     NotSupported,
+    WrongState,
 )
 from ldcnd.contract.events import CommandOutcome, CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.leases import Holder, HolderList, ListHolders, Release, Renew
+from ldcnd.contract.keys import RIG_ITSELF
+from ldcnd.contract.leases import GuestSentAway, Holder, HolderList, ListHolders, Release, Renew, SendGuestAway
 from ldcnd.contract.rig_commands import (
     AxisShare,
     GroupMoves,
+    IoReply,
     LinePath,
     MoveTogether,
     MoveTogetherReply,
@@ -154,14 +157,12 @@ class RigCommands:
                 return await self._set_speed_override(command)
             case Snapshot():
                 return await self._rig.lines[command.bus].snapshot(self._clock)
-            case SetIo():
-                module = self._rig.modules[command.module]
-                return await module.set_io(command, lambda: self._admit_module(module, command))
-            case SetIoTimer():
-                module = self._rig.modules[command.module]
-                return await module.set_timer(command, lambda: self._admit_module(module, command))
+            case SetIo() | SetIoTimer():
+                return await self._set_module(command)
             case OverrideInterlock():
                 return self._interlocks.override(command)
+            case SendGuestAway():
+                return await self._send_guest_away(command, login)
             case Reload():
                 return await self.answer_reload(command, lambda name: self._refuse_held(name, command.leases))
             case Rehearse():
@@ -174,6 +175,29 @@ class RigCommands:
                 return self._leases.release(command.lease, leave_running=command.leave_running).reply()
             case _:
                 return self._question(axis, command)
+
+    async def _set_module(self, command: SetIo | SetIoTimer) -> IoReply:
+        module = self._rig.modules[command.module]
+
+        def admit() -> None:
+            self._admit_module(module, command)
+
+        return await (module.set_io(command, admit) if isinstance(command, SetIo) else module.set_timer(command, admit))
+
+    async def _send_guest_away(self, command: SendGuestAway, login: str | None) -> GuestSentAway:
+        guest = self._rig.guest(command.port)
+        if guest.since_s is None:
+            raise WrongState(f"no program uses the port {command.port}", value=command.port)
+        axes = tuple(sorted(guest.axes))
+        try:
+            await guest.send_away()
+        except OSError as error:
+            raise WrongState(f"the port {command.port} cannot be closed: {error}", value=command.port) from error
+        said = f"the program at the port {command.port} was sent away"
+        for axis in axes or (RIG_ITSELF,):
+            self._events.note(axis, command.verb, CommandStatus.DONE, said, client=command.client, login=login)
+        log.info("guest sent away", guest=command.port, client=command.client)
+        return GuestSentAway(port=command.port, axes=axes)
 
     def _question(self, axis: str, command: Command[Frozen]) -> Frozen:
         """Answer what moves and changes nothing."""

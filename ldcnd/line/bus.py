@@ -1,6 +1,7 @@
 """One bus: owns the port, reopens it after a loss, and queues the exchanges of its users for the line."""
 
 import asyncio
+from contextvars import ContextVar
 from typing import Any, TypeVar
 
 from typing_extensions import override
@@ -19,7 +20,7 @@ from ldcnd.contract.errors import (
 from ldcnd.line.adapter import LineErrors
 from ldcnd.line.exchange import Exchange, Lane, Poller, Resync, Timing
 from ldcnd.line.flight_recorder import BusStatistics, LatencyHistogram, WireEvent, WireLog
-from ldcnd.line.line import Line, Phase, Transaction
+from ldcnd.line.line import Line, Listener, Phase, Transaction
 from ldcnd.line.proof import ALWAYS_SENT, MISSES_UNTIL_LOST, Condition, Proofs
 from ldcnd.line.schedule import Schedule
 from ldcnd.line.settings import BusSettings
@@ -39,6 +40,24 @@ LONGEST_OPENING_S = 10.0
 """Upper bound of closing a lost port and opening it again, seconds; both are bounded by themselves."""
 
 
+_guest: ContextVar[str] = ContextVar("guest", default="")
+
+
+class caused_by:  # noqa: N801 - read as a statement
+    """Mark in the wire log what is sent for this context, and for the tasks that begin in it, as caused by a guest."""
+
+    __slots__ = ("_name", "_token")
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+
+    def __enter__(self) -> None:
+        self._token = _guest.set(self._name)
+
+    def __exit__(self, *_raised: object) -> None:
+        _guest.reset(self._token)
+
+
 class Job(Transaction):
     """An exchange that a caller waits for; its future gets exactly one outcome, `timing` says when that was.
 
@@ -50,7 +69,7 @@ class Job(Transaction):
         condition: see `Transaction`.
     """
 
-    __slots__ = ("_doubted", "attempts", "attempts_left", "condition", "future", "timing")
+    __slots__ = ("_doubted", "attempts", "attempts_left", "condition", "future", "guest", "timing")
     proves = False
 
     def __init__(
@@ -63,6 +82,7 @@ class Job(Transaction):
     ) -> None:
         super().__init__(exchange, lane, loop.time())
         self.condition: Condition | None = condition
+        self.guest = _guest.get()
         self.future: asyncio.Future[Any] = loop.create_future()
         self.timing: Timing | None = None
         self.attempts = self.attempts_left = attempts
@@ -168,6 +188,7 @@ class Bus:
 
     Attributes:
         proofs: who is known to be at which address; what changes anything is sent to no other.
+        listeners: hear each intact reply; see `Listener`.
     """
 
     def __init__(self, settings: BusSettings, opener: Opener, resync: Resync | None = None) -> None:
@@ -176,6 +197,7 @@ class Bus:
         self.wire_log = WireLog(settings.recorded_s, settings.recorded_bytes)
         self._resync = resync or Resync()
         self.proofs = Proofs()
+        self.listeners: list[Listener] = []
         self._opener = opener
         self._loop = asyncio.get_running_loop()
         self._schedule: Schedule[Transaction] = Schedule(settings.cycle, self.proofs)
@@ -440,7 +462,14 @@ class Bus:
         self.wire_log.add(self._loop.time(), WireEvent.OPENED)
         self._schedule.mute.forget()
         self._line = line = Line(
-            self.settings, transport, self._schedule, self._resync, self.statistics, self.wire_log, self._note_loss
+            self.settings,
+            transport,
+            self._schedule,
+            self._resync,
+            self.statistics,
+            self.wire_log,
+            self._note_loss,
+            self.listeners,
         )
         self._closed.clear()
         self._opened.set()

@@ -25,6 +25,8 @@ RECORD_BYTES = 32
 """Memory of a record besides its bytes, roughly: instant, kind, where its bytes end, and a reference to its remark."""
 AT_ONCE_REMARK = " at once"
 """Ends the remark of a packet that waited for the reply before it."""
+GUEST_REMARK = ": "
+"""Behind the name of the guest that has caused a packet, before the rest of the remark."""
 _NOTE = " # "
 
 
@@ -73,6 +75,12 @@ class WireRecord:
     event: WireEvent
     data: bytes = b""
     note: str = ""
+
+    @property
+    def guest(self) -> str:
+        """Who has caused a packet that was sent, by the name of a port; empty for clients and the daemon."""
+        name, found, _ = self.note.partition(GUEST_REMARK)
+        return name if found and self.event is WireEvent.SENT else ""
 
     def __str__(self) -> str:
         """Return one line of text, readable and loadable; nanoseconds are kept, and one blank for any white space."""

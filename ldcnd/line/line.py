@@ -11,7 +11,7 @@ follow a request; after any loss the line is resynchronised (`Resync`) before it
 
 import asyncio
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import Any
 
@@ -19,7 +19,7 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, BusError, LdcndError, PacketRejected, ReplyTimeout, TransportLost
 from ldcnd.line.exchange import Exchange, Lane, PacketEffect, Poller, ReplyVerdict, Resync, Timing
-from ldcnd.line.flight_recorder import AT_ONCE_REMARK, BusStatistics, WireEvent, WireLog
+from ldcnd.line.flight_recorder import AT_ONCE_REMARK, GUEST_REMARK, BusStatistics, WireEvent, WireLog
 from ldcnd.line.proof import Condition
 from ldcnd.line.schedule import POLL, Schedule
 from ldcnd.line.settings import LINGER_S, BusSettings
@@ -29,6 +29,10 @@ LANES = tuple(lane.name.lower() for lane in Lane)
 """Remarks of the wire log about packets, by lane."""
 AT_ONCE = tuple(f"{lane}{AT_ONCE_REMARK}" for lane in LANES)
 """The same for packets that waited for the reply before them."""
+
+
+Listener = Callable[[Exchange[Any], bytes, Timing], None]
+"""Hears each intact reply before who waits for it does; returns at once and never raises."""
 
 
 class Transaction:
@@ -46,12 +50,14 @@ class Transaction:
         condition: raises what forbids to send it, when its turn has come; None where nothing can.
         poller: whose poll it is; None for all else.
         proves: the content of the reply proves that the line is in step.
+        guest: who has caused it, by the name of a port; empty for clients and the daemon.
     """
 
     __slots__ = ("at_baud", "exchange", "lane", "slow_to_deliver", "then_baud", "wanted_at_s")
     condition: Condition | None = None
     poller: Poller[Any] | None = None
     proves = True
+    guest = ""
 
     def __init__(self, exchange: Exchange[Any], lane: Lane, wanted_at_s: float) -> None:
         self.exchange = exchange
@@ -216,6 +222,7 @@ class Line(Receiver):
         wire_log: records what passes.
         report_loss: called once with the reason when the line is lost or closed, after every transaction on it has
             its outcome.
+        listeners: hear each intact reply.
 
     Attributes:
         phase: its state.
@@ -234,6 +241,7 @@ class Line(Receiver):
         statistics: BusStatistics,
         wire_log: WireLog,
         report_loss: Callable[[str], None],
+        listeners: Sequence[Listener] = (),
     ) -> None:
         self.phase = Phase.IDLE
         self.transport = transport
@@ -244,6 +252,7 @@ class Line(Receiver):
         self._statistics = statistics
         self._log = wire_log
         self._report_loss = report_loss
+        self._listeners = listeners
         self._loop = asyncio.get_running_loop()
         self._watchdog = Watchdog(self._loop, self._expired)
         self._transaction: Transaction | None = None  # on the wire
@@ -293,8 +302,12 @@ class Line(Receiver):
         """Deliver the replies that wait, oldest first."""
         undelivered = self.undelivered
         while undelivered:
-            transaction, reply, timing = undelivered.popleft()
-            transaction.completed(reply, timing)
+            self._hand_over(*undelivered.popleft())
+
+    def _hand_over(self, transaction: Transaction, reply: bytes, timing: Timing) -> None:
+        for listener in self._listeners:
+            listener(transaction.exchange, reply, timing)
+        transaction.completed(reply, timing)
 
     def close(self, reason: str, *, for_good: bool = False) -> None:
         """Leave the line; the transaction on the wire, if any, is lost. Safe to call twice.
@@ -412,6 +425,7 @@ class Line(Receiver):
         self._watchdog.set(over_s)
         statistics.exchanges += 1
         statistics.bytes_out += len(request)
+        remark = f"{transaction.guest}{GUEST_REMARK}{remark}" if transaction.guest else remark
         self._log.add(sent_at_s, WireEvent.SENT, request, remark)
         if settings.echo:
             self._echo += request
@@ -569,7 +583,7 @@ class Line(Receiver):
             waits = slow and following.lane is POLL and now_s + now_s - sent_at_s < self._deliver_by_s
             self._await_reply(following, AT_ONCE[following.lane], failure, early=slow and not self._coalesce_s)
         if not joins:
-            transaction.completed(reply, timing)
+            self._hand_over(transaction, reply, timing)
         elif not waits:
             self.deliver()
         if self._missing and is_poll and (following := self._transaction):

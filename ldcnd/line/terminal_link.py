@@ -34,18 +34,26 @@ class TerminalLink:
 
     def __init__(self, link: Path, terminal: Path) -> None:
         self._link = link
-        self._terminal = terminal
         self._lock = os.open(lock_of(link), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             self._take()
-            os.truncate(self._lock, 0)
-            os.write(self._lock, f"{terminal}\n".encode())
-            if link.is_symlink():
-                link.unlink()
-            link.symlink_to(terminal)
+            self.lead_to(terminal)
         except OSError:
             os.close(self._lock)
             raise
+
+    def lead_to(self, terminal: Path) -> None:
+        """Let the link lead to a terminal.
+
+        Raises:
+            OSError: it cannot.
+        """
+        os.truncate(self._lock, 0)
+        os.pwrite(self._lock, f"{terminal}\n".encode(), 0)
+        if self._link.is_symlink():
+            self._link.unlink()
+        self._link.symlink_to(terminal)
+        self._terminal = terminal
 
     def close(self) -> None:
         """Remove it, unless it leads elsewhere by now."""

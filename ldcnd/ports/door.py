@@ -22,3 +22,10 @@ class Door(Protocol):
 
     def write(self, data: bytes) -> None:
         """Send to the program; what it does not read is lost."""
+
+    def leave(self) -> None:
+        """Hang up on the program.
+
+        Raises:
+            OSError: it cannot be done; the program stays.
+        """

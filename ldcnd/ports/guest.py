@@ -10,6 +10,7 @@ from functools import partial
 from typing import Any
 
 from pydantic import ValidationError
+from typing_extensions import override
 
 from ldcnd.config.ports import GuestHost, PortConfig
 from ldcnd.contract.codec import explained
@@ -20,8 +21,8 @@ from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.ldcn.commands import Node, read_status
 from ldcnd.drives.ldcn.io_module import IoModule
-from ldcnd.drives.ldcn.packet import POSITION, CommandCode, StatusFlag, StatusItem, item_bytes
-from ldcnd.drives.ldcn.pic_io import IoItem, IoNode, IoStatus, read_io_status
+from ldcnd.drives.ldcn.packet import POSITION, CommandCode, StatusFlag, StatusItem, decode_packet, item_bytes
+from ldcnd.drives.ldcn.pic_io import ITEM_BYTES, IoItem, IoNode, IoStatus, read_io_status
 from ldcnd.drives.ldcn.profiles import PIC_IO, Profile
 from ldcnd.drives.ldcn.received import LoadTrajectory, PlainCommand, ReceivedCommand, StopMotor
 from ldcnd.drives.ldcn.servo import LdcnAxis
@@ -30,20 +31,19 @@ from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
 from ldcnd.log import get_logger
 from ldcnd.ports.control import GuestControl, Visit
+from ldcnd.ports.fresh import FreshReplies
 from ldcnd.ports.guest_module import GuestModule, PendingReply
 from ldcnd.ports.outputs import GuestOutputs
+from ldcnd.ports.presence import Presence
+from ldcnd.ports.share import LineShare
 from ldcnd.ports.translate import GuestServo, name_of, relief
 from ldcnd.sim.chain import BITS_PER_BYTE, Chain
 from ldcnd.sim.ldcn.chain import model
 
 log = get_logger("ports")
 
-LINE_SHARE = 0.25
-"""A guest that reads without a pause has so much of the line; others keep three quarters."""
 UNPAUSED_S = 0.05
 """Time of the line that a guest which has paused may use without a pause, seconds: its replies come at once."""
-SAME_REFUSAL_S = 1.0
-"""The same refusal of an axis is one event in this time: old programs repeat themselves."""
 MOST_UNSENT_BYTES = 4096
 """Bytes of a guest that are on their way to its modules, as much as a serial driver keeps; more are lost."""
 MOST_WAITING = 32
@@ -60,6 +60,8 @@ class _Reached:
     """An axis or another module as a guest reaches it, with what it has set going.
 
     Attributes:
+        node: its address on the line.
+        width: returns how many bytes of its status packets an item of the mask takes.
         servo: its drive as the guest commands it; None of a module that is none.
         outputs: of a module, likewise.
         reliefs: what takes energy out and is on its way, by its kind.
@@ -71,7 +73,9 @@ class _Reached:
 
     name: str
     profile: Profile
+    node: int
     read: Callable[[StatusItem], Exchange[Any]]
+    width: Callable[[int], int]
     servo: GuestServo | None = None
     outputs: GuestOutputs | None = None
     reliefs: "dict[type, asyncio.Task[None]]" = field(default_factory=dict)
@@ -94,13 +98,11 @@ def _moves(command: ReceivedCommand | None) -> bool:
     return False
 
 
-class Guest:
+class Guest(Presence):
     """A guest on one line: takes its bytes, returns what the modules answer.
 
     Attributes:
         chain: as the guest sees the line.
-        receive: takes what is for the guest.
-        ended: nothing begins any more: its port ends.
     """
 
     def __init__(
@@ -112,15 +114,11 @@ class Guest:
         host: GuestHost,
         group: asyncio.TaskGroup,
     ) -> None:
-        self._name, self._bus, self._host, self._group = port.name, bus, host, group
-        self._loop = asyncio.get_running_loop()
-        self._line, self._free_at_s = asyncio.Lock(), 0.0
-        self._refused: dict[tuple[str, str], float] = {}
+        super().__init__(port, host, group)
+        self._bus = bus
+        self._share = LineShare(UNPAUSED_S)
+        self._fresh = FreshReplies(bus, port.fresh_ms)
         self._timer: asyncio.TimerHandle | None = None
-        self.ended = False
-        self._visit: Visit | None = None
-        self.receive: Callable[[bytes], None] = lambda _: None
-        self._control = GuestControl(port.name, host, port.idle_s) if port.access == "control" else None
         self._axes = tuple(drive.spec.name for drive in drives)
         self._reached: list[_Reached] = []
         modules: dict[int, GuestModule] = {}
@@ -137,26 +135,24 @@ class Guest:
             if isinstance(drive, LdcnAxis):
                 name, node = drive.spec.name, Node(drive.spec.address, drive.profile)
                 servo = GuestServo(drive, partial(host.status, name), port.name)
-                add(node.address, _Reached(name, drive.profile, partial(read_status, node), servo))
+                read, width = partial(read_status, node), partial(_servo_width, drive.profile)
+                add(node.address, _Reached(name, drive.profile, node.address, read, width, servo))
         for io in ios:
             if isinstance(io, IoModule):
                 outputs = GuestOutputs(io.name, io.outputs, host.levels)
-                add(io.node, _Reached(io.name, PIC_IO, partial(_read_io, io.node), outputs=outputs))
+                read_io = partial(_read_io, io.node)
+                add(io.node, _Reached(io.name, PIC_IO, io.node, read_io, _io_width, outputs=outputs))
         self._modules = tuple(modules[address] for address in sorted(modules))
         self.chain = Chain(self._modules)
         for each in self._modules:
             each.neighbours = self._modules
-        if self._control:
-            group.create_task(self._control.watch(self.gone), name=f"guest {self._name} control")
 
-    def send(self, data: bytes) -> bool:
-        """Take bytes of the guest; what its line would not carry in time is lost, and False is returned."""
+    def send(self, data: bytes, baud: int | None) -> bool:
+        """Take bytes of the guest, see `Door`; what its line would not carry in time is lost, and False is returned."""
+        self.chain.baud = baud or int(self.chain.modules[0].baud)
         if self.ended:
             return True
-        if self._control:
-            self._control.heard()
-        if self._visit is None:
-            self._visit = Visit()
+        if self._heard():
             self.chain.unplug(self._loop.time())  # what the one before sent last may be on its way at that one's rate
             self.chain.replug()
             for module in self._modules:
@@ -167,23 +163,21 @@ class Guest:
         self._advance()
         return len(data) <= room
 
+    @override
     def close(self) -> None:
-        """Nothing begins any more: its port ends."""
-        self.ended = True
+        super().close()
+        self._fresh.close()
         if self._timer:
             self._timer.cancel()
 
+    @override
     async def gone(self) -> None:
-        """The guest has gone: what it has commanded and has not begun is dropped, and control ends."""
-        if self._visit:
-            self._visit.ended = True
-        self._visit = None  # what it sent last comes to its modules yet: they stop by it and begin nothing
+        # what it sent last comes to its modules yet: they stop by it and begin nothing
         for each in self._reached:
             each.waiting.clear()
             if each.servo:
                 each.servo.restart()  # the next program does not begin what this one has loaded
-        if self._control:
-            await self._control.end()
+        await super().gone()
 
     def _advance(self) -> None:
         """Do what is due on the guest's chain, and come back for what is due next."""
@@ -200,6 +194,7 @@ class Guest:
     # -- reading -----------------------------------------------------------------------------------------------------
 
     def _ask(self, module: _Reached, items: StatusItem, answer: PendingReply) -> None:
+        self.packets += 1
         self._group.create_task(self._read(module, items, answer), name=f"guest {self._name} reads {module.name}")
 
     async def _read(self, module: _Reached, items: StatusItem, answer: PendingReply) -> None:
@@ -209,22 +204,26 @@ class Guest:
         with suppress(TimeoutError):
             async with asyncio.timeout(REPLY_WAIT_S):
                 await module.idle.wait()
-        async with self._line:
-            await asyncio.sleep(max(0.0, self._free_at_s - self._loop.time()))
-            if not answer.wanted() or not self._host.is_up():
-                return
-            began_s = self._loop.time()
-            try:
-                status = await self._bus.execute(_as_sent(module.read(items)))
-            except LdcndError as error:
-                log.debug("not read", guest=self._name, axis=module.name, reason=error.message)
-                return
-            finally:
-                now_s = self._loop.time()
-                earned_s = max(self._free_at_s, now_s - UNPAUSED_S / LINE_SHARE)
-                self._free_at_s = earned_s + (now_s - began_s) / LINE_SHARE
+        status = self._fresh_status(module, int(items)) if self._host.is_up() else None
+        if status is None:
+            async with self._share.turn():
+                if not answer.wanted() or not self._host.is_up():
+                    return
+                try:
+                    status = await self._bus.execute(_as_sent(module.read(items)))
+                except LdcndError as error:
+                    log.debug("not read", guest=self._name, axis=module.name, reason=error.message)
+                    return
         answer.give(_as_guest(module, items, status, self._loop.time()), self._loop.time())
         self._advance()
+
+    def _fresh_status(self, module: _Reached, items: int) -> bytes | None:
+        """Return a status packet with these items that is made of a fresh one; None without one that has them all."""
+        for request, reply in self._fresh.of(module.node):
+            packet = decode_packet(request)
+            if packet.command is CommandCode.READ_STATUS and not items & ~packet.data[0]:
+                return _narrowed(reply, packet.data[0], items, module.width)
+        return None
 
     # -- commanding --------------------------------------------------------------------------------------------------
 
@@ -237,11 +236,11 @@ class Guest:
             module.waiting.clear()
             self._relieve(module, found)
         elif self._control is None:
-            self._refuse(module.name, command, f"the port {self._name} has access = read")
+            self._refuse(module.name, name_of(command), f"the port {self._name} has access = read")
         elif self._visit is None:
-            self._refuse(module.name, command, f"{self._name} has gone before it began")
+            self._refuse(module.name, name_of(command), f"{self._name} has gone before it began")
         elif len(module.waiting) >= MOST_WAITING:
-            self._refuse(module.name, command, f"{MOST_WAITING} commands wait already")
+            self._refuse(module.name, name_of(command), f"{MOST_WAITING} commands wait already")
         else:
             if found is not None and not module.idle.is_set():
                 self._relieve(module, found)  # whatever is on its way may move it by then
@@ -267,6 +266,7 @@ class Guest:
         while again:
             with suppress(LdcndError):  # the daemon has entered it among the events
                 await self._host.carry_out(module.name, command)
+            self._fresh.changed(module.node)
             again = type(command) in module.again
             module.again.discard(type(command))
 
@@ -295,12 +295,13 @@ class Guest:
                 try:
                     await self._obey(module, module.at_work, self._control, visit)
                 except LdcndError as error:
-                    self._refuse(module.name, module.at_work, error.message)
+                    self._refuse(module.name, name_of(module.at_work), error.message)
                 except ValidationError as error:  # a packet holds values that no command has
-                    self._refuse(module.name, module.at_work, explained(error).message)
+                    self._refuse(module.name, name_of(module.at_work), explained(error).message)
                 except TimeoutError:
-                    self._refuse(module.name, module.at_work, "the axis does not come to rest")
+                    self._refuse(module.name, name_of(module.at_work), "the axis does not come to rest")
         finally:
+            self._fresh.changed(module.node)
             module.at_work = None
             module.idle.set()
 
@@ -366,15 +367,29 @@ class Guest:
         if status.home is not None:
             servo.set_zero(status.home + drive.state.offset_counts, 0)
 
-    def _refuse(self, about: str, command: ReceivedCommand, why: str) -> None:
-        what, now_s = name_of(command), self._loop.time()
-        if now_s - self._refused.get((about, what), -SAME_REFUSAL_S) >= SAME_REFUSAL_S:
-            self._refused[about, what] = now_s
-            self._host.refuse(about, f"{what}: {why}; the guest has its answer, nothing was done", self._name)
-
 
 def _read_io(address: int, items: StatusItem) -> Exchange[IoStatus]:
     return read_io_status(IoNode(address), IoItem(int(items)))
+
+
+def _servo_width(profile: Profile, item: int) -> int:
+    return item_bytes(profile, StatusItem(item))
+
+
+def _io_width(item: int) -> int:
+    return ITEM_BYTES[item.bit_length() - 1]
+
+
+def _narrowed(status: bytes, mask: int, items: int, width: Callable[[int], int]) -> bytes:
+    """Return the status packet with fewer items: they come in the order of the bits of the mask.
+
+    Source: PIC-SERVO manual, 5.2, "Define Status"; PIC-I/O data sheet, 3.1.
+    """
+    body, at = bytearray(status[:1]), 1
+    for item in (1 << bit for bit in range(8) if mask & 1 << bit):
+        body += status[at : at + width(item)] if items & item else b""
+        at += width(item)
+    return bytes(body) + bytes((sum(body) & 0xFF,))
 
 
 def _as_sent(exchange: Exchange[Any]) -> Exchange[bytes]:

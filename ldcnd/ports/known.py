@@ -9,11 +9,13 @@ from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.network import IoDriver
-from ldcnd.line.bus import Bus
+from ldcnd.drives.smartstep.drive import SmartStepAxis
+from ldcnd.line.bus import Bus, caused_by
 from ldcnd.listen_address import parse_listen_address
 from ldcnd.log import get_logger
 from ldcnd.ports.door import Door
 from ldcnd.ports.guest import Guest
+from ldcnd.ports.guest_units import UnitsGuest
 from ldcnd.ports.tcp import GuestSocket
 from ldcnd.ports.terminal import GuestTerminal
 
@@ -23,11 +25,14 @@ TRIED_AGAIN_S = 5.0
 """How often a port that cannot be opened is tried again, seconds."""
 
 
+FAMILIES = ("ldcn", "smartstep")
+
+
 def check(port: PortConfig, line: BusConfig) -> None:
     """Refuse a port of another family; raises ValueError."""
-    if line.family != "ldcn":
+    if line.family not in FAMILIES:
         raise ValueError(
-            f"port {port.name}: bus {line.name} is of the family {line.family}; only ldcn lines have ports"
+            f"port {port.name}: bus {line.name} is of the family {line.family}; ports are for {' and '.join(FAMILIES)}"
         )
 
 
@@ -58,20 +63,23 @@ async def _serve_once(
         OSError, LookupError: it cannot be opened.
     """
     async with AsyncExitStack() as opened:
+        opened.enter_context(caused_by(port.name))
         door, where = await _open(port, opened)
         async with asyncio.TaskGroup() as group, AsyncExitStack() as stack:
-            guest = Guest(port, bus, drives, ios, host, group)
+            guest: Guest | UnitsGuest
+            if any(isinstance(drive, SmartStepAxis) for drive in drives):
+                guest = UnitsGuest(port, bus, drives, host, group)
+            else:
+                guest = Guest(port, bus, drives, ios, host, group)
             stack.callback(guest.close)
-
-            def take(data: bytes, baud: int | None) -> bool:
-                guest.chain.baud = baud or int(guest.chain.modules[0].baud)
-                return guest.send(data)
+            stack.callback(host.show, port.name, None)
 
             def closed() -> None:
                 if not guest.ended:
                     group.create_task(guest.gone(), name=f"guest {port.name} gone")
 
-            guest.receive, door.take, door.closed = door.write, take, closed
+            guest.receive, guest.hang_up, door.take, door.closed = door.write, door.leave, guest.send, closed
+            host.show(port.name, guest)
             log.info("port", guest=port.name, bus=port.bus, access=port.access, **where)
             if port.beyond_loopback:
                 log.warning("every machine that reaches this address can use the port", guest=port.name, **where)

@@ -29,42 +29,79 @@ class GuestTerminal:
     def __init__(self, link: Path, mode: int, group: str | None) -> None:
         self.take: Callable[[bytes, int | None], bool] = lambda _data, _baud: True
         self.closed: Callable[[], None] = lambda: None
-        self._link, self._mode, self._group = link, mode, group
+        self._mode, self._group = mode, group
         self._loop = asyncio.get_running_loop()
         self._later: asyncio.TimerHandle | None = None
-        self._baud: int | None = None
-        self._open()
-
-    def _open(self) -> None:
         # a configuration with a port can be read where there are no terminals
-        import tty  # noqa: PLC0415
-
         from ldcnd.line.terminal_link import TerminalLink  # noqa: PLC0415
 
-        self._master, slave = os.openpty()
+        self._master, self.path = self._open()
+        try:
+            self._linked = TerminalLink(link, self.path)
+        except OSError:
+            os.close(self._master)
+            raise
+        self._watch()
+
+    def _open(self) -> tuple[int, Path]:
+        """Make a terminal; return its master, and where it is."""
+        import tty  # noqa: PLC0415
+
+        master, slave = os.openpty()
         try:
             tty.setraw(slave)  # its settings stay while the master is open
-            os.set_blocking(self._master, False)
-            self.path = Path(os.ttyname(slave))
+            os.set_blocking(master, False)
+            path = Path(os.ttyname(slave))
             if self._group is not None:
-                shutil.chown(self.path, group=self._group)
-            self.path.chmod(self._mode)
-            self._linked = TerminalLink(self._link, self.path)
+                shutil.chown(path, group=self._group)
+            path.chmod(self._mode)
         except (OSError, LookupError):
-            os.close(self._master)
+            os.close(master)
             raise
         finally:
             os.close(slave)
+        return master, path
+
+    def _watch(self) -> None:
+        self._baud: int | None = None
         self._poll = select.poll()
         self._poll.register(self._master, select.POLLIN)
         self._look()
 
     def close(self) -> None:
         """Take the link away, and hang up on the program."""
+        self._linked.close()
+        self._drop()
+
+    def leave(self) -> None:
+        """Hang up on the program: the link leads to another terminal from now on; see `Door`."""
+        master, path = self._open()
+        try:
+            self._linked.lead_to(path)
+        except OSError:
+            os.close(master)
+            raise
+        self._drop()
+        self._master, self.path = master, path
+        self._watch()
+        self.closed()
+
+    def _let_be_set(self) -> None:
+        """Leave something that the next program sets: CLOCAL, which says nothing of a terminal without a modem.
+
+        A terminal has no parity, and a program that wants one and sets nothing else has an error (tried with glibc 2.36
+        of Debian 12): it could open the port only once.
+        """
+        import termios  # noqa: PLC0415 - as above
+
+        settings = termios.tcgetattr(self._master)
+        settings[2] &= ~termios.CLOCAL
+        termios.tcsetattr(self._master, termios.TCSANOW, settings)
+
+    def _drop(self) -> None:
         self._loop.remove_reader(self._master)
         if self._later:
             self._later.cancel()
-        self._linked.close()
         os.close(self._master)
 
     def write(self, data: bytes) -> None:
@@ -89,6 +126,7 @@ class GuestTerminal:
             return
         except OSError:  # EIO: nobody has it open any more
             self._loop.remove_reader(self._master)
+            self._let_be_set()
             self.closed()
             self._look()
             return

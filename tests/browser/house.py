@@ -259,7 +259,8 @@ async def open_house(folder: Path) -> AsyncIterator[House]:
         "baud = 115200", "baud = 115200\nsnapshot = true", 1
     )
     text = text.replace('{ model = "pic-servo-v4" },\n]', '{ model = "pic-servo-v4" },\n    { model = "pic-io" },\n]')
-    sim_config.write_text(text, encoding="utf-8")
+    port = f'\n[[port]]\nname = "labview"\nbus = "line0"\nlink = "{folder}/labview"\naccess = "control"\n'
+    sim_config.write_text(text + port, encoding="utf-8")
     alpha_config = folder / "alpha.toml"
     alpha_config.write_text(
         mixed_config.read_text(encoding="utf-8").replace('rig = "mixed"', 'rig = "alpha"'), encoding="utf-8"

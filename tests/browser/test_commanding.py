@@ -1,11 +1,14 @@
 """What can be commanded without typing: all axes of a rig, one of a row, and a jog for as long as it is held."""
 
+import asyncio
 import re
 
 import pytest
+import serial
 
 from ldcnd.contract.commands import SetPosition
 from ldcnd.contract.leases import ListHolders
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
@@ -209,6 +212,29 @@ async def test_an_operator_without_a_mouse_does_everything_that_a_day_asks_for(h
         await press(desk, desk.page.get_by_role("link", name="Rig", exact=True))
         await press(desk, desk.page.get_by_role("group", name="Commands for x").get_by_role("button", name="Disable x"))
         await house.sim.until("x", lambda state: not state.enabled)
+
+
+async def test_a_program_at_a_port_is_seen_on_the_network_page_and_sent_away(house):
+    await house.sim.quiet("x", "y", "z", "c")
+    link = house.sim.config.parent / "labview"
+    async with house.desk() as desk:
+        await desk.open("network")
+        ports = desk.panel("Ports of sim on line0")
+        await expect(ports).to_contain_text("no program")
+        with serial.Serial(str(link), 19_200, timeout=10) as program:
+            program.write(encode_packet(Packet(0, CommandCode.SET_ADDRESS, b"\x01\xff")))
+            assert len(await asyncio.to_thread(program.read, 2)) == 2
+            program.write(encode_packet(Packet(1, CommandCode.CLEAR_STICKY_BITS)))
+            assert len(await asyncio.to_thread(program.read, 2)) == 2
+            await expect(ports).to_contain_text("labview")
+            await expect(ports.get_by_role("cell", name="x", exact=True)).to_be_visible()
+
+            await desk.button("Send labview away").click()
+
+            await expect(ports).to_contain_text("no program")
+            with pytest.raises(serial.SerialException):
+                await asyncio.to_thread(program.read, 1)
+        assert link.is_symlink()
 
 
 async def test_an_output_is_set_and_an_instant_taken_from_the_network_page(house):

@@ -14,10 +14,10 @@ from tests.support.machine_rig import Machine, machine, running_machine
 SET_ADDRESS = CommandCode.SET_ADDRESS
 
 
-def with_port(link: Path, access: str = "read", **axis: object) -> RigConfig:
+def with_port(link: Path, access: str = "read", *, fresh_ms: float = 0.0, **axis: object) -> RigConfig:
     """Return the machine with a port."""
     document = machine(axis=axis).model_dump(mode="json", exclude_defaults=True)
-    port = {"name": "old", "bus": "line", "link": str(link), "access": access, "idle_s": 5.0}
+    port = {"name": "old", "bus": "line", "link": str(link), "access": access, "idle_s": 5.0, "fresh_ms": fresh_ms}
     return RigConfig.model_validate(document | {"port": [port]})
 
 
@@ -83,9 +83,11 @@ class Program:
 
 
 @asynccontextmanager
-async def guest(tmp_path: Path, access: str = "read", **axis: object) -> AsyncIterator[tuple[Machine, Program]]:
+async def guest(
+    tmp_path: Path, access: str = "read", *, fresh_ms: float = 0.0, **axis: object
+) -> AsyncIterator[tuple[Machine, Program]]:
     """Run the machine, and a program with its port open."""
-    async with running_machine(with_port(tmp_path / "port", access, **axis)) as rig:
+    async with running_machine(with_port(tmp_path / "port", access, fresh_ms=fresh_ms, **axis)) as rig:
         program = open_port(tmp_path / "port")
         try:
             yield rig, program

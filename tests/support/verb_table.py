@@ -41,6 +41,7 @@ METHODS_OF_RIGS = {
     "set_io",
     "set_io_timer",
     "override_interlock",
+    "send_guest_away",
     "reload",
 }
 

@@ -5,6 +5,7 @@ import { Facts, Panel, Table } from "../parts/controls.js";
 import { duration, number, percent } from "../parts/format.js";
 import { Mark } from "../parts/state.js";
 import { useRigs } from "../session/rigs.js";
+import { Guests } from "./network_guests.js";
 import { Modules, Snapshot } from "./network_io.js";
 import { WireLog } from "./network_wire_log.js";
 
@@ -49,6 +50,7 @@ function Line({ rig, bus }) {
       <div class="column"><h3>Health</h3><${Health} rig=${rig} bus=${bus} /></div>
       <div class="column"><h3>Plan</h3>${plan ? html`<${Plan} rig=${rig} plan=${plan} />` : html`<p class="quiet">This line is polled one drive after the other; nothing is promised.</p>`}</div>
     </div>
+    <${Guests} rig=${rig} bus=${bus} />
     <${Modules} rig=${rig} bus=${bus} />
     <${Snapshot} rig=${rig} bus=${bus.name} />
     <h3>Wire log</h3>

@@ -1,0 +1,218 @@
+"""A guest on a line of SmartSteps: its frames are exchanges of the line, or commands of an axis.
+
+The line is not simulated before its drives, as one of LDCN is: a frame goes on as soon as it is complete, and the reply
+comes in one piece once it is known to be intact, at the same time as its last character on the line.
+"""
+
+import asyncio
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pydantic import ValidationError
+from typing_extensions import override
+
+from ldcnd.config.ports import GuestHost, PortConfig
+from ldcnd.contract.codec import explained
+from ldcnd.contract.commands import AxisCommand, CommandReply
+from ldcnd.contract.errors import AxisUnreachable, BusError, DataRefused, LdcndError, ValueOutOfRange
+from ldcnd.drives.driver import Drive
+from ldcnd.drives.smartstep.commands import Refusal, reference, string_reference
+from ldcnd.drives.smartstep.drive import SmartStepAxis
+from ldcnd.drives.smartstep.network import BAUD
+from ldcnd.drives.smartstep.packet import (
+    END,
+    PACKET_CHARACTERS,
+    CommandPacket,
+    Function,
+    ReplyPacket,
+    ResponseStatus,
+    add_parity,
+    decode_command,
+    decode_reply,
+    strip_parity,
+)
+from ldcnd.drives.smartstep.profiles import CountUnit, SmartStepProfile
+from ldcnd.line.bus import Bus
+from ldcnd.line.exchange import Exchange
+from ldcnd.log import get_logger
+from ldcnd.ports.control import Visit
+from ldcnd.ports.fresh import FreshReplies
+from ldcnd.ports.guest_unit import GuestUnit
+from ldcnd.ports.presence import Presence
+from ldcnd.ports.share import LineShare
+
+log = get_logger("ports")
+
+UNPAUSED_S = 5.0
+"""Time of the line that a guest which has paused may use without a pause, seconds: both memories of a trace."""
+PARITY_BIT = 0x80
+_BYTES_OF_COUNT = {CountUnit.BYTES: 1.0, CountUnit.WORDS: 2.0, CountUnit.CHARS: 0.5}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Asked:
+    """A frame whose reply the guest waits for."""
+
+    frame: bytes
+    command: CommandPacket
+    visit: Visit
+
+
+class UnitsGuest(Presence):
+    """A guest on one line: takes its bytes, returns what the drives answer."""
+
+    def __init__(
+        self, port: PortConfig, bus: Bus, drives: Sequence[Drive], host: GuestHost, group: asyncio.TaskGroup
+    ) -> None:
+        super().__init__(port, host, group)
+        self._fresh = FreshReplies(bus, port.fresh_ms)
+        self._units = {drive.spec.address: GuestUnit(drive) for drive in drives if isinstance(drive, SmartStepAxis)}
+        self._share = LineShare(UNPAUSED_S)
+        self._line = bytearray()
+        self._latest: _Asked | None = None
+        self._came = asyncio.Event()
+        group.create_task(self._serve(), name=f"guest {self._name}")
+
+    def send(self, data: bytes, baud: int | None) -> bool:
+        """Take bytes of the guest, sent at this rate; see `Door.take`."""
+        if self.ended:
+            return True
+        if self._heard():
+            self._line.clear()
+        if baud not in (None, BAUD):
+            return True  # its drives hear noise
+        for byte in data:
+            if len(self._line) <= PACKET_CHARACTERS:  # one more than a frame is as wrong as a thousand more
+                self._line.append(byte)
+            if byte & ~PARITY_BIT == END[0]:
+                self._take(bytes(self._line))
+                self._line.clear()
+        return True
+
+    @override
+    def close(self) -> None:
+        super().close()
+        self._fresh.close()
+
+    @override
+    async def gone(self) -> None:
+        self._latest = None
+        for unit in self._units.values():
+            unit.restart()
+        await super().gone()
+
+    def _take(self, frame: bytes) -> None:
+        """Take what may be a frame; drives are silent about what is none, and about those of other units."""
+        command = decode_command(strip_parity(frame) if _has_parity(frame) else frame)
+        if command is None or command.unit not in self._units or self._visit is None:
+            return
+        if self._latest and self._latest.frame == frame:
+            return  # it is repeated because no reply has come yet; there will be one
+        self.packets += 1
+        self._latest = _Asked(frame, command, self._visit)
+        self._came.set()
+
+    async def _serve(self) -> None:
+        """Answer frames, one after another; the reply to one that another has followed is not sent any more."""
+        while True:
+            await self._came.wait()
+            self._came.clear()
+            while asked := self._latest:
+                reply = self._fresh_reply(asked.command)
+                if reply is None:
+                    async with self._share.turn():
+                        reply = await self._answer(asked) if asked is self._latest and self._host.is_up() else None
+                if asked is self._latest:
+                    self._latest = None
+                    if reply is not None:
+                        self.receive(add_parity(reply) if _has_parity(asked.frame) else reply)
+
+    def _fresh_reply(self, command: CommandPacket) -> bytes | None:
+        """Return what the drive has just replied to the same frame; None where the guest has changed that."""
+        kept = self._units[command.unit].kept(command.address) is not None
+        if kept or command.function is Function.SETTING or not self._host.is_up():
+            return None
+        request = command.encode()
+        return next((reply for frame, reply in self._fresh.of(command.unit) if frame == request), None)
+
+    async def _answer(self, asked: _Asked) -> bytes | None:
+        """Return the reply; None where the drive is silent."""
+        unit, command = self._units[asked.command.unit], asked.command
+        try:
+            if command.function is Function.SETTING:
+                try:
+                    return _answered(command, await self._set(unit, asked))
+                finally:
+                    self._fresh.changed(command.unit)
+            return await self._read(unit, command)
+        except (BusError, AxisUnreachable) as error:
+            log.debug("not answered", guest=self._name, axis=unit.drive.spec.name, reason=error.message)
+            return None
+
+    async def _read(self, unit: GuestUnit, command: CommandPacket) -> bytes | None:
+        name, what = unit.drive.spec.name, f"reading {command.address:04X}H"
+        try:
+            reply: bytes = await unit.drive.words.ask(_reading(command, unit.drive.profile))
+        except ValueOutOfRange as error:  # what a drive does with an odd address or count is not known
+            self._refuse(name, what, error.message)
+            return _answered(command, ResponseStatus.BYTE_COUNT_ERROR)
+        except BusError:
+            raise
+        except LdcndError as error:
+            self._refuse(name, what, error.message)
+            return None
+        word = unit.kept(command.address) if command.function is Function.REFERENCE else None
+        if word is None or not decode_reply(reply).status.normal:
+            return reply
+        return ReplyPacket(command.unit, ResponseStatus.REFERENCE, command.address, word).encode()
+
+    async def _set(self, unit: GuestUnit, asked: _Asked) -> ResponseStatus:
+        """Carry out a setting; return what the drive says to it, or to one that it does not do."""
+        axis, command, control = unit.drive.spec.name, asked.command, self._control
+        what = f"setting {command.address:04X}H to {command.data:04X}H"
+
+        async def do(wanted: AxisCommand[CommandReply]) -> None:
+            if control is None:
+                raise AssertionError("a guest without control sets nothing")
+            lease = await control.over((axis,), asked.visit)
+            await self._host.carry_out(axis, wanted.model_copy(update={"lease": lease}))
+
+        if control is None:
+            self._refuse(axis, what, f"the port {self._name} has access = read")
+            return ResponseStatus.SETTING_ADDRESS_ERROR
+        try:
+            await unit.set(command.address, command.data, do)
+        except (BusError, AxisUnreachable):
+            raise
+        except LdcndError as error:
+            self._refuse(axis, what, error.message)
+            refused = isinstance(error, DataRefused)
+            return ResponseStatus.SETTING_DATA_ERROR if refused else ResponseStatus.SETTING_ADDRESS_ERROR
+        except ValidationError as error:  # a frame holds values that no command has
+            self._refuse(axis, what, explained(error).message)
+            return ResponseStatus.SETTING_DATA_ERROR
+        return ResponseStatus.SETTING
+
+
+def _has_parity(frame: bytes) -> bool:
+    """Tell whether a program makes parity by itself: the first character of a frame has its bit set then."""
+    return bool(frame[0] & PARITY_BIT)
+
+
+def _answered(command: CommandPacket, status: ResponseStatus) -> bytes:
+    return ReplyPacket(command.unit, status, command.address, command.data).encode()
+
+
+def _reading(command: CommandPacket, profile: SmartStepProfile) -> Exchange[bytes | Refusal]:
+    """Return the exchange of a frame that reads; its reply, a refusal too, stays as it was sent.
+
+    Raises:
+        ValueOutOfRange: see `string_reference`.
+    """
+    exchange: Exchange[Any] = reference(command.unit, command.address)
+    if command.function is Function.STRING_REFERENCE:
+        count = int(command.data * _BYTES_OF_COUNT[profile.string_count_unit])
+        exchange = string_reference(command.unit, command.address, count, profile)
+    # data of a reference other than 0 are a data error, which the drive itself tells (manual 2.2, example 5)
+    return replace(exchange, request=command.encode(), decode=bytes)
