@@ -16,20 +16,23 @@ from ldcnd.contract.commands import (
     Power,
     QuickStop,
     Reset,
+    SetGains,
     SetPosition,
     SetPwm,
     Stop,
 )
 from ldcnd.contract.errors import LdcndError, WrongState
 from ldcnd.contract.events import CommandStatus, ReadOutcome
-from ldcnd.contract.rig_commands import SetSpeedOverride
+from ldcnd.contract.rig_commands import SetIo, SetSpeedOverride
 from ldcnd.contract.samples import AxisState, LinkState, Moving
-from ldcnd.drives.ldcn.pic_io import LINES
+from ldcnd.drives.ldcn.pic_io import LINES, SetDirection, SetOutput
+from ldcnd.drives.ldcn.received import SetGain
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
+from ldcnd.sim.ldcn.io import SimulatedIo
 from tests.support.dialect_rig import LS_182AP, SC, V4, dialect_rig
-from tests.support.machine_rig import ENDLESS, MODEL, Machine, machine, running_machine
+from tests.support.machine_rig import ENDLESS, LOCK, MODEL, Machine, machine, running_machine
 
 FROM_S = 5.0
 MARGIN_MS = 10
@@ -310,3 +313,40 @@ async def test_a_home_whose_last_leg_never_begins_says_so(monkeypatch):
         assert len(starts) == 2
         assert ended.status is CommandStatus.FAILED
         assert "no sign of it" in ended.reason
+
+
+def deaf_once(monkeypatch, simulated, wanted):
+    """Have a simulated module answer one command of a type and not carry it out; return what it has not heard yet."""
+    deaf, execute = [True], simulated.execute
+
+    def hear(self, command):
+        if deaf and isinstance(command, wanted):
+            deaf.pop()
+        else:
+            execute(self, command)
+
+    monkeypatch.setattr(simulated, "execute", hear)
+    return deaf
+
+
+@pytest.mark.promise("told-twice")
+async def test_a_late_reply_does_not_stand_for_that_to_gains(monkeypatch):
+    async with dialect_rig(SC) as rig:
+        await rig.power_on()
+        deaf = deaf_once(monkeypatch, SimulatedDrive, SetGain)
+        await rig.send(SetGains(kp=77))
+
+        assert not deaf
+        assert rig.drive.loop.gains.kp == 77
+
+
+@pytest.mark.promise("told-twice")
+@pytest.mark.parametrize("packet", [SetDirection, SetOutput])
+async def test_a_late_reply_does_not_stand_for_that_to_outputs(packet, monkeypatch):
+    async with running_machine(machine()) as rig:
+        deaf = deaf_once(monkeypatch, SimulatedIo, packet)
+        await rig.client.ask(SetIo(module="cabinet", high=["lock"]))
+
+        assert not deaf
+        assert rig.io.levels & 1 << LOCK - 1
+        assert rig.io.outputs & 1 << LOCK - 1
