@@ -64,8 +64,8 @@ _REMEDIES = MappingProxyType(
             "encoder or Hall signals are lost: check sensor cable and supply, reset, find the reference position again"
         ),
         FaultCode.POSITION_ERROR: (
-            "the motor left the position error limit: check for a jam, gains and acceleration, then reset; home again if the"
-            " shaft has moved and its position has not"
+            "the motor left the position error limit: check for a jam, gains and acceleration, then reset; home again"
+            " if the shaft has moved and its position has not"
         ),
         FaultCode.SENSOR_FAULT: "the analog position sensor is disconnected or at its end: check its cable, then reset",
         FaultCode.POWER_LOST: "the motor supply is off: switch it on, then reset",
