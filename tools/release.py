@@ -61,13 +61,16 @@ def version_of(root: Path) -> str:
 
 
 def named(root: Path = ROOT) -> None:
-    """The changelog begins with this version and its date, the contract of it is kept, and it has no tag yet."""
+    """The changelog begins with this version and its date, its contract and files are kept, and it has no tag yet."""
     version = version_of(root)
     heading = re.search(r"(?m)^## (.+)$", (root / "CHANGELOG.md").read_text(encoding="utf-8"))
     if not heading or not re.fullmatch(rf"{re.escape(version)} \(\d{{4}}-\d\d-\d\d\)", heading[1]):
         raise NotReady(f"CHANGELOG.md has to begin with `## {version} (YEAR-MONTH-DAY)`")
-    if not (root / "tests" / "kept" / version / "contract.txt").exists():
-        raise NotReady(f"tests/kept/{version} is not there: `make fix` writes it while the version is not yet released")
+    kept = root / "tests" / "kept" / version
+    if not (kept / "contract.txt").exists():
+        raise NotReady(f"{kept} has no contract: `make fix` writes it while the version is not yet released")
+    if not (kept / "run.mcap").exists():
+        raise NotReady(f"{kept} has no files for later versions to read: `python -m tests.kept_files` writes them")
     if _told("git", "tag", "--list", f"v{version}", root=root):
         raise NotReady(f"v{version} is tagged already")
 

@@ -22,6 +22,7 @@ def tree(tmp_path: Path) -> Path:
     root = tmp_path / "tree"
     (root / "tests/kept/1.2.0").mkdir(parents=True)
     (root / "tests/kept/1.2.0/contract.txt").write_text("+ network api: 1\n")
+    (root / "tests/kept/1.2.0/run.mcap").touch()
     (root / "pyproject.toml").write_text('[project]\nversion = "1.2.0"\n')
     (root / "CHANGELOG.md").write_text("# Changelog\n\n## 1.2.0 (2027-01-31)\n\n## 1.1.0 (2026-12-01)\n")
     git(root, "init", "--quiet")
@@ -68,10 +69,11 @@ def test_a_version_that_is_tagged_is_not_made_again(tree: Path):
         named(tree)
 
 
-def test_a_version_without_its_contract_is_refused(tree: Path):
-    (tree / "tests/kept/1.2.0/contract.txt").unlink()
+@pytest.mark.parametrize(("name", "remedy"), [("contract.txt", "make fix"), ("run.mcap", "kept_files")])
+def test_a_version_without_what_later_ones_are_held_to_is_refused(tree: Path, name: str, remedy: str):
+    (tree / "tests/kept/1.2.0" / name).unlink()
 
-    with pytest.raises(NotReady, match="make fix"):
+    with pytest.raises(NotReady, match=remedy):
         named(tree)
 
 
