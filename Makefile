@@ -9,7 +9,7 @@ PYTHONS ?= python3.11 python3.12 python3.13 python3.14
 SOURCE ?= .
 OUT ?= dist
 
-.PHONY: run test tests test-system test-edges test-pythons check fix docs dist dist-check soak mutants newcomer bench screenshots clean
+.PHONY: run test tests test-system test-edges test-pythons check fix docs dist dist-check release soak mutants newcomer bench screenshots clean
 
 # what `make test` needs is nine times as large as what `make run` needs
 run: $(if $(wildcard .venv/ready),.venv/ready,.venv/small)
@@ -62,6 +62,10 @@ dist-check: dist
 	git clone -q . build/again
 	$(MAKE) --no-print-directory dist SOURCE=build/again OUT=build/again/dist
 	diff $(OUT)/SHA256SUMS build/again/dist/SHA256SUMS
+
+# the check list of a release, in hours: everything that is checked before a tag, with times; ARGS=--help
+release: .venv/ready
+	$(PY) -m tools.release $(ARGS)
 
 # the installed package on the kernel's own serial drivers, in a machine under QEMU; skipped with the reason where there is none
 test-drivers: .venv/ready

@@ -207,6 +207,6 @@ while read -r name extras; do
     doc=$stage/$name/usr/share/doc/$name
     (cd "$source" && CYCLONEDX=$stage/bom/bin/cyclonedx-py "$opt/bin/python" -m tools sbom "$doc/sbom.cdx.json")
     [[ " ${ONLY:-$name} " != *" $name "* ]] || pack "$name" "$of_python, $depends" "$summary"
-    depends="$name (= $version)"
+    depends="libc6, $name (= $version)"
     [[ $name != "${ONLY:-}" ]] || break
 done < "$stage/packages"

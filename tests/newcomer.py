@@ -1,24 +1,36 @@
-"""A newcomer on a bare Debian 12 follows the README and every tutorial, from checkout and wheel; prints the times.
+"""A newcomer on a bare Debian follows the README, every tutorial and INSTALL.md; prints the times.
 
-Run as root: `python -m tests.newcomer` (or `make newcomer`). It makes a Debian root with nothing but what the README
-asks for, copies the committed files of this checkout into it, and works there. It needs mmdebstrap and a network; what
-a network asks for (a certificate, pip's configuration) is copied with `--copy PATH`.
+Run as root: `python -m tests.newcomer` (or `make newcomer`). For each Debian it makes a root with nothing but what the
+README asks for, copies the committed files of this checkout into it, and works there from the checkout and the wheel;
+then a root with nothing but systemd and Python, builds the package for it, boots it, and does what INSTALL.md says,
+without a network. It needs mmdebstrap, systemd-container and a network; what a network asks for (a certificate, pip's
+configuration) is copied with `--copy PATH`.
 """
 
 import argparse
 import asyncio
 import os
+import re
 import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
-PACKAGES = "git,make,python3-venv,ca-certificates"
 ROOT = Path(__file__).parents[1]
+SUITES = {"12": "bookworm", "13": "trixie"}
+PACKAGES = "git,make,python3-venv,ca-certificates"
+SERVED = "python3,systemd,udev,kmod,iproute2,ca-certificates"
+"""What a server has anyway."""
+INSTALL = ROOT / "deploy" / "INSTALL.md"
+SECTIONS = re.compile(r"(?ms)^## ([^\n]+)\n(.*?)(?=^## |\Z)")
+COMMANDS = re.compile(r"(?ms)^```sh\n(.*?)^```$")
+RUNNING = "Console, recording, metrics"
+"""Once this section is done, everything runs as a service."""
 CHECKOUT = "ldcnd"
 UP = "Ctrl-C here ends it"
 README = ("list", "power on x", "move x 10 --wait", "watch x --count 5", "power on z")
@@ -30,29 +42,43 @@ def main() -> None:
     """Work through everything; ends with the exit code of what failed first."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--copy", action="append", default=[], type=Path, help="also copy this path into the root")
+    parser.add_argument("--debian", action="append", choices=SUITES, help="only this release [12 and 13]")
+    parser.add_argument("--part", action="append", choices=PARTS, help="only this part [all]")
     parser.add_argument("--inside", choices=("tutorials",), help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.inside:
         asyncio.run(_follow_tutorials())
         return
-    with tempfile.TemporaryDirectory(prefix="newcomer-", ignore_cleanup_errors=True) as folder:
-        root = Path(folder, "root")
-        _timed("a bare Debian 12 (no work of the newcomer's)", lambda: _debian(root, given.copy))
-        home = root / "root" / CHECKOUT
-        home.mkdir(parents=True)
-        archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, check=True, capture_output=True).stdout  # noqa: S607
-        subprocess.run(["tar", "x"], cwd=home, input=archive, check=True)  # noqa: S607
+    for release in given.debian or SUITES:
+        for part in given.part or PARTS:
+            packages, work = PARTS[part]
+            with tempfile.TemporaryDirectory(prefix="newcomer-", ignore_cleanup_errors=True) as folder:
+                root = Path(folder, "root")
+                _timed(
+                    f"a bare Debian {release} (no work of the newcomer's)",
+                    lambda root=root, release=release, packages=packages: _debian(root, release, packages, given.copy),
+                )
+                work(root)
+
+
+@contextmanager
+def _with_checkout(root: Path) -> Iterator[None]:
+    """Have the committed files of this checkout in a root, and the kernel's."""
+    home = root / "root" / CHECKOUT
+    home.mkdir(parents=True)
+    archive = subprocess.run(["git", "archive", "HEAD"], cwd=ROOT, check=True, capture_output=True).stdout  # noqa: S607
+    subprocess.run(["tar", "x"], cwd=home, input=archive, check=True)  # noqa: S607
+    for place in ("proc", "dev"):
+        subprocess.run(["mount", "--rbind", f"/{place}", root / place], check=True)  # noqa: S603, S607
+    try:
+        yield
+    finally:
         for place in ("proc", "dev"):
-            subprocess.run(["mount", "--rbind", f"/{place}", root / place], check=True)  # noqa: S603, S607
-        try:
-            _work(root)
-        finally:
-            for place in ("proc", "dev"):
-                subprocess.run(["umount", "-l", root / place], check=False)  # noqa: S603, S607
+            subprocess.run(["umount", "-l", root / place], check=False)  # noqa: S603, S607
 
 
-def _debian(root: Path, copied: list[Path]) -> None:
-    command = ["mmdebstrap", "--quiet", "--variant=minbase", f"--include={PACKAGES}", "bookworm", str(root)]
+def _debian(root: Path, release: str, packages: str, copied: list[Path]) -> None:
+    command = ["mmdebstrap", "--quiet", "--variant=minbase", f"--include={packages}", SUITES[release], str(root)]
     subprocess.run(command, check=True)  # noqa: S603
     shutil.copy("/etc/resolv.conf", root / "etc" / "resolv.conf")
     shutil.copy("/etc/hosts", root / "etc" / "hosts")
@@ -65,7 +91,46 @@ def _debian(root: Path, copied: list[Path]) -> None:
             shutil.copy(path, place)
 
 
+def _install_package(root: Path) -> None:
+    """Build the package for a root, boot it, and do what INSTALL.md says, in its order."""
+    from tests.support.booted_machine import booted_machine  # noqa: PLC0415 - not where the tutorials are followed
+
+    uv = shutil.which("uv", path=f"{ROOT}/.venv/bin:{os.environ['PATH']}")
+    if not uv:
+        sys.exit("no uv")
+    with _with_checkout(root):
+        shutil.copy(uv, root / "root" / "uv")
+        build = "UV=/root/uv COMPRESSION=none deploy/build_deb.sh /root/built"
+        _timed("build the packages (no work of the newcomer's)", lambda: _run(root, build))
+    for package in (root / "root" / "built").glob("*.deb"):
+        package.rename(root / "root" / package.name)
+    for place in (root / "root" / CHECKOUT, root / "root" / ".cache", root / "root" / "built"):
+        shutil.rmtree(place, ignore_errors=True)
+    with booted_machine(root) as machine:
+        machine.must("ip", "link", "set", "lo", "up")
+        began_s = time.monotonic()
+        for section, text in SECTIONS.findall(INSTALL.read_text(encoding="utf-8")):
+            step_s = time.monotonic()
+            for command in COMMANDS.findall(text):
+                machine.must("sh", "-euxc", f"cd /root\n{command}", timeout_s=120)
+            print(f"{time.monotonic() - step_s:7.1f} s  {INSTALL.name}: {section}", flush=True)
+            if section == RUNNING:
+                print(f"{time.monotonic() - began_s:7.1f} s  until rig, console, recording and metrics run", flush=True)
+
+
 def _work(root: Path) -> None:
+    """Follow README and tutorials, from the checkout and from the wheel."""
+    with _with_checkout(root):
+        _follow_readme(root)
+
+
+PARTS: Mapping[str, tuple[str, Callable[[Path], None]]] = {
+    "source": (PACKAGES, _work),
+    "package": (SERVED, _install_package),
+}
+
+
+def _follow_readme(root: Path) -> None:
     began_s = time.monotonic()
     running = _start(root, "make run")
     try:
@@ -116,7 +181,7 @@ def _run(root: Path, script: str, before: str = "true") -> str:
 
 
 def _start(root: Path, script: str) -> "subprocess.Popen[str]":
-    kept = {name: text for name, text in os.environ.items() if name.startswith(("PIP_", "SSL_", "http", "HTTP"))}
+    kept = {name: text for name, text in os.environ.items() if name.startswith(("PIP_", "UV_", "SSL_", "http", "HTTP"))}
     environment = {"PATH": "/usr/bin:/usr/sbin:/bin", "HOME": "/root", "LANG": "C.UTF-8", **kept}
     return subprocess.Popen(  # noqa: S603 - our own commands
         ["chroot", str(root), "/bin/bash", "-c", f"cd /root/{CHECKOUT} && {script}"],  # noqa: S607

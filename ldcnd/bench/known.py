@@ -12,10 +12,10 @@ from ldcnd.contract.health import Finding
 from ldcnd.drives.family import UnopenedLine
 from ldcnd.drives.known import FAMILIES, ByName
 from ldcnd.drives.line_config import BusConfig
-from ldcnd.line.adapter import ports
 from ldcnd.line.bus import Bus
+from ldcnd.line.ports_here import ports_here
 
-__all__ = ["BENCHES", "HOMES", "line_of", "ports", "show_findings", "with_line"]
+__all__ = ["BENCHES", "HOMES", "line_of", "ports_here", "show_findings", "with_line"]
 
 OPEN_TIME_S = 5.0
 ResultT = TypeVar("ResultT")

@@ -13,7 +13,7 @@ import click
 
 from ldcnd.bench.begun import begun_with, scan_port, write
 from ldcnd.bench.family import BenchFamily, TrialMove
-from ldcnd.bench.known import BENCHES, line_of, show_findings
+from ldcnd.bench.known import BENCHES, line_of, ports_here, show_findings
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.typed import Finite, WholeNumber
 from ldcnd.config.rig import RigConfig, load_config
@@ -33,7 +33,7 @@ NOTHING_FOUND = 1
 
 
 @click.command()
-@click.argument("port")
+@click.argument("port", required=False)
 @click.option("--family", type=click.Choice(list(BENCHES)), help="Search for drives of this family only.")
 @click.option(
     "--address",
@@ -48,12 +48,21 @@ NOTHING_FOUND = 1
     help="Add what was found and is not in it yet to a configuration, or begin one.",
 )
 @click.option("--json", "as_json", is_flag=True, help="Print JSON lines.")
-def scan(port: str, family: str | None, file: Path | None, *, give_addresses: bool, as_json: bool) -> None:
+def scan(port: str | None, family: str | None, file: Path | None, *, give_addresses: bool, as_json: bool) -> None:
     """Find out which drives are on PORT, at which rate and in which state; no daemon may use it meanwhile.
 
     Listens, then probes addresses 1 to 32, or units 0 to F, at every rate: 10 to 20 seconds. It only reads: nothing
     moves, nothing is reset, nothing gets an address, unless --address says so. Exits with 1 when no drive is found.
+
+    Without PORT it opens nothing and lists the serial ports of this machine: the name to write into a configuration,
+    the driver, how long it keeps a reply back, who has it, and the adapter.
     """
+    if port is None:
+        if family or file or give_addresses:
+            raise click.UsageError("--family, --write and --address go with a PORT; `ldcnd scan` alone lists the ports")
+        sys.exit(0 if _list_ports(as_json=as_json) else NOTHING_FOUND)
+    if Path(port).exists():
+        port = str(Path(port).absolute())  # as `ldcnd sim --pty` takes it
     configure_logging(level="error")  # findings say the rest
     wrong = False
 
@@ -74,6 +83,24 @@ def scan(port: str, family: str | None, file: Path | None, *, give_addresses: bo
                 print("\n".join(write(begun_with(file, name, port, drives))), file=sys.stderr)
             break
     sys.exit(NOTHING_FOUND if wrong or not drives else 0)
+
+
+def _list_ports(*, as_json: bool) -> bool:
+    """Print the serial ports of this machine; tell whether there are any."""
+    found = ports_here()
+    width = max((len(each.port) for each in found), default=0)
+    for each in found:
+        driver = each.adapter.driver if each.adapter else ""
+        if as_json:
+            row = {"port": each.port, "node": each.node, "driver": driver, "keeps_back": each.keeps_back}
+            print(json.dumps(row | {"held_by": each.held_by, "adapter": each.what, "hardware": each.hardware}))
+            continue
+        held = f"held by {', '.join(each.held_by)}" if each.held_by else "free"
+        said = (each.node, driver, each.keeps_back and f"keeps replies back for {each.keeps_back}", held, each.what)
+        print(f"{each.port:{width}}  {', '.join(filter(None, said))}")
+    if not found and not as_json:
+        print("this machine has no serial port: plug an adapter in; `dmesg` shows what becomes of it", file=sys.stderr)
+    return bool(found)
 
 
 class Examinations(CommandGroup):

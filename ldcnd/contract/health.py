@@ -168,6 +168,8 @@ class DaemonHealth(Frozen):
     """Queries that were refused for being too many, and lost changes of clients' presence, since the daemon started."""
     heartbeat: HeartbeatHealth | None = None
     """The heartbeat; None where none is configured."""
+    version: str = ""
+    """The version of ldcnd that runs; empty from a daemon of an earlier version."""
 
 
 class Verdict(StrEnum):

@@ -23,6 +23,7 @@ from ldcnd.daemon.rig import OwnedRig
 from ldcnd.line.exchange import Lane
 from ldcnd.net.hand_over import Load
 from ldcnd.net.publisher import Publisher, Topic
+from ldcnd.version import version
 
 PERIOD_S = 1.0
 TURNS = 4
@@ -150,6 +151,7 @@ class HealthWatch:
                 waiting_queries=load.waiting,
                 dropped=load.lost,
                 heartbeat=self.heartbeat(),
+                version=version(),
             )
         }
         for bus in self._rig.buses:

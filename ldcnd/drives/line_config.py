@@ -5,9 +5,11 @@ from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, SerializeAsAny, ValidationInfo, field_validator, model_validator
 
+from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.toml import Name, refuse_duplicates
+from ldcnd.line.port_url import check_port, is_here
 from ldcnd.line.transport import Rs485Config
 
 SIMULATED = "sim:"
@@ -16,9 +18,12 @@ BAUDS = (9600, 19_200, 57_600, 115_200, 230_400)
 
 
 def _known_port(port: str) -> str:
-    if port.startswith(("/", "socket://", SIMULATED)):
-        return port
-    raise ValueError("a port is a device path, socket://host:port, or sim:NAME")
+    if not port.startswith(SIMULATED):
+        try:
+            check_port(port)
+        except ConfigError as error:
+            raise ValueError(f"{error.message}; a simulated one is {SIMULATED}NAME") from None
+    return port
 
 
 class GroupConfig(Frozen):
@@ -89,7 +94,8 @@ class BusConfig(Frozen):
     name: Name
     """Name of the line, for people and messages, and its chunk in `meta/buses`."""
     port: Annotated[str, AfterValidator(_known_port)]
-    """A device path, socket://host:port, or sim:NAME."""
+    """A device path; hwgrep://PATTERN, a regular expression that fits one adapter that `ldcnd scan` lists;
+    socket://host:port or rfc2217://host:port of a serial server; or sim:NAME."""
     family: str
     """The drive family on it, which has keys of its own."""
     baud: int = Field(default=19_200, gt=0, le=BAUDS[-1])
@@ -172,7 +178,7 @@ refuse, and skip where the drives' speed only shows on site."""
 
     @model_validator(mode="after")
     def _switched_transmitter(self) -> Self:
-        if self.rs485 and not self.port.startswith("/"):
+        if self.rs485 and not is_here(self.port):
             raise ValueError(f"rs485: only a serial port of this machine has RTS, {self.port} has not; leave it out")
         return self
 

@@ -90,6 +90,10 @@ class HealthCollector(Collector):
         build = GaugeMetricFamily("ldcnd_build_info", "1, with the version of this exporter", labels=["rig", "version"])
         build.add_metric([self._rig, version()], 1.0)
         yield build
+        runs = GaugeMetricFamily("ldcnd_daemon_info", "1, with the version of the daemon", labels=["rig", "version"])
+        if daemon and daemon.version:
+            runs.add_metric([self._rig, daemon.version], 1.0)
+        yield runs
         yield from self._of_daemon(daemon)
         yield from self._of_buses(buses)
         yield from self._of_lanes(buses)

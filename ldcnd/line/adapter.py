@@ -98,7 +98,7 @@ def adapter_of(path: Path, sys_tty: Path = SYS_TTY, by_id: Path = BY_ID) -> Adap
     if not device.exists():
         return None
     driver = device / "driver"
-    stable = next((link for link in _entries(by_id) if link.resolve().name == node), None)
+    stable = stable_names(by_id).get(node)
     return Adapter(
         node,
         driver.resolve().name if driver.exists() else "",
@@ -108,12 +108,9 @@ def adapter_of(path: Path, sys_tty: Path = SYS_TTY, by_id: Path = BY_ID) -> Adap
     )
 
 
-def ports(dev: Path = Path("/dev"), by_id: Path = BY_ID) -> list[str]:
-    """Return the serial ports on which drives may be: names that stay where there are any, then other nodes."""
-    stable = _entries(by_id)
-    named = {link.resolve().name for link in stable}
-    nodes = [node for kind in ("ttyUSB*", "ttyACM*", "ttyAMA*") for node in sorted(dev.glob(kind))]
-    return [str(each) for each in (*stable, *(node for node in nodes if node.name not in named))]
+def stable_names(by_id: Path = BY_ID) -> dict[str, Path]:
+    """Return the names that udev keeps, by the node to which each leads now."""
+    return {link.resolve().name: link for link in _entries(by_id)}
 
 
 def line_errors(descriptor: int) -> LineErrors | None:

@@ -9,7 +9,6 @@ import errno
 import fcntl
 import struct
 import termios
-from collections.abc import Sequence
 
 from ldcnd.line.transport import (
     ENABLED,
@@ -27,11 +26,6 @@ TIOCGRS485 = 0x542E
 TIOCSRS485 = 0x542F
 SERIAL_RS485 = struct.Struct("3I5I")
 
-STANDARD_BAUDS = (9600, 19_200, 38_400, 57_600, 115_200, 230_400)
-RATE_TOLERANCE = 0.02
-"""The kernel calls a rate by the name of its neighbour within this share (drivers/tty/tty_baudrate.c); two clocks that
-differ by no more still read each other's bytes."""
-
 PortFault = (OSError, ValueError, OverflowError, termios.error)
 """Exceptions for a driver's refusal; that of `termios` is no OSError."""
 
@@ -45,18 +39,6 @@ def actual_baud(descriptor: int) -> int | None:
         speed: int = TERMIOS2.unpack(fcntl.ioctl(descriptor, TCGETS2, bytes(TERMIOS2.size)))[-1]
         return speed or None
     return None
-
-
-def makes(asked: int, made: int | None) -> bool:
-    """Return whether a port that says it sends at `made` can be received at `asked`."""
-    return made is None or abs(made - asked) <= RATE_TOLERANCE * asked
-
-
-def nearest(asked: int, available: Sequence[int]) -> str:
-    """Return the two rates next to the requested one, in words."""
-    below = [baud for baud in available if baud < asked]
-    above = [baud for baud in available if baud > asked]
-    return " and ".join(str(baud) for baud in (*below[-1:], *above[:1])) or "none"
 
 
 def switch_direction(descriptor: int, wanted: Rs485Config) -> str:

@@ -24,14 +24,8 @@ from typing_extensions import override
 
 from ldcnd.contract.errors import TransportLost
 from ldcnd.line.adapter import LineErrors, line_errors
-from ldcnd.line.line_discipline import (
-    STANDARD_BAUDS,
-    PortFault,
-    actual_baud,
-    makes,
-    nearest,
-    switch_direction,
-)
+from ldcnd.line.line_discipline import PortFault, actual_baud, switch_direction
+from ldcnd.line.rates import STANDARD_BAUDS, makes, nearest
 from ldcnd.line.terminal_link import PSEUDO_TERMINALS, why_not_served
 from ldcnd.line.transport import Framing, Incoming, Receiver, Rs485Config, Transport
 

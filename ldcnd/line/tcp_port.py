@@ -8,12 +8,14 @@ import asyncio
 import contextlib
 import os
 import socket
+from typing import TypeVar
 
 from typing_extensions import override
 
 from ldcnd.contract.errors import NotSupported, TransportLost
 from ldcnd.line.transport import Incoming, Receiver, Transport
 
+CONNECT_TIME_S = 5.0
 CLOSE_TIME_S = 1.0
 UNACKNOWLEDGED_MS = 5000
 """Time without acknowledgement after which the far end is gone; without it the kernel tries for some 15 minutes."""
@@ -25,23 +27,39 @@ READ_BYTES = 4096
 LONGEST_DISCARD = 64
 """Reads after which a flood is left to the receiver."""
 
+IncomingT = TypeVar("IncomingT", bound=Incoming)
 
-async def open_tcp_port(host: str, port: int, connect_timeout_s: float = 5.0) -> Transport:
+
+async def open_tcp_port(host: str, port: int, connect_timeout_s: float = CONNECT_TIME_S) -> Transport:
     """Connect to a serial server.
 
     Raises:
         TransportLost: the name is unknown, or there is no answer in time.
     """
-    name = f"socket://{f'[{host}]' if ':' in host else host}:{port}"
+    return TcpPort(*await connected(Incoming(address("socket", host, port)), host, port, connect_timeout_s))
+
+
+def address(scheme: str, host: str, port: int) -> str:
+    """Return the name of a port at a serial server."""
+    return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
+
+
+async def connected(
+    incoming: IncomingT, host: str, port: int, connect_timeout_s: float
+) -> tuple[asyncio.Transport, IncomingT]:
+    """Connect; return the stream, and what it delivers to.
+
+    Raises:
+        TransportLost: the name is unknown, or there is no answer in time.
+    """
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(connect_timeout_s):
-            stream, incoming = await loop.create_connection(lambda: Incoming(name), host, port)
+            return await loop.create_connection(lambda: incoming, host, port)
     except TimeoutError as error:
-        raise _unreachable(name, f"no answer within {connect_timeout_s:g} s") from error
+        raise unreachable(incoming.name, f"no answer within {connect_timeout_s:g} s") from error
     except (OSError, OverflowError) as error:
-        raise _unreachable(name, str(error)) from error
-    return TcpPort(stream, incoming)
+        raise unreachable(incoming.name, str(error)) from error
 
 
 class TcpPort(Transport):
@@ -88,7 +106,7 @@ class TcpPort(Transport):
             for _ in range(LONGEST_DISCARD):
                 if not (dropped := os.read(self._descriptor, READ_BYTES)):
                     return
-                self._incoming.hear(dropped)
+                self._incoming.drop(dropped)
 
     def set_baud(self, baud: int) -> None:
         """Refuse: only the far end can.
@@ -111,6 +129,8 @@ class TcpPort(Transport):
         await self._incoming.ended.wait()
 
 
-def _unreachable(name: str, why: str) -> TransportLost:
-    remedy = "check the serial server's address, its power and the network"
+def unreachable(
+    name: str, why: str, remedy: str = "check the serial server's address, its power and the network"
+) -> TransportLost:
+    """Return why a serial server cannot be used, as an error."""
     return TransportLost(f"{name} cannot be opened: {why}; {remedy}", value=name, remedy=remedy)

@@ -127,6 +127,7 @@ class Incoming(asyncio.Protocol):
     """Stands between an asyncio transport and the port's receiver.
 
     Attributes:
+        name: of the port.
         reason: why the port can no longer be used; empty while it can.
         heard: the first bytes of the far end, which may be words for people.
         ended: set once asyncio has let go of the port: no byte follows, and the descriptor is about to be closed.
@@ -136,7 +137,7 @@ class Incoming(asyncio.Protocol):
         self.reason = ""
         self.heard = bytearray()
         self.ended = asyncio.Event()
-        self._name = name
+        self.name = name
         self._receiver: Receiver | None = None  # no receiver before `attach` and after `detach`
 
     def attach(self, receiver: Receiver) -> None:
@@ -147,18 +148,22 @@ class Incoming(asyncio.Protocol):
 
     def detach(self) -> None:
         """Deliver nothing more, not even the end: the port is being closed on purpose."""
-        self.reason = self.reason or f"{self._name} is closed"
+        self.reason = self.reason or f"{self.name} is closed"
         self._receiver = None
 
     def lost(self, why: str) -> TransportLost:
         """Note the first reason for which the port can no longer be used; return it as an error."""
-        self.reason = self.reason or f"{self._name} was lost: {why}"
+        self.reason = self.reason or f"{self.name} was lost: {why}"
         return TransportLost(self.reason, remedy="check the adapter and its cable; the port is opened again by itself")
 
     def hear(self, data: bytes) -> None:
         """Keep the first bytes that came, also of those that are dropped."""
         if len(self.heard) < MOST_HEARD:
             self.heard += data[: MOST_HEARD - len(self.heard)]
+
+    def drop(self, data: bytes) -> None:
+        """Deliver nothing of what came before it was wanted."""
+        self.hear(data)
 
     def _words(self) -> str:
         """Return what the far end has said before it closed, if it was text: serial servers say why they do."""

@@ -27,9 +27,9 @@ from ldcnd.line.line_discipline import (
     TERMINATE_BUS,
     Rs485Config,
     actual_baud,
-    makes,
 )
 from ldcnd.line.port_url import port_opener
+from ldcnd.line.rates import makes
 from ldcnd.line.serial_port import SerialPort, SerialSettings, open_serial_port
 from ldcnd.line.settings import BusSettings
 from tests.support.recording_receiver import RecordingReceiver

@@ -26,6 +26,7 @@ async def test_a_daemon_s_reports_become_metrics():
 
         assert registry.get_sample_value("ldcnd_daemon_up", {"rig": "sim"}) == 1
         assert registry.get_sample_value("ldcnd_build_info", {"rig": "sim", "version": version()}) == 1
+        assert registry.get_sample_value("ldcnd_daemon_info", {"rig": "sim", "version": version()}) == 1
         rate = registry.get_sample_value("ldcnd_axis_rate_hertz", {"rig": "sim", "bus": "line0", "axis": "x"})
         wanted = registry.get_sample_value("ldcnd_axis_rate_wanted_hertz", {"rig": "sim", "bus": "line0", "axis": "x"})
         assert rate == pytest.approx(wanted, rel=0.05)

@@ -215,8 +215,16 @@ async def test_a_port_is_a_path_or_a_socket(far: FarEnd):
 
     with pytest.raises(TransportLost, match="no such device"):
         await port_opener("/dev/does-not-exist", 115_200)()
-    for wrong in ("ttyS0", "socket://", "socket://host", "socket://host:x", "socket://host:70000", "sim:one"):
-        with pytest.raises(ConfigError, match="neither a device path"):
+    servers = (
+        "socket://",
+        "socket://host",
+        "socket://host:x",
+        "socket://host:70000",
+        "rfc2217://host",
+        "socket://h:1/x",
+    )
+    for wrong in ("ttyS0", *servers, "hwgrep://*", "sim:one"):
+        with pytest.raises(ConfigError, match="is not a device path"):
             port_opener(wrong, 115_200)
 
 

@@ -1,4 +1,4 @@
-"""A machine with a real systemd: this machine's own files under an overlay, booted in a container within a second.
+"""A machine with a real systemd: the files of this one or of another root under an overlay, booted within a second.
 
 The container must not filter system calls itself: with a filter, mlock and bpf are refused, and then systemd silently
 leaves out DeviceAllow= and IPAddressDeny=, and a test of them would prove nothing.
@@ -90,11 +90,15 @@ def eventually(look: Callable[[], str], wanted: Callable[[str], bool], within_s:
 
 
 @contextmanager
-def booted_machine() -> Iterator[Machine]:
-    """Boot a machine; everything done to it is gone when the context ends. Skips the test where that is impossible."""
+def booted_machine(base: Path = Path("/")) -> Iterator[Machine]:
+    """Boot a machine; everything done to it is gone when the context ends. Skips the test where that is impossible.
+
+    Args:
+        base: the root whose files it has, this machine's own if missing.
+    """
     with ExitStack() as stack:
         place = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="ldcnd-machine-")))
-        root = _overlay(place, stack)
+        root = _overlay(base, place, stack)
         environment = {
             "PATH": os.environ["PATH"],
             "SYSTEMD_SECCOMP": "0",
@@ -119,8 +123,8 @@ def booted_machine() -> Iterator[Machine]:
             yield machine
 
 
-def _overlay(place: Path, stack: ExitStack) -> Path:
-    """Return this machine's root under an overlay that lives in memory, with no service of its own enabled."""
+def _overlay(base: Path, place: Path, stack: ExitStack) -> Path:
+    """Return a root under an overlay that lives in memory, with no service of its own enabled."""
 
     def mount(*arguments: str) -> None:
         done = subprocess.run(["mount", *arguments], capture_output=True, text=True, check=False)  # noqa: S603, S607
@@ -137,7 +141,12 @@ def _overlay(place: Path, stack: ExitStack) -> Path:
         (above / name).mkdir()
     root = above / "root"
     mount(
-        "-t", "overlay", "-o", f"lowerdir=/,upperdir={above / 'changed'},workdir={above / 'work'}", "overlay", str(root)
+        "-t",
+        "overlay",
+        "-o",
+        f"lowerdir={base},upperdir={above / 'changed'},workdir={above / 'work'}",
+        "overlay",
+        str(root),
     )
     mount("-t", "tmpfs", "ldcnd-test", str(root / "etc/systemd/system"))
     # a package with manuals would have this machine's man-db, if it has one, look through all manuals that it knows

@@ -25,7 +25,9 @@ from ldcnd.contract.samples import (
 from ldcnd.lab.metrics import SHADOW_FRESH_S, HealthCollector
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
-DAEMON = DaemonHealth(t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=8, waiting_queries=3, dropped=9)
+DAEMON = DaemonHealth(
+    t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=8, waiting_queries=3, dropped=9, version="0.0.9"
+)
 BUS = BusHealth(
     t=1, seq=0, bus="line0", up=True, utilisation=0.25, exchanges=1000, timeouts=3, corrupt_replies=2,
     rejected_packets=0, resent=4, resynchronisations=5, stray_bytes=6, losses=1,
@@ -137,6 +139,7 @@ def registry(clock) -> CollectorRegistry:
         ("ldcnd_axis_travelled_counts_total", {"axis": "x"}, 70.0),
         ("ldcnd_shadow_value", {"axis": "x", "figure": "friction"}, 3.2),
         ("ldcnd_shadow_usual", {"axis": "x", "figure": "friction"}, 2.0),
+        ("ldcnd_daemon_info", {"version": "0.0.9"}, 1.0),
         ("ldcnd_shadow_high", {"axis": "x", "figure": "friction"}, 2.5),
         ("ldcnd_shadow_low", {"axis": "x", "figure": "friction"}, None),
         ("ldcnd_shadow_alarm", {"axis": "x", "figure": "friction"}, 1.0),
@@ -220,8 +223,8 @@ def test_alerts_fire_when_they_should(tmp_path):
         given = ",".join(f'{label}="{value}"' for label, value in {"rig": "sim", "axis": "x", **labels}.items())
         return {"series": f"{name}{{{given}}}", "values": values}
 
-    def fires(alert: str, at: str, *, expected: bool) -> dict[str, object]:
-        labels = {"rig": "sim", "axis": "x"}
+    def fires(alert: str, at: str, *, expected: bool, **more: str) -> dict[str, object]:
+        labels = {"rig": "sim", "axis": "x", **more}
         found = [{"exp_labels": labels | {"severity": "critical" if "Reference" in alert else "warning"}}]
         return {"eval_time": at, "alertname": alert, "exp_alerts": found if expected else []}
 
@@ -236,6 +239,9 @@ def test_alerts_fire_when_they_should(tmp_path):
                 series("ldcnd_axis_travelled_counts_total", "0x30 0+500x30"),
                 series("ldcnd_axis_state", "1x60", state="disabled"),
                 series("ldcnd_axis_state", "0x60", state="error_stop"),
+                series("ldcnd_build_info", "1x600", version="0.2.0"),
+                series("ldcnd_daemon_info", "1x30 stale", version="0.2.0"),
+                series("ldcnd_daemon_info", "_x30 1x600", version="0.1.0"),
             ],
             "alert_rule_test": [
                 fires("LdcndReferenceLost", "4m", expected=False),
@@ -244,6 +250,8 @@ def test_alerts_fire_when_they_should(tmp_path):
                 fires("LdcndStopLatched", "15m", expected=True),
                 fires("LdcndMovesWithoutPower", "4m", expected=False),
                 fires("LdcndMovesWithoutPower", "8m", expected=True),
+                fires("LdcndVersionsDiffer", "4m", expected=False),
+                fires("LdcndVersionsDiffer", "70m", expected=True, version="0.1.0"),
             ],
         }
     ]

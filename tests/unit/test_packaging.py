@@ -97,3 +97,13 @@ def test_the_sdist_has_what_building_testing_and_reading_takes(twice: list[dict[
         "tests/unit/test_packaging.py",
     } <= names
     assert not [name for name in names if name.startswith(("docs/faults/", "build/", ".venv/"))]
+
+
+def test_the_wheel_names_the_licence_of_each_script_that_it_holds(twice):
+    with zipfile.ZipFile(twice[0]["wheel"]) as wheel:
+        [place] = [name for name in wheel.namelist() if name.endswith(".dist-info/METADATA")]
+        metadata = wheel.read(place).decode()
+
+    vendored = {str(path.relative_to(ROOT)) for path in ROOT.glob("ldcnd/console/static/vendor/*/LICENSE*")}
+    assert "License-Expression: Apache-2.0 AND MIT AND ISC\n" in metadata
+    assert {"LICENSE", *vendored} == set(re.findall(r"(?m)^License-File: (.+)$", metadata))

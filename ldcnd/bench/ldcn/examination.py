@@ -25,6 +25,7 @@ from ldcnd.line.adapter import Adapter, adapter_of
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
+from ldcnd.line.port_url import device_of
 
 EXCHANGES = 100
 """Number of exchanges with each drive: they include the shortest and the longest wait for a servo cycle's end."""
@@ -104,7 +105,7 @@ async def examine(
         line: what the configuration says of it.
         look: returns the kernel's data of an adapter.
     """
-    for finding in adapter_findings(line, look(Path(line.port)) if line.port.startswith("/") else None):
+    for finding in adapter_findings(line, look(device) if (device := device_of(line.port)) else None):
         yield finding
     before = bus.line_errors()
     try:

@@ -34,6 +34,7 @@ from ldcnd.drives.ldcn.profiles import PIC_IO, PROFILES, Profile, Support
 from ldcnd.drives.ldcn.registers import RESET_BAUD, BaudCodes
 from ldcnd.line.adapter import Adapter, adapter_of
 from ldcnd.line.bus import Bus
+from ldcnd.line.port_url import device_of
 from ldcnd.line.proof import bringing_up
 
 LISTENED_S = 0.5
@@ -80,7 +81,7 @@ class LineScan:
     async def findings(self) -> AsyncIterator[Finding]:
         """Run the scan; yields each finding as it comes."""
         line = LineAsConfigured(self._port, self._port, 0.0, MARGIN_MS, ANY_DIALECT.name)
-        for finding in adapter_findings(line, self._look(Path(self._port)) if self._port.startswith("/") else None):
+        for finding in adapter_findings(line, self._look(device) if (device := device_of(self._port)) else None):
             yield finding
         before = self._bus.line_errors()
         try:
@@ -309,7 +310,8 @@ def configured_line(name: str, port: str, drives: Sequence[ScannedDrive]) -> str
     tops = [PROFILES[drive.model].top_baud for drive in drives if drive.model]
     baud = USUAL_BAUD if all(top >= USUAL_BAUD for top in tops) else RESET_BAUD
     seen = ", ".join(sorted({str(drive.baud) for drive in drives}))
-    adapter = adapter_of(Path(port))
+    device = device_of(port)
+    adapter = adapter_of(device) if device else None
     simulated = adapter is not None and not adapter.driver
     margin = "margin_ms = 200  # behind a pseudo-terminal a program answers, when it gets to it"
     return f"""

@@ -7,7 +7,7 @@ from typing_extensions import override
 
 from ldcnd.bench.begun import begun_with, scan_port, write
 from ldcnd.bench.family import ScannedDrive
-from ldcnd.bench.known import BENCHES, ports
+from ldcnd.bench.known import BENCHES, ports_here
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import load_config
 from ldcnd.console.commissioning.conversation import Conversation
@@ -61,7 +61,7 @@ class ScanConversation(Conversation):
         person = self.person
         port = ""
         while not port:
-            port = await person.pick("on which port", ports())
+            port = await person.pick("on which port", [each.port for each in ports_here()])
         families = {**{name: f"{name} drives" for name in BENCHES}, ANY: "not known: search for all of them"}
         wanted = await person.choose("which drives", families)
         names = list(BENCHES) if wanted == ANY else [wanted]
