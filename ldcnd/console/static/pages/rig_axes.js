@@ -2,6 +2,7 @@
 
 import { html, useId } from "../html.js";
 import { Action } from "../parts/controls.js";
+import { askEach } from "../parts/fates.js";
 import { decimalsOf, number, percent, words } from "../parts/format.js";
 import { shownQuantity } from "../parts/number_text.js";
 import { inPageTerms } from "../parts/remedies.js";
@@ -114,13 +115,16 @@ function AxisCommands({ axis }) {
   const halt = ["Halt", "halt", () => command(axis, "halt")];
   const power = [on ? "Disable" : "Enable", on ? "disable" : "enable", () => command(axis, "power", { on: !on })];
   const reset = ["Reset", "reset", () => command(axis, "reset")];
-  const home = ["Home", "home", () => command(axis, "home")];
+  const home = ["Home", "home", () => follow("Home", () => command(axis, "home"))];
   const second = obstacle(axis, "reset") === null || !axis.can("home") ? reset : home;
   const taking = ["Take control", "none", () => take([axis])];
   const held = axis.holder ? `Control is held by ${axis.holder}: take it on the page of ${axis.name}.` : null;
   const refuse = (title) => (error) => {
     axis.refusal = refused(axis, title.toLowerCase(), error); // below the row, which is one line
     changed();
+  };
+  const follow = async (title, send) => {
+    for (const { error } of await askEach(axis.rig.name, title, [axis], send)) throw error;
   };
   const begin = (run) => () => {
     axis.refusal = null;
