@@ -136,3 +136,39 @@ async def test_a_command_for_all_that_cannot_be_sent_says_what_each_axis_wants_f
     await expect(every.get_by_role("button", name="Reset all")).to_have_attribute(
         "title", re.compile("Nothing to reset")
     )
+
+
+async def test_a_preview_is_that_of_now(there):
+    """It was typed at another speed override; where an axis is not homed, its end is no place."""
+    daemon, desk = there
+    await taken_and_enabled(daemon, desk)
+    await desk.open("axis/bench/x")
+    preview, position = desk.panel("Move").locator(".preview"), desk.panel("Move").get_by_label("Position mm")
+    if not (await daemon.rig.state("x")).referenced:
+        await position.fill("50")
+        await expect(preview).to_contain_text("Ends at (50.000) mm, not homed")
+    await desk.panel("Home").get_by_label("Current position is").fill("0")
+    await desk.button("Set position").click()
+    await position.fill("20")
+    await expect(preview).to_contain_text("Ends at 20.000 mm, at 5.000 mm/s")
+    for percent, said in (
+        (25, "by the speed override of 25 %"),
+        (0, "override of the rig is 0 %"),
+        (100, "at 5.000 mm/s,"),
+    ):
+        await override(desk, percent)
+        await expect(preview).to_contain_text(said)
+        await expect(preview).not_to_contain_text("by rounding")
+    await expect(preview).not_to_contain_text("refused")
+
+
+async def override(desk, percent):
+    """Set it as a colleague would, with the control that this page has."""
+    await desk.page.evaluate(
+        """async (percent) => {
+          const { rigs } = await import("/static/session/rigs.js");
+          const { setSpeedOverride } = await import("/static/session/control.js");
+          await setSpeedOverride(rigs.get("bench"), percent);
+        }""",
+        percent,
+    )

@@ -6,7 +6,7 @@ import { askEach } from "../parts/fates.js";
 import { decimalsOf, number, percent, words } from "../parts/format.js";
 import { shownQuantity } from "../parts/number_text.js";
 import { inPageTerms } from "../parts/remedies.js";
-import { Homed, Mark, Meter, Place, StateWord } from "../parts/state.js";
+import { Homed, Mark, Meter, Place, StateWord, TroubleWords } from "../parts/state.js";
 import { command, controls, take } from "../session/control.js";
 import { calms, obstacle } from "../session/obstacles.js";
 import { changed } from "../session/rigs.js";
@@ -76,14 +76,13 @@ function LineNow({ rig, bus }) {
 function AxisRow({ axis }) {
   const { info, samples, state } = axis;
   const decimals = decimalsOf(info);
-  const { live, mark, troubles } = axis.condition;
+  const { live, troubles } = axis.condition;
   const velocity = shownQuantity(live ? axis.velocity : null, info, "velocity");
-  const said = troubles.filter(({ short }) => short !== mark && short !== axis.condition.state);
   const cell = (label, content, kind = "", title = null) => html`<td role="cell" data-label=${label} class=${kind} title=${title}>${content}</td>`;
   return html`<tr role="row" data-axis=${axis.name} data-stale=${live ? "no" : "yes"}>
     <th role="rowheader" scope="row"><a href=${`#/axis/${axis.rig.name}/${axis.name}`}>${axis.name}</a>
       <small>${info.model} · ${info.address}</small></th>
-    ${cell("State", html`<${StateWord} axis=${axis} />${said.map(({ level, short }) => html` <${Mark} level=${level}>${short}<//>`)}`,
+    ${cell("State", html`<${StateWord} axis=${axis} /><${TroubleWords} axis=${axis} />`,
       "said", [axis.condition.state, ...troubles.map(({ text }) => text)].join(". "))}
     ${cell("Position", html`<${Place} axis=${axis} decimals=${decimals} label="Position" />`, "number main")}
     ${cell("Homed", html`<${Homed} axis=${axis} />`, "homed")}
