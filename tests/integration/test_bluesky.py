@@ -673,20 +673,27 @@ def test_an_aborted_plan_halts_without_the_latch(lab: Laboratory):
 
 @pytest.mark.parametrize("ending", ["resume", "abort", "stop"])
 @pytest.mark.parametrize("several", [False, True])
-def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes_on(lab: Laboratory, several, ending):
+@pytest.mark.parametrize("checkpoint", ["before prepare", "before kickoff"])
+def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes_on(
+    lab: Laboratory, several, checkpoint, ending
+):
     def pause_in_flight():
         lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
         lab.engine.request_pause()
 
     def plan(device, flight):
         yield from bps.open_run()
+        yield from bps.mv(x, 1, y, 1)
         yield from bps.prepare(device, flight, wait=True)
         yield from bps.checkpoint()
         yield from bps.prepare(device, flight, wait=True)
         yield from bps.declare_stream(device, name="flight", collect=True)
+        if checkpoint == "before kickoff":
+            yield from bps.checkpoint()
         yield from bps.kickoff(device, wait=True)
         pausing.start()
         yield from bps.complete(device, wait=True)
+        yield from bps.collect(device, name="flight")
         yield from bps.close_run()
 
     with lab.powered("x", "y") as (x, y):
@@ -704,6 +711,12 @@ def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes
         getattr(lab.engine, ending)()
 
         assert stands(lab, "x")
+        if ending == "resume":
+            flown = [value for page in lab.documents.of("event_page") for value in page["data"]["x"]]
+            assert (min(flown), max(flown)) == (pytest.approx(0, abs=0.5), pytest.approx(30, abs=0.5))
+            assert lab.documents.exit_status == "success"
+            with pytest.raises(WrongState, match="prepare"):
+                device.kickoff().wait(20)
         assert lab.truth("x") == pytest.approx(30 if ending == "resume" else paused_at, abs=0.1)
 
 
@@ -729,6 +742,18 @@ def test_a_stop_that_overtakes_its_move_leaves_the_axis_at_rest(lab: Laboratory)
         assert ended is None
         assert stands(lab, "x")
         assert lab.truth("x") < 30
+
+
+def test_a_kickoff_that_a_stop_overtakes_is_no_failure_of_a_plan_that_was_paused(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        x.prepare(Fly(0, 30)).wait(60)
+        kicked_off = x.kickoff()
+        x.stop(success=True).wait(20)
+
+        assert kicked_off.exception(20) is None
+        assert x.complete().exception(20) is None
+        assert stands(lab, "x")
+        assert lab.truth("x") < 29
 
 
 def test_a_stop_while_a_flight_is_checked_begins_no_motion(lab: Laboratory):

@@ -2,8 +2,8 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
-from contextlib import suppress
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, TypeVar
 
 from ldcnd.client.axis import Axis as ClientAxis
@@ -227,6 +227,7 @@ class PlanAxis(ReadableAxis):
         self.velocity = Setting(self, "velocity", lambda: self._info.limits.velocity)
         self.acceleration = Setting(self, "acceleration", lambda: self._info.limits.acceleration)
         self._under_way = 0
+        self._beginning = 0
         self._stopped: bool | None = None
         self._newest: asyncio.Task[object] | None = None  # of the moves that were set
         self._flight = Flight(self.name, (self,), loop)
@@ -276,7 +277,8 @@ class PlanAxis(ReadableAxis):
         await self.stop()
 
     async def resume(self) -> None:
-        """Move nothing."""
+        """Move nothing; see `Flight.resume`."""
+        await self._flight.resume()
 
     async def locate(self) -> "Location[float]":
         """Return where the axis was sent last, or stands since anything else stopped or moved it, and where it is."""
@@ -417,7 +419,8 @@ class PlanAxis(ReadableAxis):
 
         async def moving() -> None:
             self._under_way += 1
-            self._stopped = None
+            if not self._beginning:
+                self._stopped = None
             try:
                 await work()
             except (CommandAborted, DriveFault, RequestRefused) as error:
@@ -430,6 +433,16 @@ class PlanAxis(ReadableAxis):
                 self._under_way -= 1
 
         return self._start(name, moving())
+
+    @contextmanager
+    def beginning(self) -> Iterator[None]:
+        """Have `stop` concern all that is begun in the context, on the loop: what takes several turns of it."""
+        self._beginning += 1
+        self._stopped = None
+        try:
+            yield
+        finally:
+            self._beginning -= 1
 
     async def _move(self, target: float) -> None:
         await self._end_of(
@@ -486,11 +499,12 @@ class PlanAxis(ReadableAxis):
         return self._stopped is True
 
     async def _halt(self, *, success: bool) -> None:
-        if not self._under_way:
+        if not (self._under_way or self._beginning):
             return
         self._stopped = success
-        with suppress(CommandAborted):  # by the halt of a motion that was on its way meanwhile
-            await (await self._axis.halt()).done()
+        if self._under_way:
+            with suppress(CommandAborted):  # by the halt of a motion that was on its way meanwhile
+                await (await self._axis.halt()).done()
         await self._rest()
 
     async def _rest(self, *, is_news: bool = False) -> None:
