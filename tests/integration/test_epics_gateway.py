@@ -347,6 +347,19 @@ async def test_tweaks_homing_and_set_mode():
         assert (await running.client.state("x")).moving is Moving.NO
 
 
+async def test_a_put_that_says_where_the_motor_is_returns_when_the_record_shows_it():
+    shown = []
+    async with records() as (_, made):
+        await put(made, "T:x.SET", "Set")
+        for target in (1.0, 3.0) * 5:
+            await put(made, "T:x", target)
+            shown.append(tuple(made.variables[f"T:x{name}"].value for name in ("", ".RBV", ".DIFF")))
+
+    assert [target for target, _, _ in shown] == [1.0, 3.0] * 5
+    assert [place for _, place, _ in shown] == pytest.approx([1.0, 3.0] * 5, abs=0.02)
+    assert [left for _, _, left in shown] == pytest.approx([0.0] * 10, abs=0.02)
+
+
 @pytest.mark.record(
     "STOP", "when the motor has stopped, VAL is RBV, as after Stop in SPMG, a jog, and what another program did"
 )

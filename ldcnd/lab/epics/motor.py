@@ -29,6 +29,8 @@ from ldcnd.lab.epics.record import NO_LIMIT, Defaults, MotorRecord
 
 MOTIONS = frozenset({".VAL", ".RLV", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR"})
 REFUSED = RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM)
+SHOWN_S = 2.0
+"""Longest wait for a position and a state that say what a put has set, in seconds."""
 REST_S = 10.0
 """Longest wait for the standstill after a motion that was ended early, in seconds."""
 
@@ -196,8 +198,18 @@ class MovedRecord(MotorRecord):
         axis, target = await self._movable(), float(asked)
         if self["SET"].value == "Set":
             await axis.set_position(target)
-            return Put(target)
+            await self._show_from_now_on()
+            return Put()
         return await self._go(target, halts)
+
+    async def _show_from_now_on(self) -> None:
+        """Wait until the record shows a position and a state of now, but not for ever."""
+        state_t, position_t = await self.control.published()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(SHOWN_S):
+                while self._measured <= position_t or (self.state and self.state.t < state_t):
+                    self._changed.clear()
+                    await self._changed.wait()
 
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
         return await self._put_step(sign * float(self["TWV"].value)) if asked else Put(0)

@@ -117,6 +117,7 @@ class MotorRecord:
         self._alarm = SILENT
         self._faults: FaultSample | None = None
         self._sent: Sent | None = None  # the last motion that the gateway has begun
+        self._measured = 0  # the instant of the last position, UTC in ns since 1970
         self._switches = 0  # bits of MSTA
         record = {name: field for name, field in motor_fields().items() if name not in PRIVATE}
         record["VAL"] = number()
@@ -287,6 +288,7 @@ class MotorRecord:
                 worst = max(alarm, self._alarm, key=lambda each: each.severity)
                 await self["RBV"].show(sample.value, worst, at_s)
                 await self["RRBV"].show(sample.counts, worst, at_s)
+                self._measured = sample.t
                 await self.show_target()
             case VelocitySample():
                 shown, _ = shown_quantity(sample.value, self.info, Dimension.VELOCITY)
