@@ -51,6 +51,7 @@ async def test_strangers_command_nothing(console):
 
         assert answer.status == 401, path
         assert answer.document["code"] == "not_permitted"
+        assert answer.document["remedy"] not in answer.document["message"]
     assert await untouched(console)
 
 
