@@ -8,8 +8,8 @@ UNKNOWN = "-"
 MARKS = {Severity.FINE: " ", Severity.NOTICE: "!", Severity.WRONG: "X"}
 """A mark beside the colour, readable without telling colours apart."""
 
-AXIS_TITLES = ("", "bus", "axis", "state", "position", "velocity", "target", "A/D", "age", "rate", "control", "trouble")
-NARROW = (0, 2, 3, 4, 10, 11)
+AXIS_TITLES = ("", "bus", "axis", "state", "position", "trouble", "velocity", "target", "A/D", "age", "rate", "control")
+NARROW = (0, 2, 3, 4, 5, 11)
 """Which of them a narrow terminal shows: that control and trouble can be seen comes before rates and ages."""
 BUS_TITLES = ("", "bus", "line", "busy", "exchanges", "errors", "resent", "poll p99", "stop max", "trouble")
 
@@ -23,13 +23,13 @@ def axis_cells(row: AxisGlance) -> tuple[str, ...]:
         row.axis,
         row.shown_state,
         row.shown_position,
+        row.trouble,
         UNKNOWN if row.velocity is None or row.moving is Moving.UNKNOWN else f"{row.velocity:.3f}",
         UNKNOWN if row.target is None else f"{row.target:.3f}",
         UNKNOWN if row.adc_volts is None else f"{row.adc_volts:.2f} V",
         UNKNOWN if row.age_s is None else f"{row.age_s:.1f} s",
         rate,
         row.control or UNKNOWN,
-        row.trouble,
     )
 
 
