@@ -247,20 +247,21 @@ class ModuleService:
         async with self._writes:
             self._check(condition)
             values = self.values
+            changes = [name for name, level in asked.items() if level is None or level is not values[name]]
             # first of all: motions ask for these outputs, as this asks for motions, and never do both pass
-            self._take(values | dict.fromkeys(asked))
+            self._take(values | dict.fromkeys(changes))
             try:
                 permitted()
             except LdcndError:
                 self._take(values)
                 raise
-            self._unread_until_s |= dict.fromkeys(asked, math.inf)
-            self.before = {name: (values[name], self.read_at_s) for name in asked} | self.before
+            self._unread_until_s |= dict.fromkeys(changes, math.inf)
+            self.before = {name: (values[name], self.read_at_s) for name in changes} | self.before
             try:
                 with only_while(permitted):
                     return await self._driver.set_outputs(levels, inputs, pwm)
             finally:
-                self._unread_until_s |= dict.fromkeys(asked, asyncio.get_running_loop().time())
+                self._unread_until_s |= dict.fromkeys(changes, asyncio.get_running_loop().time())
 
     async def set_timer(self, command: SetIoTimer, condition: Condition) -> IoReply:
         """Choose what is counted, if the sender still may when the packet is sent.

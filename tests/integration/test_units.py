@@ -14,11 +14,11 @@ CENTRIFUGE = load_config(ROOT / "config" / "centrifuge.toml")
 
 
 async def _ready(rig):
-    """Wait until door and lock are seen shut, and find the index."""
+    """Wait until the lock is seen shut, and find the index."""
     async with rig.control("rotor", client="test") as rotor:
         async with rig.samples("cabinet", "io") as samples:
             async for _, sample in samples:
-                if sample.named["locked"] and sample.named["door_closed"]:
+                if sample.named["locked"] and sample.named["unlock"] is False:
                     break
         await rotor.power(on=True)
         await (await rotor.home()).done()
