@@ -62,7 +62,11 @@ WAIT, LEAVE = (click.option(name, is_flag=True, help=text) for name, text in WAI
 @click.argument("axis", type=AXIS)
 @click.argument("value", type=Quantity())
 @click.option("--relative", is_flag=True, help="VALUE is a distance.")
-@click.option("--at-velocity", is_flag=True, help="VALUE is a velocity: run until stopped or to the soft limit.")
+@click.option(
+    "--at-velocity",
+    is_flag=True,
+    help="VALUE is a velocity: run until stopped, at most as long and as far as the reply says.",
+)
 @click.option("--velocity", type=Quantity(), help="Units a second; the axis default when missing.")
 @click.option("--acceleration", type=Quantity(), help="Units a second squared; the axis default when missing.")
 @click.option(
@@ -213,7 +217,7 @@ def _preview_lines(reply: PreviewReply, info: AxisInfo) -> list[str]:
         if reply.refusal.nearest is not None:
             lines.append(f"  the nearest value that would be accepted is {reply.refusal.nearest:g}")
         return lines
-    end = "runs until stopped or to the soft limit"
+    end = reply.ends or ""
     if reply.position is not None:
         end = f"ends at {number(reply.position, info)}"
     time = f", in {seconds(reply.duration_s)} without settling" if reply.duration_s is not None else ""

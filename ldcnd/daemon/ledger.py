@@ -166,6 +166,8 @@ class Ledger:
     def ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None, arrival: Arrival | None) -> None:
         """Take from an axis that a command is over; a final status is kept."""
         if entry := self._entries.get(command.command_id):
+            if status is CommandStatus.DONE and isinstance(entry.answer, CommandReply) and entry.answer.ends:
+                reason = f"came to its own end: it {entry.answer.ends}"
             self._reached(entry, entry.answer, status, reason, None, arrival)
 
     def _reached(
