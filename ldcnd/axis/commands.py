@@ -383,7 +383,7 @@ class AxisCommands:
         return motion.plan_to(position, request.velocity, request.acceleration)
 
     def _plan_velocity(self, request: MoveVelocity) -> tuple[float, MotionPlan, str]:
-        """Return the velocity as the drive will have it, a trapezoid that ends by itself even if this host dies, and how."""
+        """Return the velocity as the drive will have it, a trapezoid that ends even if this host dies, and how."""
         motion = self._motion
         plan = motion.plan_at(request.velocity, request.acceleration)
         end, ends = motion.run(request.duration_s, plan)

@@ -256,7 +256,7 @@ class CommandReply(Frozen):
     duration_s: float | None = Field(default=None, ge=0)
     """How long the profile takes, without settling; for set_pwm how long the duty stays on."""
     ends: str | None = None
-    """In words what ends a move_velocity that nobody stops, and when; the event of that end says it again. Null for
+    """What ends a move_velocity that nobody stops, and when, for people; the event of that end says it again. Null for
     all others."""
     target: int | None = None
     """Target in A/D counts, for an analog move."""
@@ -403,8 +403,8 @@ class MoveVelocity(Move):
     """Acceleration in units a second squared; the axis default when missing."""
     duration_s: float | None = Field(default=None, gt=0, le=86_400)
     """Duration at the velocity, in seconds, at most the axis's `longest_run_s`; that, or without it the software limit
-    ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also when daemon and client are gone: it
-    is a move of so many units."""
+    ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also when daemon and client are gone:
+    it is a move of so many units."""
 
 
 SHORTEST_HOLD_S, LONGEST_HOLD_S = 0.2, 1.0
@@ -736,7 +736,7 @@ class PreviewReply(Frozen):
     position: float | None = None
     """Position at the end, in axis units; null when the motion has no end."""
     ends: str | None = None
-    """In words what ends a motion at a velocity that nobody stops, and when; null for all others."""
+    """What ends a motion at a velocity that nobody stops, and when, for people; null for all others."""
     approach_from: float | None = None
     """Position to which the axis would go first, to come to its end from the configured side; null when one motion
     will do."""
