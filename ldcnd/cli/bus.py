@@ -8,7 +8,7 @@ import click
 
 from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
-from ldcnd.cli.sending import Shown, derived_question
+from ldcnd.cli.sending import NAME, Shown, derived_question
 from ldcnd.cli.typed import Finite, NewFile, force_option
 from ldcnd.client.events import fetch_wire_log
 from ldcnd.client.rig_client import RigClient
@@ -80,7 +80,9 @@ def set_io(
         except NotANumber as error:
             raise click.UsageError(f"{each!r}: {error}") from None
     given = {"high": wanted["high"], "low": wanted["low"], "inputs": wanted["input"]}
-    request = of_options(SetIo, module=module, **given, pwm1=pwm1, pwm2=pwm2, lease=lease)
+    request = of_options(
+        SetIo, module=module, **given, pwm1=pwm1, pwm2=pwm2, lease=lease, client=None if lease else NAME
+    )
     target.show(*_shown(target.run(lambda client: client.ask(request))))
 
 

@@ -20,9 +20,12 @@ from ldcnd.axis.status import ActiveCommand
 from ldcnd.contract.codec import to_json
 from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Verb
 from ldcnd.contract.errors import (
+    CommandAborted,
     CommandIdReused,
     LdcndError,
+    OutcomeUnknown,
     Remedy,
+    RequestRefused,
     SessionError,
     TooManyRequests,
     UnknownCommand,
@@ -230,6 +233,19 @@ class Ledger:
                     del self._entries[command_id]
                 del self._of_senders[sender]
                 return
+
+
+def status_of(error: LdcndError) -> CommandStatus:
+    """Return what became of a command that ended with an error."""
+    match error:
+        case OutcomeUnknown():
+            return CommandStatus.UNKNOWN
+        case CommandAborted():
+            return CommandStatus.ABORTED
+        case RequestRefused():
+            return CommandStatus.REFUSED
+        case _:
+            return CommandStatus.FAILED
 
 
 def _fingerprint(command_id: str) -> int:

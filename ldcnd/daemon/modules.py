@@ -218,8 +218,17 @@ class ModuleService:
         if twice := sorted(set(high) & set(low)):
             raise MalformedRequest(f"module {self.name}: line {twice[0]} cannot be high and low", value=twice[0])
         reading = await self._write(levels, frozenset(inputs), (command.pwm1, command.pwm2), condition)
-        log.info("outputs set", module=self.name, high=high, low=low, inputs=inputs)
         return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)
+
+    def in_words(self, command: SetIo) -> str:
+        """Return what a request sets, by the names of the lines where they have one; empty where it only reads."""
+        parts = []
+        for lines, level in ((command.high, "high"), (command.low, "low"), (command.inputs, "input")):
+            names = [self._names.get(each, f"line {each}") if isinstance(each, int) else each for each in lines]
+            parts += [f"{name} {level}" for name in names]
+        for number, duty in ((1, command.pwm1), (2, command.pwm2)):
+            parts += [] if duty is None else [f"PWM output {number} {duty:.1%}"]
+        return ", ".join(parts)
 
     def _numbers(self, lines: Sequence[int | str]) -> tuple[int, ...]:
         for line in lines:

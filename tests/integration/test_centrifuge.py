@@ -6,6 +6,7 @@ from contextlib import suppress
 
 import pytest
 
+from ldcnd.client.events import latest_events
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseExpired
 from ldcnd.lab.sequences import SequenceRun
@@ -13,6 +14,7 @@ from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.testing import run, simulated_rig
+from tests.support.command_line import virtual_rig
 from tests.support.process import ROOT
 
 CENTRIFUGE = load_config(ROOT / "config" / "centrifuge.toml")
@@ -21,6 +23,8 @@ WIRES = {name: each.line for name, each in CABINET.inputs.items()}
 BREAKS = {"cut": True, "grounded": False}
 """What a wire does to a sensor, and the level that it leaves: lines are pulled up."""
 FAST = 10.0
+PLAY = 0.002
+"""Share of its way by which a door or a bolt that is in has not arrived."""
 CREEPS = 0.2
 """Revolutions a second; faster than the hunting of a rotor that stands."""
 
@@ -75,7 +79,7 @@ class Centrifuge:
 
     @property
     def open_or_unlocked(self):
-        return self.part("door") > 0.0 or self.part("lock") < 1.0
+        return self.part("door") > PLAY or self.part("lock") < 1.0 - PLAY
 
     @property
     def speed(self) -> float:
@@ -84,6 +88,21 @@ class Centrifuge:
     def part(self, name) -> float:
         self.io.catch_up(asyncio.get_running_loop().time())
         return self.io.around.at(name)
+
+
+async def made_ready(rig, rotor):
+    """Return the machine, with its rotor homed behind a locked door."""
+    found = Centrifuge(rig, rotor)
+    await found.sees(locked=True, door_closed=True, pin=False, door=False, unlock=False)
+    await rotor.power(on=True)
+    await (await rotor.home()).done()
+    return found
+
+
+def shutting(rig):
+    """Return a run of the sequence that shuts the door."""
+    sequence = next(each for each in CENTRIFUGE.sequence if each.name == "shut")
+    return SequenceRun(rig.client, sequence, {}, lambda _: None, lambda: 0)
 
 
 def operated(what: Callable, without: str | None = None):
@@ -95,10 +114,7 @@ def operated(what: Callable, without: str | None = None):
             simulated_rig(CENTRIFUGE.model_copy(update={"interlock": rules})) as rig,
             rig.client.control("rotor", client="test") as rotor,
         ):
-            found = Centrifuge(rig, rotor)
-            await found.sees(locked=True, door_closed=True, pin=False, door=False, unlock=False)
-            await rotor.power(on=True)
-            await (await rotor.home()).done()
+            found = await made_ready(rig, rotor)
             result = await what(found)
             await (await rotor.halt()).done()
             await rig.at_rest("rotor")
@@ -234,18 +250,33 @@ def test_no_wire_that_breaks_lets_the_rotor_turn_with_an_open_door_or_a_drawn_bo
 @pytest.mark.parametrize("wire", WIRES)
 @pytest.mark.parametrize("how", BREAKS)
 def test_the_sequence_that_shuts_the_door_does_not_let_a_broken_wire_tell_it_that_it_has(how, wire):
-    shuts = next(each for each in CENTRIFUGE.sequence if each.name == "shut")
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                await machine.shut_door_opens()
+                machine.breaks(wire, how)
+            with suppress(LdcndError):
+                await shutting(rig).run()
+                assert not machine.open_or_unlocked
+            assert machine.part("door") <= PLAY or machine.part("lock") == 0.0, "the bolt went in beside the door"
+            async with rig.client.control("rotor", client="test") as machine.rotor:
+                return machine.open_or_unlocked and await machine.tries_to_spin()
 
-    async def breaks(machine):
-        await machine.shut_door_opens()
-        machine.breaks(wire, how)
-        with suppress(LdcndError):
-            await SequenceRun(machine.rig.client, shuts, {}, lambda _: None, lambda: 0).run()
-            assert not machine.open_or_unlocked
-        assert not (machine.part("door") > 0.0 and machine.part("lock") > 0.0), "the bolt went in beside the door"
-        return await machine.tries_to_spin() and machine.open_or_unlocked
+    assert not run(program())
 
-    assert not operated(breaks)
+
+def test_the_sequence_that_shuts_the_door_shuts_it_where_no_wire_breaks():
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                await machine.shut_door_opens()
+            await shutting(rig).run()
+            async with rig.client.control("rotor", client="test") as machine.rotor:
+                return machine.open_or_unlocked, await machine.tries_to_spin()
+
+    assert run(program()) == (False, True)
 
 
 @pytest.mark.parametrize("wire", WIRES)
@@ -333,3 +364,37 @@ def test_a_client_that_dies_in_a_spin_leaves_a_rotor_that_comes_to_rest_behind_i
         operated(dies)
     (machine,) = ends
     assert (machine.io.around.at("door"), machine.io.around.at("lock")) == (0.0, 1.0)
+
+
+def test_who_wrote_outputs_is_in_the_events_done_and_refused_and_the_same_again_is_no_flood():
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                for _ in range(50):
+                    with suppress(LdcndError):
+                        await machine.high("door")
+            await shutting(rig).run()
+            await rig.client.set_io("cabinet", low=[9])
+            return await latest_events(rig.client.client, 1000, "cabinet")
+
+    refused, *done, last = (each for each in run(program()) if each.verb == "set_io")
+
+    assert (refused.status, refused.client, refused.code) == ("refused", "test", "interlock_violated")
+    assert refused.reason.startswith("door high: output door: interlock door_opens: ")
+    assert [each.reason for each in done] == ["pin low", "unlock high", "door low", "unlock low"]
+    assert {(each.status, each.client) for each in done} == {("done", "sequence shut")}
+    assert (last.reason, last.client) == ("pin low", None)
+
+
+def test_the_command_line_shows_who_wrote_outputs(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        machine.wait(asyncio.sleep(1))
+        codes = [
+            machine.run(f"bus set-io cabinet {each}").code for each in ("unlock=high 12=input", "door=low", "pin=hig")
+        ]
+        shown = machine.run("log").printed
+
+    assert codes == [0, 0, 2]
+    assert "cabinet  set_io           done       by ldcnd" in shown
+    assert "unlock high, door_ajar input" in shown or "unlock high, line 12 input" in shown
