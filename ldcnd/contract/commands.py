@@ -705,6 +705,9 @@ class WhyReply(Frozen):
     """The obstacles, in the order in which they have to be cleared."""
     first_fault: str | None
     """The first fault since the last reset; null when there was none."""
+    overrides: tuple[str, ...] = ()
+    """Overridden interlocks that bind the axis or an output of its line: which, by whom, for how long still; for
+    people."""
     commands: tuple[Hindered, ...] = ()
     """What forbids each command of the axis, if that was asked."""
 

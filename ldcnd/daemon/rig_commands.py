@@ -207,7 +207,9 @@ class RigCommands:
 
     def _why(self, axis: AxisService, request: Why) -> WhyReply:
         """Tell why a motion of this axis would be refused now, and what would clear that."""
-        return explain(axis, request, lambda: self._admit(axis.config.name, request.lease))
+        name = axis.config.name
+        reply = explain(axis, request, lambda: self._admit(name, request.lease))
+        return reply.model_copy(update={"overrides": self._interlocks.overrides(name)})
 
     def _refuse_held(self, axis: str, leases: tuple[str, ...]) -> None:
         """Refuse what changes an axis that another client controls; without control of it, it is open to all.

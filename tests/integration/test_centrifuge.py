@@ -1,6 +1,7 @@
 """The centrifuge of `config/centrifuge.toml` cannot be operated against its rules; each row of them is needed."""
 
 import asyncio
+import re
 from collections.abc import Callable
 from contextlib import suppress
 
@@ -9,6 +10,8 @@ import pytest
 from ldcnd.client.events import latest_events
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseExpired
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.rig_commands import OverrideInterlock
 from ldcnd.lab.sequences import SequenceRun
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
@@ -398,3 +401,20 @@ def test_the_command_line_shows_who_wrote_outputs(monkeypatch):
     assert codes == [0, 0, 2]
     assert "cabinet  set_io           done       by ldcnd" in shown
     assert "unlock high, door_ajar input" in shown or "unlock high, line 12 input" in shown
+
+
+def test_an_override_is_shown_by_list_and_why_with_its_rule_its_client_and_its_end(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        machine.wait(asyncio.sleep(1))
+        lease = machine.wait(machine.rig.client.ask(Acquire(client="Bert", axes=("rotor",), lease_s=60.0))).lease
+        lifts = OverrideInterlock(interlock="door_shut", seconds=12.0, reason="service", lease=lease)
+        machine.wait(machine.rig.client.ask(lifts))
+        machine.wait(asyncio.sleep(1.5))
+        during = [machine.run(line).printed for line in ("list", "why rotor")]
+        machine.wait(asyncio.sleep(13))
+        after = [machine.run(line).printed for line in ("list", "why rotor")]
+
+    assert all(
+        re.search(r"interlock door_shut is overridden by Bert for (9|10|11|12) s still", each) for each in during
+    )
+    assert not any("overridden" in each for each in after)
