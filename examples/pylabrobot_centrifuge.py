@@ -15,7 +15,12 @@ from pylabrobot.centrifuge.backend import CentrifugeBackend
 import ldcnd
 from ldcnd.contract.samples import IoSample, Moving, StateSample
 
-_SENSORS = ("pin_in", "locked", "door_closed", "door_open", "balanced")
+_SHUT = {"door_closed": True, "door_ajar": False, "door_open": False}
+_OPEN = {"door_closed": False, "door_ajar": True, "door_open": True}
+_LOCKED = {"locked": True, "unlocked": False}
+_UNLOCKED = {"locked": False, "unlocked": True}
+_PIN_IN = {"pin_in": True, "pin_out": False}
+_PIN_OUT = {"pin_in": False, "pin_out": True}
 
 
 class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no types
@@ -59,31 +64,31 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
     async def open_door(self) -> None:
         """Unlock and open it."""
         await self.unlock_door()
-        await self._set(high="door", until={"door_open": True})
+        await self._set(high="door", until=_OPEN)
 
     async def close_door(self) -> None:
         """Close it; it stays unlocked."""
-        if (await self._named())["door_closed"] is not True:
-            await self._set(high="unlock", until={"locked": False})
-        await self._set(low="door", until={"door_closed": True})
+        if not _are(_SHUT, await self._named()):
+            await self._set(high="unlock", until=_UNLOCKED)
+        await self._set(low="door", until=_SHUT)
 
     async def lock_door(self) -> None:
         """Lock it."""
-        if (await self._named())["door_closed"] is not True:
+        if not _are(_SHUT, await self._named()):
             raise RuntimeError("the door is not closed")
-        await self._set(low="unlock", until={"locked": True})
+        await self._set(low="unlock", until=_LOCKED)
 
     async def unlock_door(self) -> None:
         """Unlock it; refused while the rotor turns."""
-        await self._set(high="unlock", until={"locked": False})
+        await self._set(high="unlock", until=_UNLOCKED)
 
     async def lock_bucket(self) -> None:
         """Hold the rotor by its pin."""
-        await self._set(high="pin", until={"pin_in": True})
+        await self._set(high="pin", until=_PIN_IN)
 
     async def unlock_bucket(self) -> None:
         """Let go of the rotor."""
-        await self._set(low="pin", until={"pin_in": False})
+        await self._set(low="pin", until=_PIN_OUT)
 
     async def go_to_bucket1(self) -> None:
         """Bring the first bucket to the door, and open it."""
@@ -139,7 +144,7 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
 
     async def _named(self) -> Mapping[str, bool | None]:
         sample = await self._rig.latest("cabinet", "io")
-        return sample.named if isinstance(sample, IoSample) else dict.fromkeys(_SENSORS)
+        return sample.named if isinstance(sample, IoSample) else {}
 
     async def _rest(self) -> None:
         await (await self._rotor.halt()).done()
@@ -153,12 +158,16 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
                 while True:
                     seen, state = await self._named(), await self._rig.latest("rotor", "state")
                     stands = isinstance(state, StateSample) and state.moving is Moving.NO
-                    if (stands or not at_rest) and all(seen[name] is value for name, value in named.items()):
+                    if (stands or not at_rest) and _are(named, seen):
                         return
                     await anext(samples)
         except TimeoutError:
             wanted = dict(named) or "standstill"
             raise RuntimeError(f"{wanted} did not come within {within_s:g} s: {dict(seen)}") from None
+
+
+def _are(wanted: Mapping[str, bool], seen: Mapping[str, bool | None]) -> bool:
+    return all(seen.get(name) is value for name, value in wanted.items())
 
 
 async def main(endpoint: str | None = None) -> None:

@@ -7,7 +7,7 @@ those that had to wait are carried out in the axis's own. A stop never waits for
 import asyncio
 import contextlib
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from dataclasses import replace
 from typing import Literal
 
@@ -312,6 +312,13 @@ class AxisService:
             causes = [(error, guard is guards.check_stands) for error, guard in found]
         return causes + self._violations(verb, None)
 
+    def _while_it_coasts(self) -> Iterator[LdcndError]:
+        """Yield what forbids to close the loop of a shaft that still turns with it open; that passes by itself."""
+        try:
+            guards.check_does_not_coast(self.tracker)
+        except LdcndError as error:
+            yield error
+
     def obstacles_to_motion(
         self, *, absolute: bool, turns: bool = False, speed: float | None = None
     ) -> list[tuple[LdcndError, bool]]:
@@ -336,6 +343,8 @@ class AxisService:
             if guard is guards.check_not_in_error:
                 causes.append((guards.error_stop(self.tracker, faults), False))
             elif error not in first:
+                if guard is guards.check_enabled:
+                    causes += [(each, True) for each in self._while_it_coasts()]
                 causes.append((error, guard is guards.check_stands))
         if moves:
             causes += self._violations(Verb.MOVE_VELOCITY if turns else Verb.MOVE_ABSOLUTE, speed)

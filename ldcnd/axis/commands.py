@@ -1,6 +1,5 @@
 """The commands of one axis: check, plan, send to the drive, update the tracker."""
 
-import math
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -361,9 +360,9 @@ class AxisCommands:
         if guards.goes_on(request.verb, self._tracker) and not self._driver.retargets:
             return await self._undertake(VelocityChange(self._motion, permit, request))
         self._check_may_start(permit, request)
-        velocity, bounded = self._plan_velocity(request)
+        velocity, bounded, ends = self._plan_velocity(request)
         reply = await self._move(permit, bounded, AxisState.CONTINUOUS_MOTION)
-        return reply.model_copy(update={"velocity": velocity})
+        return reply.model_copy(update={"velocity": velocity, "ends": ends})
 
     async def _jog(self, permit: Permit, request: Jog) -> CommandReply:
         now_s = self._motion.clock.now_s()
@@ -383,15 +382,12 @@ class AxisCommands:
         position = motion.scale.position(from_counts) + request.distance
         return motion.plan_to(position, request.velocity, request.acceleration)
 
-    def _plan_velocity(self, request: MoveVelocity) -> tuple[float, MotionPlan]:
-        """Return the velocity as the drive will have it, and a trapezoid that ends by itself even if this host dies."""
+    def _plan_velocity(self, request: MoveVelocity) -> tuple[float, MotionPlan, str]:
+        """Return the velocity as the drive will have it, a trapezoid that ends even if this host dies, and how."""
         motion = self._motion
         plan = motion.plan_at(request.velocity, request.acceleration)
-        run_s = motion.run_s(request.duration_s, plan.motion.velocity_counts_per_s)
-        if request.duration_s is None and motion.limit_ahead(request.velocity) is not None:
-            run_s = math.inf  # the limit is its end
-        end, _ = motion.end_ahead(motion.here, plan.velocity * run_s)
-        return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration)
+        end, ends = motion.run(request.duration_s, plan)
+        return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration), ends
 
     async def _move(
         self,

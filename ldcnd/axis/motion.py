@@ -311,16 +311,16 @@ class AxisMotion:
         """Return for how long a motion at a velocity goes on, within what the drive's counter holds.
 
         Args:
-            asked_s: the requested duration; that of the configuration when missing.
+            asked_s: the requested duration; the longest one of the configuration when missing.
             counts_per_s: the velocity.
 
         Raises:
             ValueOutOfRange: the requested duration is longer than the configuration or the counter allows.
         """
         config, counter_s = self.config, COUNTER_SHARE * LARGEST_COUNT / abs(counts_per_s)
-        if asked_s is None:
-            return min(config.jog_horizon_s, counter_s)
         longest_s = min(config.longest_run_s or config.jog_horizon_s, counter_s)
+        if asked_s is None:
+            return longest_s
         if asked_s > longest_s:
             raise ValueOutOfRange(
                 f"axis {config.name}: a motion at this velocity lasts at most {longest_s:g} s, not {asked_s:g} s",
@@ -331,6 +331,26 @@ class AxisMotion:
                 remedy="send it again before its end" if longest_s == counter_s else "configure longest_run_s",
             )
         return asked_s
+
+    def run(self, asked_s: float | None, plan: MotionPlan) -> tuple[float, str]:
+        """Return where a motion at a velocity ends that is about to begin, in axis units, and in words what ends it.
+
+        Raises:
+            ValueOutOfRange: as `run_s`.
+            PositionLimit: as `end_ahead`.
+        """
+        run_s = self.run_s(asked_s, plan.motion.velocity_counts_per_s)
+        if asked_s is None and self.config.longest_run_s is None and self.limit_ahead(plan.velocity) is not None:
+            run_s = math.inf  # the limit is its end
+        end, at_limit = self.end_ahead(self.here, plan.velocity * run_s)
+        return end, self.end_in_words(run_s, plan.velocity, at_limit=at_limit)
+
+    def end_in_words(self, run_s: float, velocity: float, *, at_limit: bool) -> str:
+        """Return what ends a motion at a velocity that nobody stops; see `CommandReply.ends`."""
+        limit = self.limit_ahead(velocity)
+        if at_limit and limit is not None:
+            return f"runs until it is stopped, at most to its software limit {limit:g} {self.scale.unit}"
+        return f"runs until it is stopped, for at most {run_s:g} s unless it is sent again"
 
     def limit_ahead(self, velocity: float) -> float | None:
         """Return the software limit that a motion at this velocity runs towards, in axis units; None without one.
@@ -548,7 +568,9 @@ class AxisMotion:
         self.reference.woken.set()
         self.telemetry.publish_state(self.tracker.status, self.clock.now_ns())
 
-    def reply(self, permit: Permit, plan: MotionPlan | None = None, **values: float | None) -> CommandReply:
+    def reply(
+        self, permit: Permit, plan: MotionPlan | None = None, *, ends: str | None = None, **values: float | None
+    ) -> CommandReply:
         """Return the reply to a command: what is planned, and what it says besides or instead, by field."""
         planned: dict[str, float | None] = {}
         if plan:
@@ -564,5 +586,6 @@ class AxisMotion:
             axis=self.config.name,
             verb=permit.verb,
             since=command.since_ns if command and command.command_id == permit.command_id else None,
+            ends=ends,
             **{**planned, **values},
         )

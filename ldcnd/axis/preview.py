@@ -23,6 +23,7 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
     name = motion.config.name
     try:
         plan = _plan(motion, request)
+        ends = motion.run(None, plan)[1] if plan.position is None else None
         first = motion.before_approach(plan, request.velocity, request.acceleration)
     except MalformedRequest:
         raise
@@ -39,6 +40,7 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
         obstacles=obstacles,
         position=motion.shown(plan.position),
         approach_from=motion.shown(first.position) if first else None,
+        ends=ends,
         velocity=plan.velocity,
         velocity_error=plan.velocity - asked_velocity,
         acceleration=plan.acceleration,

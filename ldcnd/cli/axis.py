@@ -10,6 +10,7 @@ import click
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.names import whose
+from ldcnd.cli.nearest import naming_nearest
 from ldcnd.cli.output import end_as_interrupted, keys, repetitions, show_lines
 from ldcnd.cli.quantities import decimals, number, seconds
 from ldcnd.cli.sending import (
@@ -62,7 +63,11 @@ WAIT, LEAVE = (click.option(name, is_flag=True, help=text) for name, text in WAI
 @click.argument("axis", type=AXIS)
 @click.argument("value", type=Quantity())
 @click.option("--relative", is_flag=True, help="VALUE is a distance.")
-@click.option("--at-velocity", is_flag=True, help="VALUE is a velocity: run until stopped or to the soft limit.")
+@click.option(
+    "--at-velocity",
+    is_flag=True,
+    help="VALUE is a velocity: run until stopped, at most as long and as far as the reply says.",
+)
 @click.option("--velocity", type=Quantity(), help="Units a second; the axis default when missing.")
 @click.option("--acceleration", type=Quantity(), help="Units a second squared; the axis default when missing.")
 @click.option(
@@ -150,10 +155,11 @@ def jog(
             control(client, f"{NAME} jog", axis, lease_s=LEASE_S, force=force) as held,
             halting(client, info),
         ):
-            if for_s is None:
-                await _while_pressed(client, info, held, command)
-            else:
-                await _for_a_time(client, info, held, command, for_s)
+            with naming_nearest((command, given, info)):
+                if for_s is None:
+                    await _while_pressed(client, info, held, command)
+                else:
+                    await _for_a_time(client, info, held, command, for_s)
             return await halted(client, info)
 
     end_as_interrupted()
@@ -209,11 +215,8 @@ def _previewed(reply: PreviewReply, info: AxisInfo | None) -> Shown:
 
 def _preview_lines(reply: PreviewReply, info: AxisInfo) -> list[str]:
     if reply.refusal:
-        lines = [f"{info.axis}: would be refused: {reply.refusal.message} [{reply.refusal.code}]"]
-        if reply.refusal.nearest is not None:
-            lines.append(f"  the nearest value that would be accepted is {reply.refusal.nearest:g}")
-        return lines
-    end = "runs until stopped or to the soft limit"
+        return [f"{info.axis}: would be refused: {reply.refusal.message} [{reply.refusal.code}]"]
+    end = reply.ends or ""
     if reply.position is not None:
         end = f"ends at {number(reply.position, info)}"
     time = f", in {seconds(reply.duration_s)} without settling" if reply.duration_s is not None else ""

@@ -85,7 +85,9 @@ def set_io(
         except NotANumber as error:
             raise click.UsageError(f"{each!r}: {error}") from None
     given = {"high": wanted["high"], "low": wanted["low"], "inputs": wanted["input"]}
-    request = of_options(SetIo, module=module, **given, pwm1=pwm1, pwm2=pwm2, lease=lease)
+    request = of_options(
+        SetIo, module=module, **given, pwm1=pwm1, pwm2=pwm2, lease=lease, client=None if lease else NAME
+    )
     target.show(*_shown(target.run(lambda client: client.ask(request))))
 
 

@@ -219,6 +219,7 @@ def why(target: Target, axis: str) -> None:
         lines.append(f"  {cause.text}{f': {remedy}' if remedy else ''}")
         if cause.page:
             lines.append(f"    more: ldcnd fault {cause.page.rpartition('/')[2]}")
+    lines += [f"  {override}" for override in reply.overrides]
     if reply.first_fault:
         lines.append(f"  first fault since the last reset: {reply.first_fault}")
     for fault in info.past_faults:

@@ -89,7 +89,8 @@ def exit_code(error: BaseException) -> int:
 def show_error(error: LdcndError, whose: str = "") -> None:
     """Print an error as every command does: what, to whom, what to do, and where more is said."""
     page = [f"  more: ldcnd fault {error.page.rpartition('/')[2]}"] if error.page else []
-    show_lines(f"{whose}{error.message} [{error.code}]", *_remedy(error), *page, err=True)
+    notes = getattr(error, "__notes__", ())
+    show_lines(f"{whose}{error.message} [{error.code}]", *notes, *_remedy(error), *page, err=True)
 
 
 def _remedy(error: LdcndError) -> list[str]:

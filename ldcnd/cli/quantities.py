@@ -51,7 +51,7 @@ def seconds(value: float) -> str:
 def values_of(reply: CommandReply, info: AxisInfo) -> str:
     """Return what the drive's registers make of a command."""
     parts = []
-    if reply.position is not None:
+    if reply.position is not None and reply.ends is None:
         parts.append(f"to {number(reply.position, info)}")
     if reply.target is not None:
         parts.append(f"to A/D count {reply.target}")
@@ -61,7 +61,9 @@ def values_of(reply: CommandReply, info: AxisInfo) -> str:
         parts.append(f"at {quantity_text(reply.velocity, info, Dimension.VELOCITY)}")
     if reply.acceleration is not None:
         parts.append(f"with {quantity_text(reply.acceleration, info, Dimension.ACCELERATION)}")
-    if reply.duration_s is not None:
+    if reply.ends is not None:
+        parts.append(reply.ends)
+    elif reply.duration_s is not None:
         parts.append(f"in {seconds(reply.duration_s)}")
     return f": {', '.join(parts)}" if parts else ""
 

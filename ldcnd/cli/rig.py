@@ -13,6 +13,7 @@ import click
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.names import whose
+from ldcnd.cli.nearest import Typed, naming_nearest
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, commanding, derived_for_all, halted
@@ -335,7 +336,8 @@ def group_move(
                 sender.target.show(state, f"{whose(client.rig)}{outcome(info, ended, state)}")
             return failed
 
-        reply = await client.ask(converted)
+        with naming_nearest(*_typed(converted, wanted, infos)):
+            reply = await client.ask(converted)
         lines = _accepted(client, reply.replies, infos)
         if reply.deviation is not None:
             lines.append(f"at most {rounded(reply.deviation)} from the line")
@@ -404,7 +406,8 @@ def group_path(
 
     async def work(client: RigClient) -> None:
         converted, infos = await _in_units(client, request, wanted, bounds)
-        reply = await client.ask(converted)
+        with naming_nearest(*_typed(converted, wanted, infos)):
+            reply = await client.ask(converted)
         lines = _accepted(client, reply.replies, infos)
         said = f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation)} from the path"
         sender.target.show(reply, *lines, f"{said}; ends within {rounded(reply.ahead_s)} s if the daemon dies")
@@ -429,6 +432,13 @@ def _shares(
         given = {"position": number_of(position, each), "velocity": velocity, "acceleration": acceleration}
         shares.append((of_options(AxisMove, axis=axis, **given, **who), given))
     return shares
+
+
+def _typed(
+    request: MoveTogether | WalkPath, shares: Sequence[tuple[AxisMove, Mapping[str, object]]], infos: Sequence[AxisInfo]
+) -> list[Typed]:
+    """Return the share of each axis as it is sent, with what was typed for it."""
+    return [(move, given, info) for move, (_, given), info in zip(request.moves, shares, infos, strict=True)]
 
 
 async def _in_units(

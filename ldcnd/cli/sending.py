@@ -14,12 +14,13 @@ from typing_extensions import override
 
 from ldcnd.cli.connection import AXIS, Target, of_options, with_target
 from ldcnd.cli.names import typed, whose
+from ldcnd.cli.nearest import Typed, naming_nearest, nearest_lines
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines, show_passing
 from ldcnd.cli.quantities import number, outcome, sample_text, values_of
 from ldcnd.cli.typed import Finite, Quantity, WholeNumber, axis_of, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.commands import About, AxisCommand, Command, CommandReply, Halt, Verb
+from ldcnd.contract.commands import About, AxisCommand, Command, CommandReply, Halt, PreviewReply, Verb
 from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, step
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.frozen import Frozen, attribute_docstrings
@@ -86,7 +87,8 @@ class Sender:
             info = await axis_of(client, axis)
             converted = in_units(command, given, info)
             async with halting(client, info, leave_running=leave_running) if wait else nullcontext():
-                reply = await self.command(client, axis, converted)
+                with naming_nearest((converted, given, info)):
+                    reply = await self.command(client, axis, converted)
                 words = command.verb.replace("_", " ")
                 waits = f", waits until {reply.waits_for} has ended" if reply.waits_for else ""
                 said = f"{whose(client.rig)}{axis}: {words} accepted{values_of(reply, info)}{waits}"
@@ -295,18 +297,22 @@ def derived_question(
             raise click.Abort
         request = of_options(command, **given)
 
-        async def work(client: RigClient) -> tuple[ReplyT, AxisInfo | None]:
+        async def work(client: RigClient) -> tuple[ReplyT, AxisInfo | None, *tuple[Typed, ...]]:
             if axis is None:
                 return await client.ask(request), None
             info = await axis_of(client, axis)
             converted = in_units(request, given, info)
-            if isinstance(converted, AxisCommand):
-                return await client.command(axis, converted), info
-            return await client.ask(converted, axis), info
+            sent = converted, given, info
+            with naming_nearest(sent):
+                if isinstance(converted, AxisCommand):
+                    return await client.command(axis, converted), info, sent
+                return await client.ask(converted, axis), info, sent
 
-        reply, info = target.run(work)
+        reply, info, *sent = target.run(work)
+        refusal = reply.refusal if isinstance(reply, PreviewReply) else None
+        nearest = nearest_lines(refusal.code, refusal.value, refusal.nearest, sent) if refusal else ()
         for part, lines in shows(reply, info):
-            target.show(part, *lines)
+            target.show(part, *lines, *nearest)
 
     first = [click.Argument(["axis"], type=AXIS)] if command.about is About.AXIS else []
     asks = [click.Option(["--yes"], is_flag=True, help="Do not ask for confirmation.")] if confirm else []

@@ -156,9 +156,9 @@ class AxisVerbs(ABC):
             buffer_mode: Effect if the axis moves already.
             velocity: Velocity in units a second, positive forward, not 0.
             acceleration: Acceleration in units a second squared; the axis default when missing.
-            duration_s: Duration at the velocity, in seconds, at most the axis's `longest_run_s`; `jog_horizon_s` when
-                missing. The drive itself ends it with a ramp, also when daemon and client are gone: it is a move of so
-                many units.
+            duration_s: Duration at the velocity, in seconds, at most the axis's `longest_run_s`; that, or without it
+                the software limit ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also
+                when daemon and client are gone: it is a move of so many units.
         """
         return await self._start(
             MoveVelocity, buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, duration_s=duration_s

@@ -255,6 +255,9 @@ class CommandReply(Frozen):
     """Acceleration in axis units a second squared."""
     duration_s: float | None = Field(default=None, ge=0)
     """How long the profile takes, without settling; for set_pwm how long the duty stays on."""
+    ends: str | None = None
+    """What ends a move_velocity that nobody stops, and when, for people; the event of that end says it again. Null for
+    all others."""
     target: int | None = None
     """Target in A/D counts, for an analog move."""
     duty: float | None = None
@@ -399,8 +402,9 @@ class MoveVelocity(Move):
     acceleration: float | None = Field(default=None, gt=0)
     """Acceleration in units a second squared; the axis default when missing."""
     duration_s: float | None = Field(default=None, gt=0, le=86_400)
-    """Duration at the velocity, in seconds, at most the axis's `longest_run_s`; `jog_horizon_s` when missing. The drive
-    itself ends it with a ramp, also when daemon and client are gone: it is a move of so many units."""
+    """Duration at the velocity, in seconds, at most the axis's `longest_run_s`; that, or without it the software limit
+    ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also when daemon and client are gone:
+    it is a move of so many units."""
 
 
 SHORTEST_HOLD_S, LONGEST_HOLD_S = 0.2, 1.0
@@ -701,6 +705,9 @@ class WhyReply(Frozen):
     """The obstacles, in the order in which they have to be cleared."""
     first_fault: str | None
     """The first fault since the last reset; null when there was none."""
+    overrides: tuple[str, ...] = ()
+    """Overridden interlocks that bind the axis or an output of its line: which, by whom, for how long still; for
+    people."""
     commands: tuple[Hindered, ...] = ()
     """What forbids each command of the axis, if that was asked."""
 
@@ -731,6 +738,8 @@ class PreviewReply(Frozen):
     """The other obstacles now; see `why`."""
     position: float | None = None
     """Position at the end, in axis units; null when the motion has no end."""
+    ends: str | None = None
+    """What ends a motion at a velocity that nobody stops, and when, for people; null for all others."""
     approach_from: float | None = None
     """Position to which the axis would go first, to come to its end from the configured side; null when one motion
     will do."""

@@ -68,6 +68,7 @@ class TroubleKind(Enum):
     WARNING = auto()
     MISSED_POLLS = auto()
     SLOW = auto()
+    OVERRIDDEN = auto()
     SLOWED = auto()
 
 
@@ -332,7 +333,7 @@ def assess(
     if gone:
         return replace(_unanswered(last, (*pending, gone), gone.short), holder=holder, control=control)
     place, mark = _place(state, faults, is_old=_is_old(state, age_s, health))
-    troubles = (*pending, *_found(state, faults, health, place), *_slowed(state))
+    troubles = (*pending, *_found(state, faults, health, place), *_overridden(health), *_slowed(state))
     worst = max((trouble.severity for trouble in troubles), default=_FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
     live = place is not Place.OLD
@@ -408,6 +409,12 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     elif health:
         found += _slowness(health)
     return tuple(sorted(found, key=lambda trouble: -trouble.severity))
+
+
+def _overridden(health: AxisHealth | None) -> tuple[Trouble, ...]:
+    """Return the rules that do not bind at present."""
+    texts = health.overrides if health else ()
+    return tuple(Trouble(TroubleKind.OVERRIDDEN, _NOTICE, text, text) for text in texts)
 
 
 def _slowed(state: KnownState) -> tuple[Trouble, ...]:

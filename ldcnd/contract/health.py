@@ -72,6 +72,8 @@ class AxisHealth(Frozen):
     """Faults that stand now."""
     items: tuple[ItemHealth, ...] = ()
     """Its polled items; empty for a drive family that paces itself."""
+    overrides: tuple[str, ...] = ()
+    """Overridden interlocks that bind it or an output of its line: which, by whom, for how long still; for people."""
     eeprom_writes: int | None = Field(default=None, ge=0)
     """How often its drive's EEPROM was written, ever; null for drives without one and where no ledger is kept."""
 

@@ -118,13 +118,14 @@ def _about_unit(parts: _Parts, units: Sequence[str]) -> str:
 
 
 def same_unit(written: str, unit: str) -> bool:
-    """Compare as units look: a superscript 2 is a 2, micro is also written u, degrees with their sign."""
+    """Compare as units look: a superscript 2 is a 2, micro is also written u, degrees with their sign, RPM, x g."""
     return bool(unit) and _plain(written) == _plain(unit)
 
 
 def _plain(unit: str) -> str:
     plain = unicodedata.normalize("NFKC", unit).replace("\u03bc", "u").replace("\u00b0", "deg")
-    return plain.replace(" ", "")
+    plain = re.sub("rpm", "rpm", plain, flags=re.IGNORECASE).replace(" ", "")
+    return "g" if plain in ("xg", "\u00d7g") else plain  # as the force in a centrifuge is written
 
 
 def read_whole(text: str, unit: str = "") -> int:

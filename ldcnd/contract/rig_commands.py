@@ -270,6 +270,8 @@ class SetIo(Command[IoReply]):
     """Share of time for which PWM output 1 is on."""
     pwm2: float | None = Field(default=None, ge=0, le=1)
     """Duty of output 2, in the same way."""
+    client: str | None = Field(default=None, max_length=64)
+    """The requester, for events and the log; without it the holder of the lease."""
     lease: str | None = None
     """The sender's lease: it must cover all axes on the module's line, where a motion of them would need one."""
     leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)

@@ -170,6 +170,14 @@ def read_quantity(text: str, info: Described, dimension: Dimension) -> float:
         raise NotANumber(f"\u201c{text.strip()}\u201d is too large") from None
 
 
+def quantity_in(value: float, unit: str, info: Described, dimension: Dimension) -> float:
+    """Return a number of the network in a unit that is taken for the axis, as it would be typed."""
+    scale = next((each for name, each in _scales(info, dimension).items() if same_unit(unit, name)), None)
+    if scale is None:  # g of a rotor
+        return math.copysign((value / (info.g_velocity or math.nan)) ** 2, value)
+    return float(Fraction(value) / Fraction(scale))
+
+
 def converts(info: Described, dimension: Dimension) -> bool:
     """Tell whether numbers are shown in another unit than they have on the network."""
     return next(iter(_scales(info, dimension).values())) != "1"

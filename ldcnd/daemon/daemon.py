@@ -81,6 +81,7 @@ class Daemon:
         self._health = HealthWatch(rig, self._keys, publisher, clock, self._load)
         plan = plan_rig(config)
         self._health.stop_bounds_s = _stop_bounds_s(plan)
+        self._health.overrides = self._dispatcher.interlocks.overrides
         self._heartbeat = heartbeat
         if heartbeat:
             self._health.heartbeat = lambda: heartbeat.health

@@ -32,13 +32,11 @@ from ldcnd.contract.commands import (
     StopReply,
 )
 from ldcnd.contract.errors import (
-    CommandAborted,
     CommandExpired,
     DuplicateDaemon,
     InternalError,
     LdcndError,
     OutcomeUnknown,
-    RequestRefused,
     ShuttingDown,
     TooManyRequests,
     UnknownVerb,
@@ -49,7 +47,7 @@ from ldcnd.contract.keys import RIG_ITSELF, CommandAddress, Keys
 from ldcnd.contract.leases import Acquire
 from ldcnd.daemon.interlocks import Interlocks
 from ldcnd.daemon.leases import Authority, LeaseWatch
-from ldcnd.daemon.ledger import EventLog, Ledger, LedgerEntry
+from ldcnd.daemon.ledger import EventLog, Ledger, LedgerEntry, status_of
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.rig_commands import AnswerReload, RigCommands
 from ldcnd.line.flight_recorder import WireEvent
@@ -448,7 +446,7 @@ class Dispatcher:
                 return await axis.in_turn(command, permit, lambda: self._start(axis, command, permit), waits)
             return await self._start(axis, command, permit)
         except LdcndError as error:
-            self._ledger.answered(command_id, error, _status(error))
+            self._ledger.answered(command_id, error, status_of(error))
             raise
         except BaseException:
             self._ledger.answered(command_id, OutcomeUnknown("the command was cut short"), CommandStatus.UNKNOWN)
@@ -567,15 +565,3 @@ class Dispatcher:
                 value=others,
                 remedy="end all but one of the daemons",
             )
-
-
-def _status(error: LdcndError) -> CommandStatus:
-    match error:
-        case OutcomeUnknown():
-            return CommandStatus.UNKNOWN
-        case CommandAborted():
-            return CommandStatus.ABORTED
-        case RequestRefused():
-            return CommandStatus.REFUSED
-        case _:
-            return CommandStatus.FAILED

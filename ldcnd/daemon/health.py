@@ -86,6 +86,7 @@ class HealthWatch:
         latest: the newest report of each key.
         stop_bounds_s: what the plan promises of stops, by line.
         heartbeat: returns how the heartbeat is; None where none is configured.
+        overrides: returns the overridden interlocks of an axis, in words.
     """
 
     def __init__(
@@ -104,6 +105,7 @@ class HealthWatch:
         self._clock = clock
         self._load = load
         self.heartbeat: Callable[[], HeartbeatHealth | None] = lambda: None
+        self.overrides: Callable[[str], tuple[str, ...]] = lambda _: ()
         self._seq = 0
         self._missed = 0
         self._busy_s: dict[str, float] = {}
@@ -206,6 +208,7 @@ class HealthWatch:
             rate_wanted_hz=axis.config.rates.position,
             rate_hz=self._granted_hz(position, asked_hz.get(TelemetryItem.POSITION, 0.0)),
             faults=len(axis.tracker.status.active_faults),
+            overrides=self.overrides(name),
             eeprom_writes=parameters.eeprom_writes if (parameters := axis.driver.parameters) else None,
             items=tuple(
                 ItemHealth(item=item.value, asked_hz=hz, granted_hz=self._granted_hz(self._topic(name, item), hz))

@@ -338,6 +338,16 @@ class Interlocks:
             self._end_override(rule, rule.override, "taken back")
         return OverrideReply(interlock=command.interlock, seconds=command.seconds, client=client)
 
+    def overrides(self, axis: str) -> tuple[str, ...]:
+        """Return in words which rules are overridden that bind an axis or an output of its line."""
+        now_s = self._now_s()
+        return tuple(
+            f"interlock {rule.config.name} is overridden by {rule.override.client or 'somebody'}"
+            f" for {max(0.0, rule.override.until_s - now_s):.0f} s still"
+            for rule in self._rules.values()
+            if rule.override and axis in rule.holders
+        )
+
     def _goes_on(self, rule: BoundRule, override: Override) -> bool:
         """Tell whether an override is still in force; one that is not is ended."""
         now_s = self._now_s()

@@ -20,9 +20,12 @@ from ldcnd.axis.status import ActiveCommand
 from ldcnd.contract.codec import to_json
 from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Power, Verb
 from ldcnd.contract.errors import (
+    CommandAborted,
     CommandIdReused,
     LdcndError,
+    OutcomeUnknown,
     Remedy,
+    RequestRefused,
     SessionError,
     TooManyRequests,
     UnknownCommand,
@@ -167,6 +170,8 @@ class Ledger:
     def ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None, arrival: Arrival | None) -> None:
         """Take from an axis that a command is over; a final status is kept."""
         if entry := self._entries.get(command.command_id):
+            if status is CommandStatus.DONE and isinstance(entry.answer, CommandReply) and entry.answer.ends:
+                reason = f"came to its own end: it {entry.answer.ends}"
             self._reached(entry, entry.answer, status, reason, None, arrival)
 
     def _reached(
@@ -229,6 +234,19 @@ class Ledger:
                     del self._entries[command_id]
                 del self._of_senders[sender]
                 return
+
+
+def status_of(error: LdcndError) -> CommandStatus:
+    """Return what became of a command that ended with an error."""
+    match error:
+        case OutcomeUnknown():
+            return CommandStatus.UNKNOWN
+        case CommandAborted():
+            return CommandStatus.ABORTED
+        case RequestRefused():
+            return CommandStatus.REFUSED
+        case _:
+            return CommandStatus.FAILED
 
 
 def _fingerprint(command_id: str) -> int:

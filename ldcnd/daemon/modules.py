@@ -218,8 +218,17 @@ class ModuleService:
         if twice := sorted(set(high) & set(low)):
             raise MalformedRequest(f"module {self.name}: line {twice[0]} cannot be high and low", value=twice[0])
         reading = await self._write(levels, frozenset(inputs), (command.pwm1, command.pwm2), condition)
-        log.info("outputs set", module=self.name, high=high, low=low, inputs=inputs)
         return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)
+
+    def in_words(self, command: SetIo) -> str:
+        """Return what a request sets, by the names of the lines where they have one; empty where it only reads."""
+        parts = []
+        for lines, level in ((command.high, "high"), (command.low, "low"), (command.inputs, "input")):
+            names = [self._names.get(each, f"line {each}") if isinstance(each, int) else each for each in lines]
+            parts += [f"{name} {level}" for name in names]
+        for number, duty in ((1, command.pwm1), (2, command.pwm2)):
+            parts += [] if duty is None else [f"PWM output {number} {duty:.1%}"]
+        return ", ".join(parts)
 
     def _numbers(self, lines: Sequence[int | str]) -> tuple[int, ...]:
         for line in lines:
@@ -247,20 +256,21 @@ class ModuleService:
         async with self._writes:
             self._check(condition)
             values = self.values
+            changes = [name for name, level in asked.items() if level is None or level is not values[name]]
             # first of all: motions ask for these outputs, as this asks for motions, and never do both pass
-            self._take(values | dict.fromkeys(asked))
+            self._take(values | dict.fromkeys(changes))
             try:
                 permitted()
             except LdcndError:
                 self._take(values)
                 raise
-            self._unread_until_s |= dict.fromkeys(asked, math.inf)
-            self.before = {name: (values[name], self.read_at_s) for name in asked} | self.before
+            self._unread_until_s |= dict.fromkeys(changes, math.inf)
+            self.before = {name: (values[name], self.read_at_s) for name in changes} | self.before
             try:
                 with only_while(permitted):
                     return await self._driver.set_outputs(levels, inputs, pwm)
             finally:
-                self._unread_until_s |= dict.fromkeys(asked, asyncio.get_running_loop().time())
+                self._unread_until_s |= dict.fromkeys(changes, asyncio.get_running_loop().time())
 
     async def set_timer(self, command: SetIoTimer, condition: Condition) -> IoReply:
         """Choose what is counted, if the sender still may when the packet is sent.

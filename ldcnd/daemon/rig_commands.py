@@ -1,6 +1,7 @@
 """Commands of several axes, of a module or of the rig as a whole, and questions: what is not for one axis alone."""
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import replace
 
@@ -64,7 +65,7 @@ from ldcnd.contract.rig_commands import (
 )
 from ldcnd.daemon.interlocks import Interlocks
 from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy
-from ldcnd.daemon.ledger import EventLog, Ledger
+from ldcnd.daemon.ledger import EventLog, Ledger, status_of
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.modules import ModuleService
 from ldcnd.daemon.rig import OwnedRig
@@ -79,6 +80,8 @@ LONGEST_DATA_BYTES = 2_000
 """Of a longer burst, such as noise on a broken line, only the beginning is shown."""
 BACK_WITHIN_S = 20.0
 """Time for a line to come up again whose loss was rehearsed, seconds."""
+SAME_OUTPUTS_AFTER_S = 10.0
+"""Pause between two events of the same outputs that the same client sets to the same levels again, seconds."""
 LINE_OVERHEAD_BYTES = 3
 """Quotation marks and comma in JSON."""
 
@@ -143,6 +146,7 @@ class RigCommands:
         self._admit = admit
         self._interlocks = interlocks
         self.answer_reload: AnswerReload = refuse_reload
+        self._outputs_noted: dict[str, tuple[object, float]] = {}
 
     async def answer(self, axis: str, command: Command[Frozen], login: str | None) -> Frozen:
         """Carry out a command that is not for one axis, or answer a question; see `Dispatcher.answer`.
@@ -158,7 +162,7 @@ class RigCommands:
             case Snapshot():
                 return await self._rig.lines[command.bus].snapshot(self._clock)
             case SetIo() | SetIoTimer():
-                return await self._set_module(command)
+                return await self._set_module(command, login)
             case OverrideInterlock():
                 return self._interlocks.override(command)
             case SendGuestAway():
@@ -176,13 +180,11 @@ class RigCommands:
             case _:
                 return self._question(axis, command)
 
-    async def _set_module(self, command: SetIo | SetIoTimer) -> IoReply:
+    async def _set_module(self, command: SetIo | SetIoTimer, login: str | None) -> IoReply:
+        if isinstance(command, SetIo):
+            return await self._set_io(command, login)
         module = self._rig.modules[command.module]
-
-        def admit() -> None:
-            self._admit_module(module, command)
-
-        return await (module.set_io(command, admit) if isinstance(command, SetIo) else module.set_timer(command, admit))
+        return await module.set_timer(command, lambda: self._admit_module(module, command))
 
     async def _send_guest_away(self, command: SendGuestAway, login: str | None) -> GuestSentAway:
         guest = self._rig.guest(command.port)
@@ -227,7 +229,9 @@ class RigCommands:
 
     def _why(self, axis: AxisService, request: Why) -> WhyReply:
         """Tell why a motion of this axis would be refused now, and what would clear that."""
-        return explain(axis, request, lambda: self._admit(axis.config.name, request.lease))
+        name = axis.config.name
+        reply = explain(axis, request, lambda: self._admit(name, request.lease))
+        return reply.model_copy(update={"overrides": self._interlocks.overrides(name)})
 
     def _refuse_held(self, axis: str, leases: tuple[str, ...]) -> None:
         """Refuse what changes an axis that another client controls; without control of it, it is open to all.
@@ -248,6 +252,37 @@ class RigCommands:
         """Return which of these leases is the one on an axis; None when another one is, or none."""
         holder = self._authority.holder(axis)
         return holder.token if holder and holder.token in leases else None
+
+    async def _set_io(self, command: SetIo, login: str | None) -> IoReply:
+        """Set outputs, and enter who has, or would have: what they switch may move something."""
+        module = self._rig.modules[command.module]
+        tokens = {command.lease, *command.leases} - {None}
+        holders = (self._authority.holder(name) for name in module.axes)
+        holder = next((each.client for each in holders if each and each.token in tokens), None)
+        what = module.in_words(command)
+        status, said, code = CommandStatus.UNKNOWN, what, None
+        try:
+            reply = await module.set_io(command, lambda: self._admit_module(module, command))
+            status = CommandStatus.DONE
+        except LdcndError as error:
+            status, said, code = status_of(error), f"{what}: {error.message}", error.code.value
+            raise
+        finally:
+            if what:
+                self._note_outputs(module.name, (status, said, command.client or holder, login), code)
+        return reply
+
+    def _note_outputs(
+        self, module: str, news: tuple[CommandStatus, str, str | None, str | None], code: str | None
+    ) -> None:
+        """Enter what became of outputs: status, words, client and login; the same again at once only now and then."""
+        now_s = self._clock.now_s()
+        before, since_s = self._outputs_noted.get(module, (None, -math.inf))
+        if news == before and now_s - since_s < SAME_OUTPUTS_AFTER_S:
+            return
+        self._outputs_noted[module] = news, now_s
+        status, said, client, login = news
+        self._events.note(module, SetIo.verb, status, said, client=client, login=login, code=code)
 
     def _admit_module(self, module: ModuleService, command: SetIo | SetIoTimer) -> None:
         """Refuse outputs to who may not move the axes of the module's line, and while one of them is stopped.

@@ -277,7 +277,7 @@ on their limit inputs."""
     jog_horizon_s: float = Field(default=60.0, gt=0, le=3600)
     """Time after which the drive itself ends a motion at constant velocity that no software limit ends, seconds."""
     longest_run_s: float | None = Field(default=None, gt=0, le=86_400)
-    """Longest duration that a `move_velocity` may ask for, in seconds; without it `jog_horizon_s`."""
+    """Longest duration of a `move_velocity`, and of one that asks for none, in seconds; without it `jog_horizon_s`."""
     jog_reach_s: float = Field(default=5.0, gt=0, le=3600)
     """How far ahead the goal of a jog is, in seconds, in a drive that takes no other goal before it stands: if the \
 daemon dies it runs on for as long, and a jog that is held for longer pauses there. PIC-SERVO SC gets nearer goals."""

@@ -132,7 +132,10 @@ def write_cabinet(folder: Path) -> Path:
         ("baud = 115200", "baud = 57600"),
         ("acceleration = 10 }", "acceleration = 60 }"),  # the program goes to its buckets at 50 rev/s²
         ("[bus.module.outputs]", '[bus.module.outputs]\nlamp = { line = 6, start = "low", reset = "low" }'),
-        (', { input = "locked", value = false }]', "]"),  # the program unlocks and opens with one packet
+        (
+            ', { input = "locked", value = false }, { input = "unlocked" }]',
+            "]",
+        ),  # the program unlocks and opens with one packet
     ):
         assert there in text
         text = text.replace(there, instead)

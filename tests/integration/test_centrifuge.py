@@ -1,23 +1,35 @@
 """The centrifuge of `config/centrifuge.toml` cannot be operated against its rules; each row of them is needed."""
 
 import asyncio
+import re
 from collections.abc import Callable
 from contextlib import suppress
 
 import pytest
 
+from ldcnd.client.events import latest_events
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseExpired
+from ldcnd.contract.leases import Acquire
+from ldcnd.contract.rig_commands import OverrideInterlock
+from ldcnd.lab.sequences import SequenceRun
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.testing import run, simulated_rig
+from tests.support.command_line import virtual_rig
 from tests.support.process import ROOT
 
 CENTRIFUGE = load_config(ROOT / "config" / "centrifuge.toml")
-CLOSED = 4
-"""Line of the sensor of the closed door."""
+(CABINET,) = CENTRIFUGE.bus[0].module
+WIRES = {name: each.line for name, each in CABINET.inputs.items()}
+BREAKS = {"cut": True, "grounded": False}
+"""What a wire does to a sensor, and the level that it leaves: lines are pulled up."""
 FAST = 10.0
+PLAY = 0.002
+"""Share of its way by which a door or a bolt that is in has not arrived."""
+CREEPS = 0.2
+"""Revolutions a second; faster than the hunting of a rotor that stands."""
 
 
 class Centrifuge:
@@ -31,6 +43,9 @@ class Centrifuge:
 
     async def high(self, *names):
         await self.rig.client.set_io("cabinet", high=names)
+
+    async def low(self, *names):
+        await self.rig.client.set_io("cabinet", low=names)
 
     async def spin(self):
         motion = await self.rotor.move_velocity(FAST, acceleration=10, duration_s=60)
@@ -49,6 +64,26 @@ class Centrifuge:
                 if all(sample.named[name] is value for name, value in wanted.items()):
                     return
 
+    def breaks(self, wire, how):
+        self.io.drive_line(WIRES[wire], high=BREAKS[how], at_s=asyncio.get_running_loop().time())
+
+    def jam(self, part, *, jammed=True):
+        self.io.jam(part, jammed=jammed, at_s=asyncio.get_running_loop().time())
+
+    async def tries_to_spin(self):
+        """Try it for long enough; return whether the rotor has turned."""
+        with suppress(LdcndError):
+            await self.rotor.move_velocity(FAST, acceleration=10, duration_s=2)
+        await asyncio.sleep(0.7)
+        turned = self.speed > CREEPS
+        with suppress(LdcndError):
+            await (await self.rotor.halt()).done()
+        return turned
+
+    @property
+    def open_or_unlocked(self):
+        return self.part("door") > PLAY or self.part("lock") < 1.0 - PLAY
+
     @property
     def speed(self) -> float:
         return abs(self.rig.truth("rotor").velocity)
@@ -56,6 +91,21 @@ class Centrifuge:
     def part(self, name) -> float:
         self.io.catch_up(asyncio.get_running_loop().time())
         return self.io.around.at(name)
+
+
+async def made_ready(rig, rotor):
+    """Return the machine, with its rotor homed behind a locked door."""
+    found = Centrifuge(rig, rotor)
+    await found.sees(locked=True, door_closed=True, pin=False, door=False, unlock=False)
+    await rotor.power(on=True)
+    await (await rotor.home()).done()
+    return found
+
+
+def shutting(rig):
+    """Return a run of the sequence that shuts the door."""
+    sequence = next(each for each in CENTRIFUGE.sequence if each.name == "shut")
+    return SequenceRun(rig.client, sequence, {}, lambda _: None, lambda: 0)
 
 
 def operated(what: Callable, without: str | None = None):
@@ -67,10 +117,7 @@ def operated(what: Callable, without: str | None = None):
             simulated_rig(CENTRIFUGE.model_copy(update={"interlock": rules})) as rig,
             rig.client.control("rotor", client="test") as rotor,
         ):
-            found = Centrifuge(rig, rotor)
-            await found.sees(locked=True, door_closed=True)
-            await rotor.power(on=True)
-            await (await rotor.home()).done()
+            found = await made_ready(rig, rotor)
             result = await what(found)
             await (await rotor.halt()).done()
             await rig.at_rest("rotor")
@@ -138,10 +185,108 @@ def test_what_a_row_forbids_happens_only_without_it(row):
     assert operated(NEEDS[row], without=row)
 
 
-def test_a_sensor_that_falls_out_in_a_spin_brings_the_rotor_to_rest_behind_the_locked_door():
+async def shut(_machine):
+    """Begin behind a locked door."""
+
+
+async def unlocked(machine):
+    await machine.high("unlock")
+    await machine.sees(unlocked=True)
+
+
+async def drawn_bolt_jams(machine):
+    await unlocked(machine)
+    machine.jam("lock")
+    await machine.low("unlock")
+
+
+async def bolt_jams_half_way(machine):
+    await machine.high("unlock")
+    await asyncio.sleep(0.15)
+    machine.jam("lock")
+    await machine.low("unlock")
+
+
+async def open_door_jams_before_its_bolt(machine):
+    await machine.shut_door_opens()
+    machine.jam("door")
+    await machine.low("door", "unlock")
+    await asyncio.sleep(0.5)
+
+
+async def door_jams_half_way_before_its_bolt(machine):
+    await machine.high("unlock")
+    await machine.sees(unlocked=True)
+    await machine.high("door")
+    await asyncio.sleep(0.8)
+    await open_door_jams(machine)
+
+
+async def open_door_jams(machine):
+    machine.jam("door")
+    await machine.low("door", "unlock")
+    await asyncio.sleep(0.5)
+
+
+STATES = (shut, unlocked, Centrifuge.shut_door_opens, drawn_bolt_jams, bolt_jams_half_way)
+STATES += (open_door_jams_before_its_bolt, door_jams_half_way_before_its_bolt)
+
+
+@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("how", BREAKS)
+@pytest.mark.parametrize("state", STATES, ids=lambda each: each.__name__)
+def test_no_wire_that_breaks_lets_the_rotor_turn_with_an_open_door_or_a_drawn_bolt(state, how, wire):
+    async def breaks(machine):
+        await state(machine)
+        machine.breaks(wire, how)
+        await asyncio.sleep(0.5)
+        open_or_unlocked = machine.open_or_unlocked
+        assert open_or_unlocked is (state is not shut)
+        return await machine.tries_to_spin(), open_or_unlocked
+
+    turned, open_or_unlocked = operated(breaks)
+
+    assert not (turned and open_or_unlocked)
+    assert not (turned and how == "cut")
+
+
+@pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.parametrize("how", BREAKS)
+def test_the_sequence_that_shuts_the_door_does_not_let_a_broken_wire_tell_it_that_it_has(how, wire):
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                await machine.shut_door_opens()
+                machine.breaks(wire, how)
+            with suppress(LdcndError):
+                await shutting(rig).run()
+                assert not machine.open_or_unlocked
+            assert machine.part("door") <= PLAY or machine.part("lock") == 0.0, "the bolt went in beside the door"
+            async with rig.client.control("rotor", client="test") as machine.rotor:
+                return machine.open_or_unlocked and await machine.tries_to_spin()
+
+    assert not run(program())
+
+
+def test_the_sequence_that_shuts_the_door_shuts_it_where_no_wire_breaks():
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                await machine.shut_door_opens()
+            await shutting(rig).run()
+            async with rig.client.control("rotor", client="test") as machine.rotor:
+                return machine.open_or_unlocked, await machine.tries_to_spin()
+
+    assert run(program()) == (False, True)
+
+
+@pytest.mark.parametrize("wire", WIRES)
+def test_a_wire_that_is_cut_in_a_spin_brings_the_rotor_to_rest_behind_the_locked_door(wire):
     async def falls_out(machine):
         motion = await machine.spin()
-        machine.io.drive_line(CLOSED, high=False, at_s=asyncio.get_running_loop().time())
+        machine.breaks(wire, "cut")
         with pytest.raises(LdcndError):
             await motion.done()
         with pytest.raises(InterlockViolated):
@@ -150,6 +295,64 @@ def test_a_sensor_that_falls_out_in_a_spin_brings_the_rotor_to_rest_behind_the_l
         return machine.part("door"), machine.part("lock")
 
     assert operated(falls_out) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("part", ["lock", "door", "pin"])
+def test_an_output_that_is_high_refuses_a_spin_though_its_part_has_jammed(part):
+    output = {"lock": "unlock", "door": "door", "pin": "pin"}[part]
+
+    async def jams(machine):
+        if part == "door":
+            await unlocked(machine)
+        machine.jam(part)
+        await machine.high(output)
+        await machine.low(*{"unlock"} - {output})
+        await asyncio.sleep(0.5)
+        with pytest.raises(InterlockViolated, match=f"output {output} is high"):
+            await machine.rotor.move_velocity(FAST, acceleration=10, duration_s=2)
+        machine.jam(part, jammed=False)
+        await asyncio.sleep(1.0)
+        return machine.speed
+
+    assert operated(jams) < CREEPS
+
+
+def test_an_output_that_is_written_the_level_that_it_has_stays_known():
+    async def writes(machine):
+        for _ in range(5):
+            await machine.low("unlock", "door", "pin")
+            await (await machine.rotor.move_velocity(1.0, acceleration=10, duration_s=0.5)).done()
+        return True
+
+    assert operated(writes)
+
+
+def test_of_a_spin_and_an_unlocking_at_one_instant_at_most_one_passes():
+    async def race(machine):
+        for apart_s in (-0.02, -0.005, -0.001, 0.0, 0.001, 0.003, 0.006, 0.01, 0.02, 0.05, 0.2):
+
+            async def spin(after_s=-apart_s):
+                await asyncio.sleep(max(after_s, 0.0))
+                await machine.rotor.move_velocity(FAST, acceleration=10, duration_s=5)
+
+            async def unlock(after_s=apart_s):
+                await asyncio.sleep(max(after_s, 0.0))
+                await machine.high("unlock")
+
+            went = await asyncio.gather(spin(), unlock(), return_exceptions=True)
+            refused = [each for each in went if each is not None]
+            assert refused
+            assert all(isinstance(each, InterlockViolated) for each in refused)
+            for _ in range(50):
+                await asyncio.sleep(0.02)
+                assert not (machine.speed > CREEPS and machine.part("lock") < 1.0)
+            await (await machine.rotor.halt()).done()
+            await machine.rig.at_rest("rotor")
+            await machine.low("unlock")
+            await machine.sees(locked=True, unlocked=False, unlock=False)
+        return True
+
+    assert operated(race)
 
 
 def test_a_client_that_dies_in_a_spin_leaves_a_rotor_that_comes_to_rest_behind_its_locked_door():
@@ -164,3 +367,54 @@ def test_a_client_that_dies_in_a_spin_leaves_a_rotor_that_comes_to_rest_behind_i
         operated(dies)
     (machine,) = ends
     assert (machine.io.around.at("door"), machine.io.around.at("lock")) == (0.0, 1.0)
+
+
+def test_who_wrote_outputs_is_in_the_events_done_and_refused_and_the_same_again_is_no_flood():
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                for _ in range(50):
+                    with suppress(LdcndError):
+                        await machine.high("door")
+            await shutting(rig).run()
+            await rig.client.set_io("cabinet", low=[9])
+            return await latest_events(rig.client.client, 1000, "cabinet")
+
+    refused, *done, last = (each for each in run(program()) if each.verb == "set_io")
+
+    assert (refused.status, refused.client, refused.code) == ("refused", "test", "interlock_violated")
+    assert refused.reason.startswith("door high: output door: interlock door_opens: ")
+    assert [each.reason for each in done] == ["pin low", "unlock high", "door low", "unlock low"]
+    assert {(each.status, each.client) for each in done} == {("done", "sequence shut")}
+    assert (last.reason, last.client) == ("pin low", None)
+
+
+def test_the_command_line_shows_who_wrote_outputs(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        machine.wait(asyncio.sleep(1))
+        codes = [
+            machine.run(f"bus set-io cabinet {each}").code for each in ("unlock=high 12=input", "door=low", "pin=hig")
+        ]
+        shown = machine.run("log").printed
+
+    assert codes == [0, 0, 2]
+    assert "cabinet  set_io           done       by ldcnd" in shown
+    assert "unlock high, door_ajar input" in shown or "unlock high, line 12 input" in shown
+
+
+def test_an_override_is_shown_by_list_and_why_with_its_rule_its_client_and_its_end(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        machine.wait(asyncio.sleep(1))
+        lease = machine.wait(machine.rig.client.ask(Acquire(client="Bert", axes=("rotor",), lease_s=60.0))).lease
+        lifts = OverrideInterlock(interlock="door_shut", seconds=12.0, reason="service", lease=lease)
+        machine.wait(machine.rig.client.ask(lifts))
+        machine.wait(asyncio.sleep(1.5))
+        during = [machine.run(line).printed for line in ("list", "why rotor")]
+        machine.wait(asyncio.sleep(13))
+        after = [machine.run(line).printed for line in ("list", "why rotor")]
+
+    assert all(
+        re.search(r"interlock door_shut is overridden by Bert for (9|10|11|12) s still", each) for each in during
+    )
+    assert not any("overridden" in each for each in after)

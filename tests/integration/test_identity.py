@@ -160,6 +160,10 @@ async def test_a_loop_is_not_closed_while_the_shaft_coasts():
             await rig.send(Power(on=True))
         assert abs(rig.drive.shaft.velocity_counts) > 5  # in a servo cycle: 10000 counts/s
         assert not (await rig.rig.client.state("x")).enabled
+        turns, off, *_ = (await rig.rig.client.ask(Why(), "x")).causes
+        assert "turns with its motor off" in turns.text
+        assert turns.remedy.startswith("wait until it stands")
+        assert (turns.passes, off.passes) == (True, False)
 
         async with asyncio.timeout(120.0):
             while True:

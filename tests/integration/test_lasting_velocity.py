@@ -5,8 +5,9 @@ import asyncio
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.contract.commands import BufferMode, MoveVelocity, Power, SetPosition
+from ldcnd.contract.commands import BufferMode, Halt, MoveVelocity, Power, Preview, SetPosition
 from ldcnd.contract.errors import PositionLimit, ValueOutOfRange
+from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.samples import AxisState
 from ldcnd.testing import simulated_rig
 from tests.support.chain_rig import rig_on
@@ -104,3 +105,58 @@ async def test_a_limit_that_was_passed_is_not_returned_to(side):
             await client.command("x", MoveVelocity(velocity=side * 8.0))
         await asyncio.sleep(1.0)
         assert rig.truth("x").position == pytest.approx(before, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("axis", "lasts_s"),
+    [
+        ({"longest_run_s": 15, "jog_horizon_s": 5}, 15),
+        ({"longest_run_s": 3, "jog_horizon_s": 60}, 3),
+        ({"jog_horizon_s": 4}, 4),
+    ],
+)
+@pytest.mark.parametrize("on_the_fly", [False, True])
+async def test_one_that_asks_for_no_duration_says_when_it_will_end_and_that_it_has_ended_by_that(
+    axis, lasts_s, on_the_fly
+):
+    async with running_machine(machine(axis=axis)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        planned = await rig.client.ask(Preview(velocity=5.0), "rotor")
+        if on_the_fly:
+            await rig.client.command("rotor", MoveVelocity(velocity=2.0))
+            await asyncio.sleep(1.0)
+        reply = await rig.client.command("rotor", MoveVelocity(velocity=5.0, buffer_mode=BufferMode.ABORTING))
+        await asyncio.sleep(lasts_s - 0.2)
+        assert rig.speed() == pytest.approx(5.0, rel=0.05)
+        await rig.until("rotor", lambda state: state.state is AxisState.STANDSTILL, within_s=3.0)
+        ended = await rig.client.ask(ReadOutcome(command_id=reply.command_id))
+
+    said = f"runs until it is stopped, for at most {lasts_s} s unless it is sent again"
+    assert (planned.ends, reply.ends) == (said, said)
+    assert (ended.status, ended.reason) == (CommandStatus.DONE, f"came to its own end: it {said}")
+
+
+async def test_one_with_a_limit_ahead_says_where_it_will_end():
+    async with simulated_rig(load_config(SIMULATED)) as rig:
+        client = rig.client.client
+        await client.command("x", Power(on=True))
+        await client.command("x", SetPosition(position=90.0))
+        planned = await client.ask(Preview(velocity=8.0), "x")
+        reply = await client.command("x", MoveVelocity(velocity=8.0))
+        await asyncio.sleep(4.0)
+        ended = await client.ask(ReadOutcome(command_id=reply.command_id))
+
+    assert planned.ends == reply.ends == "runs until it is stopped, at most to its software limit 100 mm"
+    assert ended.reason == f"came to its own end: it {reply.ends}"
+
+
+async def test_one_that_is_halted_does_not_claim_that_it_ended_by_itself():
+    async with running_machine(machine(axis=LONG)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        reply = await rig.client.command("rotor", MoveVelocity(velocity=5.0))
+        await asyncio.sleep(1.0)
+        await rig.client.command("rotor", Halt())
+        await rig.until("rotor", lambda state: state.state is AxisState.STANDSTILL, within_s=3.0)
+        ended = await rig.client.ask(ReadOutcome(command_id=reply.command_id))
+
+    assert "own end" not in (ended.reason or "")

@@ -160,7 +160,10 @@ def test_it_is_typed_and_taught(monkeypatch, tmp_path):
     assert unhomed.code == 1
     assert "home it first" in unhomed.errors
     assert [each.code for each in ran] == [0] * 6, ran
-    assert "  8/8  door high, until door_open is true: done in " in ran[0].printed
+    assert (
+        "  8/8  door high, until door_closed is false, until door_ajar is true, until door_open is true: done in "
+        in ran[0].printed
+    )
     assert [json.loads(line)["event"] for line in record.read_text().splitlines()] == ["begun", "done"] * 8
     taught = {each["name"]: each["axes"] for each in tomllib.loads(config.read_text())["position"]}
     assert taught["here"]["rotor"] == pytest.approx(0.6, abs=0.002)

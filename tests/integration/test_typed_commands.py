@@ -59,7 +59,7 @@ async def test_what_a_drive_can_do_can_be_typed(tmp_path):
     assert re.fullmatch(r"sim: x: done, standstill at (2\.99|3\.00)\d mm, 0\.00\d mm off its target", done)
     assert (
         went["axis preview x --position 400"].printed.splitlines()[1]
-        == "  the nearest value that would be accepted is 100"
+        == "  the nearest value that would be accepted is 100 mm"
     )
     assert "z: halted at " in went["jog z 1 --for 0.2"].printed
     assert "ldcnd reset z" in went["move z 1"].errors

@@ -1,6 +1,7 @@
 """Numbers with units at every face of a rig: the simulated shaft turns as fast as was typed."""
 
 import asyncio
+import re
 
 import pytest
 
@@ -14,11 +15,11 @@ CENTRIFUGE = load_config(ROOT / "config" / "centrifuge.toml")
 
 
 async def _ready(rig):
-    """Wait until door and lock are seen shut, and find the index."""
+    """Wait until the lock is seen shut, and find the index."""
     async with rig.control("rotor", client="test") as rotor:
         async with rig.samples("cabinet", "io") as samples:
             async for _, sample in samples:
-                if sample.named["locked"] and sample.named["door_closed"]:
+                if sample.named["locked"] and sample.named["unlock"] is False:
                     break
         await rotor.power(on=True)
         await (await rotor.home()).done()
@@ -77,3 +78,40 @@ def test_a_unit_can_be_typed_wherever_a_value_is(monkeypatch):
     assert "type the value in rpm, rev/s, deg/s" in refused.errors
     assert limited.code == 1
     assert "velocity 4000 rpm (1789 g) is above the limit 3300 rpm (1218 g)" in limited.errors
+
+
+@pytest.mark.parametrize(
+    ("line", "code", "nearest"),
+    [
+        ('axis preview rotor --velocity "5000 g"', 0, "1217.76 g"),
+        ('axis preview rotor --velocity "-5000 g"', 0, "-1217.76 g"),
+        ("axis preview rotor --velocity 5000", 0, "3300 rpm"),
+        ('move rotor "5000 g" --at-velocity', 1, "1217.76 g"),
+        ('move rotor "100 rev/s" --at-velocity', 1, "55 rev/s"),
+        ('move rotor 300 --at-velocity --acceleration "10000 rpm/s"', 1, "600 rpm/s"),
+        ("move rotor 300 --at-velocity --for 5000", 1, "3600 s"),
+        ('move rotor 0.2 --velocity "30000 deg/s"', 1, "19800 deg/s"),
+        ('jog rotor "5000 rpm" --for 1', 1, "3300 rpm"),
+        ('home rotor --acceleration "100 rev/s2"', 1, "10 rev/s2"),
+    ],
+)
+def test_a_refusal_names_the_nearest_value_in_the_unit_that_was_typed_and_that_is_accepted(
+    monkeypatch, line, code, nearest
+):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        machine.wait(asyncio.sleep(1))
+        begun = [machine.run(each).code for each in ("power on rotor", "home rotor --wait")]
+        refused = machine.run(line)
+        said = (
+            (refused.printed + refused.errors)
+            .partition("nearest value that would be accepted is ")[2]
+            .partition("\n")[0]
+        )
+        again = machine.run(
+            re.sub(r'"[^"]+"$|"[^"]+" |(?<=velocity )5000|(?<=for )5000', f'"{said.removesuffix(" s")}" ', line)
+        )
+
+    assert (begun, refused.code) == ([0, 0], code)
+    assert said == nearest
+    assert again.code == 0, again
+    assert "would be refused" not in again.printed

@@ -38,9 +38,9 @@ SWITCH = {"module": IO, "line": STILL, "drive": 1, "above_counts_per_s": 5000}
 class Host(SimulatedHost):
     """A host of a PIC-SERVO and a PIC-I/O in a machine."""
 
-    def __init__(self, *event, part=(LOCK, DOOR)):
+    def __init__(self, *event, part=(LOCK, DOOR), imbalance=(SWITCH,)):
         modules = [{"model": "pic-servo-sc"}, {"model": "pic-io"}]
-        table = {"module": modules, "part": part, "imbalance": [SWITCH], "event": event}
+        table = {"module": modules, "part": part, "imbalance": imbalance, "event": event}
         super().__init__(build_chain(SimulationConfig.model_validate(table).spec()))
         self.address_all()
         outputs = 1 << BOLT_OUT - 1 | 1 << DOOR_OPENS - 1
@@ -119,8 +119,9 @@ def test_what_jams_stays_where_it_is_until_it_is_free_and_an_unplugged_sensor_sa
     assert OPEN not in host.sees()
 
 
-def test_a_rotor_out_of_balance_hits_the_switch_while_it_is_fast():
-    host = Host()
+@pytest.mark.parametrize("inverted", [False, True])
+def test_a_rotor_out_of_balance_hits_the_switch_while_it_is_fast(inverted):
+    host = Host(imbalance=({**SWITCH, "inverted": inverted},))
     host.drive.set_condition(FaultCondition.UNBALANCED, present=True, at_s=host.now_s)
     slow = host.sees()
     host.drive.catch_up(host.now_s)
@@ -129,9 +130,7 @@ def test_a_rotor_out_of_balance_hits_the_switch_while_it_is_fast():
     fast = host.sees()
     host.drive.set_condition(FaultCondition.UNBALANCED, present=False, at_s=host.now_s)
 
-    assert STILL in slow
-    assert STILL not in fast
-    assert STILL in host.sees()
+    assert [STILL in each for each in (slow, fast, host.sees())] == [not inverted, inverted, not inverted]
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,22 @@ import(module).then(({ readNumber, unitsOf, Unread }) => {
 """
 
 
+@pytest.mark.parametrize(
+    ("text", "same"),
+    [
+        ("1000 RPM", "1000 rpm"),
+        ("1000Rpm", "1000 rpm"),
+        ("1000 x g", "1000 g"),
+        ("1000 xg", "1000 g"),
+        ("20 \u00d7 g", "20 g"),
+    ],
+)
+def test_units_of_a_centrifuge_are_taken_as_people_write_them(text, same):
+    taken = [read_quantity(each, ROTOR, Dimension.VELOCITY) for each in (text, same)]
+
+    assert taken[0] == taken[1]
+
+
 def test_pages_convert_as_the_command_line_does():
     node = shutil.which("node") or _node_of_playwright()
     if node is None:

@@ -41,7 +41,9 @@ class VelocityChange(EndlessMotion):
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
         self._until_s = motion.clock.now_s() + min(run_s, COUNTER_SHARE * room_s)
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        return motion.reply(self.permit, velocity=plan.velocity, acceleration=plan.acceleration)
+        _, at_limit = motion.end_ahead(motion.here, plan.velocity * run_s)
+        ends = motion.end_in_words(run_s, plan.velocity, at_limit=at_limit)
+        return motion.reply(self.permit, ends=ends, velocity=plan.velocity, acceleration=plan.acceleration)
 
     @override
     def fastest(self, velocity: float) -> tuple[float, float]:

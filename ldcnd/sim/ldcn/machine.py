@@ -64,6 +64,8 @@ class ImbalanceSwitchConfig(Frozen):
     """Place of its PIC-I/O in the chain, from 1 on."""
     line: LineNumber
     """The line that it drives: low while it is hit."""
+    inverted: bool = False
+    """Whether the line is high while it is hit, not low."""
     drive: Place
     """Place of the drive that turns the rotor; its condition `unbalanced` says that the rotor is out of balance."""
     above_counts_per_s: float = Field(gt=0)
@@ -181,7 +183,7 @@ class Surroundings:
             drive.catch_up(at_s)
             speed = abs(drive.shaft.velocity_counts) / drive.profile.servo_cycle_s
             hit = drive.suffers(FaultCondition.UNBALANCED) and speed > switch.above_counts_per_s
-            present = _with(present, switch.line, high=not hit)
+            present = _with(present, switch.line, high=hit is switch.inverted)
         return present
 
 

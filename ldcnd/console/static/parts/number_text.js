@@ -111,7 +111,8 @@ function sameUnit(written, unit) {
 }
 
 function plain(unit) {
-  return unit.normalize("NFKC").replaceAll("μ", "u").replaceAll("°", "deg").replaceAll(" ", "");
+  const bare = unit.normalize("NFKC").replaceAll("μ", "u").replaceAll("°", "deg").replaceAll(" ", "").replace(/rpm/i, "rpm");
+  return /^[x×]g$/.test(bare) ? "g" : bare; // as the force in a centrifuge is written
 }
 
 function quoted(text) {
