@@ -23,8 +23,9 @@ def with_lock(**levels: object) -> dict[str, object]:
 
 
 async def events(rig: Machine) -> list[tuple[str, str | None]]:
+    """Return what the daemon tells of the module besides who has written to it."""
     page = await rig.client.ask(ReadEvents(axis="cabinet", count=100))
-    return [(event.verb, event.reason) for event in page.events]
+    return [(event.verb, event.reason) for event in page.events if event.verb != SetIo.verb]
 
 
 def driven(rig: Machine) -> int | None:
