@@ -44,7 +44,8 @@ axes = ["x", "y"]
 name = "cabinet"
 address = 5
 model = "pic-io"
-outputs = [4]
+inputs = { door = { line = 3 } }
+outputs = { lamp = { line = 4 } }
 """
 
 

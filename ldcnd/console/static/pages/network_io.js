@@ -1,7 +1,7 @@
 /** What one packet does to a whole line: a snapshot of all positions and inputs; and its PIC-I/O modules. */
 
 import { html, useState } from "../html.js";
-import { Action, Choice, Panel, Table } from "../parts/controls.js";
+import { Action, Choice, Facts, Panel, Table } from "../parts/controls.js";
 import { number } from "../parts/format.js";
 import { NumberField, unread } from "../parts/number_field.js";
 import { ofRig } from "../session/control.js";
@@ -17,6 +17,9 @@ const TIMER = [
   ["timer", "time, at 5 MHz"],
   ["counter", "edges of line 10"],
 ];
+
+/** A module is read at least twice a second. */
+const OLD_S = 2;
 
 const levelsOf = (levels) => levels.map((level, index) => `${index + 1} ${level ? "high" : "low"}`).join(", ");
 
@@ -45,16 +48,26 @@ export function Modules({ rig, bus }) {
   return named.map((module) => html`<${Module} key=${module.name} rig=${rig} name=${module.name} />`);
 }
 
+/** Return the named lines of a module, in their order: on, off, or unknown. */
+function namedOf(rig, module) {
+  const seen = rig.axis(module);
+  const known = !rig.worth && seen.ageS("io") < OLD_S;
+  return Object.entries(seen.samples.io?.named ?? {}).map(([line, on]) => [line, known && on !== null ? (on ? "on" : "off") : "unknown"]);
+}
+
 function Module({ rig, name }) {
   const [line, setLine] = useState("1");
   const [becomes, setBecomes] = useState("high");
   const [pwm, setPwm] = useState({});
   const [counts, setCounts] = useState("off");
   const [shown, setShown] = useState(null);
+  const named = namedOf(rig, name);
+  const lines = [...named.map(([each]) => [each, each]), ...LINES];
   const told = (verb, body) => ofRig(rig, verb, { module: name, ...body });
   return html`<${Panel} title=${`Module ${name}`} note="An output may move something; it keeps its level when this page is gone.">
+    ${named.length > 0 && html`<${Facts} of=${named} />`}
     <div class="fields">
-      <${Choice} label="Line" options=${LINES} value=${line} onChange=${setLine} />
+      <${Choice} label="Line" options=${lines} value=${line} onChange=${setLine} />
       <${Choice} label="Becomes" options=${BECOMES} value=${becomes} onChange=${setBecomes} />
       <${NumberField} label="PWM 1" value=${pwm.pwm1} min=${0} max=${1} onChange=${(pwm1) => setPwm((last) => ({ ...last, pwm1 }))} hint="0 to 1; empty: as it is" />
       <${NumberField} label="PWM 2" value=${pwm.pwm2} min=${0} max=${1} onChange=${(pwm2) => setPwm((last) => ({ ...last, pwm2 }))} hint="0 to 1; empty: as it is" />
@@ -62,7 +75,7 @@ function Module({ rig, name }) {
     </div>
     <p class="row">
       <${Action} act=${() => told("set_io")} onDone=${setShown}>Read ${name}<//>
-      <${Action} kind="main" act=${() => told("set_io", { [becomes]: [Number(line)] })} onDone=${setShown}>Set line ${line}<//>
+      <${Action} kind="main" act=${() => told("set_io", { [becomes]: [Number(line) || line] })} onDone=${setShown}>Set line ${line}<//>
       <${Action} act=${() => told("set_io", pwm)} obstacle=${unread({ "PWM 1": pwm.pwm1, "PWM 2": pwm.pwm2 })} onDone=${setShown}>Set PWM<//>
       <${Action} act=${() => told("set_io_timer", { mode: counts })} onDone=${setShown}>Count<//>
     </p>
