@@ -40,6 +40,10 @@ GROUP = """
 name = "gantry"
 axes = ["x", "y"]
 
+[[bus.group]]
+name = "table"
+axes = ["z", "c"]
+
 [[bus.module]]
 name = "cabinet"
 address = 5

@@ -149,6 +149,31 @@ async def test_a_group_is_moved_together_from_the_rig_page_by_keyboard(house):
         await house.sim.reaches("y", -2, within=0.05)
 
 
+async def test_a_group_of_other_units_has_a_velocity_for_each_axis(house):
+    await house.sim.quiet("z", "c")
+    for axis in ("z", "c"):
+        await house.sim.rig.command(axis, SetPosition(position=0.0))
+    async with house.desk(width=1280) as desk:
+        await desk.open("rig")
+        every = desk.page.get_by_role("group", name="Commands for all axes of sim")
+        group = desk.panel("Group table")
+        for name in ("Take control of all", "Enable all"):
+            await every.get_by_role("button", name=name).click()
+        for axis in ("z", "c"):
+            await house.sim.until(axis, lambda state: state.enabled)
+        for label, typed in (
+            ("z to mm", "2"),
+            ("c to deg", "3"),
+            ("Velocity of z mm/s", "4"),
+            ("Velocity of c deg/s", "1"),
+        ):
+            await group.get_by_label(label).press_sequentially(typed)
+        await group.get_by_role("button", name="Move z and c together").click()
+        await house.sim.reaches("z", 2, within=0.05)
+        assert await house.sim.position("c") < 2.5  # it is slower
+        await house.sim.reaches("c", 3, within=0.05)
+
+
 async def test_pins_become_outputs_and_a_slow_velocity_can_be_read(house):
     await house.sim.quiet("z")
     async with house.desk() as desk:

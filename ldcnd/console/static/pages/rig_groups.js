@@ -21,21 +21,25 @@ export function GroupMoves({ rig }) {
 
 function GroupMove({ group, axes }) {
   const [targets, setTargets] = useState({});
-  const [speed, setSpeed] = useState(null);
+  const [speeds, setSpeeds] = useState({});
   const [straight, setStraight] = useState(false);
   const [line, setLine] = useState(null);
   const reason = useId();
   const once = useOnce();
-  const body = unread({ ...targets, Velocity: speed }) ? null : { targets, speed, straight };
+  // what is typed once is meant in one unit
+  const alike = axes.every(({ info }) => unitsOf(info, "velocity")[0].unit === unitsOf(axes[0].info, "velocity")[0].unit);
+  const label = (name) => (alike ? "Velocity" : `Velocity of ${name}`);
+  const unreadable = unread({ ...targets, ...Object.fromEntries(axes.map(({ name }) => [label(name), speeds[name]])) });
+  const body = unreadable ? null : { targets, speeds, straight };
   const hindered = axes.find((axis) => obstacle(axis, "move_absolute"));
   const missing = axes.find(({ name }) => targets[name] === null || targets[name] === undefined);
   const way = hindered
     ? `${hindered.name}: ${obstacle(hindered, "move_absolute")}`
-    : (unread({ ...targets, Velocity: speed }) ??
+    : (unreadable ??
       (missing ? `The position of ${missing.name} is missing.` : once.obstacle(body, axes.some(moves))));
   const place = `${axes[0].rig.name}/${group}`;
   const send = async () => {
-    const sent = moveTogether(axes, targets, speed, straight);
+    const sent = moveTogether(axes, targets, speeds, straight);
     const of = async ({ name }) => (await sent).replies.find((each) => each.axis === name);
     for (const { error } of await askEach(place, "Move", axes, of)) throw error;
   };
@@ -49,12 +53,15 @@ function GroupMove({ group, axes }) {
         meaning=${(text) => `moves ${axis.name} to ${text};`} hint=${`now ${placeText(axis, decimalsOf(axis.info))}`}
         onChange=${(value) => setTargets((last) => ({ ...last, [axis.name]: value }))} />`,
       )}
-      <${NumberField} label="Velocity" units=${unitsOf(axes[0].info, "velocity")} value=${speed} onChange=${setSpeed} hint="empty: the axis default" />
+      ${(alike ? [axes] : axes.map((axis) => [axis])).map(
+        (of) => html`<${NumberField} key=${of[0].name} label=${label(of[0].name)} units=${unitsOf(of[0].info, "velocity")} value=${speeds[of[0].name]}
+        hint="empty: the axis default" onChange=${(value) => setSpeeds((last) => ({ ...last, ...Object.fromEntries(of.map(({ name }) => [name, value])) }))} />`,
+      )}
     </div>
     <${Tick} label="Straight line" checked=${straight} onChange=${setStraight} />
     <p class="row"><${Action} kind="main" act=${move} obstacle=${way || null}
       reason=${reason}>Move ${axes.map(({ name }) => name).join(" and ")} together<//>
-      ${straight && html`<${Action} act=${async () => setLine({ of: situation, ...(await previewLine(axes, targets, speed)) })} obstacle=${missing || !body ? way : null}
+      ${straight && html`<${Action} act=${async () => setLine({ of: situation, ...(await previewLine(axes, targets, speeds)) })} obstacle=${missing || !body ? way : null}
         reason=${reason}>Preview the line<//>`}</p>
     <${Fates} place=${place} />
     ${straight && line?.of === situation && html`<p role="status">${number(line.duration_s, 2)} s, at most

@@ -63,8 +63,8 @@ export function command(axis, verb, body = {}, patienceMs = undefined) {
 }
 
 /** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
-export function moveTogether(axes, targets, velocity, straight = false) {
-  const moves = shares(axes, targets, velocity).map((move) => ({ ...move, command_id: crypto.randomUUID() }));
+export function moveTogether(axes, targets, velocities, straight = false) {
+  const moves = shares(axes, targets, velocities).map((move) => ({ ...move, command_id: crypto.randomUUID() }));
   return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves, ...(straight && { path: "linear" }) });
 }
 
@@ -74,13 +74,13 @@ export function setSpeedOverride(rig, percent) {
 }
 
 /** Ask how long a straight line would take and how far from it the axes would get; no effect. */
-export function previewLine(axes, targets, velocity) {
-  const moves = shares(axes, targets, velocity);
+export function previewLine(axes, targets, velocities) {
+  const moves = shares(axes, targets, velocities);
   return ask(`${rigPath(axes[0].rig.name)}/rig/preview_together`, { moves, path: "linear" });
 }
 
-function shares(axes, targets, velocity) {
-  return axes.map(({ name }) => given({ axis: name, position: targets[name], velocity }));
+function shares(axes, targets, velocities) {
+  return axes.map(({ name }) => given({ axis: name, position: targets[name], velocity: velocities[name] }));
 }
 
 /** Ask a rig for what concerns a whole line; the console adds this page's leases. */
