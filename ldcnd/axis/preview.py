@@ -30,7 +30,8 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
         return PreviewReply(axis=name, refusal=error_reply(error), obstacles=obstacles)
     legs = [leg for leg in (first, plan) if leg]
     exchanges = [each for leg in legs for sent in motion.driver.exchanges(leg.motion) for each in (sent,) * sent.times]
-    asked_velocity = motion.config.velocity if request.velocity is None else request.velocity
+    full_velocity = motion.config.velocity if request.velocity is None else request.velocity
+    asked_velocity = full_velocity * motion.tracker.status.speed_share
     asked_acceleration = motion.config.acceleration if request.acceleration is None else request.acceleration
     return PreviewReply(
         axis=name,

@@ -277,6 +277,7 @@ class AxisStatus:
             "has_reference": self.commanded,
             "reference_lost": self.reference_lost,
             "target": self.target,
+            "unit": self.unit,
             "speed_override": self.speed_override,
             "holder": self.holder,
         }

@@ -47,7 +47,7 @@ FILE = click.Path(path_type=Path, dir_okay=False)
     type=FILE,
     help="Serve the commissioning page for this configuration of a rig: it writes the file, and its steps move axes.",
 )
-@click.option("--link", is_flag=True, help="Print another link of the console that runs on the port of --listen.")
+@click.option("--link", is_flag=True, help="Print another link of the console that listens at --listen.")
 @click.option("--json", "as_json", is_flag=True, help="Print the link as a line of JSON.")
 @click.option(
     "--log-level",
@@ -83,7 +83,7 @@ def console(
     from ldcnd.console.settings import ConsoleSettings, read_token  # noqa: PLC0415
 
     if link:
-        show_link(asyncio.run(ask_for_link(listen.port)), as_json=as_json)
+        show_link(asyncio.run(ask_for_link(listen)), as_json=as_json)
         return
     configure_logging(level=log_level)
     if config and config.suffix == ".toml":

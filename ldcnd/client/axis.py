@@ -10,7 +10,7 @@ from typing import TypeVar
 import pydantic
 
 from ldcnd.client.lease import Control
-from ldcnd.client.motion import Jogging, Motion, Position, Sent, State
+from ldcnd.client.motion import Jogging, Motion, Position, Sent, State, set_point
 from ldcnd.client.notebook import table
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, take_trace
@@ -129,9 +129,7 @@ class Axis(AxisVerbs):
         Raises:
             SessionError: nothing has come from it yet.
         """
-        state = self.state.sample
-        target = self._sent.target(state) if self._sent else state.target
-        return self.position.value if target is None else target
+        return set_point(self.state.sample, lambda: self.position.value, self._sent)
 
     async def at(self, t: int) -> AxisInstant:
         """Return where it was at an instant of the last 600 s, UTC in ns since 1970, with bounds that hold.

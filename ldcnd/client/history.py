@@ -13,7 +13,7 @@ from ldcnd.contract.events import (
     CommandEvent,
 )
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.meta import AxisInfo, DaemonInfo
 from ldcnd.contract.samples import PastFault
 
 CONTROL = frozenset({"acquire", "renew", "release", "override_interlock"})
@@ -30,6 +30,8 @@ class HistoryKind(StrEnum):
     """Control was taken, lost or refused, or an interlock was overridden."""
     FAULT = "fault"
     """A fault was seen."""
+    DAEMON = "daemon"
+    """The daemon was started: what an earlier run of it has seen is not known any more, but for faults."""
     DRIVE = "drive"
     """A drive did something that no command of the daemon explains."""
 
@@ -42,9 +44,9 @@ class HistoryRow(Frozen):
     kind: HistoryKind
     """What kind of thing it was."""
     axis: str
-    """The axis, or the I/O module."""
+    """The axis, or the I/O module; empty for what concerns the rig."""
     what: str
-    """The verb of the command, or the code of the fault."""
+    """The verb of the command, of `power` with on or off, or the code of the fault."""
     how: str
     """How far a command has got; empty for what is no command."""
     who: str
@@ -73,7 +75,7 @@ def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
         t=event.t,
         kind=kind,
         axis=event.axis,
-        what=event.verb,
+        what=event.verb if event.on is None else f"{event.verb} {'on' if event.on else 'off'}",
         how="" if kind is HistoryKind.DRIVE else event.status.value,
         who=f"{event.client or ''}{login}".strip(),
         why=event.reason or "",
@@ -98,6 +100,11 @@ def _row_of_fault(axis: AxisInfo, fault: PastFault) -> HistoryRow:
     )
 
 
+def _row_of_start(daemon: DaemonInfo) -> HistoryRow:
+    why = f"ldcnd {daemon.version}, run {daemon.instance}"
+    return HistoryRow(t=daemon.started, kind=HistoryKind.DAEMON, axis="", what="started", how="", who="", why=why)
+
+
 async def history(client: RigClient, axis: str | None = None, since_ns: int = 0, count: int = 50) -> list[HistoryRow]:
     """Return the latest things that happened, oldest first, as far as the daemon remembers them.
 
@@ -115,5 +122,6 @@ async def history(client: RigClient, axis: str | None = None, since_ns: int = 0,
         if axis in (None, name):
             seen = {(fault.code, fault.since): fault for fault in (*info.past_faults, *faults.get(name, ()))}
             rows += [_row_of_fault(info, fault) for fault in seen.values()]
+    rows.append(_row_of_start(await client.daemon()))
     rows = sorted((row for row in rows if row.t >= since_ns), key=lambda row: row.t)
     return rows[-count:]

@@ -29,7 +29,14 @@ class LoopThread:
         self._loop.call_soon_threadsafe(callback, *args)
 
     def run(self, work: Coroutine[Any, Any, ResultT]) -> ResultT:
-        """Run a coroutine to its end; an interrupted wait cancels it."""
+        """Run a coroutine to its end; an interrupted wait cancels it.
+
+        Raises:
+            RuntimeError: this is the loop's own thread, which would wait for itself.
+        """
+        if self._is_here():
+            work.close()
+            raise RuntimeError("this thread would wait for itself: what is called by the client cannot wait for it")
         future = self.start(work)
         try:
             self.wait(future)
@@ -37,6 +44,12 @@ class LoopThread:
         except BaseException:
             future.cancel()
             raise
+
+    def _is_here(self) -> bool:
+        try:
+            return asyncio.get_running_loop() is self._loop
+        except RuntimeError:
+            return False
 
     def wait(self, *futures: concurrent.futures.Future[Any]) -> None:
         """Wait until one of them is done."""

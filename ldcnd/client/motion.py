@@ -156,6 +156,18 @@ class Sent:
         return self.asked if is_reply and self.asked is not None else target
 
 
+def set_point(state: StateSample, here: Callable[[], float], sent: Sent | None) -> float:
+    """Return where an axis was sent last, by any program; where it is, once anything else stopped or moved it.
+
+    Args:
+        state: the last one that has arrived.
+        here: returns the last position, in axis units.
+        sent: the last motion that this program has begun; None without one.
+    """
+    target = sent.target(state) if sent else state.target
+    return here() if target is None else target
+
+
 @dataclass(slots=True, eq=False)
 class Motion:
     """A command that the drive has acknowledged and that ends later.

@@ -4,6 +4,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 
+from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import decode_received
 from ldcnd.contract.condition import Condition, Place, assess
@@ -111,13 +112,15 @@ async def overview(client: RigClient) -> list[AxisNow]:
     axes, states, positions = await client.axes(), await client.states(), await client.positions()
     faults, report = await client.faults(), await last_health(client)
     lines = {line.bus: line for line in await last_bus_health(client)}
+    clock = DaemonClock()
     stamps = [sample.t for samples in (states, positions) for sample in samples.values()]
-    now_ns = max([*stamps, report.t if report else 0], default=0)  # the clocks of two hosts may differ
+    for t in (*stamps, *([report.t] if report else [])):
+        clock.note(t, 0.0)
     found = []
     for info in axes:
         line, state, position = lines.get(info.bus), states.get(info.axis), positions.get(info.axis)
         health = next((each for each in line.axes if each.axis == info.axis), None) if line else None
-        age_s = (now_ns - position.t) / 1e9 if position else None
+        age_s = clock.age_s(position.t, 0.0) if position else None
         fault: FaultSample | None = faults.get(info.axis)
         condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up)
         found.append(AxisNow(info, state, position, age_s, health, condition))

@@ -11,6 +11,7 @@ from typing import TypeVar
 
 import msgpack
 
+from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.contract.codec import Encoding, decode_received
 from ldcnd.contract.condition import SILENT_S, Condition, Place, Severity, Trouble, TroubleKind, assess
@@ -63,7 +64,7 @@ class Conditions:
         self._now_s = now_s
         self._axes: dict[str, _Axis] = {}
         self._lines: dict[str, BusHealth] = {}
-        self._newest: tuple[int, float] = (0, 0.0)  # the daemon's clock, and when it was that late here
+        self._clock = DaemonClock()
         self._heard_at_s = now_s()
 
     def take(self, sample: Publication) -> None:
@@ -82,7 +83,7 @@ class Conditions:
             except LdcndError:
                 return  # of a daemon of another version
             self._lines[report.bus] = report
-            self._note_clock(report.t)
+            self._clock.note(report.t, self._now_s())
 
     def show_again(self) -> None:
         """Send all of them once more: the pages' values were put in order."""
@@ -121,27 +122,18 @@ class Conditions:
         position = _decoded(axis.position, PositionSample)
         for sample in (state, position):
             if sample:
-                self._note_clock(sample.t)
+                self._clock.note(sample.t, self._now_s())
         line = next((line for line in self._lines.values() if any(each.axis == name for each in line.axes)), None)
         health = next((each for each in line.axes if each.axis == name), None) if line else None
         condition = assess(
             state,
             fault,
             health,
-            age_s=self._age_s(position.t) if position else None,
+            age_s=self._clock.age_s(position.t, self._now_s()) if position else None,
             line_up=line is None or line.up,
             silence=silence,
         )
         return as_payload(condition)
-
-    def _note_clock(self, t: int) -> None:
-        if t > self._newest[0]:
-            self._newest = (t, self._now_s())
-
-    def _age_s(self, t: int) -> float:
-        """Return how old an instant is by the daemon's own clock: that of this host may differ."""
-        newest, at_s = self._newest
-        return (newest - t) / 1e9 + self._now_s() - at_s
 
 
 def as_payload(condition: Condition) -> dict[str, object]:

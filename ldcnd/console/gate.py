@@ -119,7 +119,7 @@ class RequestGate:
 
 def _stranger(path: str) -> Response:
     if path.startswith("/api/"):
-        return _refusal(401, "this browser is not let in; open the console with the link that it prints")
+        return _refusal(401, "this browser is not let in")
     return HTMLResponse(STRANGER_PAGE, 401)
 
 

@@ -6,6 +6,7 @@ It lies in the user's runtime folder, where nobody else may look: whoever can op
 import asyncio
 import json
 import os
+import socket
 import tempfile
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
@@ -13,11 +14,15 @@ from pathlib import Path
 
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
+from ldcnd.listen_address import ListenAddress
 
 ANSWER_S = 5.0
 RUNTIME_FOLDERS = ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR")
 """Where services and users have a folder of their own for sockets (systemd.exec, XDG base directories)."""
 PRIVATE = 0o700
+EVERY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - a console there listens on the address that is asked for
+_PREFIX, _SUFFIX = "ldcnd-console-", ".sock"
+_ANY = f"{_PREFIX}*-*{_SUFFIX}"
 
 
 class GivenLink(Frozen):
@@ -29,11 +34,11 @@ class GivenLink(Frozen):
     """For how long it lets one browser in; null for one that lets in every browser that has it."""
 
 
-def socket_of(port: int) -> Path:
-    """Return where the console that listens on a port gives links.
+def _folder() -> Path:
+    """Return where the consoles of this user give links.
 
     Raises:
-        ConfigError: the folder for it belongs to another user, or this machine has no such sockets.
+        ConfigError: the folder belongs to another user, or this machine has no such sockets.
     """
     if not hasattr(asyncio, "open_unix_connection"):
         raise ConfigError("consoles give no further links on this machine", remedy="start the console again")
@@ -42,12 +47,23 @@ def socket_of(port: int) -> Path:
     folder.mkdir(mode=PRIVATE, parents=True, exist_ok=True)
     if folder.stat().st_uid != os.getuid():
         raise ConfigError(f"{folder} belongs to another user: no links of a console are given there")
-    return folder / f"ldcnd-console-{port}.sock"
+    return folder
+
+
+def _socket_at(host: str, port: int) -> Path:
+    """Return where the console gives links that listens on an IP address and a port."""
+    return _folder() / f"{_PREFIX}{host}-{port}{_SUFFIX}"
 
 
 @asynccontextmanager
-async def giving_links(port: int, new_link: Callable[[], GivenLink]) -> AsyncIterator[None]:
-    """Give a link to whoever opens the socket, until the context ends; a console without such a folder gives none."""
+async def giving_links(host: str, port: int, new_link: Callable[[], GivenLink]) -> AsyncIterator[None]:
+    """Give a link to whoever opens the socket, until the context ends; a console without such a folder gives none.
+
+    Args:
+        host: the IP address on which the console listens.
+        port: and its port.
+        new_link: makes a link.
+    """
 
     async def give(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         with suppress(OSError):
@@ -56,8 +72,8 @@ async def giving_links(port: int, new_link: Callable[[], GivenLink]) -> AsyncIte
         writer.close()
 
     try:
-        path = socket_of(port)
-        path.unlink(missing_ok=True)  # of a console that was killed: the port was free
+        path = _socket_at(host, port)
+        path.unlink(missing_ok=True)  # of a console that was killed: the address was free
         server = await asyncio.start_unix_server(give, path)
     except (OSError, ConfigError):
         yield
@@ -70,21 +86,34 @@ async def giving_links(port: int, new_link: Callable[[], GivenLink]) -> AsyncIte
             path.unlink(missing_ok=True)
 
 
-async def ask_for_link(port: int) -> GivenLink:
-    """Return another link of the console that runs on a port of this machine, for this user.
+async def ask_for_link(address: ListenAddress) -> GivenLink:
+    """Return another link of the console that listens at an address of this machine, for this user.
 
     Raises:
         ConfigError: there is none, or it does not answer.
     """
+    for host in (_ip_of(address.host), *EVERY_ADDRESS):
+        try:
+            async with asyncio.timeout(ANSWER_S):
+                reader, writer = await asyncio.open_unix_connection(_socket_at(host, address.port))
+                line = await reader.readline()
+                writer.close()
+            return GivenLink.model_validate(json.loads(line))
+        except (OSError, TimeoutError, ValueError):
+            continue
+    named = (each.name.removeprefix(_PREFIX).removesuffix(_SUFFIX).rpartition("-") for each in _folder().glob(_ANY))
+    others = ", ".join(sorted(f"{ListenAddress(host, int(port)).in_url}:{port}" for host, _, port in named))
+    raise ConfigError(
+        f"no console of this user gives links at {address.in_url}:{address.port}"
+        f"{f'; there may be one at {others}' if others else ''}",
+        value=address.port,
+        remedy="name its address with --listen, ask as the user that runs it, or start one: ldcnd console",
+    )
+
+
+def _ip_of(host: str) -> str:
+    """Return the IP address on which a console listens that was given this host."""
     try:
-        async with asyncio.timeout(ANSWER_S):
-            reader, writer = await asyncio.open_unix_connection(socket_of(port))
-            line = await reader.readline()
-            writer.close()
-        return GivenLink.model_validate(json.loads(line))
-    except (OSError, TimeoutError, ValueError) as error:
-        raise ConfigError(
-            f"no console of this user gives links for port {port}",
-            value=port,
-            remedy="name its port with --listen, ask as the user that runs it, or start one: ldcnd console",
-        ) from error
+        return str(socket.getaddrinfo(host, None, socket.AF_INET6 if ":" in host else socket.AF_INET)[0][4][0])
+    except OSError:
+        return host

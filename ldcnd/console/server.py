@@ -98,7 +98,7 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
     rigs = Rigs(values, settings.rigs)
     visitors = Visitors(loop.time, settings.token)
     listening = _listen(settings.address)
-    port = listening.getsockname()[1]
+    host, port = listening.getsockname()[:2]
 
     def new_link() -> str:
         return f"{settings.scheme}://{settings.shown_host}:{port}/?link={visitors.new_link()}"
@@ -108,7 +108,7 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
 
     async with (
         Feed(values, time.time_ns) as feed,
-        giving_links(port, give_link),
+        giving_links(host, port, give_link),
         asyncio.TaskGroup() as group,
     ):
         server = _Server(_config(build_app(settings, rigs, feed, visitors, new_link, commissioning), settings))

@@ -737,7 +737,7 @@ class PreviewReply(Frozen):
     velocity: float | None = None
     """Velocity that the registers would hold, units a second."""
     velocity_error: float | None = None
-    """Held minus requested velocity, units a second."""
+    """Held velocity minus the requested one at the speed override of the rig, units a second."""
     acceleration: float | None = None
     """Acceleration that the registers would hold, units a second squared."""
     acceleration_error: float | None = None

@@ -144,12 +144,12 @@ class Condition:
     @property
     def summary(self) -> str:
         """The state and everything that is to be said besides, in one line."""
-        return ", ".join((self.state, *(trouble.short for trouble in self.troubles)))
+        return ", ".join(dict.fromkeys((self.state, *(trouble.short for trouble in self.troubles))))
 
     @property
     def in_full(self) -> str:
         """The same and who controls the axis."""
-        return ", ".join((self.state, *self.notes))
+        return ", ".join(dict.fromkeys((self.state, *self.notes)))
 
     @property
     def wrong(self) -> tuple["Trouble", ...]:

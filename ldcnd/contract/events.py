@@ -69,6 +69,8 @@ class CommandEvent(Frozen):
     motion that did not settle, `reference` for what became of a kept reference, `drive_changed` for a drive that was
     reset or that another program has changed, `interlock` for a motion that an interlock has ended, and of an I/O
     module the situation for which its outputs were set, or `output_differs`: these have no request."""
+    on: bool | None = None
+    """Direction of `power`: true to close the loop, false to open it; null of every other verb."""
     client: str | None
     """The client, as it calls itself; not authenticated."""
     login: str | None = None

@@ -10,7 +10,7 @@ from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import LineCounters
 from ldcnd.contract.plan import PollPriority
-from ldcnd.contract.samples import PastFault
+from ldcnd.contract.samples import LatchSample, PastFault, PositionSample, Sample, StateSample, VelocitySample
 from ldcnd.contract.units import Dimension
 
 API = 1
@@ -220,3 +220,14 @@ class AxisInfo(Frozen):
     """The contents of the drive's write-only registers, as far as they are known to the daemon."""
     past_faults: tuple[PastFault, ...] = ()
     """The latest faults, oldest first; with a `state_dir` also those before the daemon was started."""
+
+    def describes(self, sample: Sample) -> bool:
+        """Tell whether the values of a sample are in the units of this description: a restart may bring others."""
+        match sample:
+            case PositionSample() | LatchSample():
+                return sample.unit == self.unit
+            case VelocitySample():
+                return sample.unit == f"{self.unit}/s"
+            case StateSample():
+                return sample.unit in (None, self.unit)
+        return True

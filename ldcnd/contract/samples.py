@@ -315,6 +315,8 @@ class StateSample(Sample):
     target: float | None = None
     """Position to which the axis was sent last, in axis units; once something else has stopped or moved it, where it
     came to rest. Null while it moves without a target, while its position loop is open, and while it is not known."""
+    unit: str | None = None
+    """The axis unit, that of targets; null from a daemon of an earlier version."""
     speed_override: float = Field(default=100.0, ge=0, le=100)
     """Percent of every velocity, for the whole rig; nothing moves at 0."""
     holder: str | None = UNKNOWN_HOLDER

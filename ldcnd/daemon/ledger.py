@@ -18,7 +18,7 @@ from ldcnd.axis.clock import Clock
 from ldcnd.axis.readings import Arrival
 from ldcnd.axis.status import ActiveCommand
 from ldcnd.contract.codec import to_json
-from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Verb
+from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Power, Verb
 from ldcnd.contract.errors import (
     CommandIdReused,
     LdcndError,
@@ -124,7 +124,8 @@ class Ledger:
         entry = self._entries.get(command_id)
         if entry is None:
             raise UnknownCommand(
-                f"no command {command_id!r} is known",
+                f"no command {command_id!r} is known: the daemon was started again since it was sent, or has taken it"
+                " too long ago, or never",
                 value=command_id,
                 remedy=Remedy("{}", step("events", "look at the events")),
             )
@@ -315,6 +316,7 @@ class EventLog:
             axis=entry.axis,
             command_id=entry.command_id,
             verb=entry.verb.value,
+            on=entry.command.on if isinstance(entry.command, Power) else None,
             client=entry.client,
             login=entry.login,
             status=entry.status,

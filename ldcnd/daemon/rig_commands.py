@@ -518,12 +518,13 @@ def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyRe
         others = alike[texts].verbs if texts in alike else ()
         alike[texts] = Hindered(verbs=(*others, verb.value), causes=causes)
     causes = _causes(axis, not_admitted + axis.obstacles_to_motion(absolute=request.absolute))
-    first = axis.tracker.status.first_fault
+    status = axis.tracker.status
+    first = status.first_fault
     return WhyReply(
         axis=axis.config.name,
         can_move=not causes,
         causes=causes,
-        first_fault=f"{first.code}: {first.text}" if first else None,
+        first_fault=guards.in_words(status, first) if first else None,
         commands=tuple(alike.values()),
     )
 

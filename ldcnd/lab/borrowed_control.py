@@ -9,6 +9,7 @@ from collections.abc import Awaitable, Callable
 from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.contract.errors import LdcndError, LeaseRequired
+from ldcnd.contract.samples import TelemetryItem
 
 NO_HOLDER = "none"
 """Shown as who controls an axis while a gateway does not and was not refused."""
@@ -92,6 +93,12 @@ class BorrowedControl:
         elif self._holder != NO_HOLDER or self._is_busy():
             async with self._rig.watch(self._name) as axis:
                 await axis.stop()
+
+    async def published(self) -> tuple[int, int]:
+        """Return the instants of the last state and of the last position that the daemon has published; 0 without."""
+        last = [await self._rig.latest(self._name, item) for item in (TelemetryItem.STATE, TelemetryItem.POSITION)]
+        state, position = (sample.t if sample else 0 for sample in last)
+        return state, position
 
     async def power_off(self) -> None:
         """Open the position loop, which needs no control."""

@@ -9,14 +9,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Literal, Self, TypedDict, Unpack
 
-from ldcnd.contract.errors import ValueOutOfRange
+from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.drives.ldcn.registers import SERVO_CYCLE_S
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultKind, LineFault
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.module import EVERYBODY, SimulatedModule
-from ldcnd.sim.ldcn.power import FaultCondition
+from ldcnd.sim.ldcn.power import OF_POWER, FaultCondition, LogosolPower
 from ldcnd.sim.plant import MotorPlant
 from ldcnd.testing.truth import Machine, Truth
 
@@ -305,7 +305,13 @@ class RigFaults:
         axis: str,
         **start: Unpack[FaultStart],
     ) -> RigFault:
-        """Take away the motor's supply; a PIC-SERVO goes on answering."""
+        """Take away the motor's supply; a PIC-SERVO goes on answering.
+
+        A Logosol drive has one supply for its motor and itself: it is off as after `power_loss` (LS-182AP manual,
+        "Undervoltage/Overvoltage Protection").
+        """
+        if isinstance(self._machine_of(axis).servo.stage, LogosolPower):
+            return self.power_loss(axis, **start)
         return self._condition(axis, "motor supply lost", FaultCondition.MOTOR_POWER_OFF, start)
 
     def stop_input(
@@ -417,7 +423,10 @@ class RigFaults:
     def _condition(
         self, axis: str, name: str, condition: FaultCondition, start: FaultStart
     ) -> RigFault:  # fmt: skip
-        servo = self._machine_of(axis).servo
+        machine = self._machine_of(axis)
+        servo = machine.servo
+        if condition in OF_POWER - servo.stage.feels:
+            raise NotSupported(f"axis {axis}: {name} has no effect on a {machine.config.model}", axis=axis)
         return self._on(
             axis,
             name,

@@ -76,6 +76,9 @@ async def test_the_axis_page_says_every_condition_beside_its_large_number(house)
                 await playwright.expect(number).to_contain_text("(")
                 await playwright.expect(panel.locator(".place-mark")).to_have_text(told["mark"])
             await playwright.expect(panel.locator(".state")).to_have_text(told["state"])
+            strip = desk.page.locator(".strip")
+            for trouble in told["troubles"]:
+                await playwright.expect(strip).to_contain_text(trouble["short"])
 
 
 async def test_a_line_that_is_down_is_one_cause_with_the_names_of_its_axes(house):

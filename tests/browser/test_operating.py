@@ -152,6 +152,8 @@ async def test_a_fault_is_shown_with_its_remedy_and_the_remedy_helps(house):
         await expect(desk.panel("Can it move?")).to_contain_text("drive fault")
         told = await house.sim.rig.last("z", TelemetryItem.FAULT)
         assert told.first.code == "position_error"
+        await expect(desk.page.locator(".strip")).to_contain_text("position error")
+        await expect(desk.panel("Now").get_by_label("Inputs")).to_contain_text("amplifier enable set, motor off")
 
         await desk.page.get_by_label("New el").fill("4000")
         await desk.button("Write el = 4000").click()
@@ -163,6 +165,12 @@ async def test_a_fault_is_shown_with_its_remedy_and_the_remedy_helps(house):
         await desk.button("Move").click()
         await house.sim.reaches("z", before + 2, within=0.05)
         assert not (await house.sim.rig.last("z", TelemetryItem.FAULT)).active
+        await desk.open("events")
+        row = desk.page.get_by_role("row", name="position_error").first
+        await expect(row).to_contain_text("the motor left the position error limit")
+        await expect(desk.page.get_by_role("row", name="power on").first).to_contain_text("console-")
+        await desk.page.get_by_label("Status").select_option("started")
+        await expect(desk.page.get_by_role("row", name=re.compile("sim daemon started"))).to_have_count(1)
 
 
 WATCH_VELOCITY = """() => {

@@ -5,6 +5,7 @@ Each prints nothing and exits with 0, or raises. A process for each: libca reads
 
 import argparse
 import asyncio
+import math
 import sys
 import time
 from collections.abc import Callable
@@ -200,6 +201,17 @@ def p4p_calls(record: str) -> None:
         assert "SPMG" not in there.get(f"{record}:message", timeout=LONGEST_S)
         assert len(seen) > 3
         subscription.close()
+        assert there.get(f"{record}.DESC$", timeout=LONGEST_S) == there.get(f"{record}.DESC", timeout=LONGEST_S) != ""
+        with pytest.raises(RemoteError, match=r"^nan is not a finite number"):
+            there.put(record, math.nan, wait=True, timeout=LONGEST_S)
+        for name in (record, f"{record}.RBV"):
+            limits = there.get(name, timeout=LONGEST_S).raw.control
+            assert (limits.limitLow, limits.limitHigh) == (-100, 100)
+        there.put(f"{record}.SPMG", "Go", wait=True, timeout=LONGEST_S)
+        there.put(f"{record}.SET", "Set", wait=True, timeout=LONGEST_S)
+        for target in (1.0, 3.0) * 3:
+            there.put(record, target, wait=True, timeout=LONGEST_S)
+            assert abs(there.get(f"{record}.RBV", timeout=LONGEST_S) - target) < 0.02
 
 
 CLIENTS = {

@@ -9,7 +9,16 @@ import bluesky.plans as bp
 import pytest
 from bluesky import protocols
 from bluesky.preprocessors import monitor_during_wrapper
-from bluesky.suspenders import SuspendBoolHigh
+from bluesky.suspenders import (
+    SuspendBoolHigh,
+    SuspendBoolLow,
+    SuspendCeil,
+    SuspendFloor,
+    SuspendInBand,
+    SuspendOutBand,
+    SuspendWhenChanged,
+    SuspendWhenOutsideBand,
+)
 from bluesky.utils import FailedStatus, RunEngineInterrupted
 
 import ldcnd.lab.bluesky.flight
@@ -398,14 +407,116 @@ def test_a_plan_is_suspended_while_a_fault_or_a_value_is_there_and_goes_on_after
         lab.engine.remove_suspender(suspender)
         tripped = []
         floor = lab.devices.signal("x", "velocity")
-        floor.subscribe(lambda value, **_: tripped.append(value), event_type="value", run=True)
+
+        def take(value, **_):
+            tripped.append(value)
+
+        floor.subscribe(take, event_type="value", run=True)
         x.set(0).wait(60)
-        floor.clear_sub(next(iter(floor._followers)))
+        floor.clear_sub(take)
 
     assert lab.documents.exit_status == "success"
     assert suspended_for[0] < 5
     assert len({event["seq_num"] for event in lab.documents.of("event")}) == 5
     assert min(tripped) < -1
+
+
+SUSPENDERS = {
+    "ceil": lambda velocity, _: SuspendCeil(velocity, 1.0, resume_thresh=0.5),
+    "floor": lambda velocity, _: SuspendFloor(velocity, -1.0, resume_thresh=-0.5),
+    "outside band": lambda velocity, _: SuspendWhenOutsideBand(velocity, -1.0, 1.0),
+    "in band": lambda velocity, _: SuspendInBand(velocity, -1.0, 1.0),
+    "out band": lambda velocity, _: SuspendOutBand(velocity, 1.0, 100.0),
+    "changed": lambda _, state: SuspendWhenChanged(state, allow_resume=True),
+    "position": lambda _, __, y: SuspendWhenOutsideBand(y, -1.0, 1.0),
+}
+
+
+@pytest.mark.filterwarnings("ignore:SuspendInBand has been renamed", "ignore:bluesky.suspenders.SuspendOutBand")
+@pytest.mark.parametrize("kind", SUSPENDERS)
+def test_a_plan_is_suspended_while_another_axis_turns(lab: Laboratory, capsys, kind: str):
+    async def turn():
+        await lab.running.until("x", lambda state: state.moving is Moving.YES)
+        motion = await y._axis.move_absolute(-40 if kind == "floor" else 40, velocity=5)
+        for _ in range(2):
+            await asyncio.sleep(3)
+            events.append(len(lab.documents.of("event")))
+        await motion.done()
+        if kind == "position":
+            await (await y._axis.move_absolute(0)).done()
+
+    events = []
+    with lab.powered("x", "y") as (x, y):
+        x.set(0).wait(60)
+        y.set(0).wait(60)
+        of_y = [lab.devices.signal("y", item) for item in ("velocity", "state")]
+        suspender = SUSPENDERS[kind](*of_y, y) if kind == "position" else SUSPENDERS[kind](*of_y)
+        lab.engine.install_suspender(suspender)
+        turning = lab.loop.start(turn())
+        lab.engine(bp.scan([], x, 0, 40, 41))
+        turning.result(60)
+        lab.engine.remove_suspender(suspender)
+
+    assert lab.documents.exit_status == "success"
+    assert events[0] == events[1] < 20
+    assert len({event["seq_num"] for event in lab.documents.of("event")}) == 41
+    assert "Justification for this suspension" in capsys.readouterr().out
+
+
+def test_a_plan_is_suspended_while_a_text_is_empty(lab: Laboratory):
+    async def short(*, present: bool):
+        if present:
+            await y._axis.power(on=True)
+        lab.module("y").set_condition(
+            FaultCondition.MOTOR_SHORT, present=present, at_s=asyncio.get_running_loop().time()
+        )
+        if present:
+            await lab.running.until("y", lambda state: state.state is AxisState.ERROR_STOP)
+        else:
+            await y._axis.reset()
+
+    async def cure():
+        await lab.running.until("x", lambda state: state.moving is Moving.YES)
+        await short(present=False)
+        await asyncio.sleep(20)
+        events.append(len(lab.documents.of("event")))
+        await short(present=True)
+
+    events = []
+    with lab.powered("x", "y") as (x, y):
+        x.set(0).wait(60)
+        lab.loop.run(short(present=True))
+        fault = lab.devices.signal("y", "fault")
+        shown = fault.value
+        suspender = SuspendBoolLow(fault)
+        lab.engine.install_suspender(suspender)
+        cured = lab.loop.start(cure())
+        lab.engine(bp.scan([], x, 0, 40, 5))
+        cured.result(60)
+        lab.engine.remove_suspender(suspender)
+        lab.loop.run(short(present=False))
+
+    assert lab.documents.exit_status == "success"
+    assert shown
+    assert events[0] < 5
+
+
+def test_what_a_subscriber_raises_is_said_and_it_is_told_of_the_next_value(lab: Laboratory, caplog):
+    def take(value, **_):
+        told.append(value)
+        raise ValueError("too fast")
+
+    told = []
+    with lab.powered("x") as (x,):
+        for device in (lab.devices.signal("x", "velocity"), x):
+            device.subscribe(take, run=True)
+            x.set(2 if device is x else 4).wait(60)
+            assert device.get() == told[-1]
+            device.clear_sub(take)
+
+    assert len(told) > 4
+    assert {record.name for record in caplog.records} == {"ldcnd.bluesky"}
+    assert "too fast" in caplog.text
 
 
 def test_what_devices_are_fits_a_line_of_a_terminal(lab: Laboratory):
@@ -562,20 +673,27 @@ def test_an_aborted_plan_halts_without_the_latch(lab: Laboratory):
 
 @pytest.mark.parametrize("ending", ["resume", "abort", "stop"])
 @pytest.mark.parametrize("several", [False, True])
-def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes_on(lab: Laboratory, several, ending):
+@pytest.mark.parametrize("checkpoint", ["before prepare", "before kickoff"])
+def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes_on(
+    lab: Laboratory, several, checkpoint, ending
+):
     def pause_in_flight():
         lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
         lab.engine.request_pause()
 
     def plan(device, flight):
         yield from bps.open_run()
+        yield from bps.mv(x, 1, y, 1)
         yield from bps.prepare(device, flight, wait=True)
         yield from bps.checkpoint()
         yield from bps.prepare(device, flight, wait=True)
         yield from bps.declare_stream(device, name="flight", collect=True)
+        if checkpoint == "before kickoff":
+            yield from bps.checkpoint()
         yield from bps.kickoff(device, wait=True)
         pausing.start()
         yield from bps.complete(device, wait=True)
+        yield from bps.collect(device, name="flight")
         yield from bps.close_run()
 
     with lab.powered("x", "y") as (x, y):
@@ -593,6 +711,12 @@ def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes
         getattr(lab.engine, ending)()
 
         assert stands(lab, "x")
+        if ending == "resume":
+            flown = [value for page in lab.documents.of("event_page") for value in page["data"]["x"]]
+            assert (min(flown), max(flown)) == (pytest.approx(0, abs=0.5), pytest.approx(30, abs=0.5))
+            assert lab.documents.exit_status == "success"
+            with pytest.raises(WrongState, match="prepare"):
+                device.kickoff().wait(20)
         assert lab.truth("x") == pytest.approx(30 if ending == "resume" else paused_at, abs=0.1)
 
 
@@ -618,6 +742,18 @@ def test_a_stop_that_overtakes_its_move_leaves_the_axis_at_rest(lab: Laboratory)
         assert ended is None
         assert stands(lab, "x")
         assert lab.truth("x") < 30
+
+
+def test_a_kickoff_that_a_stop_overtakes_is_no_failure_of_a_plan_that_was_paused(lab: Laboratory):
+    with lab.powered("x") as (x,):
+        x.prepare(Fly(0, 30)).wait(60)
+        kicked_off = x.kickoff()
+        x.stop(success=True).wait(20)
+
+        assert kicked_off.exception(20) is None
+        assert x.complete().exception(20) is None
+        assert stands(lab, "x")
+        assert lab.truth("x") < 29
 
 
 def test_a_stop_while_a_flight_is_checked_begins_no_motion(lab: Laboratory):

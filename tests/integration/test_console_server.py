@@ -108,6 +108,32 @@ async def test_another_link_is_given_without_stopping_anything():
     assert b"ldcnd console" in refused
 
 
+async def link_of(listen):
+    """Ask for another link of the console at an address; return how that ended, and what was said."""
+    asked = await asyncio.create_subprocess_exec(
+        *LDCND, "console", "--link", "--listen", listen, stdout=PIPE, stderr=PIPE
+    )
+    printed, complaint = await asked.communicate()
+    return asked.returncode, (printed + complaint).decode()
+
+
+async def test_of_two_consoles_on_one_port_the_link_is_that_of_the_address_asked_for():
+    port, nowhere = free_port(), f"tcp/127.0.0.1:{free_port()}"
+    async with AsyncExitStack() as stack:
+        for host in ("127.0.0.1", "127.0.0.2"):
+            other = process("console", "-e", nowhere, "--listen", f"{host}:{port}")
+            running = await stack.enter_async_context(other)
+            assert f"//{host}:{port}" in (await running.stdout.readline()).decode()
+        told = {host: await link_of(f"{host}:{port}") for host in ("127.0.0.1", "127.0.0.2", "localhost", "127.0.0.3")}
+
+    assert [told[host][0] for host in told] == [0, 0, 0, 78]
+    assert f"http://127.0.0.1:{port}/" in told["127.0.0.1"][1]
+    assert f"http://127.0.0.2:{port}/" in told["127.0.0.2"][1]
+    assert f"http://127.0.0.1:{port}/" in told["localhost"][1]
+    assert f"no console of this user gives links at 127.0.0.3:{port}" in told["127.0.0.3"][1]
+    assert all(f"{host}:{port}" in told["127.0.0.3"][1] for host in ("127.0.0.1", "127.0.0.2"))
+
+
 async def test_the_web_server_refuses_what_the_gate_refuses():
     async with console("-e", f"tcp/127.0.0.1:{free_port()}") as running:
         used = await running.stranger.get(path_of(running.link))

@@ -11,6 +11,7 @@ from caproto import AccessRights, AlarmSeverity, Forbidden
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.plan import plan_rig
+from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import MoveAbsolute, Reset
 from ldcnd.contract.errors import (
     CommandAborted,
@@ -26,13 +27,13 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.meta import AxisLimits
-from ldcnd.contract.samples import Moving
+from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.lab.epics.gateway import gateway
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.dialect_rig import LS_182AP, dialect_rig
 from tests.support.epics_records import VALUES, put, records, shows
-from tests.support.rig import EPOCH_NS, two_axes
+from tests.support.rig import EPOCH_NS, running_rig, two_axes
 
 SCREENS = {
     "motorx_all": "ACCL ATHM BACC BDST BVEL CARD CNEN DESC DHLM DIFF DIR DLLM DLY DMOV DRBV DTYP DVAL EGU ERES FLNK "
@@ -346,6 +347,19 @@ async def test_tweaks_homing_and_set_mode():
         assert (await running.client.state("x")).moving is Moving.NO
 
 
+async def test_a_put_that_says_where_the_motor_is_returns_when_the_record_shows_it():
+    shown = []
+    async with records() as (_, made):
+        await put(made, "T:x.SET", "Set")
+        for target in (1.0, 3.0) * 5:
+            await put(made, "T:x", target)
+            shown.append(tuple(made.variables[f"T:x{name}"].value for name in ("", ".RBV", ".DIFF")))
+
+    assert [target for target, _, _ in shown] == [1.0, 3.0] * 5
+    assert [place for _, place, _ in shown] == pytest.approx([1.0, 3.0] * 5, abs=0.02)
+    assert [left for _, _, left in shown] == pytest.approx([0.0] * 10, abs=0.02)
+
+
 @pytest.mark.record(
     "STOP", "when the motor has stopped, VAL is RBV, as after Stop in SPMG, a jog, and what another program did"
 )
@@ -582,6 +596,56 @@ async def test_a_daemon_with_another_unit_is_not_moved_by_numbers_of_the_former_
             assert made.variables["T:x.RBV"].units == "mm"
             assert made.variables["T:x.VELO"].units == "mm/s"
             assert (await client.position("x")).value == pytest.approx(stands + 2, abs=0.02)
+
+
+async def test_no_value_of_a_daemon_with_another_unit_is_shown_in_the_unit_of_the_former_one():
+    broker = MemoryBroker()
+    seen: list[tuple[str, float, str, AlarmSeverity]] = []
+
+    def follow(name: str, field) -> None:
+        field.followers.append(lambda: seen.append((name, field.value, field.units, field.severity)))
+
+    def config(unit: str, per: float) -> RigConfig:
+        document = two_axes().model_dump(mode="json", exclude_unset=True)
+        for axis in document["bus"][0]["axis"]:
+            axis |= {"unit": unit, "counts_per_unit": 1000 / per, "velocity": 5 * per, "acceleration": 50 * per}
+            axis["limits"] = {"position_min": -100 * per, "position_max": 100 * per, "velocity": 50 * per}
+        return RigConfig.model_validate(document)
+
+    async with broker.session() as session, AsyncExitStack() as faces:
+        client = RigClient(session, "sim")
+        async with running_rig(config("mm", 1), broker=broker) as first:
+            await first.until("x", lambda state: state.link is LinkState.UP)
+            rig = Rig(client, await client.daemon())
+            made = await faces.enter_async_context(gateway(rig, prefix="T:", moves=rig.axes))
+            await shows(made, "T:x.SEVR", "NO_ALARM")
+            await put(made, "T:x.CNEN", "Enable")
+            await put(made, "T:x.MDEL", 0.001)
+            await put(made, "T:x", 6.0)
+            await put(made, "T:x.CNEN", "Disable")
+            for name in ("VAL", "RBV", "HLM", "VELO", "JVEL", "DIFF"):
+                follow(name, made.variables[f"T:x.{name}"])
+            follow("velocity", made.variables["T:x:velocity"])
+        async with running_rig(config("um", 1000), broker=broker) as second:
+            await second.until("x", lambda state: state.link is LinkState.UP)
+            async with rig.control("x", client="ann") as x:  # before the gateway has described it anew
+                await x.power(on=True)
+                await (await x.move_absolute(7000)).done()
+            await shows(made, "T:x.EGU", "um")
+            await shows(made, "T:x.SEVR", "NO_ALARM")
+            await asyncio.sleep(2)
+            target, speed = made.variables["T:x"], made.variables["T:x.VELO"]
+            control = {name: made.variables[f"T:x.{name}"].upper_ctrl_limit for name in ("VAL", "RBV")}
+            shown = (target.value, made.variables["T:x.RBV"].value, speed.value, made.variables["T:x.MDEL"].value)
+
+    good = [each for each in seen if each[3] != AlarmSeverity.INVALID_ALARM]
+    in_mm, in_um = ([each for each in good if each[2].startswith(unit)] for unit in ("mm", "um"))
+    assert [each for each in in_mm if each[1] > 150] == []
+    assert [each for each in in_um if each[0] in ("HLM", "VELO", "JVEL") and each[1] < 1000] == []
+    assert [each for each in in_um if each[0] in ("VAL", "RBV") and 5.9 < each[1] < 6.1] == []
+    assert shown == (7000, pytest.approx(7000, abs=20), pytest.approx(5000, rel=0.01), 0)
+    assert speed.severity == AlarmSeverity.NO_ALARM
+    assert control == {"VAL": 100_000, "RBV": 100_000}
 
 
 async def test_an_axis_that_a_restart_brings_is_shown_and_one_that_it_takes_away_is_invalid():

@@ -30,10 +30,10 @@ def rows(rig, words=""):
 
 
 def test_commands_stand_in_their_order_with_what_became_of_them(rig):
-    found = rows(rig, "--axis x")
+    found = rows(rig, "--axis x --kind command")
     told = [(row["what"], row["how"]) for row in found]
     assert told == [
-        ("power", "done"),
+        ("power on", "done"),
         ("move_absolute", "done"),
         ("move_absolute", "refused"),
         ("stop", "done"),
@@ -45,7 +45,7 @@ def test_commands_stand_in_their_order_with_what_became_of_them(rig):
 
 
 def test_rows_are_filtered_and_exported(rig):
-    assert {row["axis"] for row in rows(rig, "--axis y")} == {"y"}
+    assert {row["axis"] for row in rows(rig, "--axis y")} == {"y", ""}
     assert rows(rig, "--kind fault") == []
     assert rows(rig, "--since 2100-01-01") == []
     assert len(rows(rig, "--count 2")) == 2
@@ -75,4 +75,16 @@ def test_a_fault_stands_among_the_commands(rig, chain):
     faults = rows(rig, "--kind fault")
     assert [row["what"] for row in faults] == ["overcurrent"]
     everything = [row["what"] for row in rows(rig)]
-    assert everything.index("overcurrent") > everything.index("power")
+    assert everything.index("overcurrent") > everything.index("power on")
+
+
+def test_who_switched_off_and_when_the_daemon_was_started_can_be_told(rig):
+    rig.run("power off y")
+    found = rows(rig)
+
+    assert [row["what"] for row in rows(rig, "--axis y") if row["what"].startswith("power")] == [
+        "power on",
+        "power off",
+    ]
+    assert (found[0]["kind"], found[0]["what"]) == ("daemon", "started")
+    assert f"run {rig.wait(rig.rig.client.daemon()).instance}" in found[0]["why"]

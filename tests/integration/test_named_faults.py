@@ -38,6 +38,9 @@ CASES = {
     "motor_short": Case(lambda faults: faults.motor_short("x", at=10), says="short"),
     "overvoltage": Case(lambda faults: faults.overvoltage("x", at=10), says="overvoltage"),
     "motor_supply_lost": Case(lambda faults: faults.motor_supply_lost("z", at=10), axis="z", says="power"),
+    "motor_supply_lost_of_a_logosol": Case(
+        lambda faults: faults.motor_supply_lost("x", at=10, for_s=1.0), says="reset"
+    ),
     "stop_input": Case(lambda faults: faults.stop_input("x", at=10), says="stop_input"),
     "power_loss": Case(lambda faults: faults.power_loss("x", at=10, for_s=1.0), says="reset"),
     "mute": Case(lambda faults: faults.mute("x", at=10, for_s=2.0), says="link_lost"),
@@ -72,6 +75,14 @@ async def test_every_fault_does_to_the_machine_what_its_name_says(ldcnd_rig, nam
     truth = ldcnd_rig.truth(case.axis)
     assert (abs(truth.position - 20) < 0.05) == (case.goes_on if case.arrives is None else case.arrives)
     assert case.says in told
+
+
+@pytest.mark.parametrize(
+    "name", ["encoder_lost", "overheat", "overcurrent", "motor_short", "overvoltage", "stop_input"]
+)
+async def test_a_fault_that_a_drive_does_not_feel_is_refused(ldcnd_rig, name):
+    with pytest.raises(ldcnd.LdcndError, match="no effect on a pic-servo-v4"):
+        getattr(ldcnd_rig.faults, name)("z")
 
 
 async def test_the_axis_next_to_a_cut_cable_is_lost_as_the_others_are_and_does_not_go_on(ldcnd_rig):

@@ -4,6 +4,7 @@ import pytest
 
 from ldcnd.contract.commands import MoveAbsolute, Power, Preview
 from ldcnd.contract.errors import MalformedRequest
+from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.line.flight_recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig
 
@@ -35,6 +36,17 @@ async def test_a_plan_is_what_the_move_then_is():
         assert abs(plan.velocity_error) < 0.001
         assert plan.packets == tuple(packet for packet in sent(rig)[before:] if packet in plan.packets)
         assert 0.001 < plan.bus_s < 0.01
+
+
+async def test_a_speed_override_is_no_rounding():
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.ask(SetSpeedOverride(percent=25))
+
+        plan = await rig.client.ask(Preview(position=12.0, velocity=8.0), "x")
+
+        assert plan.velocity == pytest.approx(2.0, abs=0.001)
+        assert plan.velocity_error == pytest.approx(0, abs=0.001)
 
 
 async def test_a_plan_sends_nothing():

@@ -1,15 +1,18 @@
 """What stands between an axis and a module of a SECoP node, on a whole daemon; clients try the node itself."""
 
 import asyncio
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import pytest
 
 from ldcnd.client.rig import Rig
+from ldcnd.client.rig_client import RigClient
+from ldcnd.config.rig import RigConfig
 from ldcnd.contract.errors import LdcndError, LeaseRequired, PositionLimit
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.lab.secop.link import StatusCode, linked
+from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.rig import running_rig, two_axes
 
 
@@ -108,3 +111,71 @@ async def test_a_daemon_that_says_nothing_is_an_error():
                 await asyncio.sleep(0.1)
 
         assert link.status()[0] == StatusCode.ERROR
+
+
+def shown_target(updates):
+    return [update for update in updates if (update.module, update.parameter) == ("x", "target")][-1]
+
+
+@pytest.mark.parametrize("mover", ["node", "another program"])
+@pytest.mark.parametrize("ending", ["end", "stop", "power off"])
+async def test_the_target_is_where_the_axis_was_sent_last_by_any_program_or_came_to_rest(mover: str, ending: str):
+    async with linked_x() as (running, link, updates), AsyncExitStack() as moving:
+        await link.go(1.0)
+        await becomes(link, StatusCode.IDLE)
+        if mover == "node":
+            await link.go(9.0)
+        else:
+            await asyncio.sleep(31)  # control is given back
+            rig = Rig(running.client, await running.client.daemon())
+            other = await moving.enter_async_context(rig.control("x", client="ann"))
+            await other.move_absolute(9.0)
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await asyncio.sleep(0.2)
+        under_way = shown_target(updates).value
+        match ending:
+            case "stop":
+                await running.client.stop("x")
+            case "power off":
+                await link.enable(on=False)
+        await running.until("x", lambda state: state.moving is Moving.NO)
+        await asyncio.sleep(1)
+        place = (await running.client.position("x")).value
+
+        assert under_way == 9
+        assert shown_target(updates).value == pytest.approx(9 if ending == "end" else place, abs=0.05)
+        assert (abs(place - 9) < 0.05) == (ending == "end")
+
+
+async def test_no_target_of_a_daemon_with_another_unit_is_shown_as_one_in_the_unit_that_is_described():
+    broker, updates = MemoryBroker(), []
+    document = two_axes().model_dump(mode="json", exclude_unset=True)
+    document["bus"][0]["axis"][0] |= {"unit": "um"}
+    async with broker.session() as session, AsyncExitStack() as links:
+        client = RigClient(session, "sim")
+        async with running_rig(two_axes(), broker=broker) as first:
+            await first.until("x", lambda state: state.link is LinkState.UP)
+            rig = Rig(client, await client.daemon())
+            infos = {info.axis: info for info in await rig.describe() if info.axis == "x"}
+            await links.enter_async_context(linked(rig, infos, updates.append, ("x",)))
+            await asyncio.sleep(1)
+            assert shown_target(updates).problem is None
+        updates.clear()
+        async with running_rig(RigConfig.model_validate(document), broker=broker) as second:
+            await second.until("x", lambda state: state.link is LinkState.UP)
+            async with rig.control("x", client="ann") as x:
+                await x.power(on=True)
+                await (await x.move_absolute(50)).done()
+            await asyncio.sleep(1)
+
+    values = [each for each in updates if each.parameter in ("value", "target") and each.module in ("x", "x_velocity")]
+    assert {(each.module, each.parameter) for each in values} == {
+        ("x", "value"),
+        ("x", "target"),
+        ("x_velocity", "value"),
+    }
+    assert {each.value for each in values} == {None}
+    assert {each.problem for each in values if each.problem and "old" not in each.problem} == {
+        "it is in um now and is described in mm",
+        "it is in um/s now and is described in mm/s",
+    }

@@ -3,6 +3,7 @@
 import asyncio
 from contextlib import asynccontextmanager
 
+from ldcnd.client.overview import overview
 from ldcnd.contract.commands import Halt, MoveAbsolute, Power
 from ldcnd.contract.condition import Severity
 from ldcnd.contract.samples import AxisState, LinkState, Moving
@@ -84,6 +85,24 @@ async def test_a_drive_that_lost_power_comes_first_and_says_so():
     assert (shown.axes[0].axis, shown.axes[0].link, shown.axes[0].moving) == ("c", LinkState.DOWN, Moving.UNKNOWN)
     assert "the drive does not answer" in "\n".join(as_text(shown))
     assert headline(shown).endswith("not working: 1")
+
+
+async def test_who_begins_to_look_later_sees_the_same_age():
+    chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
+    async with running_rig(chains={"line0": chain}) as rig:
+        await rig.until("c", lambda state: state.link is LinkState.UP)
+        chain.modules[3].power(on=False, at_s=asyncio.get_running_loop().time())
+        await rig.until("c", lambda state: state.link is LinkState.DOWN)
+        await asyncio.sleep(30)
+        async with followed(rig) as glance:
+            shown = await until(glance, lambda now: now.axes and now.axes[0].age_s)
+            (listed,) = [now for now in await overview(rig.client) if now.info.axis == "c"]
+            healthy = [row.age_s for row in shown.axes[1:]]
+
+    assert (shown.axes[0].axis, listed.age_s > 29) == ("c", True)
+    assert abs(shown.axes[0].age_s - listed.age_s) < 2
+    assert f", {shown.axes[0].age_s:.0f} s old" in shown.axes[0].shown_position
+    assert all(age_s < 2 for age_s in healthy)
 
 
 async def test_a_daemon_that_ended_is_said_to_be_silent_and_nothing_is_said_to_stand():

@@ -65,6 +65,26 @@ def test_a_faulted_axis_says_what_its_fault_is():
         guards.check(Verb.MOVE_RELATIVE, ready("overheat", state=AxisState.ERROR_STOP))
 
 
+SILENT = FaultEntry(code="link_lost", text="the drive does not answer", since=0, source="daemon")
+
+
+def test_a_fault_that_is_over_is_not_said_to_be_there():
+    answers_again = ready(state=AxisState.ERROR_STOP, first_fault=SILENT)
+
+    with pytest.raises(WrongState, match="in error stop because of link lost, which is over") as refusal:
+        guards.check(Verb.MOVE_RELATIVE, answers_again)
+
+    assert "does not answer" not in refusal.value.message
+    assert refusal.value.remedy == "send reset"
+
+
+def test_a_fault_of_an_axis_that_is_not_seen_is_not_said_to_be_over():
+    with pytest.raises(WrongState, match="in error stop: the drive does not answer") as refusal:
+        guards.check_not_in_error(ready(state=AxisState.ERROR_STOP, link=LinkState.DOWN, first_fault=SILENT))
+
+    assert "remove the cause" in refusal.value.remedy
+
+
 def test_an_unreferenced_axis_takes_no_absolute_target():
     with pytest.raises(NotReferenced) as refusal:
         guards.check_referenced(ready(referenced=False))

@@ -16,9 +16,7 @@ from ldcnd.contract.fault_pages import codes
 from tests.support.pages import ROOT
 from tools.schemas import all_schemas
 
-NOT_SOURCE = shutil.ignore_patterns(
-    ".git", ".venv*", "build", "dist", "state", "__pycache__", ".*_cache", ".hypothesis"
-)
+NOT_SOURCE = shutil.ignore_patterns(".git", ".venv*", "build", "dist", "state", "__pycache__", ".*_cache", ".hyp*")
 EPOCH = "1700000000"
 RUNTIME_EXTRAS = {"bench", "console", "fast", "foxglove", "journal", "lab", "ops", "plot", "tui"}
 PINS = set(re.findall(r"(?m)^([\w.-]+)==(\S+)", (ROOT / "constraints.txt").read_text()))

@@ -80,6 +80,22 @@ _REMEDIES = MappingProxyType(
         FaultCode.SERVO_OVERRUN: "the drive's processor was late for a servo cycle: harmless unless it lasts",
     }
 )
+_REMEMBERED = MappingProxyType(
+    {
+        FaultCode.STOP_INPUT: (
+            "the stop input was opened, and may be open still: close the emergency stop circuit, then reset"
+        ),
+        FaultCode.OVERHEAT: "the drive was too hot (80 degC): let it cool down, check load and cooling, then reset",
+        FaultCode.ENCODER_OR_HALL: (
+            "encoder or Hall signals were lost: check sensor cable and supply, reset, find the reference position again"
+        ),
+        FaultCode.SENSOR_FAULT: (
+            "the analog position sensor was disconnected or at its end: check its cable, then reset"
+        ),
+        FaultCode.POWER_LOST: "the motor supply was off: see that it is on, then reset",
+    }
+)
+"""What is said of a cause of which only is known that it switched the motor off: it may be gone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +116,7 @@ class LdcnFault:
     @property
     def remedy(self) -> str:
         """Meaning and remedy, for an operator."""
-        return self.code.remedy
+        return (_REMEMBERED.get(self.code) if self.latched else None) or self.code.remedy
 
     @property
     def stops(self) -> bool:

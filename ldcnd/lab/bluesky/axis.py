@@ -2,9 +2,9 @@
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
-from contextlib import suppress
-from typing import TYPE_CHECKING, TypeVar, cast
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, TypeVar
 
 from ldcnd.client.axis import Axis as ClientAxis
 from ldcnd.client.axis import Positions, at_rest
@@ -26,13 +26,12 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import LinkState, Moving, PositionSample, Quality
 from ldcnd.lab.bluesky.flight import Flight, Fly
+from ldcnd.lab.bluesky.followers import Followers, ValueCallback
 from ldcnd.lab.bluesky.setting import Setting
 from ldcnd.lab.bluesky.status import Status
 from ldcnd.lab.bluesky.trace import TraceDetector
 from ldcnd.lab.bluesky.values import (
     PATIENCE_S,
-    ValueCallback,
-    by_value,
     instant,
     number_key,
     reading,
@@ -70,7 +69,7 @@ class ReadableAxis:
         self._source = f"ldcnd://{rig.name}/{info.axis}"
         self._loop = loop
         self._not_before_ns = 0
-        self._followers: dict[object, Status] = {}
+        self._followers: Followers[float] = Followers(name, loop, self._readings, self._reading)
 
     @property
     def hints(self) -> "Hints":
@@ -142,21 +141,23 @@ class ReadableAxis:
         Args:
             function: what is called.
             event_type: accepted for those who name one, as suspenders do.
-            run: any value: call with `value` and `timestamp`, as a signal of ophyd does; suspenders need that.
+            run: call with `value` and `timestamp`, as a signal of ophyd does, and when true with the last position at
+                once; suspenders need that.
         """
-        told = by_value(self.name, function) if run is not None else cast("Callback[float]", function)
-
-        async def follow() -> None:
-            async for sample in self._axis.positions():
-                told(self._of(sample))
-
-        self._followers[function] = self._start("subscription", follow())
+        self._followers.add(function, run)
 
     def clear_sub(self, function: "Callback[float] | ValueCallback") -> None:
         """End a subscription."""
-        status = self._followers.pop(function, None)
-        if status:
-            status.cancel()
+        self._followers.remove(function)
+
+    def get(self) -> float:
+        """Return the position that subscribers were told last, and else that of `read`, as a signal of ophyd does."""
+        return self._followers.value()
+
+    @property
+    def value(self) -> float:
+        """The position, see `get`."""
+        return self.get()
 
     def trace(
         self, *channels: str, samples: int = 500, interval_s: float | None = None, name: str | None = None
@@ -170,6 +171,13 @@ class ReadableAxis:
             name: of the device.
         """
         return TraceDetector(name or f"{self.name}_trace", self._axis, channels, samples, interval_s, self._loop)
+
+    async def _readings(self, last_first: bool) -> "AsyncIterator[dict[str, Reading[float]]]":  # noqa: FBT001
+        positions = self._axis.positions()
+        if last_first:
+            yield self._of((await self.measured()).sample)
+        async for sample in positions:
+            yield self._of(sample)
 
     async def _reading(self) -> "dict[str, Reading[float]]":
         return self._of((await self.measured()).sample)
@@ -219,6 +227,7 @@ class PlanAxis(ReadableAxis):
         self.velocity = Setting(self, "velocity", lambda: self._info.limits.velocity)
         self.acceleration = Setting(self, "acceleration", lambda: self._info.limits.acceleration)
         self._under_way = 0
+        self._beginning = 0
         self._stopped: bool | None = None
         self._newest: asyncio.Task[object] | None = None  # of the moves that were set
         self._flight = Flight(self.name, (self,), loop)
@@ -268,7 +277,8 @@ class PlanAxis(ReadableAxis):
         await self.stop()
 
     async def resume(self) -> None:
-        """Move nothing."""
+        """Move nothing; see `Flight.resume`."""
+        await self._flight.resume()
 
     async def locate(self) -> "Location[float]":
         """Return where the axis was sent last, or stands since anything else stopped or moved it, and where it is."""
@@ -409,7 +419,8 @@ class PlanAxis(ReadableAxis):
 
         async def moving() -> None:
             self._under_way += 1
-            self._stopped = None
+            if not self._beginning:
+                self._stopped = None
             try:
                 await work()
             except (CommandAborted, DriveFault, RequestRefused) as error:
@@ -422,6 +433,16 @@ class PlanAxis(ReadableAxis):
                 self._under_way -= 1
 
         return self._start(name, moving())
+
+    @contextmanager
+    def beginning(self) -> Iterator[None]:
+        """Have `stop` concern all that is begun in the context, on the loop: what takes several turns of it."""
+        self._beginning += 1
+        self._stopped = None
+        try:
+            yield
+        finally:
+            self._beginning -= 1
 
     async def _move(self, target: float) -> None:
         await self._end_of(
@@ -478,11 +499,12 @@ class PlanAxis(ReadableAxis):
         return self._stopped is True
 
     async def _halt(self, *, success: bool) -> None:
-        if not self._under_way:
+        if not (self._under_way or self._beginning):
             return
         self._stopped = success
-        with suppress(CommandAborted):  # by the halt of a motion that was on its way meanwhile
-            await (await self._axis.halt()).done()
+        if self._under_way:
+            with suppress(CommandAborted):  # by the halt of a motion that was on its way meanwhile
+                await (await self._axis.halt()).done()
         await self._rest()
 
     async def _rest(self, *, is_news: bool = False) -> None:

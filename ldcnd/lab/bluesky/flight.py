@@ -2,13 +2,13 @@
 
 import asyncio
 from collections.abc import AsyncIterator, Coroutine, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING
 
 from ldcnd.client.loop_thread import LoopThread
-from ldcnd.contract.errors import CommandAborted, LdcndError, OutcomeUnknown, WrongState
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown, WrongState
 from ldcnd.contract.samples import PositionSample
 from ldcnd.lab.bluesky.status import Status
 
@@ -58,6 +58,8 @@ class Flight:
         self._axes = axes
         self._loop = loop
         self._prepared: dict[str, Fly] = {}
+        self._unfinished: dict[str, Fly] = {}  # what was prepared last, until it has ended well
+        self._resumed = False
         self._under_way: Status | None = None
         self._rows: list[Row] = []
 
@@ -83,6 +85,7 @@ class Flight:
             for axis in self._axes:
                 await axis.check_flight(flights[axis.name])
 
+        self._unfinished, self._resumed = flights, False
         moves = [axis.prepare_flight(flights[axis.name], check) for axis in self._axes]
 
         async def ready() -> None:
@@ -93,16 +96,26 @@ class Flight:
         return self._start("preparation", ready())
 
     def kickoff(self) -> Status:
-        """Begin the motions that `prepare` was given; done when every drive has acknowledged its own."""
+        """Begin the motions that `prepare` was given; done when every drive has acknowledged its own.
+
+        Of a plan that was paused in the flight and goes on behind its `prepare` they are prepared anew first.
+        """
 
         async def kick_off() -> None:
-            flights, self._prepared = self._prepared, {}
-            if not flights:
-                raise WrongState(f"{self.name}: no fly scan is prepared", remedy="call prepare")
-            began: list[asyncio.Future[None]] = [asyncio.get_running_loop().create_future() for _ in self._axes]
-            self._rows = []
-            self._under_way = self._start("flight", self._fly(flights, began))
-            await asyncio.gather(*began)
+            with ExitStack() as beginning:
+                for axis in self._axes:
+                    beginning.enter_context(axis.beginning())
+                if self._resumed and self._unfinished and not self._prepared:
+                    await self.prepare(self._unfinished)
+                    if not self._prepared:
+                        return  # it was paused again
+                flights, self._prepared = self._prepared, {}
+                if not flights:
+                    raise WrongState(f"{self.name}: no fly scan is prepared", remedy="call prepare")
+                began: list[asyncio.Future[None]] = [asyncio.get_running_loop().create_future() for _ in self._axes]
+                self._rows = []
+                self._under_way = self._start("flight", self._fly(flights, began))
+                await asyncio.gather(*began)
 
         return self._start("kickoff", kick_off())
 
@@ -127,7 +140,8 @@ class Flight:
         await self.stop()
 
     async def resume(self) -> None:
-        """Move nothing."""
+        """Move nothing; a kickoff begins what was not finished anew."""
+        self._resumed = True
 
     async def describe_collect(self) -> "dict[str, DataKey]":
         """Return what the events hold; the plan names the stream."""
@@ -173,6 +187,8 @@ class Flight:
             await asyncio.gather(*(moved.wrapped() for moved in moves))
             for axis in self._axes:
                 await axis.measured()
+            if not any(axis.is_stopped() for axis in self._axes):
+                self._unfinished = {}
         except LdcndError:
             with suppress(LdcndError):  # what failed matters more than how the others came to rest
                 await self.stop(success=False)
@@ -194,10 +210,15 @@ class Flight:
 
 
 def _pass_on(loop: LoopThread, began: asyncio.Future[None], move: Status) -> None:
-    """Let a motion that ended before it began be the error of its beginning."""
+    """Let a motion that failed before it began be the error of its beginning; a stop that was meant is none."""
 
     def end() -> None:
-        if not began.done():
-            began.set_exception(move.exception() or CommandAborted("the motion was stopped before it began"))
+        if began.done():
+            return
+        error = move.exception()
+        if error is None:
+            began.set_result(None)
+        else:
+            began.set_exception(error)
 
     loop.call(end)

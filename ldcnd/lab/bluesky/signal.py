@@ -1,7 +1,8 @@
 """An item of an axis's telemetry as a Bluesky device that is read and monitored."""
 
 import asyncio
-from typing import TYPE_CHECKING, cast
+from collections.abc import AsyncIterator
+from typing import TYPE_CHECKING
 
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
@@ -17,11 +18,10 @@ from ldcnd.contract.samples import (
     StateSample,
     VelocitySample,
 )
+from ldcnd.lab.bluesky.followers import Followers, ValueCallback
 from ldcnd.lab.bluesky.status import Status
 from ldcnd.lab.bluesky.values import (
     PATIENCE_S,
-    ValueCallback,
-    by_value,
     instant,
     number_key,
     reading,
@@ -56,7 +56,7 @@ class Signal:
         self._loop = loop
         self._triggered: Sample | None = None
         self._unit: str | None = None  # as described last
-        self._followers: dict[object, Status] = {}
+        self._followers: Followers[float | str] = Followers(name, loop, self._readings, self._reading)
 
     @property
     def hints(self) -> "Hints":
@@ -87,7 +87,7 @@ class Signal:
             SessionError: there is none yet, or the daemon does not answer.
         """
         sample, self._triggered = self._triggered, None
-        return self._of(sample or await self._latest())
+        return self._of(sample) if sample else await self._reading()
 
     async def describe(self) -> "dict[str, DataKey]":
         """Return what the value is."""
@@ -110,23 +110,35 @@ class Signal:
             run: call with `value` and `timestamp`, as a signal of ophyd does, and when true with the last value at
                 once; suspenders need that.
         """
-        told = by_value(self.name, function) if run is not None else cast("Callback[float | str]", function)
-
-        async def follow() -> None:
-            async with self._rig.samples(self._axis, self._item) as samples:
-                last = await self._rig.latest(self._axis, self._item) if run else None
-                if last is not None:
-                    told(self._of(last))
-                async for _, sample in samples:
-                    told(self._of(sample))
-
-        self._followers[function] = Status(f"subscription of {self.name}", self._loop.start(follow()))
+        self._followers.add(function, run)
 
     def clear_sub(self, function: "Callback[float | str] | ValueCallback") -> None:
         """End a subscription."""
-        status = self._followers.pop(function, None)
-        if status:
-            status.cancel()
+        self._followers.remove(function)
+
+    def get(self) -> float | str:
+        """Return the value that subscribers were told last, and the last value where there is none, as ophyd does.
+
+        Raises:
+            SessionError: there is none yet, or the daemon does not answer.
+        """
+        return self._followers.value()
+
+    @property
+    def value(self) -> float | str:
+        """The value, see `get`."""
+        return self.get()
+
+    async def _readings(self, last_first: bool) -> "AsyncIterator[dict[str, Reading[float | str]]]":  # noqa: FBT001
+        async with self._rig.samples(self._axis, self._item) as samples:
+            last = await self._rig.latest(self._axis, self._item) if last_first else None
+            if last is not None:
+                yield self._of(last)
+            async for _, sample in samples:
+                yield self._of(sample)
+
+    async def _reading(self) -> "dict[str, Reading[float | str]]":
+        return self._of(await self._latest())
 
     async def _latest(self) -> Sample:
         sample = await asyncio.wrap_future(self._loop.start(self._rig.latest(self._axis, self._item)))

@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING, Protocol, TypeVar, cast
+from typing import TYPE_CHECKING, TypeVar
 
 from ldcnd.client.rig import Rig
 from ldcnd.contract.condition import Condition
@@ -11,7 +11,7 @@ from ldcnd.contract.errors import SessionError, WrongState
 from ldcnd.contract.samples import Quality
 
 if TYPE_CHECKING:
-    from bluesky.protocols import Callback, Reading
+    from bluesky.protocols import Reading
     from event_model.documents import DataKey
 
 ValueT = TypeVar("ValueT")
@@ -34,22 +34,6 @@ def reading(
         return plain
     message = f"quality {quality.value}"
     return {"value": value, "timestamp": at_s, "alarm_severity": SEVERITIES[quality], "message": message}
-
-
-class ValueCallback(Protocol):
-    """What is called as the signals of ophyd call: suspenders take that."""
-
-    def __call__(self, *, value: object, timestamp: float) -> object:
-        """Take a value."""
-
-
-def by_value(name: str, function: "Callback[ValueT] | ValueCallback") -> "Callback[ValueT]":
-    """Return what calls a function with the value of the reading of a name, and its time."""
-
-    def call(read: "dict[str, Reading[ValueT]]") -> None:
-        cast("ValueCallback", function)(value=read[name]["value"], timestamp=read[name]["timestamp"])
-
-    return call
 
 
 def refuse_other_unit(axis: str, described: str, measured: str) -> None:

@@ -11,16 +11,17 @@ from caproto.asyncio.server import Context
 
 from ldcnd.client.fresh import fresh_samples
 from ldcnd.client.rig import Rig
+from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import LdcndError, UnknownAxis
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.lab.borrowed_control import BorrowedControl
 from ldcnd.lab.epics.fields import Put, RecordField, Short, Value
 from ldcnd.lab.epics.motor import MovedRecord
-from ldcnd.lab.epics.record import MotorRecord
+from ldcnd.lab.epics.record import MOTIONLESS, Defaults, MotorRecord
 from ldcnd.listen_address import ListenAddress
 
-MOTIONLESS = (1.0, 1.0)
-"""Velocity and acceleration that are shown of what has none."""
+LEARN_S = 0.5
+"""Time between two queries for velocities and accelerations that are not known yet, seconds."""
 WHO = "epics gateway"
 
 
@@ -44,6 +45,7 @@ class Gateway:
         self._group = group
         self._tasks: set[asyncio.Task[None]] = set()
         self._records: dict[str, MotorRecord] = {}
+        self._learning: set[str] = set()
         self._all_stop = Short(value=0)
         self._all_stop.action = self._stop_all
 
@@ -51,7 +53,7 @@ class Gateway:
         """Begin to follow what the axes are."""
         self._start(self._follow_descriptions(), "descriptions")
 
-    def add(self, info: AxisInfo, defaults: tuple[float, float], *, moves: bool) -> None:
+    def add(self, info: AxisInfo, defaults: Defaults | None, *, moves: bool) -> None:
         """Show an axis, and begin to follow it."""
         prefix = self._prefix
         record = (
@@ -91,9 +93,23 @@ class Gateway:
         async for described in self._rig.follow_descriptions():
             for name, info in described.items():
                 if name in self._records:
-                    await self._take(self._records[name], info)
+                    record = self._records[name]
+                    await self._take(record, info)
+                    if record.defaults is None and name not in self._learning:
+                        self._learning.add(name)
+                        self._start(self._learn_defaults(record), f"velocities of {name}")
                 elif self._shows_all:  # the daemon was restarted with another axis
-                    self.add(info, await _defaults(self._rig, name) or MOTIONLESS, moves=self._moves_all)
+                    self.add(info, await _defaults(self._rig, info), moves=self._moves_all)
+
+    async def _learn_defaults(self, record: MotorRecord) -> None:
+        """Describe a record anew once its axis says how fast it moves: it may not have been up before."""
+        while record.defaults is None:
+            await asyncio.sleep(LEARN_S)
+            info = record.info
+            defaults = await _defaults(self._rig, info)
+            if defaults and record.info is info:
+                await record.describe(info, defaults)
+        self._learning.discard(record.info.axis)
 
     async def _describe(self, record: MotorRecord) -> None:
         """Have a record say what its axis is by the daemon that is there now."""
@@ -102,7 +118,8 @@ class Gateway:
                 await self._take(record, info)
 
     async def _take(self, record: MotorRecord, info: AxisInfo) -> None:
-        await record.describe(info, await _defaults(self._rig, info.axis) or record.defaults)
+        kept = record.defaults if info.unit == record.info.unit else None
+        await record.describe(info, await _defaults(self._rig, info) or kept)
 
     async def _follow(self, record: MotorRecord) -> None:
         axis = record.info.axis
@@ -181,7 +198,7 @@ async def gateway(
         async with asyncio.TaskGroup() as group:
             made = Gateway(rig, group, prefix, shows_all=not axes, moves_all={*known} <= {*moves})
             for name in axes or known:
-                made.add(known[name], await _defaults(rig, name) or MOTIONLESS, moves=name in moves)
+                made.add(known[name], await _defaults(rig, known[name]), moves=name in moves)
             made.begin()
             try:
                 yield made
@@ -208,10 +225,12 @@ async def serve(records: Gateway, address: ListenAddress) -> None:
     await context.run()
 
 
-async def _defaults(rig: Rig, name: str) -> tuple[float, float] | None:
+async def _defaults(rig: Rig, info: AxisInfo) -> Defaults | None:
     """Return the velocity and acceleration of a move that names none; None when the daemon does not say now."""
+    if Verb.MOVE_ABSOLUTE not in info.capabilities:
+        return MOTIONLESS
     try:
-        async with rig.watch(name) as axis:
+        async with rig.watch(info.axis) as axis:
             preview = await axis.preview(distance=0)
     except LdcndError:
         return None

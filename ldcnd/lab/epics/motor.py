@@ -25,10 +25,12 @@ from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import Moving, Sample, StateSample
 from ldcnd.lab.borrowed_control import BorrowedControl
 from ldcnd.lab.epics.fields import Action, Number, Put, RecordAlarm, RecordField, Value
-from ldcnd.lab.epics.record import NO_LIMIT, MotorRecord
+from ldcnd.lab.epics.record import NO_LIMIT, Defaults, MotorRecord
 
 MOTIONS = frozenset({".VAL", ".RLV", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR"})
 REFUSED = RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM)
+SHOWN_S = 2.0
+"""Longest wait for a position and a state that say what a put has set, in seconds."""
 REST_S = 10.0
 """Longest wait for the standstill after a motion that was ended early, in seconds."""
 
@@ -46,7 +48,7 @@ class MovedRecord(MotorRecord):
     def __init__(
         self,
         info: AxisInfo,
-        defaults: tuple[float, float],
+        defaults: Defaults | None,
         start: Callable[[Coroutine[object, object, None], str], asyncio.Future[None]],
         clients: Callable[[], frozenset[object]],
     ) -> None:
@@ -60,7 +62,6 @@ class MovedRecord(MotorRecord):
         self._wanted: float | None = None  # the newest target that was put and has no reply yet
         self._waiting: asyncio.Future[Put] | None = None  # what sends it once those before it have a reply
         self._turn = asyncio.Lock()
-        self._sent: Sent | None = None
         self._changed = asyncio.Event()
         self._released = asyncio.Event()  # the jog under way is to end
         self._jogging: asyncio.Future[None] | None = None
@@ -112,7 +113,7 @@ class MovedRecord(MotorRecord):
 
     # -- what the axis says ------------------------------------------------------------------------------------------
 
-    async def describe(self, info: AxisInfo, defaults: tuple[float, float]) -> None:
+    async def describe(self, info: AxisInfo, defaults: Defaults | None) -> None:
         """Take what the axis is from now on.
 
         After a change of unit nothing moves until Go is put to SPMG: numbers of clients may be in the former one.
@@ -120,7 +121,6 @@ class MovedRecord(MotorRecord):
         before = self.info
         if info.unit != before.unit:
             await self["SPMG"].show("Stop")
-            self._sent = None
         await super().describe(info, defaults)
         if info.unit != before.unit:
             await self.show_beside(
@@ -132,11 +132,9 @@ class MovedRecord(MotorRecord):
         await super().take(sample, item)
         self._changed.set()
 
-    def target(self, state: StateSample) -> float | None:
-        """Return where the axis was sent, by any program, or is to be sent; None where only a position tells."""
-        if self._wanted is not None:
-            return self._wanted
-        return self._sent.target(state) if self._sent else super().target(state)
+    def target(self, state: StateSample) -> float:
+        """Return where the axis was sent, by any program, or is to be sent, or else where it is."""
+        return super().target(state) if self._wanted is None else self._wanted
 
     def stands(self) -> bool:
         """Tell whether the axis has done what was put."""
@@ -200,8 +198,18 @@ class MovedRecord(MotorRecord):
         axis, target = await self._movable(), float(asked)
         if self["SET"].value == "Set":
             await axis.set_position(target)
-            return Put(target)
+            await self._show_from_now_on()
+            return Put()
         return await self._go(target, halts)
+
+    async def _show_from_now_on(self) -> None:
+        """Wait until the record shows a position and a state of now, but not for ever."""
+        state_t, position_t = await self.control.published()
+        with suppress(TimeoutError):
+            async with asyncio.timeout(SHOWN_S):
+                while self._measured <= position_t or (self.state and self.state.t < state_t):
+                    self._changed.clear()
+                    await self._changed.wait()
 
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
         return await self._put_step(sign * float(self["TWV"].value)) if asked else Put(0)

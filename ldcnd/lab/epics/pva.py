@@ -11,7 +11,7 @@ from p4p.server import Server, StaticProvider
 from p4p.server.asyncio import SharedPV
 
 from ldcnd.contract.errors import LdcndError
-from ldcnd.lab.epics.fields import ChoiceField, Integer, Number, RecordField, Short
+from ldcnd.lab.epics.fields import ChoiceField, Integer, Number, RecordField, Short, String, Text
 from ldcnd.lab.epics.gateway import Gateway
 from ldcnd.listen_address import ListenAddress
 
@@ -26,7 +26,8 @@ class _Puts:
         """Carry a put out; one that asks for it (`record[block=true]`) is answered at the end of its effect."""
         try:
             given = operation.value()
-            value = int(given) if isinstance(self._field, ChoiceField) else given
+            # what p4p gives is said with a time in a message
+            value = int(given) if isinstance(self._field, ChoiceField) else given.raw.value
             await self._field.write(value, wait=_is_blocking(operation))
         except (LdcndError, ValueError, PermissionError) as error:
             operation.done(error=str(error))
@@ -97,6 +98,8 @@ async def serve_pva(records: Gateway, address: ListenAddress) -> AsyncIterator[N
             provider.add(name, shared[id(field)])
             if "." not in name and f"{name}.VAL" not in variables:
                 provider.add(f"{name}.VAL", shared[id(field)])
+            if isinstance(field, String | Text):
+                provider.add(f"{name}$", shared[id(field)])
 
     add(records.variables)
     records.on_added.append(add)

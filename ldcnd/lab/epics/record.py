@@ -9,6 +9,7 @@ from functools import partial
 
 from caproto import AlarmSeverity, AlarmStatus
 
+from ldcnd.client.motion import Sent, set_point
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.condition import Alarm as Severity
 from ldcnd.contract.condition import assess
@@ -45,6 +46,9 @@ from ldcnd.lab.epics.fields import (
     text,
 )
 
+Defaults = tuple[float, float]
+MOTIONLESS: Defaults = (1.0, 1.0)
+"""Velocity and acceleration that are shown of what has none, and while they are not known."""
 NO_LIMIT = 1e30
 """Stands for a missing limit when the other one is set; both 0 stand for none, as in the motor record."""
 SILENT = RecordAlarm(AlarmStatus.COMM, AlarmSeverity.INVALID_ALARM)
@@ -97,13 +101,14 @@ class MotorRecord:
 
     Attributes:
         info: what the axis is.
-        defaults: its velocity and acceleration, in units a second and a second squared, when a client names no others.
+        defaults: its velocity and acceleration, in units a second and a second squared, when a client names no others;
+            None while they are not known.
         condition: how it is.
         moving: whether it moves.
         state: as it was published last; None when that was of a daemon that described it differently.
     """
 
-    def __init__(self, info: AxisInfo, defaults: tuple[float, float]) -> None:
+    def __init__(self, info: AxisInfo, defaults: Defaults | None) -> None:
         self.info = info
         self.condition = assess(None)
         self.moving = Moving.UNKNOWN
@@ -111,6 +116,8 @@ class MotorRecord:
         self.defaults = defaults
         self._alarm = SILENT
         self._faults: FaultSample | None = None
+        self._sent: Sent | None = None  # the last motion that the gateway has begun
+        self._measured = 0  # the instant of the last position, UTC in ns since 1970
         self._switches = 0  # bits of MSTA
         record = {name: field for name, field in motor_fields().items() if name not in PRIVATE}
         record["VAL"] = number()
@@ -200,7 +207,7 @@ class MotorRecord:
 
     def _speeds(self) -> dict[str, Value]:
         """Return the values of fields that say how an axis moves for which a client has put nothing else."""
-        velocity, acceleration = self.defaults
+        velocity, acceleration = self.defaults or MOTIONLESS
         return {
             **dict.fromkeys(("VELO", "BVEL", "JVEL"), velocity),
             **dict.fromkeys(("S", "SBAK"), velocity / self._step),
@@ -221,25 +228,25 @@ class MotorRecord:
             "JAR": (f"{unit}/s2", places),
         }
         fields = {self[name]: (*meaning, (0.0, 0.0)) for name, meaning in means.items()}
-        fields[self["VAL"]] = unit, places, self._limits
+        fields |= dict.fromkeys((self["VAL"], self["RBV"]), (unit, places, self._limits))
         velocity = self.beside(":velocity")
         if velocity is not None:
             fields[velocity] = shown_quantity(0.0, self.info, Dimension.VELOCITY)[1], places, (0.0, 0.0)
         return [field for field, meaning in fields.items() if isinstance(field, Number) and field.mean(*meaning)]
 
-    async def describe(self, info: AxisInfo, defaults: tuple[float, float]) -> None:
+    async def describe(self, info: AxisInfo, defaults: Defaults | None) -> None:
         """Take what the axis is from now on: its daemon was reloaded or restarted.
 
-        What a client has put into a field stays, unless it cannot be: after a change of unit, or above a limit.
+        What a client has put into a field stays, unless it cannot be: after a change of unit, or above a limit. What is
+        not known in another unit yet is INVALID; of the rest every number is shown in it before its clients are told
+        that it has another meaning.
         """
         before, speeds_before = self.info, self._speeds()
-        self.info, self.defaults = info, defaults
         is_other_unit = info.unit != before.unit
         if is_other_unit:
-            self.state = None
-            await self.grow_old()  # what is shown is of the former daemon
-        for field in self._set_metadata():
-            await field.write_metadata()
+            await self._forget()
+        self.info, self.defaults = info, defaults
+        changed = self._set_metadata()
         speeds, most = self._speeds(), info.limits.velocity or NO_LIMIT
         for first, *others in SPEEDS:
             held = self[first].value
@@ -247,22 +254,41 @@ class MotorRecord:
             if was_put and not is_other_unit:
                 for name in (first, *others):
                     del speeds[name]
-        for name, value in {**self._described(), **speeds}.items():
+        for name, value in self._described().items():
             await self[name].show(value)
+        for name, value in speeds.items():
+            await self[name].show(value, SILENT if defaults is None else NO_ALARM)
+        for field in changed:
+            await field.write_metadata()
+
+    async def _forget(self) -> None:
+        """Show that nothing is known of the axis in its unit of now."""
+        self.state = self._sent = None
+        await self["UDF"].show(1)
+        await self["MDEL"].show(0.0)
+        position = self["RBV"]
+        if isinstance(position, Number):
+            position.deadband = 0.0
+        await self.grow_old()
+        for field in (self["VAL"], self["DIFF"], self.beside(":velocity")):
+            if field is not None:
+                await field.show(field.value, SILENT)
 
     # -- what the axis says ------------------------------------------------------------------------------------------
 
     async def take(self, sample: Sample, item: str = "") -> None:
         """Show a sample; the item names monitors."""
+        if not self.info.describes(sample):
+            await self.grow_old()  # what is shown is of the former daemon, and this one is not described here yet
+            return
         alarm, at_s = QUALITIES[sample.quality], sample.t * 1e-9
         match sample:
-            case PositionSample() if sample.unit != self.info.unit:
-                await self["RBV"].show(self["RBV"].value, SILENT)  # of a daemon that is not described here yet
             case PositionSample():
+                await self._define()
                 worst = max(alarm, self._alarm, key=lambda each: each.severity)
                 await self["RBV"].show(sample.value, worst, at_s)
                 await self["RRBV"].show(sample.counts, worst, at_s)
-                await self["UDF"].show(0)
+                self._measured = sample.t
                 await self.show_target()
             case VelocitySample():
                 shown, _ = shown_quantity(sample.value, self.info, Dimension.VELOCITY)
@@ -287,18 +313,23 @@ class MotorRecord:
                         ":inputs", ", ".join(sample.active if sample.active is not None else sample.high)
                     )
 
-    def target(self, state: StateSample) -> float | None:
-        """Return where the axis was sent; None where only a position tells."""
-        return state.target
+    async def _define(self) -> None:
+        """Take note that a position is known; the alarm of the record is shown with it."""
+        if self["UDF"].value:
+            await self["UDF"].show(0)
+            self._alarm = self.alarm()
+            await self.show_motion()
+
+    def target(self, state: StateSample) -> float:
+        """Return where the axis was sent, or else where it is."""
+        return set_point(state, lambda: float(self["RBV"].value), self._sent)
 
     async def show_target(self) -> None:
         """Show where the axis was sent, by any program, or else where it is, and how far it is from there."""
-        if self.state is None:
+        if self.state is None or self["UDF"].value:
             return
-        target = self.target(self.state)
-        here = float(self["RBV"].value)
-        await self["VAL"].show(here if target is None else target)
-        difference = float(self["VAL"].value) - here
+        await self["VAL"].show(self.target(self.state))
+        difference = float(self["VAL"].value) - float(self["RBV"].value)
         steps = round(difference / self._step)
         await self["DIFF"].show(difference)
         await self["RDIF"].show(steps)
@@ -317,7 +348,7 @@ class MotorRecord:
 
     def alarm(self) -> RecordAlarm:
         """Return the alarm of the record."""
-        return SILENT if self.moving is Moving.UNKNOWN else ALARMS[self.condition.alarm]
+        return SILENT if self.moving is Moving.UNKNOWN or self["UDF"].value else ALARMS[self.condition.alarm]
 
     async def show_alarm(self) -> None:
         """Show the alarm of the record on its position: no sample may come that would carry it."""

@@ -9,7 +9,7 @@ from enum import IntEnum
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.fresh import fresh_samples
-from ldcnd.client.motion import Motion
+from ldcnd.client.motion import Motion, Sent, set_point
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import BufferMode
 from ldcnd.contract.condition import Alarm, Condition, assess
@@ -85,7 +85,11 @@ class AxisLink:
         self._condition: Condition = assess(None)
         self._state: StateSample | None = None
         self._faults: FaultSample | None = None
+        self._here: float | None = None  # the last position
+        self._sent: Sent | None = None
+        self._target: object = None  # as it is shown
         self._pending = 0
+        self._on_the_way = 0  # commands of motions that have no reply yet
         self._velocity = 0.0
         self._motions: set[asyncio.Task[None]] = set()
         self.control = BorrowedControl(
@@ -134,11 +138,15 @@ class AxisLink:
     def take(self, sample: Sample) -> None:
         """Show a sample."""
         match sample:
-            case PositionSample() if sample.unit != self.info.unit:
-                self._update("value", problem=f"it is in {sample.unit} now and is described in {self.info.unit}")
+            case PositionSample() | VelocitySample() if not self.info.describes(sample):
+                module, per = ("_velocity", "/s") if isinstance(sample, VelocitySample) else ("", "")
+                problem = self._other_unit(sample.unit, per)
+                self._announce(Update(f"{self.info.axis}{module}", "value", problem=problem))
             case PositionSample():
+                self._here = sample.value
                 step = 1.0 / self.info.counts_per_unit if self.info.counts_per_unit else 1.0
                 self._show(self.info.axis, sample, sample.value, step + abs(self._velocity) * sample.t_error_ns * 1e-9)
+                self._show_target()
             case VelocitySample():
                 self._velocity = sample.value
                 shown, _ = shown_quantity(sample.value, self.info, Dimension.VELOCITY)
@@ -151,9 +159,24 @@ class AxisLink:
                 self._state, self._condition = sample, assess(sample, self._faults)
                 if self.moves:
                     self._update("enabled", sample.enabled)
-                    if not self.is_busy() and sample.target is not None:
-                        self._update("target", sample.target)
+                self._show_target()
                 self._show_status()
+
+    def _other_unit(self, unit: str | None, per: str = "") -> str:
+        return f"it is in {unit} now and is described in {self.info.unit}{per}"
+
+    def _show_target(self) -> None:
+        """Show where the axis was sent, by any program, or else where it is."""
+        state = self._state
+        if not self.moves or state is None or self._on_the_way:
+            return
+        here, problem = self._here, None if self.info.describes(state) else self._other_unit(state.unit)
+        if here is None and not problem:
+            return
+        target = problem or set_point(state, lambda: here or 0.0, self._sent)
+        if target != self._target:
+            self._target = target
+            self._update("target", None if problem else target, problem=problem)
 
     def _show(self, module: str, sample: Sample, value: float, error: float | None = None) -> None:
         if sample.quality is Quality.BAD:
@@ -193,13 +216,14 @@ class AxisLink:
 
     async def go(self, target: float) -> float:
         """Send the axis to a target; returns once the drive has acknowledged it."""
-        return await self._begin(
+        await self._begin(
             lambda axis: axis.move_absolute(target, buffer_mode=BufferMode.ABORTING, velocity=self.speed), target
         )
+        return target
 
     async def home(self) -> None:
         """Begin to find the reference position, as the axis's configuration says."""
-        await self._begin(lambda axis: axis.home(), 0.0)
+        await self._begin(lambda axis: axis.home(), None)
 
     async def stop(self) -> None:
         """Halt; without control a stop is the only thing that is not refused, and it latches."""
@@ -217,19 +241,24 @@ class AxisLink:
             await self.control.power_off()
         return on
 
-    async def _begin(self, starting: Callable[[Axis], Awaitable[Motion]], target: float) -> float:
+    async def _begin(self, starting: Callable[[Axis], Awaitable[Motion]], target: float | None) -> None:
         axis = await self.control.taken()
         self._pending += 1
+        self._on_the_way += 1
         try:
             motion = await starting(axis)
         except BaseException:
             self._pending -= 1
             raise
+        finally:
+            self._on_the_way -= 1
+        self._sent = Sent(motion.reply, target if self.info.modulo is None else None)
+        self._target = None  # the client is shown what it has put
         task = asyncio.create_task(self._until_end(motion), name=f"motion of {self.info.axis}")
         self._motions.add(task)
         task.add_done_callback(self._motions.discard)
         self._show_status()  # busy before the reply, as the specification wants it
-        return target
+        self._show_target()
 
     async def _until_end(self, motion: Motion) -> None:
         try:

@@ -6,6 +6,7 @@ Samples are kept as they come and decoded when they are shown: a rig publishes m
 from dataclasses import dataclass
 from typing import TypeVar
 
+from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.client.overview import seen_of
 from ldcnd.contract.codec import decode_received
@@ -59,6 +60,7 @@ class RigView:
     def __init__(self, rig: str, now_s: float) -> None:
         self._keys = Keys(rig)
         self._began_at_s = now_s
+        self._clock = DaemonClock()
         self._ended = False
         self._description: Description | None = None
         self._kept: dict[str, _Kept] = {}
@@ -83,6 +85,7 @@ class RigView:
 
     def glance(self, now_s: float) -> RigGlance:
         """Return the rig as it is now, the most urgent first."""
+        self._read_clock()
         description = self._description
         trouble = self._rig_trouble(now_s)
         axes = description.axes if description else ()
@@ -98,6 +101,12 @@ class RigView:
             buses=tuple(sorted(lines, key=lambda line: -line.severity)),
         )
 
+    def _read_clock(self) -> None:
+        """Learn how late it is by the daemon's clock: each axis gives a sign of life every second."""
+        for key, kept in self._kept.items():
+            if key.endswith(f"/{TelemetryItem.STATE}"):
+                self._clock.note(self._decoded(kept, StateSample).t, kept.at_s)
+
     def _rig_trouble(self, now_s: float) -> str:
         report = self._kept.get(self._keys.health)
         silent_s = now_s - (report.at_s if report else self._began_at_s)
@@ -108,14 +117,13 @@ class RigView:
         return "" if self._description else "waiting for the daemon"
 
     def _axis(self, info: AxisInfo, line: BusHealth | None, now_s: float, silent: str) -> AxisGlance:
-        position_key = self._keys.telemetry(info.axis, TelemetryItem.POSITION)
-        position = self._latest(position_key, PositionSample)
+        position = self._latest(self._keys.telemetry(info.axis, TelemetryItem.POSITION), PositionSample)
         velocity = self._latest(self._keys.telemetry(info.axis, TelemetryItem.VELOCITY), VelocitySample)
         adc = self._latest(self._keys.telemetry(info.axis, TelemetryItem.ADC), AdcSample)
         fault = self._latest(self._keys.telemetry(info.axis, TelemetryItem.FAULT), FaultSample)
         state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
         health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
-        age_s = now_s - self._kept[position_key].at_s if position else None
+        age_s = self._clock.age_s(position.t, now_s) if position else None
         condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent)
         worst = next(iter(condition.troubles), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong

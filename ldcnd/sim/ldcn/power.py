@@ -5,6 +5,7 @@ Sources: LS-182AP manual, "Diagnostic bits", "Safety features and diagnostics"; 
 
 from abc import ABC, abstractmethod
 from enum import Enum, StrEnum
+from typing import ClassVar
 
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag
 
@@ -59,6 +60,8 @@ _TRIPS = (
     (FaultCondition.OVERCURRENT, Trip.OVERCURRENT),
     (FaultCondition.ENCODER_LOSS, Trip.ENCODER),
 )
+OF_POWER = frozenset({FaultCondition.MOTOR_POWER_OFF, *(condition for condition, _ in _TRIPS)})
+"""Conditions that only a power stage can feel."""
 
 
 class PowerStage(ABC):
@@ -69,7 +72,10 @@ class PowerStage(ABC):
         enabled: the enable bit of Stop Motor as last sent (AMP_EN, Pic_ae).
         drives: whether the motor gets voltage.
         allows_servo: whether the position loop may be closed.
+        feels: the conditions that have an effect here, of those that only a power stage can feel.
     """
+
+    feels: ClassVar[frozenset[FaultCondition]]
 
     def __init__(self) -> None:
         self.conditions: set[FaultCondition] = set()
@@ -114,6 +120,8 @@ class PowerStage(ABC):
 class PicServoPower(PowerStage):
     """An external amplifier: an enable pin, and motor power that is sensed and whose loss opens the loop."""
 
+    feels: ClassVar = frozenset({FaultCondition.MOTOR_POWER_OFF})
+
     def check(self) -> None:
         """Draw the consequences of the conditions."""
         self.allows_servo = FaultCondition.MOTOR_POWER_OFF not in self.conditions
@@ -140,6 +148,8 @@ class ScPower(PicServoPower):
     Source: PIC-SERVO SC data sheet, 4.7.
     """
 
+    feels: ClassVar = PicServoPower.feels | {FaultCondition.OVERVOLTAGE}
+
     def check(self) -> None:
         """Draw the consequences of the conditions."""
         super().check()
@@ -155,6 +165,8 @@ class LogosolPower(PowerStage):
 
     A cause that stands while Pic_ae is 0 is shown but not latched; it is latched as soon as Pic_ae is set.
     """
+
+    feels: ClassVar = frozenset(condition for condition, _ in _TRIPS)
 
     def __init__(self) -> None:
         super().__init__()

@@ -6,7 +6,7 @@ import { decimalsOf, duration, number } from "../parts/format.js";
 import { StoryOf } from "../parts/motion_story.js";
 import { NumberField, unread } from "../parts/number_field.js";
 import { shownQuantity, unitsOf } from "../parts/number_text.js";
-import { command, question } from "../session/control.js";
+import { command, controls, question } from "../session/control.js";
 import { moves, obstacle } from "../session/obstacles.js";
 
 const PAUSE_MS = 250;
@@ -159,8 +159,9 @@ function Preview({ axis, body, field, onNearest }) {
   const [refusal, setRefusal] = useState(null);
   const asked = body && !axis.rig.worth && JSON.stringify({ ...body, buffer_mode: undefined });
   const { state } = axis;
-  // what a motion would do depends on where the axis is, which a motion or a stop has changed
-  const situation = [state?.state, state?.command?.command_id, state?.referenced, state?.stop_latched].join();
+  // what a motion would do depends on where the axis is, which a motion or a stop has changed, and on how fast it may be
+  const situation = JSON.stringify([state?.state, state?.command?.command_id, state?.referenced, state?.stop_latched,
+    state?.enabled, state?.link, state?.speed_override, axis.holder, controls(axis)]);
   useEffect(() => {
     setPlan(null);
     setRefusal(null);
@@ -208,8 +209,11 @@ function Planned({ axis, plan, field, onNearest }) {
     const noticed = Math.abs(error) > NOTICED * Math.abs(value);
     return `${number(shown.value, 3)} ${shown.unit}${noticed ? ` (${error > 0 ? "+" : ""}${number(off.value, 4)} by rounding)` : ""}`;
   };
-  return html`<p>${plan.position === null ? "Runs until stopped or to the soft limit" : `Ends at ${number(plan.position, decimals)} ${unit}`},
-    ${" "}at ${held(plan.velocity, plan.velocity_error, "velocity")}, with ${held(plan.acceleration, plan.acceleration_error, "acceleration")}${
+  const { known, mark } = axis.condition;
+  const end = known ? `${number(plan.position, decimals)} ${unit}` : `(${number(plan.position, decimals)}) ${unit}, ${mark}`;
+  const override = axis.state?.speed_override ?? 100;
+  return html`<p>${plan.position === null ? "Runs until stopped or to the soft limit" : `Ends at ${end}`},
+    ${" "}at ${held(plan.velocity, plan.velocity_error, "velocity")}${override === 100 ? "" : ` by the speed override of ${number(override, 0)} %`}, with ${held(plan.acceleration, plan.acceleration_error, "acceleration")}${
       plan.duration_s === null ? "" : `, in ${duration(plan.duration_s)} without settling`
     }.
     ${" "}<span class="quiet">${plan.packets.length} packets, ${duration(plan.bus_s)} on the line at most.</span></p>`;

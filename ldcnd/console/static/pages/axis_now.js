@@ -27,7 +27,7 @@ export function NowPanel({ axis }) {
     </div>
     <${Facts} of=${[
       ["velocity", html`${number(velocity.value, decimals)} <span class="unit">${velocity.unit}</span>`],
-      ["following error", html`${number(position?.following_error, decimals)} <span class="unit">${info.unit}</span>`],
+      ["following error", html`${number(live ? position?.following_error : null, decimals)} <span class="unit">${info.unit}</span>`],
       ["target", html`${number(target, decimals)} <span class="unit">${info.unit}</span>`],
       ["left to go", html`${number(left, decimals)} <span class="unit">${info.unit}</span>`],
       ["encoder", html`${number(position?.counts, 0)} <span class="unit">count</span>`],
@@ -36,7 +36,7 @@ export function NowPanel({ axis }) {
       ["last motion", axis.ended() ? html`<${EndOfMotion} axis=${axis} event=${axis.ended()} />` : "none yet"],
     ]} />
     <h3>Status</h3>
-    <${StatusLamps} state=${state} live=${live} />
+    <${StatusLamps} state=${state} live=${live} silent=${axis.rig.worth} />
     <${Inputs} axis=${axis} live=${live} />
     <${Monitors} axis=${axis} />
     <${Signals} axis=${axis} />
@@ -48,7 +48,7 @@ function remaining(command, nowNs) {
   return `ends in ${age(Math.max(0, (command.expected_end - nowNs) / 1e9))}`;
 }
 
-function StatusLamps({ state, live }) {
+function StatusLamps({ state, live, silent }) {
   const now = live ? state : null; // what is latched stays true of an axis that does not answer
   return html`<ul class="lamps" aria-label="Status bits">
     <${Lamp} label="loop closed" on=${now?.enabled} />
@@ -56,7 +56,7 @@ function StatusLamps({ state, live }) {
     <${Lamp} label="moving" on=${now && now.moving !== "unknown" ? now.moving === "yes" : null} />
     <${Lamp} label="answers" on=${state && live && state.link !== "down"} yes=${state?.link} no="down"
       level=${state?.link === "degraded" ? "warn" : ""} />
-    <${Lamp} label="stop latched" on=${state?.stop_latched} level="warn" />
+    <${Lamp} label="stop latched" on=${state?.stop_latched || (silent ? null : state?.stop_latched)} level="warn" />
     ${state?.stop_pending && html`<${Lamp} label="stop confirmed by the drive" on=${true} yes="NO" level="bad" />`}
     <${Lamp} label="error stop" on=${now && now.state === "error_stop"} level="bad" />
   </ul>`;
@@ -68,12 +68,14 @@ function Inputs({ axis, live }) {
   if (!sample) return null;
   const tripped = axis.info.limit_stop; // the level at which the drive stops, where it does
   const limits = tripped === "high" ? ["tripped", "clear"] : tripped === "low" ? ["clear", "tripped"] : ["high", "low"];
+  // a drive that has tripped keeps the enable bit, and its motor off: what it shows then is why it has tripped
+  const isOpen = sample.amplifier_enable && axis.state?.state === "error_stop" && !axis.state.enabled;
   const lamp = (name, yes, no, off) => html`<${Lamp} label=${words(name)} on=${live ? sample[name] : null} yes=${yes} no=${no}
-    unknown=${live ? `not shown while ${off}` : "unknown"} />`;
+    unknown=${live ? `not shown ${isOpen ? "before reset" : `while ${off}`}` : "unknown"} />`;
   return html`<h3>Inputs</h3>
     <ul class="lamps" aria-label="Inputs">
       ${lamp("reverse_limit", ...limits, "disabled")}${lamp("forward_limit", ...limits, "disabled")}${lamp("index", "high", "low", "disabled")}
-      ${lamp("stop_input", "open", "closed", "enabled")}${lamp("amplifier_enable", "on", "off", "not known to the daemon")}
+      ${lamp("stop_input", "open", "closed", "enabled")}${lamp("amplifier_enable", isOpen ? "set, motor off" : "on", "off", "not known to the daemon")}
     </ul>`;
 }
 

@@ -1,4 +1,4 @@
-/** What has happened: every command of every rig, how it ended, and who sent it. */
+/** What has happened: every command of every rig, how it ended, and who sent it; faults, and starts of daemons. */
 
 import { html, useEffect, useState } from "../html.js";
 import { Action, Choice, Panel, RefusalText, Table } from "../parts/controls.js";
@@ -12,7 +12,7 @@ import { changed, useRigs } from "../session/rigs.js";
 
 const ASKED = 500;
 const MOST_SHOWN = 300;
-const LEVELS = { refused: "warn", aborted: "warn", failed: "bad", unknown: "bad" };
+const LEVELS = { refused: "warn", aborted: "warn", failed: "bad", unknown: "bad", fault: "bad" };
 
 export function EventsPage() {
   const all = [...useRigs().values()];
@@ -31,7 +31,7 @@ export function EventsPage() {
     .flatMap((rig) => [...rig.axes.values()])
     .map((axis) => [`${axis.rig.name}/${axis.name}`, `${axis.rig.name} · ${axis.name}`]);
   const found = all
-    .flatMap((rig) => rig.events.map((event) => ({ rig, event })))
+    .flatMap((rig) => [...rig.events, ...faultsOf(rig), ...startOf(rig)].map((event) => ({ rig, event })))
     .filter((each) => matches(each, only))
     .sort((one, other) => other.event.t - one.event.t);
 
@@ -39,7 +39,7 @@ export function EventsPage() {
     <${Panel} title="Commands and how they ended">
       <div class="fields">
         <${Choice} label="Axis" options=${[["", "all"], ...axes]} value=${only.axis} onChange=${set("axis")} />
-        <${Choice} label="Status" options=${[["", "all"], ...COMMAND_STATUSES.map((each) => [each, each])]}
+        <${Choice} label="Status" options=${[["", "all"], ...[...COMMAND_STATUSES, "fault", "started"].map((each) => [each, each])]}
           value=${only.status} onChange=${set("status")} />
         <${TextField} label="Find" type="search" value=${only.text || null} onChange=${set("text")} />
       </div>
@@ -53,12 +53,32 @@ export function EventsPage() {
 }
 
 function Row({ rig, event }) {
-  return html`<tr key=${`${rig.name}/${event.axis}/${event.seq}`}>
+  return html`<tr key=${`${rig.name}/${event.axis}/${event.seq ?? event.code}/${event.t}`}>
     <td class="time">${dateAndClock(event.t)}</td>
-    <td><a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a></td>
-    <td>${words(event.verb)}</td><td><${Mark}
+    <td>${event.axis ? html`<a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a>` : rig.name}</td>
+    <td>${whatOf(event)}</td><td><${Mark}
       level=${LEVELS[event.status] ?? ""}>${event.status}<//></td><td>${event.client ?? "–"}</td>
     <td>${event.reason ?? arrival(event)}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;
+}
+
+/** What it was, in words: of `power`, which way. */
+function whatOf({ verb, on }) {
+  return `${words(verb)}${on === null || on === undefined ? "" : on ? " on" : " off"}`;
+}
+
+/** The faults of the axes of a rig, those that are over too, as events. */
+function faultsOf(rig) {
+  const axes = [...rig.axes.values()].filter(({ info }) => info);
+  return axes.flatMap((axis) => {
+    const seen = new Map([...axis.info.past_faults, ...axis.faults].map((fault) => [`${fault.code} ${fault.since}`, fault]));
+    return [...seen.values()].map(({ code, since, text }) => ({ t: since, axis: axis.name, verb: "fault", status: "fault", reason: text, code }));
+  });
+}
+
+/** The start of the daemon: what an earlier run of it has done is not known any more. */
+function startOf({ daemon }) {
+  if (!daemon) return [];
+  return [{ t: daemon.started, axis: "", verb: "daemon", status: "started", reason: `ldcnd ${daemon.version}, run ${daemon.instance}` }];
 }
 
 function arrival({ position, following_error: off, settled }) {
@@ -70,7 +90,7 @@ function arrival({ position, following_error: off, settled }) {
 function matches({ rig, event }, { axis, status, text }) {
   if (axis && axis !== `${rig.name}/${event.axis}`) return false;
   if (status && status !== event.status) return false;
-  return [event.axis, event.verb, event.client, event.reason, event.code, event.command_id]
+  return [event.axis, whatOf(event), event.client, event.reason, event.code, event.command_id]
     .join(" ")
     .toLowerCase()
     .includes(text.toLowerCase());
@@ -90,7 +110,7 @@ function csvOf(found) {
       dateAndClock(event.t),
       rig.name,
       event.axis,
-      event.verb,
+      whatOf(event),
       event.status,
       event.client,
       event.reason,

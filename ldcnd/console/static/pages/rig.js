@@ -4,11 +4,12 @@ import { html, useState } from "../html.js";
 import { Action, Choice, Facts, Swap, Tick } from "../parts/controls.js";
 import { dateAndClock, words } from "../parts/format.js";
 import { TextField } from "../parts/number_field.js";
+import { askEach, Fates } from "../parts/fates.js";
 import { problems } from "../parts/problems.js";
 import { Mark } from "../parts/state.js";
 import { ask } from "../session/api.js";
 import { command, controls, release, take } from "../session/control.js";
-import { calms, isUseless, obstacle } from "../session/obstacles.js";
+import { calms, isUseless, obstacle, useless } from "../session/obstacles.js";
 import { axesOf, changed, endpoints, useRigs } from "../session/rigs.js";
 import { AxesOf, refused, ShortAction } from "./rig_axes.js";
 import { GroupMoves } from "./rig_groups.js";
@@ -125,32 +126,28 @@ function RigSection({ rig }) {
 function RigCommands({ rig }) {
   const axes = [...rig.axes.values()].filter((axis) => axis.can("power"));
   const [from, setFrom] = useState(null); // consent to take them from these holders is none to take them from others
-  const [told, setTold] = useState("");
   if (!axes.length) return null;
   const mine = axes.filter(controls);
   const others = axes.filter((axis) => !controls(axis) && axis.holder);
   const held = others.map(({ name, holder }) => `${name} is controlled by ${holder}`).join(", ");
   const force = others.length > 0 && from === held;
   // an axis that is homed gets another origin by homing it again: on an index mark whole turns away, where it is not near its own
-  const wants = (axis, act) => act !== "home" || !(axis.condition.known && axis.state?.referenced);
+  const wants = (axis, act) => (act === "home" ? !(axis.condition.known && axis.state?.referenced) : !isUseless(axis, act));
   const ready = (act) => axes.filter((axis) => wants(axis, act) && obstacle(axis, act) === null);
-  const each = (act, verb, body) => async () => {
+  const each = (title, act, verb, body) => async () => {
     // what forbade it before this page had control may not be told anew yet: the daemon refuses what it must
-    const asked = axes.filter((axis) => wants(axis, act) && (obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth && !isUseless(axis, act))));
-    for (const axis of axes) axis.refusal = null;
-    const outcomes = await Promise.allSettled(asked.map((axis) => command(axis, verb, body)));
-    outcomes.forEach(({ reason }, at) => {
-      if (reason) asked[at].refusal = refused(asked[at], verb, reason);
-    });
+    const asked = axes.filter((axis) => wants(axis, act) && (obstacle(axis, act) === null || (controls(axis) && !axis.rig.worth)));
     for (const axis of axes) {
-      const way = act === "home" && wants(axis, act) && !asked.includes(axis) && obstacle(axis, act);
-      if (way) axis.refusal = `${words(verb)} refused: ${way}`;
+      const way = wants(axis, act) && !asked.includes(axis) && obstacle(axis, act);
+      axis.refusal = way ? `${words(verb)} not sent: ${way}` : null;
     }
-    const failed = axes.filter((axis) => axis.refusal);
-    setTold(failed.length ? `${words(verb)}: refused by ${failed.map(({ name }) => name).join(", ")}; the reasons are in their rows.` : `${verb === "power" ? (body.on ? "enabled" : "disabled") : verb}: ${asked.map(({ name }) => name).join(", ")}`);
+    for (const { axis, error } of await askEach(rig.name, title, asked, (axis) => command(axis, verb, body))) {
+      axis.refusal = refused(axis, verb, error);
+    }
+    changed();
   };
-  const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" calms=${calms(axes[0], act)} act=${each(act, verb, body)}
-    obstacle=${ready(act).length ? null : axes.some((axis) => wants(axis, act)) ? (obstacle(axes[0], act) ?? "No axis can do that now.") : "Every axis is homed: home one again on its page."} />`;
+  const button = (title, act, verb, body) => html`<${ShortAction} title=${title} name="all" calms=${calms(axes[0], act)} act=${each(title, act, verb, body)}
+    obstacle=${ready(act).length ? null : wayOfAll(axes, act, wants)} />`;
   return html`<div class="rig-commands" role="group" aria-label=${`Commands for all axes of ${rig.name}`}>
     <div class="row">
       <${Swap}>${mine.length < axes.length && html`<${Action} key="take" kind="main" act=${() => take(axes.filter((axis) => !controls(axis)), force)} onDone=${() => setFrom(null)}
@@ -166,6 +163,18 @@ function RigCommands({ rig }) {
       ${button("Halt", "halt", "halt", {})}
       <${SpeedOverride} rig=${rig} />
     </div>
-    <p class="told" role="status">${told}</p>
+    <${Fates} place=${rig.name} />
   </div>`;
+}
+
+/** Why a command for all axes would do nothing now: no axis wants it, or what is in the way of each that does. */
+function wayOfAll(axes, act, wants) {
+  const wanting = axes.filter((axis) => wants(axis, act));
+  if (!wanting.length) return act === "home" ? "Every axis is homed: home one again on its page." : useless(axes[0], act);
+  const ways = new Map();
+  for (const axis of wanting) {
+    const way = obstacle(axis, act).replaceAll(`axis ${axis.name}:`, "").replaceAll(`axis ${axis.name}`, "it").trim();
+    ways.set(way, [...(ways.get(way) ?? []), axis.name]);
+  }
+  return [...ways].map(([way, names]) => `${names.join(", ")}: ${way}`).join(" ");
 }

@@ -2,10 +2,11 @@
 
 import { html, useId } from "../html.js";
 import { Action } from "../parts/controls.js";
+import { askEach } from "../parts/fates.js";
 import { decimalsOf, number, percent, words } from "../parts/format.js";
 import { shownQuantity } from "../parts/number_text.js";
 import { inPageTerms } from "../parts/remedies.js";
-import { Homed, Mark, Meter, Place, StateWord } from "../parts/state.js";
+import { Homed, Mark, Meter, Place, StateWord, TroubleWords } from "../parts/state.js";
 import { command, controls, take } from "../session/control.js";
 import { calms, obstacle } from "../session/obstacles.js";
 import { changed } from "../session/rigs.js";
@@ -75,14 +76,13 @@ function LineNow({ rig, bus }) {
 function AxisRow({ axis }) {
   const { info, samples, state } = axis;
   const decimals = decimalsOf(info);
-  const { live, mark, troubles } = axis.condition;
+  const { live, troubles } = axis.condition;
   const velocity = shownQuantity(live ? axis.velocity : null, info, "velocity");
-  const said = troubles.filter(({ short }) => short !== mark && short !== axis.condition.state);
   const cell = (label, content, kind = "", title = null) => html`<td role="cell" data-label=${label} class=${kind} title=${title}>${content}</td>`;
   return html`<tr role="row" data-axis=${axis.name} data-stale=${live ? "no" : "yes"}>
     <th role="rowheader" scope="row"><a href=${`#/axis/${axis.rig.name}/${axis.name}`}>${axis.name}</a>
       <small>${info.model} · ${info.address}</small></th>
-    ${cell("State", html`<${StateWord} axis=${axis} />${said.map(({ level, short }) => html` <${Mark} level=${level}>${short}<//>`)}`,
+    ${cell("State", html`<${StateWord} axis=${axis} /><${TroubleWords} axis=${axis} />`,
       "said", [axis.condition.state, ...troubles.map(({ text }) => text)].join(". "))}
     ${cell("Position", html`<${Place} axis=${axis} decimals=${decimals} label="Position" />`, "number main")}
     ${cell("Homed", html`<${Homed} axis=${axis} />`, "homed")}
@@ -114,13 +114,16 @@ function AxisCommands({ axis }) {
   const halt = ["Halt", "halt", () => command(axis, "halt")];
   const power = [on ? "Disable" : "Enable", on ? "disable" : "enable", () => command(axis, "power", { on: !on })];
   const reset = ["Reset", "reset", () => command(axis, "reset")];
-  const home = ["Home", "home", () => command(axis, "home")];
+  const home = ["Home", "home", () => follow("Home", () => command(axis, "home"))];
   const second = obstacle(axis, "reset") === null || !axis.can("home") ? reset : home;
   const taking = ["Take control", "none", () => take([axis])];
   const held = axis.holder ? `Control is held by ${axis.holder}: take it on the page of ${axis.name}.` : null;
   const refuse = (title) => (error) => {
     axis.refusal = refused(axis, title.toLowerCase(), error); // below the row, which is one line
     changed();
+  };
+  const follow = async (title, send) => {
+    for (const { error } of await askEach(axis.rig.name, title, [axis], send)) throw error;
   };
   const begin = (run) => () => {
     axis.refusal = null;

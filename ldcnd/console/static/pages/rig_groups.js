@@ -2,6 +2,7 @@
 
 import { html, useId, useState } from "../html.js";
 import { Action, enterSends, Panel, Reason, Tick, useOnce } from "../parts/controls.js";
+import { askEach, Fates } from "../parts/fates.js";
 import { decimalsOf, number } from "../parts/format.js";
 import { NumberField, unread } from "../parts/number_field.js";
 import { unitsOf } from "../parts/number_text.js";
@@ -32,7 +33,15 @@ function GroupMove({ group, axes }) {
     ? `${hindered.name}: ${obstacle(hindered, "move_absolute")}`
     : (unread({ ...targets, Velocity: speed }) ??
       (missing ? `The position of ${missing.name} is missing.` : once.obstacle(body, axes.some(moves))));
-  const move = () => once.send(body, axes.some(moves), () => moveTogether(axes, targets, speed, straight));
+  const place = `${axes[0].rig.name}/${group}`;
+  const send = async () => {
+    const sent = moveTogether(axes, targets, speed, straight);
+    const of = async ({ name }) => (await sent).replies.find((each) => each.axis === name);
+    for (const { error } of await askEach(place, "Move", axes, of)) throw error;
+  };
+  const move = () => once.send(body, axes.some(moves), send);
+  // what a line would be depends on where it begins, and on the speed override
+  const situation = JSON.stringify([body, axes.map(({ state }) => [state?.state, state?.speed_override, state?.referenced])]);
   return html`<${Panel} title=${`Group ${group}`} note="All start in the same servo cycle, or none; on a straight line they ramp alike and arrive together.">
     <div class="fields" onKeyDown=${enterSends}>
       ${axes.map(
@@ -45,9 +54,10 @@ function GroupMove({ group, axes }) {
     <${Tick} label="Straight line" checked=${straight} onChange=${setStraight} />
     <p class="row"><${Action} kind="main" act=${move} obstacle=${way || null}
       reason=${reason}>Move ${axes.map(({ name }) => name).join(" and ")} together<//>
-      ${straight && html`<${Action} act=${async () => setLine(await previewLine(axes, targets, speed))} obstacle=${missing || !body ? way : null}
+      ${straight && html`<${Action} act=${async () => setLine({ of: situation, ...(await previewLine(axes, targets, speed)) })} obstacle=${missing || !body ? way : null}
         reason=${reason}>Preview the line<//>`}</p>
-    ${straight && line && html`<p role="status">${number(line.duration_s, 2)} s, at most
+    <${Fates} place=${place} />
+    ${straight && line?.of === situation && html`<p role="status">${number(line.duration_s, 2)} s, at most
       ${number(line.deviation, 4)} ${axes[0].info.unit} from the line.</p>`}
     ${way && html`<${Reason} id=${reason} text=${way} />`}
   <//>`;

@@ -5,7 +5,7 @@ import { clock, decimalsOf, duration, number, words } from "./format.js";
 import { Mark } from "./state.js";
 
 /** Ends that are nobody's mistake, by how the event says them. */
-const ORDINARY = { "aborted by halt": "halted", "aborted by stop": "stopped", "aborted by quick_stop": "stopped" };
+export const ORDINARY = { "aborted by halt": "halted", "aborted by stop": "stopped", "aborted by quick_stop": "stopped" };
 
 /** How a motion ended; `event` is its last event. */
 export function EndOfMotion({ axis, event }) {

@@ -41,6 +41,13 @@ export function Homed({ axis }) {
   return html`<span class="quiet">${axis.state?.has_reference === false ? "–" : "homed"}</span>`;
 }
 
+/** What is to be said of an axis besides its state and its mark, in a few words each. */
+export function TroubleWords({ axis }) {
+  const { mark, state, troubles } = axis.condition;
+  const said = troubles.filter(({ short }) => short !== mark && short !== state);
+  return said.map(({ level, short }) => html` <${Mark} level=${level}>${short}<//>`);
+}
+
 /** How much the values are worth and how old they are. */
 export function QualityWord({ axis }) {
   const { word, level } = axis.quality;

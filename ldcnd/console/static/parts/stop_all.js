@@ -73,7 +73,7 @@ function outcome(rig, reply) {
   if (!reply.axes) return { level: "bad", text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.` };
   const missing = reply.axes.filter((axis) => !reply.confirmed.includes(axis));
   const confirmed = reply.confirmed.length ? `confirmed by ${reply.confirmed.join(", ")}` : "confirmed by no drive";
-  if (!missing.length) return { answered: rig, level: "", text: `${rig}: stopped and latched; ${confirmed}.` };
+  if (!missing.length) return { answered: rig, level: "", text: `${rig}: stop latched; ${confirmed}.` };
   return {
     answered: rig,
     level: "bad",
@@ -90,13 +90,15 @@ function StopsOf({ rig }) {
   const axes = [...rig.axes.values()].filter((axis) => axis.info && axis.state?.stop_latched);
   const pending = axes.filter(({ state }) => state.stop_pending);
   const latched = axes.filter(({ state }) => !state.stop_pending);
+  const [moving, stopped] = [true, false].map((is) => latched.filter(({ state }) => (state.moving === "yes") === is));
   if (!axes.length) return null;
   const of = rigs.size > 1 ? `${rig.name}: ` : "";
   const ready = latched.filter((axis) => obstacle(axis, "reset") === null);
   const reset = () => Promise.all(ready.map((axis) => command(axis, "reset")));
   return html`<p class="notice mark stops" data-level=${pending.length ? "bad" : "warn"}>
     ${pending.length > 0 && html`<span>${of}stop NOT confirmed by ${named(pending)}: use the machine’s emergency stop.</span> `}
-    ${latched.length > 0 && html`<span>${of}stopped and latched: ${named(latched)}. Nothing moves before Reset.</span> `}
+    ${moving.length > 0 && html`<span>${of}stop latched, moving still: ${named(moving)}.</span> `}
+    ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}. Nothing moves before Reset.</span> `}
     ${ready.length > 0 && html`<${Action} act=${reset}>Reset stopped axes<//>`}
   </p>`;
 }

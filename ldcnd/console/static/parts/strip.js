@@ -5,7 +5,7 @@ import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { Action } from "./controls.js";
 import { decimalsOf, number } from "./format.js";
-import { Homed, Place, StateWord } from "./state.js";
+import { Homed, Place, StateWord, TroubleWords } from "./state.js";
 import { stopAxis } from "./stop_all.js";
 
 /** Where an axis is, and where it goes. */
@@ -20,7 +20,7 @@ export function AxisStrip({ axis }) {
   const toHalt = obstacle(axis, "halt");
   return html`<div class="strip of-axis">
     <span class="where"><b>${axis.name}</b> <${PlaceAndTarget} axis=${axis} /></span>
-    <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /></span>
+    <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /><${TroubleWords} axis=${axis} /></span>
     ${axis.can("stop") && html`<span class="endings" role="group" aria-label=${`End a motion of ${axis.name}`}>
       <${Action} calms act=${() => command(axis, "halt")} obstacle=${toHalt} reason="halt-way"
         title=${toHalt ?? "Decelerate and hold; no latch"}>Halt<//><span class="unseen" id="halt-way">${toHalt ?? ""}</span>

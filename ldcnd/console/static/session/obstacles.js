@@ -39,8 +39,8 @@ export function obstacle(axis, act, joins = false) {
   return cause ? inWords(cause) : null;
 }
 
-/** Why an act would change nothing on an axis as it is; of one whose readings are old nobody knows. */
-function useless(axis, act) {
+/** Why an act would change nothing on an axis as it is, or false; of one whose readings are old nobody knows. */
+export function useless(axis, act) {
   return axis.condition.live && USELESS[act]?.(axis);
 }
 
