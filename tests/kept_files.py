@@ -4,6 +4,7 @@ A configuration, a state directory and a recording go to `tests/kept/VERSION`; e
 (tests/integration/test_kept_versions.py). Captures of wires are in `tests/captures`.
 """
 
+import argparse
 import asyncio
 import shutil
 import tomllib
@@ -51,6 +52,7 @@ async def live(place: Path) -> None:
 
 def main() -> None:
     """Write the files of this version."""
+    argparse.ArgumentParser(description=__doc__).parse_args()
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     place = ROOT / "tests" / "kept" / version
     place.mkdir(parents=True, exist_ok=True)

@@ -114,7 +114,7 @@ def _commands() -> Iterator[Channel]:
 def _stops() -> Iterator[Channel]:
     said = "Of the payload, which may be missing or nonsense, `client` is entered into the events."
     yield _channel(_KEYS.stop(), Kind.STOP, StopReply, Stop, f"Stop every axis, and latch. {said}")
-    yield _channel(_KEYS.stop(_AXIS), Kind.STOP, StopReply, Stop, f"Stop one axis, and latch. {said}")
+    yield _channel(_KEYS.stop(_AXIS), Kind.STOP, StopReply, Stop, "Stop one axis, and latch.")
 
 
 def _channel(key: str, kind: Kind, sent: type[Frozen], taken: type[Frozen] | None = None, summary: str = "") -> Channel:

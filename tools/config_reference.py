@@ -49,7 +49,7 @@ def _sections(
         said = attribute_docstrings(common) | said
     title = f"{f'`[{path}]`' if path else 'Top level'}{f', family `{family}`' if family else ''}"
     what = (model.__doc__ or "").strip().splitlines()[0]
-    about = what if not role or what.startswith(role.rstrip(".")) else f"{what} {role}"
+    about = what if not role or what.startswith(role.rstrip(".")) else role
     below = {name: inner for name, field in fields.items() if (inner := _table(field.annotation)[0])}
     new = {name for name, inner in below.items() if inner not in seen}
     rows = "".join(_row(name, field, said.get(name, "")) for name, field in fields.items() if name not in new)

@@ -241,7 +241,7 @@ class AxisConfig(Frozen):
     limits: AxisLimits = AxisLimits()
     """Software limits, in axis units."""
     gains: GainsConfig | None = None
-    """Gains of the position loop; without them the loop of this drive stays open."""
+    """Gains of the position loop, registers as in the drive's manual; without them this drive's loop stays open."""
     gain_sets: Mapping[Name, GainsConfig] = {}
     """Further sets of gains by name, with the `sr` of `gains`; `set_gains` loads one by its name."""
     gains_for: Mapping[MotionKind, Name] = {}
