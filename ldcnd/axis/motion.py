@@ -342,7 +342,9 @@ class AxisMotion:
         run_s = self.run_s(asked_s, plan.motion.velocity_counts_per_s)
         if asked_s is None and self.config.longest_run_s is None and self.limit_ahead(plan.velocity) is not None:
             run_s = math.inf  # the limit is its end
-        end, at_limit = self.end_ahead(self.here, plan.velocity * run_s)
+        # what is asked for is time at the velocity: its two ramps together go as far as one of them would at it
+        ramp_s = 0.0 if asked_s is None else abs(plan.velocity) / plan.acceleration
+        end, at_limit = self.end_ahead(self.here, plan.velocity * (run_s + ramp_s))
         return end, self.end_in_words(run_s, plan.velocity, at_limit=at_limit)
 
     def end_in_words(self, run_s: float, velocity: float, *, at_limit: bool) -> str:

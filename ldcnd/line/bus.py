@@ -231,9 +231,12 @@ class Bus:
             LdcndError: as the condition refused it; nothing was sent.
         """
         for _ in range(exchange.times):
-            # of a node that has not answered for long each attempt costs the others a resynchronisation, too
-            gone = self.misses(exchange.node) > MISSES_UNTIL_LOST
-            job = self._submit(exchange, lane, 1 if once or gone else self.settings.attempts)
+            attempts = 1 if once else self.settings.attempts
+            # each attempt costs the others a resynchronisation, too; the first answer of a node that was mute may be to
+            # something older, and does not count
+            if self.misses(exchange.node) > MISSES_UNTIL_LOST:
+                attempts = min(attempts, 2)
+            job = self._submit(exchange, lane, attempts)
             reply: ReplyT = await job.future
         return reply
 

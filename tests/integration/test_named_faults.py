@@ -44,7 +44,7 @@ CASES = {
     "stop_input": Case(lambda faults: faults.stop_input("x", at=10), says="stop_input"),
     "power_loss": Case(lambda faults: faults.power_loss("x", at=10, for_s=1.0), says="reset"),
     "mute": Case(lambda faults: faults.mute("x", at=10, for_s=2.0), says="link_lost"),
-    "cable_cut": Case(lambda faults: faults.cable_cut("x", at=10, for_s=1.8), goes_on=True, says="link_lost"),
+    "cable_cut": Case(lambda faults: faults.cable_cut("x", at=10, for_s=1.8), arrives=True, says="link_lost"),
     "noise": Case(lambda faults: faults.noise(0.05, after_s=0.5, for_s=1.0), goes_on=True),
     "late_replies": Case(lambda faults: faults.late_replies(0.004, after_s=0.5, for_s=1.0), goes_on=True),
     "lost_replies": Case(lambda faults: faults.lost_replies(0.05, after_s=0.5, for_s=1.0), goes_on=True),

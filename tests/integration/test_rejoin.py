@@ -406,6 +406,7 @@ def test_a_drive_whose_stop_waits_comes_back_though_nobody_answers(margin_ms, wi
             rig.client.control("rotor", client="test") as rotor,
         ):
             await rotor.power(on=True)
+            await asyncio.sleep(1.0)  # its outputs are written and read
             await (await rotor.home()).done()
             await rotor.move_velocity(10, acceleration=10, duration_s=60)
             await asyncio.sleep(3.0)
