@@ -375,6 +375,8 @@ def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
 
 def _switch_loop(status: AxisStatus, event: LoopSwitched) -> AxisStatus:
     rest = RestEvidence(rests=False, commanded=status.rest.commanded)
+    if not event.on:  # a load may fall; a shaft whose motor was off before is as it was
+        rest = replace(rest, rests=None) if status.enabled else status.rest
     return replace(status, effective_from_s=event.now_s, enabled=event.on, rest=rest)
 
 
@@ -522,6 +524,8 @@ def _came_to_rest(status: AxisStatus) -> bool:
 
 
 def _fail(status: AxisStatus, reason: str, *, settled: bool | None = None) -> AxisStatus:
+    if status.command is None and status.state is not AxisState.ERROR_STOP:  # the first cause stays
+        status = _with(status, last_error=reason)
     return _end(_with(status, state=AxisState.ERROR_STOP), CommandStatus.FAILED, reason, settled=settled)
 
 

@@ -425,6 +425,7 @@ class Dispatcher:
         if command.takes_energy_out:
             if self._ledger.is_taken(command_id):
                 command_id = self.events.next_command_id()
+            client = client or self._holder_by(axis_name, command)
         else:
             if entry := self._ledger.repeated(command_id, axis_name, command):
                 return await self._answer_again(entry)
@@ -512,6 +513,11 @@ class Dispatcher:
             )
         self._refuse_late(axis, command)
         return self.authority.admit(axis, command.lease, command.sequence, self._clock.now_s())
+
+    def _holder_by(self, axis: str, command: AxisCommand[CommandReply]) -> str | None:
+        """Return the client under whose lease a command comes that needs none."""
+        holder = self.authority.holder(axis)
+        return holder.client if holder and holder.token == command.lease else None
 
     def _admit_lease(self, axis: str, lease: str | None) -> None:
         """Refuse whatever could move an axis to another client than its holder."""

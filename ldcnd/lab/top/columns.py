@@ -14,6 +14,14 @@ NARROW = (0, 2, 3, 4, 5, 11)
 BUS_TITLES = ("", "bus", "line", "busy", "exchanges", "errors", "resent", "poll p99", "stop max", "trouble")
 
 
+def narrow_cells(row: AxisGlance) -> tuple[str, ...]:
+    """Return the cells of an axis that a narrow terminal shows: what its trouble says its state does not say again."""
+    cells = axis_cells(row)
+    return tuple(
+        cells[column].partition(", ")[0] if AXIS_TITLES[column] == "state" else cells[column] for column in NARROW
+    )
+
+
 def axis_cells(row: AxisGlance) -> tuple[str, ...]:
     """Return the cells of an axis, one for each of `AXIS_TITLES`."""
     rate = UNKNOWN if row.rate_hz is None else f"{row.rate_hz:.0f}/{row.rate_wanted_hz:.0f} Hz"

@@ -14,7 +14,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import Halt, Reset, StopReply
 from ldcnd.contract.condition import Severity
 from ldcnd.contract.errors import LdcndError
-from ldcnd.lab.top.columns import AXIS_TITLES, BUS_TITLES, NARROW, axis_cells, bus_cells, headline
+from ldcnd.lab.top.columns import AXIS_TITLES, BUS_TITLES, NARROW, axis_cells, bus_cells, headline, narrow_cells
 from ldcnd.lab.top.follow import follow
 from ldcnd.lab.top.rig_view import RigView
 
@@ -121,8 +121,8 @@ class TopScreen(App[None]):
             axes.clear(columns=True)
             axes.add_columns(*(AXIS_TITLES[column] for column in columns))
             self._laid_out = columns
-        cells = [(axis_cells(row), row.severity) for row in glance.axes]
-        _fill(axes, [(tuple(row[column] for column in columns), severity) for row, severity in cells])
+        cells = narrow_cells if columns == NARROW else axis_cells
+        _fill(axes, [(cells(row), row.severity) for row in glance.axes])
         _fill(self.query_one("#buses", DataTable), [(bus_cells(row), row.severity) for row in glance.buses])
 
 

@@ -2,6 +2,7 @@
 
 import { html } from "../html.js";
 import { changed } from "../session/rigs.js";
+import { clock } from "./format.js";
 import { ORDINARY } from "./motion_story.js";
 import { Mark } from "./state.js";
 
@@ -17,7 +18,7 @@ const asked = new Map();
  */
 export async function askEach(place, title, axes, send) {
   const parts = axes.map((axis) => ({ axis, run: axis.rig.daemon?.instance, sent: null, error: null, atMs: 0 }));
-  asked.set(place, { title, parts });
+  asked.set(place, { title: `${title} at ${clock(axes[0].rig.nowNs()).split(".")[0]}`, parts });
   changed();
   await Promise.all(
     parts.map(async (part) => {
