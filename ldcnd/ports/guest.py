@@ -277,6 +277,8 @@ class Guest(Presence):
             module.outputs.restart()
         if module.servo:
             module.servo.restart()
+            # programs take it for their zero: "position ... set to zero" at power-up (PIC-SERVO manual, 4.1)
+            module.servo.set_zero(module.servo.drive.state.counts, 0)
             if self._control and module.name in self._control.axes:
                 self._relieve(module, Power(on=False, client=self._name))
             if self._control and self._visit and self._host.status(module.name).state is AxisState.ERROR_STOP:

@@ -190,6 +190,21 @@ async def test_a_hard_reset_of_the_program_switches_off_what_it_controls_and_not
         assert rig.daemon.rig.axes["table"].tracker.status.enabled
 
 
+async def test_after_a_hard_reset_the_program_finds_its_counter_at_zero(tmp_path):
+    """Programs take it for their zero: with an older one they would move elsewhere, and back."""
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=2000))
+        await finished(program)
+        await asyncio.sleep(1.0)
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=1000))
+        await finished(program)
+        assert shaft(rig) == pytest.approx(3000, abs=20)
+
+
 async def test_limits_hold_for_the_program_and_its_move_is_not_done(tmp_path):
     limits = {"limits": {"position_min": -2.0, "position_max": 2.0, "velocity": 11.0}}
     async with guest(tmp_path, "control", **limits) as (rig, program):

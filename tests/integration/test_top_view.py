@@ -6,6 +6,7 @@ from contextlib import asynccontextmanager
 from ldcnd.client.overview import overview
 from ldcnd.contract.commands import Halt, MoveAbsolute, Power
 from ldcnd.contract.condition import Severity
+from ldcnd.contract.errors import TransportLost
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.lab.top.columns import as_text, headline
 from ldcnd.lab.top.follow import follow
@@ -85,6 +86,23 @@ async def test_a_drive_that_lost_power_comes_first_and_says_so():
     assert (shown.axes[0].axis, shown.axes[0].link, shown.axes[0].moving) == ("c", LinkState.DOWN, Moving.UNKNOWN)
     assert "the drive does not answer" in "\n".join(as_text(shown))
     assert headline(shown).endswith("not working: 1")
+
+
+async def test_while_a_line_is_down_ages_grow():
+    async with running_rig() as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        rig.daemon.rig.buses[0].bus._opener = never
+        rig.daemon.rig.buses[0].bus.drop("a plug that is pulled")
+        await asyncio.sleep(20)
+        async with followed(rig) as glance:
+            shown = await until(glance, lambda now: now.axes and now.axes[0].age_s)
+
+    assert shown.axes[0].age_s > 18
+    assert all(row.age_s > 18 for row in shown.axes if row.age_s is not None)
+
+
+async def never():
+    raise TransportLost("no such port")
 
 
 async def test_who_begins_to_look_later_sees_the_same_age():

@@ -12,7 +12,7 @@ from ldcnd.client.overview import seen_of
 from ldcnd.contract.codec import decode_received
 from ldcnd.contract.condition import SHARED, SILENT_S, Severity, Trouble, TroubleKind, assess, line_troubles
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.health import BusHealth, LaneHealth
+from ldcnd.contract.health import BusHealth, DaemonHealth, LaneHealth
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import AxisInfo, DaemonInfo
 from ldcnd.contract.samples import (
@@ -102,7 +102,9 @@ class RigView:
         )
 
     def _read_clock(self) -> None:
-        """Learn how late it is by the daemon's clock: each axis gives a sign of life every second."""
+        """Learn how late it is by the daemon's clock: it reports every second, also while nothing comes from a line."""
+        if report := self._kept.get(self._keys.health):
+            self._clock.note(self._decoded(report, DaemonHealth).t, report.at_s)
         for key, kept in self._kept.items():
             if key.endswith(f"/{TelemetryItem.STATE}"):
                 self._clock.note(self._decoded(kept, StateSample).t, kept.at_s)
