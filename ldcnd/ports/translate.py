@@ -121,7 +121,7 @@ class GuestServo:
         self.restart()
 
     def restart(self) -> None:
-        """Forget what the guest has loaded, as its drive does with a reset; its counter goes on for the next program."""
+        """Forget what the guest has loaded, as its drive does with a reset; the next program finds its counter."""
         self._registers = Trajectory()
         self._holds = False  # the guest's drive has its servo on, whatever its amplifier does
         self.armed = _NO_HOMING
