@@ -32,7 +32,7 @@ def axis_cells(row: AxisGlance) -> tuple[str, ...]:
         row.shown_state,
         row.shown_position,
         row.trouble,
-        UNKNOWN if row.velocity is None or row.moving is Moving.UNKNOWN else f"{row.velocity:.3f}",
+        UNKNOWN if row.moving is Moving.UNKNOWN else row.shown_velocity or UNKNOWN,
         UNKNOWN if row.target is None else f"{row.target:.3f}",
         UNKNOWN if row.adc_volts is None else f"{row.adc_volts:.2f} V",
         UNKNOWN if row.age_s is None else f"{row.age_s:.1f} s",

@@ -31,6 +31,8 @@ class AxisGlance(Glance, AxisSeen):
     """The state in words."""
     velocity: float | None
     """How fast it moves."""
+    shown_velocity: str
+    """The same in the unit that is configured for velocities; empty while it is not known."""
     target: float | None
     """Where its command ends."""
     adc_volts: float | None

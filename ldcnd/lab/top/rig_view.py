@@ -23,6 +23,7 @@ from ldcnd.contract.samples import (
     TelemetryItem,
     VelocitySample,
 )
+from ldcnd.contract.units import Dimension, quantity_text
 from ldcnd.lab.top.glance import AxisGlance, BusGlance, RigGlance
 
 ModelT = TypeVar("ModelT", bound=Frozen)
@@ -138,6 +139,7 @@ class RigView:
             shown_position=condition.position(f"{position.value:.3f}" if position else None, info.unit, age_s),
             shown_state=condition.summary,
             velocity=velocity.value if velocity else None,
+            shown_velocity=quantity_text(velocity.value, info, Dimension.VELOCITY) if velocity else "",
             target=state.command.target if state and state.command else None,
             adc_volts=adc.volts if adc else None,
             rate_hz=health.rate_hz if health else None,
