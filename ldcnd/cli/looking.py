@@ -208,11 +208,14 @@ def monitors(target: Target, axis: str, names: tuple[str, ...], *, read: bool) -
 def why(target: Target, axis: str) -> None:
     """Tell why AXIS cannot move now, and what would clear that; exits with 1 when something is in the way."""
 
-    async def work(client: RigClient) -> tuple[AxisInfo, WhyReply]:
-        return await axis_of(client, axis), await client.ask(Why(), axis)
+    async def work(client: RigClient) -> tuple[AxisInfo, WhyReply, bool]:
+        reply = await client.ask(Why(), axis)
+        goes = reply.can_move or (await client.ask(Why(absolute=False), axis)).can_move
+        return await axis_of(client, axis), reply, goes
 
-    info, reply = target.run(work)
-    lines = [f"{axis}: {'ready to move' if reply.can_move else 'cannot move now'}"]
+    info, reply, goes = target.run(work)
+    without = "cannot move to a position now, only by a distance or at a velocity" if goes else "cannot move now"
+    lines = [f"{axis}: {'ready to move' if reply.can_move else without}"]
     for cause in reply.causes:
         known = remedy_of(cause)
         remedy = known and known.phrased(lambda step: typed(step, axis))

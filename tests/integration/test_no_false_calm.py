@@ -45,6 +45,8 @@ def test_a_daemon_that_ended_in_mid_move_leaves_an_axis_that_says_it_is_not_home
         listed, topped = second.run("list").printed, second.run("top").printed
         watched = second.run("watch x --item position --count 1")
         fleet, why, now = second.run("fleet").printed, second.run("why x").printed, rows(second)["x"]
+        second.run("power on x")
+        switched_on = second.run("why x")
 
     assert abs(chain.modules[0].shaft.position_counts) > 20_000  # the shaft is far from where it reads 0
     assert "(0.000) mm not homed" in line_of(listed, "x")
@@ -55,6 +57,8 @@ def test_a_daemon_that_ended_in_mid_move_leaves_an_axis_that_says_it_is_not_home
     assert "needs attention" in fleet
     assert "not homed" in line_of(fleet, "x")
     assert "disabled" in why
+    assert "x: cannot move to a position now, only by a distance or at a velocity" in switched_on.printed
+    assert switched_on.code == 1
 
 
 def test_a_drive_that_lost_power_has_lost_its_reference_and_a_reset_does_not_bring_it_back(monkeypatch):
