@@ -43,12 +43,6 @@ COPY = """(text) => {
   from.select();
 }"""
 FORGET = "() => document.getElementById('copied').remove()"
-PRESS = """(text) => {
-  const found = [...document.querySelectorAll("main button")].find((each) => each.textContent.trim() === text);
-  if (!found || found.getAttribute("aria-disabled")) return false;
-  found.click();
-  return true;
-}"""
 CHOOSE = """(label, option) => {
   const found = [...document.querySelectorAll("select")].find((each) => each.labels[0].textContent === label);
   const wanted = [...found?.options ?? []].find((each) => each.textContent === option);
@@ -96,8 +90,8 @@ async def ready(window, house):
     await house.sim.quiet("x")
     await house.sim.rig.command("x", SetPosition(position=0.0))
     await axis_page(window, house)
-    await until(window, PRESS, "Take control")
-    await until(window, PRESS, "Enable")
+    await until(window, windows.PRESS, "Take control")
+    await until(window, windows.PRESS, "Enable")
     await house.sim.until("x", lambda state: state.enabled)
     await until(window, windows.PRESSABLE, "+0.1 mm")
 

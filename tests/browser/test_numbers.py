@@ -64,12 +64,6 @@ CHOOSE = """(label, option) => {
   found.dispatchEvent(new Event("change", { bubbles: true }));
   return true;
 }"""
-PRESS = """(text) => {
-  const found = [...document.querySelectorAll("button")].find((each) => each.textContent.trim() === text);
-  if (!found || found.getAttribute("aria-disabled")) return false;
-  found.click();
-  return true;
-}"""
 TOLD = """(text) => {
   const story = document.querySelector(".story").textContent;
   return story.includes(text) && story.includes("settled");
@@ -118,7 +112,7 @@ async def go(window, house, place, choice):
     if isinstance(choice, tuple):
         await until(window, CHOOSE, *choice)
     elif choice:
-        await until(window, PRESS, choice)
+        await until(window, windows.PRESS, choice)
     await until(window, COUNT, None)
 
 
@@ -164,8 +158,8 @@ async def test_the_shaft_stands_where_the_text_says(house, window):
     await house.sim.quiet("x")
     await house.sim.rig.command("x", SetPosition(position=0.0))
     await go(window, house, "axis/sim/x", None)
-    await until(window, PRESS, "Take control")
-    await until(window, PRESS, "Enable")
+    await until(window, windows.PRESS, "Take control")
+    await until(window, windows.PRESS, "Enable")
     await house.sim.until("x", lambda state: state.enabled)
     labels = [each["label"] for each in await window.evaluate(READ, None)]
     at = labels.index("Position mm")

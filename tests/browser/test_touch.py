@@ -29,12 +29,6 @@ TO_JOG = """() => {
   found?.scrollIntoView({ block: "center" });
   return Boolean(found);
 }"""
-PRESS = """(text) => {
-  const found = [...document.querySelectorAll("main button")].find((each) => each.textContent.trim() === text);
-  if (!found || found.getAttribute("aria-disabled")) return false;
-  found.click();
-  return true;
-}"""
 
 
 async def ready(window, house):
@@ -42,8 +36,8 @@ async def ready(window, house):
     await house.sim.rig.command("x", SetPosition(position=0.0))
     await window.open(f"{house.url}/#/axis/sim/x")
     await window.reload()
-    await until(window, PRESS, "Take control")
-    await until(window, PRESS, "Enable")
+    await until(window, windows.PRESS, "Take control")
+    await until(window, windows.PRESS, "Enable")
     await house.sim.until("x", lambda state: state.enabled)
     await until(window, windows.PRESSABLE, "Hold to run + ▶")
     await until(window, TO_JOG)
@@ -70,7 +64,7 @@ async def test_a_second_finger_halts_a_motion_while_the_first_one_rests_on_the_p
     await ready(window, house)
     beside = await until(window, TITLE)
     try:
-        await until(window, PRESS, "+10 mm")
+        await until(window, windows.PRESS, "+10 mm")
         await house.sim.until("x", lambda state: state.moving == "yes")
         await window.touch(beside)
         await window.touch(beside, await until(window, PLACE, "Halt"))

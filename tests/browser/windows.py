@@ -13,7 +13,7 @@ from playwright.async_api import CDPSession, Page
 from tests.browser.house import House, console
 from tests.support.marionette import CONTROL, DELETE, ENTER, ESCAPE, SHIFT, TAB, Firefox, firefox, open_firefox
 
-__all__ = ["PRESSABLE", "Chromium", "Window", "console", "open_chromium", "open_gecko", "until"]
+__all__ = ["PRESS", "PRESSABLE", "Chromium", "Window", "console", "open_chromium", "open_gecko", "until"]
 PATIENCE_S = 45.0
 NAMED = {CONTROL: "Control", DELETE: "Delete", ENTER: "Enter", TAB: "Tab", ESCAPE: "Escape", SHIFT: "Shift"}
 
@@ -21,6 +21,13 @@ NAMED = {CONTROL: "Control", DELETE: "Delete", ENTER: "Enter", TAB: "Tab", ESCAP
 PRESSABLE = """(text) => [...document.querySelectorAll("main button")].some(
   (each) => each.textContent.trim() === text && !each.getAttribute("aria-disabled"))"""
 """Tells whether a button of the page can act, as it is drawn; a page is drawn a moment after the daemon has told."""
+PRESS = """(text) => {
+  const found = [...document.querySelectorAll("main button")].find((each) => each.textContent.trim() === text);
+  if (!found || found.getAttribute("aria-disabled")) return false;
+  found.click();
+  return true;
+}"""
+"""Presses it; tells whether it could."""
 
 
 class Chromium:
