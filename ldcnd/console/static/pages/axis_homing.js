@@ -37,7 +37,7 @@ export function HomePanel({ axis }) {
       ${field("Longest search", "s", "timeout_s")}
       ${field("Longest search", "position", "distance")}
     </div>
-    <p class="row"><${Action} act=${() => command(axis, "home", values)} of=${[JSON.stringify(values), axis.state?.state].join()} obstacle=${way} reason=${toHome}
+    <p class="row"><${Action} act=${() => command(axis, "home", values)} of=${[Object.entries(values), axis.state?.state].join()} obstacle=${way} reason=${toHome}
       kind="main">Home<//></p>
     ${way && html`<${Reason} id=${toHome} text=${way} />`}
     ${
