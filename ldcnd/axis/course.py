@@ -35,7 +35,7 @@ class Braking:
 
     Attributes:
         mode: how.
-        heard_at_s: when it was confirmed, in loop time.
+        acknowledged_at_s: when, in loop time.
         deceleration_counts_per_s2: that the drive holds for it; None while it is not known.
         from_counts: where the first reading after it has found the shaft; None before that.
         room_counts: how far from there it may go.
@@ -44,7 +44,7 @@ class Braking:
     """
 
     mode: StopMode
-    heard_at_s: float
+    acknowledged_at_s: float
     deceleration_counts_per_s2: float | None = None
     from_counts: int | None = None
     room_counts: float = math.inf
@@ -60,7 +60,7 @@ class Braking:
             driven_open: the motor may have voltage with its loop open, which no flag shows: a stop that holds closes
                 the loop, and of one that switches off only a shaft at rest shows that it was heard.
         """
-        if at_s < self.heard_at_s:
+        if at_s < self.acknowledged_at_s:
             return self
         if driven_open and not reading.enabled:
             return self._observe_open(reading.position_counts, at_s) if self.mode is StopMode.OFF else False
@@ -83,7 +83,7 @@ class Braking:
 
     def _observe_open(self, position: int, at_s: float) -> "Braking | bool":
         if abs(position - self.still_counts) > REST_COUNTS or math.isinf(self.still_since_s):
-            return at_s - self.heard_at_s < AGAIN_S and replace(self, still_counts=position, still_since_s=at_s)
+            return at_s - self.acknowledged_at_s < AGAIN_S and replace(self, still_counts=position, still_since_s=at_s)
         return True if at_s - self.still_since_s >= REST_S else self
 
     def _room_counts(self, reading: AxisReading) -> float:

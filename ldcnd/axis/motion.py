@@ -342,10 +342,16 @@ class AxisMotion:
         run_s = self.run_s(asked_s, plan.motion.velocity_counts_per_s)
         if asked_s is None and self.config.longest_run_s is None and self.limit_ahead(plan.velocity) is not None:
             run_s = math.inf  # the limit is its end
-        # what is asked for is time at the velocity: its two ramps together go as far as one of them would at it
-        ramp_s = 0.0 if asked_s is None else abs(plan.velocity) / plan.acceleration
-        end, at_limit = self.end_ahead(self.here, plan.velocity * (run_s + ramp_s))
+        end, at_limit = self.end_ahead(self.here, plan.velocity * (run_s + self.ramp_s(asked_s, plan)))
         return end, self.end_in_words(run_s, plan.velocity, at_limit=at_limit)
+
+    @staticmethod
+    def ramp_s(asked_s: float | None, plan: MotionPlan) -> float:
+        """Return what a duration at a velocity that was asked for lacks of the whole motion, seconds.
+
+        What is asked for is time at the velocity: both ramps together go as far as one of them lasts at it.
+        """
+        return 0.0 if asked_s is None else abs(plan.velocity) / plan.acceleration
 
     def end_in_words(self, run_s: float, velocity: float, *, at_limit: bool) -> str:
         """Return what ends a motion at a velocity that nobody stops; see `CommandReply.ends`."""

@@ -39,10 +39,10 @@ class VelocityChange(EndlessMotion):
         self.check_room(plan.velocity)
         await self.permit.load(plan.motion)
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
-        ramp_s = 0.0 if request.duration_s is None else abs(plan.velocity) / plan.acceleration
-        self._until_s = motion.clock.now_s() + min(run_s + ramp_s, COUNTER_SHARE * room_s)
+        last_s = run_s + motion.ramp_s(request.duration_s, plan)
+        self._until_s = motion.clock.now_s() + min(last_s, COUNTER_SHARE * room_s)
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        _, at_limit = motion.end_ahead(motion.here, plan.velocity * run_s)
+        _, at_limit = motion.end_ahead(motion.here, plan.velocity * last_s)
         ends = motion.end_in_words(run_s, plan.velocity, at_limit=at_limit)
         return motion.reply(self.permit, ends=ends, velocity=plan.velocity, acceleration=plan.acceleration)
 
