@@ -36,6 +36,7 @@ TEXTS = [
 ]
 MOVED = ("1.5", "1.05", "1,5", "0.05", "12.25", "-1.5", "−1,25", "1e1", ".5", "5.", "+2", "2.5 mm", "1500 um")  # noqa: RUF001
 REFUSED = ("1,234", "1.234,5", "1 2", "1.5 kg", "0x10", "NaN", "--5")
+TURNING = AxisUnits("deg", unit_table("deg", None, None, None, {}))
 SLIDE = AxisUnits("mm", unit_table("mm", None, None, None, {}))
 KEY_PAUSE_MS = 8
 FIELDS = "input[inputmode=decimal]"
@@ -121,7 +122,12 @@ def judge(field, text):
     if field["text"] != text:
         return f"{field['label']}: {text!r} became {field['text']!r}"
     try:
-        value = read_number(text, field["unit"]) if text.strip() else None
+        if not text.strip():
+            value = None
+        elif field["unit"] == "deg/s":  # of an axis that turns: rpm and rev/s are taken, too
+            value = read_quantity(text, TURNING, Dimension.VELOCITY)
+        else:
+            value = read_number(text, field["unit"])
     except NotANumber as error:
         quoted = (said.partition(" is not ")[0] for said in (field["refusal"], str(error)))  # units differ by the field
         right = field["invalid"] and len({*quoted}) == 1
