@@ -6,12 +6,19 @@ What a program keeps for itself is read by `read`, whatever has become of the fi
 import contextlib
 import os
 import stat
+from collections import defaultdict
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from threading import Lock
+from typing import BinaryIO, TypeVar
 from urllib.parse import quote
 
 KeptT = TypeVar("KeptT")
+BLOCK_BYTES = 4096
+_WRITING: defaultdict[Path, Lock] = defaultdict(Lock)
+"""Held by the thread that writes a draft."""
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_WRITING.clear)  # threads that hold one end with the fork
 
 
 class DamagedFile(ValueError):
@@ -67,19 +74,45 @@ def replace(path: Path, text: str) -> None:
     """
     path = Path(os.path.realpath(path))  # of a link to itself this is the link, which is replaced then
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f"{path.name}.new")
-    try:
-        with draft.open("w", encoding="utf-8") as file:
-            _give_the_rights_of(path, file.fileno())
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        draft.replace(path)
-    except OSError:
-        with contextlib.suppress(OSError):
-            draft.unlink(missing_ok=True)
-        raise
+    draft = _draft_of(path)
+    with _WRITING[draft]:
+        had_room = draft.exists()
+        try:
+            with _opened(draft) as file:
+                _give_the_rights_of(path, file.fileno())
+                file.write(text.encode())
+                file.truncate()
+                file.flush()
+                os.fsync(file.fileno())
+            draft.replace(path)
+        except OSError:
+            if not had_room:
+                with contextlib.suppress(OSError):
+                    draft.unlink(missing_ok=True)
+            raise
     _sync(path.parent)
+
+
+def keep_room(path: Path, size_bytes: int) -> None:
+    """Have room on the disk for the next text of a file, or what there is of it: a full disk takes that text, too."""
+    draft = _draft_of(Path(os.path.realpath(path)))
+    with _WRITING[draft], contextlib.suppress(OSError):
+        draft.parent.mkdir(parents=True, exist_ok=True)
+        with _opened(draft) as file:
+            file.seek(0, os.SEEK_END)
+            while (missing := size_bytes - file.tell()) > 0:
+                file.write(bytes(min(missing, BLOCK_BYTES)))
+                file.flush()
+            os.fsync(file.fileno())
+
+
+def _draft_of(path: Path) -> Path:
+    return path.with_name(f"{path.name}.new")
+
+
+def _opened(draft: Path) -> BinaryIO:
+    """Open a draft to be written from its beginning, without giving back the room that it has."""
+    return os.fdopen(os.open(draft, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666), "r+b")
 
 
 def remove(path: Path) -> None:

@@ -7,8 +7,9 @@ costs the reference, and a file never says more than was true when it was writte
 """
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, TypeVar
 
@@ -20,6 +21,9 @@ from ldcnd.drives.driver import StopMode
 FORMAT = 1
 DISK_TIME_S = 2.0
 """A disk that takes longer than this counts as failed."""
+LATCHES = "latches.json"
+LATCH_ROOM_BYTES = 16 * 1024
+"""Kept on the disk for latches that come once it is full: more than 30 axes in error_stop take."""
 ResultT = TypeVar("ResultT")
 
 
@@ -103,12 +107,16 @@ class KeptFiles:
 
     One thread writes them, so that they change in the order of the requests; the latches have one of their own, because
     the answer of a stop waits for them.
+
+    Attributes:
+        troubles: why files are not on the disk as they should be, by their names.
     """
 
     def __init__(self, directory: Path) -> None:
+        self.troubles: dict[str, str] = {}
         self._directory = directory
         self._worker = ThreadPoolExecutor(1, "kept files")
-        self._latches = directory / "latches.json"
+        self._latches = directory / LATCHES
         self._latch_worker = ThreadPoolExecutor(1, "kept latches")
 
     def latches(self) -> dict[str, KeptLatch]:
@@ -117,6 +125,7 @@ class KeptFiles:
         Raises:
             DamagedFile: they cannot be read, or make no sense.
         """
+        self._latch_worker.submit(durable.keep_room, self._latches, LATCH_ROOM_BYTES)
         kept = _read(self._latches, LatchFile)()
         return kept.axes if kept else {}
 
@@ -127,11 +136,9 @@ class KeptFiles:
             OSError: they cannot be written; what was kept before still is.
         """
         text = LatchFile(axes=latches).model_dump_json(exclude_defaults=True)
-        future = asyncio.get_running_loop().run_in_executor(
-            self._latch_worker, lambda: durable.replace(self._latches, text)
-        )
-        async with asyncio.timeout(DISK_TIME_S):
-            await asyncio.shield(future)
+        with self._noted(self._latches):
+            await self._in_thread(lambda: durable.replace(self._latches, text), self._latch_worker)
+        self._latch_worker.submit(durable.keep_room, self._latches, LATCH_ROOM_BYTES)
 
     async def reference(self, axis: str) -> KeptReference | None:
         """Return the reference that is kept of an axis; None without one.
@@ -149,7 +156,8 @@ class KeptFiles:
             OSError: it cannot be written; what was kept before still is.
         """
         path, text = self._path("references", axis), reference.model_dump_json()
-        await self._in_thread(lambda: durable.replace(path, text))
+        with self._noted(path):
+            await self._in_thread(lambda: durable.replace(path, text))
 
     async def remove_reference(self, axis: str) -> None:
         """Remove the reference of an axis; it has gone from the disk when this returns.
@@ -158,7 +166,8 @@ class KeptFiles:
             OSError: it cannot be removed.
         """
         path = self._path("references", axis)
-        await self._in_thread(lambda: durable.remove(path))
+        with self._noted(path):
+            await self._in_thread(lambda: durable.remove(path))
 
     async def faults(self, axis: str) -> tuple[PastFault, ...]:
         """Return the faults that are kept of an axis, oldest first.
@@ -177,15 +186,34 @@ class KeptFiles:
             OSError: they cannot be written.
         """
         path, text = self._path("faults", axis), FaultFile(faults=faults).model_dump_json()
-        await self._in_thread(lambda: durable.replace(path, text))
+        with self._noted(path):
+            await self._in_thread(lambda: durable.replace(path, text))
 
     def _path(self, what: str, axis: str) -> Path:
         return self._directory / what / f"{axis}.json"
 
-    async def _in_thread(self, work: Callable[[], ResultT]) -> ResultT:
-        future = asyncio.get_running_loop().run_in_executor(self._worker, work)
+    @contextmanager
+    def _noted(self, path: Path) -> Iterator[None]:
+        """Note why a file cannot be written, until it can."""
+        name = str(path.relative_to(self._directory))
+        try:
+            yield
+        except OSError as error:
+            self.troubles[name] = in_words(error)
+            raise
+        self.troubles.pop(name, None)
+
+    async def _in_thread(self, work: Callable[[], ResultT], worker: ThreadPoolExecutor | None = None) -> ResultT:
+        future = asyncio.get_running_loop().run_in_executor(worker or self._worker, work)
         async with asyncio.timeout(DISK_TIME_S):  # TimeoutError is an OSError
             return await asyncio.shield(future)
+
+
+def in_words(error: Exception) -> str:
+    """Return why a file could not be read or written."""
+    if isinstance(error, TimeoutError):
+        return "the disk does not answer"
+    return getattr(error, "strerror", None) or str(error)
 
 
 ModelT = TypeVar("ModelT", bound=Frozen)

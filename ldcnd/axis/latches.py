@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Callable, Mapping
 
 from ldcnd.axis.events import LatchRecalled
-from ldcnd.axis.kept import KeptFiles, KeptLatch
+from ldcnd.axis.kept import KeptFiles, KeptLatch, in_words
 from ldcnd.axis.status import AxisStatus
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.samples import AxisState
@@ -100,7 +100,7 @@ class LatchKeeper:
             try:
                 await files.keep_latches(now)
             except OSError as error:
-                trouble = "the disk does not answer" if isinstance(error, TimeoutError) else str(error)
+                trouble = in_words(error)
                 if trouble != self._trouble:
                     log.error("latches not kept: a restart of the daemon would lose them", reason=trouble)
                 self._trouble = trouble

@@ -11,7 +11,7 @@ import asyncio
 import contextlib
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.kept import FORMAT, KeptFiles, KeptReference, ReferenceEvidence
+from ldcnd.axis.kept import FORMAT, KeptFiles, KeptReference, ReferenceEvidence, in_words
 from ldcnd.axis.rest import window_counts
 from ldcnd.axis.status import AxisStatus, new_faults
 from ldcnd.axis.tracker import AxisTracker
@@ -127,11 +127,11 @@ class ReferenceKeeper:
             await self._files.remove_reference(self._config.name)
         except OSError as error:
             if await self._is_void_without(self._drive):
-                self._complain(f"reference not removed: {_words(error)}")
+                self._complain(f"reference not removed: {in_words(error)}")
                 self._kept = None
                 return
             raise WrongState(
-                f"axis {self._config.name}: the reference that is kept cannot be removed: {_words(error)}; the next"
+                f"axis {self._config.name}: the reference that is kept cannot be removed: {in_words(error)}; the next"
                 " start of the daemon would believe it",
                 axis=self._config.name,
                 remedy="make state_dir writable, or remove the file below it",
@@ -158,7 +158,7 @@ class ReferenceKeeper:
         try:
             kept = await files.faults(self._config.name)
         except (OSError, ValueError) as error:
-            log.warning("kept faults not read", axis=self._config.name, reason=_words(error))
+            log.warning("kept faults not read", axis=self._config.name, reason=in_words(error))
             return
         if not self.faults:
             self._faults_kept = len(kept)
@@ -184,7 +184,7 @@ class ReferenceKeeper:
         try:
             kept = await self._files.reference(self._config.name)
         except (OSError, ValueError) as error:
-            return None, f"it cannot be read: {_words(error)}"
+            return None, f"it cannot be read: {in_words(error)}"
         if kept is None:
             self._on_disk = False
             return None, ""
@@ -320,7 +320,7 @@ class ReferenceKeeper:
             await self._files.keep_reference(self._config.name, reference)
         except OSError as error:
             self._on_disk = was_there or isinstance(error, TimeoutError)  # then it may be written later
-            self._complain(f"reference not kept: {_words(error)}")
+            self._complain(f"reference not kept: {in_words(error)}")
             return
         self._trouble = ""
         if generation == self._generation:
@@ -342,7 +342,7 @@ class ReferenceKeeper:
         try:
             await self._files.keep_faults(self._config.name, faults)
         except OSError as error:
-            self._complain(f"faults not kept: {_words(error)}")
+            self._complain(f"faults not kept: {in_words(error)}")
         self._faults_kept = len(faults)
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
@@ -359,9 +359,3 @@ class ReferenceKeeper:
 
 def _scale_of(config: AxisConfig) -> tuple[float, str, float | None]:
     return (config.signed_counts_per_unit, config.unit, config.modulo)
-
-
-def _words(error: Exception) -> str:
-    if isinstance(error, TimeoutError):
-        return "the disk does not answer"
-    return getattr(error, "strerror", None) or str(error)

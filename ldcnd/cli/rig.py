@@ -64,6 +64,8 @@ def stop_rig(target: Target, axis: str | None) -> None:
             continue
         unconfirmed = sorted(set(reply.axes) - set(reply.confirmed))
         target.show(reply, f"{whose}stopped and latched: {', '.join(reply.confirmed) or 'none'}", rig=rig)
+        if reply.warning:
+            show_lines(f"{whose}{reply.warning}", err=True)
         if unconfirmed:
             codes.add(FAILED)
             names = ", ".join(unconfirmed)

@@ -279,6 +279,8 @@ class StopReply(Frozen):
     kept: tuple[str, ...] = ()
     """The axes whose latch is on the disk of the daemon: it outlasts a restart. The others lose it when the daemon
     ends: none is kept without a `state_dir`."""
+    warning: str = ""
+    """That the latches cannot be written to the `state_dir`, and why, for a person; empty where they are."""
 
 
 class RemedyStep(Frozen):

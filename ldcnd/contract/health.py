@@ -168,6 +168,8 @@ class DaemonHealth(Frozen):
     """Queries that have no answer yet: questions, commands and stops."""
     dropped: int = Field(default=0, ge=0)
     """Queries that were refused for being too many, and lost changes of clients' presence, since the daemon started."""
+    not_kept: tuple[str, ...] = ()
+    """Files of the `state_dir` that cannot be written, each with the reason: what they hold is lost with the daemon."""
     heartbeat: HeartbeatHealth | None = None
     """The heartbeat; None where none is configured."""
     version: str = ""

@@ -13,6 +13,7 @@ from functools import partial
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.events import StopLatch
+from ldcnd.axis.kept import LATCHES
 from ldcnd.axis.permit import UNCONDITIONAL, Permit, Right
 from ldcnd.config.interlocks import InterlockConfig
 from ldcnd.contract.catalogue import BY_VERB, RENAMED
@@ -245,7 +246,9 @@ class Requests:
             log.exception("stop not recorded", key=query.key)  # it is carried out all the same
         confirmed = await self._stop_once(names, query)
         kept = tuple(each for each in names if self._rig.axes[each].stops.latch_is_kept)
-        return StopReply(axes=names, confirmed=confirmed, kept=kept)
+        trouble = self._rig.not_kept.get(LATCHES)
+        warning = f"The latch is not on the disk ({trouble}): it is lost when the daemon ends." if trouble else ""
+        return StopReply(axes=names, confirmed=confirmed, kept=kept, warning=warning)
 
     async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
         """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.

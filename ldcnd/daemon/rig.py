@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import TypeVar
 
 from ldcnd.config.ports import GuestView
@@ -41,6 +42,7 @@ class OwnedRig:
         axes: by name; raises `UnknownAxis` for another one.
         lines: by name; raises `ValueOutOfRange` for another one.
         modules: the I/O modules by name; likewise.
+        not_kept: why files of the state directory cannot be written, by name.
     """
 
     def __init__(
@@ -49,8 +51,10 @@ class OwnedRig:
         buses: tuple[BusService, ...],
         groups: Mapping[str, tuple[str, ...]],
         modules: tuple[ModuleService, ...] = (),
+        not_kept: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         self.name = name
+        self.not_kept = not_kept
         self.buses = buses
         self.groups = groups
         self.axes = Named(

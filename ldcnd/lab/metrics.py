@@ -107,13 +107,15 @@ class HealthCollector(Collector):
         missed = CounterMetricFamily("ldcnd_missed_reports", "Health reports that were left out", labels=["rig"])
         waiting = GaugeMetricFamily("ldcnd_waiting_queries", "Queries without an answer yet", labels=["rig"])
         dropped = CounterMetricFamily("ldcnd_dropped", "Queries refused for being too many, news lost", labels=["rig"])
+        lost = GaugeMetricFamily("ldcnd_files_not_kept", "State files that cannot be written", labels=["rig"])
         if daemon:
+            lost.add_metric([self._rig], len(daemon.not_kept))
             lag.add_metric([self._rig], daemon.loop_lag_s)
             published.add_metric([self._rig], daemon.published)
             missed.add_metric([self._rig], daemon.missed_reports)
             waiting.add_metric([self._rig], daemon.waiting_queries)
             dropped.add_metric([self._rig], daemon.dropped)
-        yield from (lag, published, missed, waiting, dropped)
+        yield from (lag, published, missed, waiting, dropped, lost)
 
     def _of_buses(self, buses: list[BusHealth]) -> Iterator[Metric]:
         labels = ["rig", "bus"]

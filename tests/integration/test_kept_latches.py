@@ -17,6 +17,7 @@ from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.power import FaultCondition
 from tests.integration.test_kept_references import chain_of, keeping
 from tests.support.chain_rig import ChainRig, drive, rig_on
+from tests.support.small_disk import fill, small_disk
 
 pytestmark = pytest.mark.promise("latch-outlasts-daemon")
 AXES = ("x", "y", "z", "c")
@@ -217,6 +218,24 @@ async def test_without_a_place_for_it_the_answer_says_that_the_latch_ends_with_t
 
     assert (set(reply.confirmed), reply.kept) == (set(AXES), ())
     assert not state.stop_latched
+
+
+async def test_a_stop_on_a_full_disk_outlasts_a_killed_daemon(tmp_path):
+    """Nothing else is kept there then; what is not is said in the health report."""
+    with small_disk(tmp_path / "state", 256 * 1024) as disk:
+        chain, config = chain_of(), keeping(disk)
+        async with rig_on(chain, config) as rig:
+            await jogging(rig)
+            fill(disk)
+            replies = [await rig.client.stop(axis) for axis in ("x", "y")]
+            await settled(rig)
+            await rig.kill()
+        async with rig_on(chain, config) as rig:
+            await up(rig)
+            latched = [await refused_motion(rig, axis) for axis in ("x", "y")]
+
+    assert [(reply.kept, reply.warning) for reply in replies] == [(("x",), ""), (("y",), "")]
+    assert latched == [["stop_latched"] * 3] * 2
 
 
 async def test_a_disk_that_fails_delays_no_stop_and_the_answer_says_so(tmp_path, monkeypatch):

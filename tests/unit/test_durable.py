@@ -2,7 +2,10 @@
 
 import stat
 
+import pytest
+
 from ldcnd import durable
+from tests.support.small_disk import fill, small_disk
 
 
 def test_a_replaced_file_keeps_who_may_read_it_and_the_link_to_it(tmp_path):
@@ -25,3 +28,21 @@ def test_a_new_file_is_made_with_its_folder(tmp_path):
     durable.replace(file, "new")
 
     assert file.read_text() == "new"
+
+
+def test_a_full_disk_takes_text_after_text_of_a_file_that_room_was_kept_for(tmp_path):
+    with small_disk(tmp_path / "disk", 128 * 1024) as disk:
+        file = disk / "latches.json"
+        durable.keep_room(file, 16 * 1024)
+        fill(disk)
+        texts = [f"{at} " * 2000 for at in range(5)]
+        read = []
+        for text in texts:
+            durable.replace(file, text)
+            durable.keep_room(file, 16 * 1024)
+            read.append(file.read_text())
+        with pytest.raises(OSError, match="No space"):
+            durable.replace(disk / "other.json", "new")
+
+        assert read == texts
+        assert not (disk / "other.json.new").exists()

@@ -148,4 +148,4 @@ def _stopped(reply: StopReply) -> str:
             f"STOP NOT CONFIRMED BY {', '.join(missing)}: nothing else starts, but use the machine's emergency stop."
             f" Confirmed by {', '.join(reply.confirmed) or 'none'}."
         )
-    return f"stopped and latched: {', '.join(reply.confirmed)}"
+    return f"stopped and latched: {', '.join(reply.confirmed)}{reply.warning and f'. {reply.warning}'}"

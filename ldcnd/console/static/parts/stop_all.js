@@ -72,12 +72,13 @@ function isNews({ answered }) {
 function outcome(rig, reply) {
   if (!reply.axes) return { level: "bad", text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.` };
   const missing = reply.axes.filter((axis) => !reply.confirmed.includes(axis));
+  const warning = reply.warning ? ` ${reply.warning}` : "";
   const confirmed = reply.confirmed.length ? `confirmed by ${reply.confirmed.join(", ")}` : "confirmed by no drive";
-  if (!missing.length) return { answered: rig, level: "", text: `${rig}: stop latched; ${confirmed}.` };
+  if (!missing.length) return { answered: rig, level: warning && "warn", text: `${rig}: stop latched; ${confirmed}.${warning}` };
   return {
     answered: rig,
     level: "bad",
-    text: `${rig}: NOT confirmed by ${missing.join(", ")}; ${confirmed}. The latch holds; look at the machine.`,
+    text: `${rig}: NOT confirmed by ${missing.join(", ")}; ${confirmed}. The latch holds; look at the machine.${warning}`,
   };
 }
 
