@@ -15,6 +15,9 @@ OUT ?= dist
 run: $(if $(wildcard .venv/ready),.venv/ready,.venv/small)
 	.venv/bin/ldcnd run --config $(CONFIG) --console $(ARGS)
 
+# every process that a test starts would compile all sources again
+unexport PYTHONDONTWRITEBYTECODE
+
 # side by side: the checks leave one processor idle
 test: .venv/ready
 	$(MAKE) --no-print-directory -j 2 check tests
@@ -22,9 +25,9 @@ test: .venv/ready
 tests: .venv/ready
 	$(PY) -m pytest -n 3 --dist worksteal
 
-# whole programs as people run them: browsers, systemd, packages, pages to the letter; a quarter of an hour
+# what takes long, and whole programs as people run them: browsers, systemd, packages, pages to the letter; half an hour
 test-system: .venv/ready
-	$(PY) -m pytest -m "system and not alone" -n 2 --dist worksteal --timeout 240
+	$(PY) -m pytest -m "(system or long) and not alone" -n 2 --dist worksteal --timeout 240
 	$(PY) -m pytest -m alone
 
 check: .venv/ready

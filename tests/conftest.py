@@ -4,6 +4,7 @@ import asyncio
 import re
 import signal
 import sys
+from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 
@@ -81,9 +82,19 @@ def pytest_asyncio_loop_factories(
     return {"jumping": JumpingLoop}
 
 
+@pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Have every test that runs on a loop looked at; a loop for each of the thousands of others costs ten seconds."""
+    """Mark as long what is left out of a sweep, before tests are chosen by their marks.
+
+    Have every test that runs on a loop looked at; a loop for each of the thousands of others costs ten seconds.
+    """
+    rows = Counter[tuple[Path, str]]()
     for item in items:
+        if (sweep := item.get_closest_marker("sweep")) and not item.get_closest_marker("soak"):
+            function = item.path, item.nodeid.partition("[")[0]
+            if rows[function] % sweep.args[0]:
+                item.add_marker(pytest.mark.long)
+            rows[function] += 1
         if is_async_test(item) and no_task_is_left.__name__ not in item.fixturenames:
             item.fixturenames.insert(0, no_task_is_left.__name__)
 

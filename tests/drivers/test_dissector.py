@@ -81,6 +81,7 @@ def statuses(capture: Capture) -> dict[int, tuple[int, StatusPacket]]:
 @needs_tshark
 @pytest.mark.real_time
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.sweep(2)
 def test_every_status_says_what_our_own_decoder_says(name: str, tmp_path: Path):
     capture = kept(name)
 

@@ -55,6 +55,7 @@ async def examined(chain: Chain, holding: Holding = AT_ONCE) -> dict[str, Findin
     ],
     ids=["at once", "FTDI 1 ms", "FTDI 16 ms", "16550A"],
 )
+@pytest.mark.sweep(2)
 async def test_latency_of_an_adapter_is_measured_and_proposed(holding, least_ms, most_ms):
     found = await examined(await addressed_chain(), holding)
 

@@ -101,6 +101,7 @@ def random_chain(dice: random.Random) -> tuple[Chain, dict[int, tuple[str, int, 
 
 
 @pytest.mark.parametrize("seed", [*range(10), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(10, 40))])
+@pytest.mark.sweep(2)
 async def test_a_chain_in_any_state_is_told_as_it_is_and_left_as_it_was(seed):
     dice = random.Random(seed)
     chain, expected, waiting = random_chain(dice)

@@ -125,6 +125,7 @@ async def unplug(times: int, seed: int, policy: str) -> None:
 
 
 @pytest.mark.parametrize("policy", ["halt", "run_to_target"])
+@pytest.mark.sweep(2)
 async def test_a_rig_survives_a_plug_that_is_pulled_at_any_instant(policy):
     await unplug(times=8, seed=20, policy=policy)
 

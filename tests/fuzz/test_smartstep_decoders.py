@@ -60,6 +60,7 @@ any_bytes = st.binary(max_size=60) | almost_packets() | almost_packets().map(lam
 
 
 @pytest.mark.parametrize("exchange", EXCHANGES, ids=lambda exchange: exchange.request.decode("ascii").strip())
+@pytest.mark.sweep(2)
 def test_exchanges_take_any_bytes(exchange):
     @given(any_bytes)
     def take(data: bytes) -> None:

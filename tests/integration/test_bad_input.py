@@ -104,6 +104,7 @@ async def ask(rig: RunningRig, key: str, payload: bytes, encoding: str) -> dict[
         (f"{X}/reset", b" " * (MAX_PAYLOAD_BYTES + 1), "application/json", "payload_too_large", ["16384"]),
     ],
 )
+@pytest.mark.sweep(3)
 async def test_bad_input_gets_one_typed_error_and_nothing_reaches_the_wire(key, payload, encoding, code, words):
     async with running_rig() as rig:
         await rig.until("x", lambda state: state.link == "up")

@@ -434,6 +434,7 @@ SUSPENDERS = {
 
 @pytest.mark.filterwarnings("ignore:SuspendInBand has been renamed", "ignore:bluesky.suspenders.SuspendOutBand")
 @pytest.mark.parametrize("kind", SUSPENDERS)
+@pytest.mark.sweep(7)
 def test_a_plan_is_suspended_while_another_axis_turns(lab: Laboratory, capsys, kind: str):
     async def turn():
         await lab.running.until("x", lambda state: state.moving is Moving.YES)
@@ -674,6 +675,7 @@ def test_an_aborted_plan_halts_without_the_latch(lab: Laboratory):
 @pytest.mark.parametrize("ending", ["resume", "abort", "stop"])
 @pytest.mark.parametrize("several", [False, True])
 @pytest.mark.parametrize("checkpoint", ["before prepare", "before kickoff"])
+@pytest.mark.sweep(5)
 def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes_on(
     lab: Laboratory, several, checkpoint, ending
 ):

@@ -107,6 +107,7 @@ async def waiting_behind_a_long_move(rig: RunningRig) -> tuple[str, CommandReply
     return first, await rig.client.command("x", MoveAbsolute(position=2.0, buffer_mode=BufferMode.BUFFERED))
 
 
+@pytest.mark.long
 async def test_a_move_behind_a_long_one_is_answered_at_once_and_its_end_is_waited_for():
     async with running_rig() as rig:
         began_s = asyncio.get_running_loop().time()
@@ -121,6 +122,7 @@ async def test_a_move_behind_a_long_one_is_answered_at_once_and_its_end_is_waite
         assert await position_of(rig) == pytest.approx(2.0, abs=0.0011)
 
 
+@pytest.mark.long
 async def test_a_bare_query_that_is_short_of_time_has_its_answer_before_anything_begins():
     async with running_rig() as rig:
         first, _ = await waiting_behind_a_long_move(rig)
@@ -135,6 +137,7 @@ async def test_a_bare_query_that_is_short_of_time_has_its_answer_before_anything
         assert await position_of(rig) == pytest.approx(4.0, abs=0.0011)
 
 
+@pytest.mark.long
 async def test_a_halt_withdraws_what_waits():
     async with running_rig() as rig:
         _, waiting = await waiting_behind_a_long_move(rig)
@@ -150,6 +153,7 @@ async def test_a_halt_withdraws_what_waits():
         assert await position_of(rig) == pytest.approx(halted_at, abs=0.0011)
 
 
+@pytest.mark.long
 async def test_a_program_that_gives_up_its_wait_leaves_nothing_that_begins_later():
     async with controlled() as (rig, x):
         await x.power(on=True)
@@ -168,6 +172,7 @@ async def test_a_program_that_gives_up_its_wait_leaves_nothing_that_begins_later
         assert await position_of(rig) == pytest.approx(given_up_at, abs=0.0011)
 
 
+@pytest.mark.long
 async def test_a_program_waits_for_as_long_as_what_it_waits_behind_takes():
     async with controlled() as (_, x):
         await x.power(on=True)
@@ -234,6 +239,7 @@ async def test_an_aborting_move_on_a_standing_axis_is_like_any_other():
         assert (await rig.client.state("x")).state is AxisState.CONTINUOUS_MOTION
 
 
+@pytest.mark.long
 def test_the_command_line_waits_for_as_long_as_what_it_waits_behind_takes(monkeypatch):
     with virtual_rig(monkeypatch) as here:
         here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))

@@ -180,6 +180,7 @@ def test_each_row_is_asked_below():
 
 
 @pytest.mark.parametrize("row", NEEDS)
+@pytest.mark.sweep(3)
 def test_what_a_row_forbids_happens_only_without_it(row):
     assert not operated(NEEDS[row])
     assert operated(NEEDS[row], without=row)
@@ -235,6 +236,7 @@ STATES += (open_door_jams_before_its_bolt, door_jams_half_way_before_its_bolt)
 @pytest.mark.parametrize("wire", WIRES)
 @pytest.mark.parametrize("how", BREAKS)
 @pytest.mark.parametrize("state", STATES, ids=lambda each: each.__name__)
+@pytest.mark.sweep(26)
 def test_no_wire_that_breaks_lets_the_rotor_turn_with_an_open_door_or_a_drawn_bolt(state, how, wire):
     async def breaks(machine):
         await state(machine)
@@ -252,6 +254,7 @@ def test_no_wire_that_breaks_lets_the_rotor_turn_with_an_open_door_or_a_drawn_bo
 
 @pytest.mark.parametrize("wire", WIRES)
 @pytest.mark.parametrize("how", BREAKS)
+@pytest.mark.sweep(9)
 def test_the_sequence_that_shuts_the_door_does_not_let_a_broken_wire_tell_it_that_it_has(how, wire):
     async def program():
         async with simulated_rig(CENTRIFUGE) as rig:
@@ -283,6 +286,7 @@ def test_the_sequence_that_shuts_the_door_shuts_it_where_no_wire_breaks():
 
 
 @pytest.mark.parametrize("wire", WIRES)
+@pytest.mark.sweep(3)
 def test_a_wire_that_is_cut_in_a_spin_brings_the_rotor_to_rest_behind_the_locked_door(wire):
     async def falls_out(machine):
         motion = await machine.spin()

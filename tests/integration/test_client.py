@@ -252,6 +252,7 @@ async def test_an_unknown_axis_is_named_with_those_that_there_are():
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_the_first_program_runs(tmp_path: Path):
     program = """
         import asyncio, ldcnd
@@ -370,6 +371,7 @@ async def first_event(rig: Rig) -> ldcnd.CommandEvent:
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_a_program_waits_for_a_daemon_that_starts_and_may_leave_it_open():
     endpoint = free_endpoint()
     program = """

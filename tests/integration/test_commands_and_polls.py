@@ -11,6 +11,7 @@ SECONDS = 1.0
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("drives", CROWDS)
+@pytest.mark.sweep(4)
 def test_commands_for_half_of_the_time_leave_every_axis_a_poll_in_two_rounds(order, drives):
     seen = shared(order, drives, Load.HALF, SECONDS)
 
@@ -21,6 +22,7 @@ def test_commands_for_half_of_the_time_leave_every_axis_a_poll_in_two_rounds(ord
 
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("drives", CROWDS)
+@pytest.mark.sweep(4)
 def test_commands_that_always_wait_leave_every_axis_a_poll_in_two_rounds(order, drives):
     seen = shared(order, drives, Load.FULL, SECONDS)
 

@@ -62,6 +62,7 @@ def test_nothing_that_moves_is_sent_before_the_confirmation(rig, config):
     assert MOVING & set(sent(rig)[before + len(shown) :])
 
 
+@pytest.mark.long
 def test_all_steps_are_gone_through_and_the_change_is_shown_and_written(rig, config, tmp_path):
     typed = "\n".join(
         [

@@ -95,6 +95,7 @@ async def test_a_reversed_motor_is_caught_within_the_stated_distance(direction, 
 
 @pytest.mark.parametrize("count", [2, pytest.param(60, marks=SOAK)])
 @pytest.mark.parametrize("wrong", ["", "motor_reversed", "encoder_disconnected"])
+@pytest.mark.sweep(3)
 async def test_drawn_machines_stay_near_whatever_is_wrong_with_their_wires(wrong, count, tmp_path):
     for drawn in drawn_plants(SEED, count):
         machine = dict(drawn.motor)
@@ -127,6 +128,7 @@ def is_seen_to_move(rig):
 
 
 @pytest.mark.parametrize("wired", [("x", "y"), ("y", "x")])
+@pytest.mark.sweep(2)
 async def test_a_chain_that_is_numbered_from_the_other_end_is_noticed_when_the_first_axis_moves(wired, tmp_path):
     x = rig_text().partition("[[bus.axis]]")[2].partition("[[sim]]")[0]
     y = x.replace('"x" # the slide', '"y"').replace("address = 1", "address = 2")
@@ -142,6 +144,7 @@ async def test_a_chain_that_is_numbered_from_the_other_end_is_noticed_when_the_f
         assert ("exchange the addresses" in kept.result.text) is not right
 
 
+@pytest.mark.long
 async def test_a_motor_with_friction_is_driven_with_little_more_than_that(tmp_path):
     async with commissioning_rig(tmp_path, STANDS, friction_nm=0.05) as rig:
         kept = await (await rig.checklist()).run("motor")
@@ -162,6 +165,7 @@ async def test_no_more_output_is_tried_once_the_axis_moved_without_counts(tmp_pa
         assert await rig.registers() == GAINS
 
 
+@pytest.mark.long
 async def test_a_motor_that_stands_is_said_to_stand(tmp_path):
     async with commissioning_rig(tmp_path, STANDS) as rig:
         rig.drive.shaft.stalled = True
@@ -285,6 +289,7 @@ def recorded_requests(chain):
 
 @pytest.mark.parametrize("powered", [False, True], ids=["open", "closed"])
 @pytest.mark.parametrize("step", MOVING)
+@pytest.mark.sweep(2)
 async def test_a_step_that_is_refused_control_sends_nothing_and_leaves_the_record_as_it_was(step, powered, tmp_path):
     async with commissioning_rig(tmp_path, ALL_ANSWERS) as rig:
         checklist = await rig.checklist()
@@ -397,6 +402,7 @@ def in_pwm(motor):
 
 
 @pytest.mark.parametrize(("direction", "pulls"), [("forward", -3.2), ("reverse", -3.2), ("forward", 4.4)])
+@pytest.mark.sweep(3)
 async def test_the_output_at_rest_tells_friction_and_load(direction, pulls, tmp_path):
     nm = PLANT.torque_nm_per_a * PLANT.supply_v / PLANT.resistance_ohm / 255
     text = rig_text(direction=direction)
@@ -452,6 +458,7 @@ async def braked_without_power(rig):
 
 
 @pytest.mark.parametrize("count", [2, pytest.param(20, marks=SOAK)])
+@pytest.mark.long
 async def test_friction_and_load_of_drawn_machines_are_measured(count, tmp_path):
     hanging = [drawn for drawn in drawn_plants(SEED, 5 * count) if drawn.motor.load_nm][:count]
     off = []
@@ -472,6 +479,7 @@ async def test_friction_and_load_of_drawn_machines_are_measured(count, tmp_path)
     assert max(map(abs, off)) < 1.0
 
 
+@pytest.mark.long
 async def test_an_axis_that_a_brake_holds_is_said_not_to_follow(tmp_path):
     async with commissioning_rig(tmp_path) as rig:
         rig.drive.shaft.stalled = True

@@ -123,6 +123,7 @@ async def test_a_stop_overtakes_the_commands_before_it(console):
         (f"{X}/read_alarms", b"{}", 409, "not_supported"),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_what_cannot_be_done_is_refused_in_the_public_form(console, path, body, status, code):
     answer = await console.browser.post(path, body)
 

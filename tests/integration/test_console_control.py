@@ -51,6 +51,7 @@ async def test_a_page_that_goes_halts_what_it_moved_and_gives_up_control(console
     assert await holder(console, "x") is None
 
 
+@pytest.mark.long
 async def test_control_lasts_in_a_page_that_says_nothing(console):
     async with open_page(console.app, console.browser) as page:
         await page.take("sim", "x")

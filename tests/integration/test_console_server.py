@@ -86,6 +86,7 @@ async def test_a_page_that_never_reads_delays_nobody_and_the_console_ends_withou
     assert not capfd.readouterr().err
 
 
+@pytest.mark.long
 async def test_another_link_is_given_without_stopping_anything():
     async with console("-e", f"tcp/127.0.0.1:{free_port()}") as running:
         port = urlsplit(running.link).port
@@ -117,6 +118,7 @@ async def link_of(listen):
     return asked.returncode, (printed + complaint).decode()
 
 
+@pytest.mark.long
 async def test_of_two_consoles_on_one_port_the_link_is_that_of_the_address_asked_for():
     port, nowhere = free_port(), f"tcp/127.0.0.1:{free_port()}"
     async with AsyncExitStack() as stack:
@@ -212,6 +214,7 @@ async def test_tls_and_a_token_let_in_whoever_has_it_and_cookies_stay_inside_tls
     assert (stopped.status, plain.status) == (200, 403)
 
 
+@pytest.mark.long
 async def test_what_cannot_be_served_or_would_let_strangers_in_is_refused_with_the_reason():
     taken = socket.create_server(("127.0.0.1", 0))
     with taken:

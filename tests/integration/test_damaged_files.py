@@ -79,6 +79,7 @@ def config(folder: Path):
 
 
 @EVERY
+@pytest.mark.sweep(5)
 def test_a_rig_whose_kept_files_are_damaged_starts_and_lacks_what_they_held(
     monkeypatch, tmp_path, kept, damage, capsys
 ):

@@ -3,6 +3,8 @@
 import asyncio
 from itertools import pairwise
 
+import pytest
+
 from ldcnd.contract.commands import Power, Why
 from ldcnd.contract.samples import LinkState
 from ldcnd.line.flight_recorder import WireEvent
@@ -25,6 +27,7 @@ def lost_s(records):
     return records[-1].at_s - records[0].at_s - busy_s
 
 
+@pytest.mark.long
 async def test_a_dead_drive_costs_the_others_two_percent_at_most_and_is_found_when_it_is_back():
     chain = build_chain(ChainSpec((ModuleSpec("ls182ap"),) * DRIVES))
     last, loop = f"a{DRIVES}", asyncio.get_running_loop()

@@ -100,6 +100,7 @@ NONSENSE = {"no object": b"[1]", "no text": b"\xff\xfe", "words": b"now!", "null
 
 
 @pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.sweep(3)
 async def test_what_would_have_another_command_refused_has_no_say(verb):
     async with leased_rig() as (rig, chain, lease):
         await rig.client.command("x", SetGains(kp=300, lease=lease, sequence=5, command_id="taken"))
@@ -112,6 +113,7 @@ async def test_what_would_have_another_command_refused_has_no_say(verb):
 
 
 @pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.sweep(5)
 async def test_what_is_wrong_with_a_request_is_told_after_it_was_carried_out(verb):
     async with leased_rig() as (rig, chain, lease):
         flaws = FLAWS | (NONSENSE if verb != "power" else {"a word": {"on": "off"}, "a number": {"on": 0}})
@@ -129,6 +131,7 @@ async def test_what_is_wrong_with_a_request_is_told_after_it_was_carried_out(ver
 
 
 @pytest.mark.parametrize("on", [True, 1, "on", "yes", None, "?", [], {}])
+@pytest.mark.sweep(2)
 async def test_power_that_does_not_mean_off_switches_nothing(on):
     async with leased_rig() as (rig, chain, lease):
         await run(rig, lease)
@@ -140,6 +143,7 @@ async def test_power_that_does_not_mean_off_switches_nothing(on):
 
 
 @pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.sweep(2)
 async def test_neither_another_daemon_nor_a_flood_nor_a_line_that_is_busy_is_in_the_way(verb):
     off = {"on": False} if verb == "power" else {}
     async with leased_rig() as (rig, chain, lease):
@@ -170,6 +174,7 @@ async def test_neither_another_daemon_nor_a_flood_nor_a_line_that_is_busy_is_in_
     [Halt(), Stop(), QuickStop(), Power(on=False), None],
     ids=["halt", "stop", "quick_stop", "power", "@stop"],
 )
+@pytest.mark.sweep(3)
 async def test_it_reaches_the_one_of_two_daemons_that_has_the_line(command):
     chain, run_on = chain_of(), {"loss": {"bus": "run_to_target"}}
     async with rig_on(chain, simulated_config(run_on)) as rig, rig.broker.session() as session:

@@ -103,6 +103,7 @@ async def test_a_jog_runs_until_it_is_released():
 
 
 @pytest.mark.parametrize("ending", ["client gone", "STOP", "SPMG", "JOGR", "stop from elsewhere"])
+@pytest.mark.sweep(2)
 async def test_a_jog_ends_with_whatever_may_have_held_it(ending: str):
     async with records() as (running, made):
         connected = {"screen", "archiver"}
@@ -152,6 +153,7 @@ async def test_an_axis_that_another_program_controls_is_switched_off_by_a_put():
 
 @pytest.mark.record("HLS", "it and LLS are those of the user's directions, and bits 3 and 14 of MSTA")
 @pytest.mark.parametrize("direction", ["forward", "reverse"])
+@pytest.mark.sweep(2)
 async def test_a_limit_switch_shows_at_the_end_of_the_axis_where_it_is(direction: str):
     async with dialect_rig(LS_182AP, limit_switches="stop", direction=direction) as drive:
         rig = Rig(drive.rig.client, await drive.rig.client.daemon())
@@ -296,6 +298,7 @@ async def test_spmg_halts_and_refuses_and_go_starts_nothing():
 
 
 @pytest.mark.parametrize(("field", "value"), [("STOP", 1), ("SPMG", "Pause"), ("SPMG", "Stop")])
+@pytest.mark.sweep(2)
 async def test_a_move_that_waits_for_the_end_of_a_jog_does_not_begin_after_a_stop(field: str, value: float | str):
     async with records() as (running, made):
         await put(made, "T:x.JVEL", 2.0)
@@ -364,6 +367,7 @@ async def test_a_put_that_says_where_the_motor_is_returns_when_the_record_shows_
     "STOP", "when the motor has stopped, VAL is RBV, as after Stop in SPMG, a jog, and what another program did"
 )
 @pytest.mark.parametrize("ending", ["STOP", "SPMG", "jog", "stop from elsewhere", "another program", "power"])
+@pytest.mark.sweep(2)
 async def test_a_relative_move_begins_where_the_axis_is_whatever_has_moved_or_stopped_it(ending: str):
     async with records() as (running, made):
         moving = asyncio.create_task(put(made, "T:x", 50.0))
@@ -407,6 +411,7 @@ async def test_a_relative_move_begins_where_the_axis_is_whatever_has_moved_or_st
 @pytest.mark.parametrize(
     ("step", "count", "pause_s"), [(0.1, 50, 0.0), (0.1, 20, 0.02), (1.0, 6, 0.03), (0.002, 20, 0.001)]
 )
+@pytest.mark.sweep(2)
 async def test_no_tweak_is_lost_however_quick_they_are(step: float, count: int, pause_s: float):
     async with records() as (running, made):
         await put(made, "T:x.TWV", step)
@@ -456,6 +461,7 @@ async def test_a_daemon_that_says_nothing_leaves_no_axis_that_has_arrived():
         assert made.variables["T:x.RBV"].severity == AlarmSeverity.INVALID_ALARM
 
 
+@pytest.mark.long
 async def test_an_axis_of_a_gateway_that_idles_can_be_reset_by_others():
     async with records() as (running, made):
         await put(made, "T:x", 2.0)
@@ -498,6 +504,7 @@ async def test_a_latch_is_cleared_by_a_put_and_nothing_moves():
 
 @pytest.mark.parametrize("starting", ["VAL", "TWF", "JOGF", "HOMF"])
 @pytest.mark.parametrize("ending", ["STOP", "SPMG", "release"])
+@pytest.mark.sweep(12)
 async def test_what_is_halted_while_control_is_on_its_way_does_not_begin(starting: str, ending: str):
     async with records() as (running, made):
         await put(made, "T:x.HVEL", 1.0)

@@ -33,6 +33,7 @@ def chain(seed: int) -> Chain:
 
 @pytest.mark.promise("reading-judged")
 @pytest.mark.parametrize("seed", [1, 2, 4, 26])
+@pytest.mark.sweep(4)
 async def test_of_a_standing_rig_no_false_position_and_no_false_fault_is_published(seed: int):
     async with running_rig(rig_config(), {"line0": chain(seed)}) as rig:
         published: list[PositionSample] = []

@@ -142,6 +142,7 @@ async def stopped_after(rig: DialectRig, condition: FaultCondition) -> None:
     [(LS_182AP, condition) for condition in LATCHED] + [(each, FaultCondition.STALLED) for each in DIALECTS],
     ids=lambda each: each.name.lower(),
 )
+@pytest.mark.sweep(2)
 async def test_one_reset_is_enough_for_a_tripped_drive_that_was_stopped_and_taken_over(dialect, condition):
     async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
         await stopped_after(rig, condition)

@@ -69,6 +69,7 @@ def codes(sample):
         (FaultCondition.ENCODER_LOSS, FaultCode.ENCODER_OR_HALL),
     ],
 )
+@pytest.mark.sweep(3)
 async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(dialect, condition, code):
     lost = code is FaultCode.ENCODER_OR_HALL
     async with dialect_rig(dialect) as rig:
@@ -135,6 +136,7 @@ async def test_what_is_wrong_with_the_power_driver_off_is_named(dialect, conditi
 
 
 @named(DIALECTS)
+@pytest.mark.sweep(2)
 async def test_a_jam_ends_in_a_position_error(dialect):
     async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
         await rig.power_on()

@@ -199,6 +199,7 @@ def commanded(chain, names="xy"):
 
 @pytest.mark.promise("line-all-or-none")
 @pytest.mark.parametrize("velocity", [1.0, 10.0, 20.0])
+@pytest.mark.sweep(2)
 async def test_axes_on_a_line_leave_it_by_no_more_than_was_said_before(velocity):
     chain = chain_of()
     async with rig_on(chain, GANTRY) as rig:

@@ -72,6 +72,7 @@ async def test_a_start_that_waits_behind_a_busy_line_is_withdrawn_by_a_stop():
 
 @pytest.mark.promise("stop-in-any-state")
 @pytest.mark.parametrize("share", [n / 12 for n in range(13)])
+@pytest.mark.sweep(3)
 async def test_a_stop_on_a_busy_line_wins_at_any_instant_of_a_move(share):
     """The sweep of stops over a move's packets, while polls fill the line."""
     async with dialect_rig(V4, rates={"position": 150, "velocity": 150, "adc": 5, "state": 50}) as rig:

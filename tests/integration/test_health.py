@@ -171,6 +171,7 @@ async def test_the_wear_of_an_eeprom_is_reported_for_the_drives_that_have_one(tm
         assert axes == {"x": None, "feed": 12, "spool": 0}
 
 
+@pytest.mark.long
 async def test_rates_of_drives_that_pace_themselves_are_reported_like_those_of_others(tmp_path):
     config = load_config(MIXED).model_copy(update={"state_dir": tmp_path})
     async with running_rig(config) as rig:

@@ -280,6 +280,7 @@ def pipe(path):
 
 @pytest.mark.promise("heartbeat-ends")
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_sigstop_a_hung_loop_and_sigkill_end_the_changes_within_the_bound(tmp_path):
     config, endpoint = tmp_path / "rig.toml", f"tcp/127.0.0.1:{free_port()}"
     with pipe(tmp_path / "level") as wire:

@@ -52,6 +52,7 @@ async def offset(rig: DialectRig) -> float:
 
 @named(LIMITS)
 @pytest.mark.parametrize(("method", "velocity"), [(HomeMethod.REVERSE_LIMIT, -5.0), (HomeMethod.FORWARD_LIMIT, 5.0)])
+@pytest.mark.sweep(4)
 async def test_a_limit_switch_marks_the_reference(dialect, method, velocity):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
@@ -64,6 +65,7 @@ async def test_a_limit_switch_marks_the_reference(dialect, method, velocity):
 
 
 @named(DIALECTS)
+@pytest.mark.sweep(2)
 async def test_the_index_marks_the_reference(dialect):
     async with dialect_rig(dialect, WIDE_INDEX) as rig:
         await rig.power_on()
@@ -75,6 +77,7 @@ async def test_the_index_marks_the_reference(dialect):
 
 
 @named(DIALECTS)
+@pytest.mark.sweep(3)
 async def test_an_excess_position_error_at_a_hard_stop_marks_the_reference(dialect):
     async with dialect_rig(dialect, HARD_STOP, gains=GAINS | {"el": 800, "ol": 120}) as rig:
         await rig.power_on()
@@ -92,6 +95,7 @@ async def test_an_excess_position_error_at_a_hard_stop_marks_the_reference(diale
 
 
 @named(PIC_SERVOS)
+@pytest.mark.sweep(2)
 async def test_current_limiting_at_a_hard_stop_marks_the_reference(dialect):
     async with dialect_rig(dialect, HARD_STOP, gains=GAINS | {"cl": 101, "el": 16_000}) as rig:
         await rig.power_on()
@@ -113,6 +117,7 @@ async def test_a_drive_without_limit_capture_refuses_it(dialect):
 
 @named((V1, V2, V3, LS_182AP))
 @pytest.mark.parametrize("stop", [HomeStop.SMOOTH, HomeStop.ABRUPT])
+@pytest.mark.sweep(2)
 async def test_the_motor_stops_and_holds_at_home(dialect, stop):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
@@ -306,6 +311,7 @@ async def test_a_stop_ends_a_search_for_good():
 
 
 @pytest.mark.parametrize("rate", [600, 1000])
+@pytest.mark.sweep(2)
 async def test_polls_between_the_packets_of_a_command_do_not_disturb_it(rate):
     rates = {"position": rate, "velocity": rate, "state": rate}
     async with dialect_rig(V2, start_counts=-20_500.0, rates=rates) as rig:
@@ -319,6 +325,7 @@ async def test_polls_between_the_packets_of_a_command_do_not_disturb_it(rate):
 
 @named((V2, LS_182AP_22))
 @pytest.mark.parametrize("seed", range(1, 6))
+@pytest.mark.sweep(3)
 async def test_on_a_bad_line_a_search_ends_with_the_right_reference_or_with_a_reason(dialect, seed):
     print("seed", seed)
     bad_line = FaultPlan((LineFault(FaultKind.REPLY_LOST, 0.1, from_s=5.0),), seed=seed)

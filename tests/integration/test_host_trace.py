@@ -168,6 +168,7 @@ async def test_second_trace_is_refused_until_the_first_is_aborted():
 
 
 @pytest.mark.parametrize("replaced", [False, True])
+@pytest.mark.sweep(2)
 async def test_who_stops_waiting_ends_his_own_trace_and_no_other(replaced):
     async with running_rig() as rig:
         await ready(rig)

@@ -80,6 +80,7 @@ def held(here: VirtualRig, *axes: str) -> str:
     return here.wait(here.rig.client.ask(Acquire(client="ann", axes=axes, lease_s=60.0))).lease
 
 
+@pytest.mark.long
 def test_every_command_inside_lease_hold_is_sent_under_its_lease(rig, monkeypatch, tmp_path):
     monkeypatch.setenv("LDCND_LEASE", held(rig, *ALL))
     failed = []

@@ -90,6 +90,7 @@ def four_drives() -> ChainSpec:
         (lambda module: setattr(module, "baud", 9600), True, "link_lost"),
     ],
 )
+@pytest.mark.sweep(4)
 async def test_what_another_program_does_to_a_drive_is_found_at_the_next_polls(axis, tamper, on, code):
     """Also where a drive was reset within the position error limit, which no jump of the position would show."""
     chain = build_chain(four_drives())

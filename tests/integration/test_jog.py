@@ -44,6 +44,7 @@ async def hold(rig, jog, for_s, velocity):
 @pytest.mark.promise("jog-while-renewed")
 @dialects
 @pytest.mark.parametrize("velocity", [5.0, -5.0])
+@pytest.mark.sweep(2)
 async def test_a_jog_runs_while_it_is_renewed_and_ends_when_it_is_not(dialect, velocity):
     async with ready(dialect) as rig:
         jog = await rig.send(Jog(velocity=velocity, hold_s=HOLD_S))
@@ -73,6 +74,7 @@ async def test_a_jog_that_is_halted_ends_at_once(dialect):
 
 
 @dialects
+@pytest.mark.sweep(3)
 async def test_a_jog_is_held_for_longer_than_its_goal_is_ahead(dialect):
     async with ready(dialect, jog_reach_s=1.0) as rig:
         jog = await rig.send(Jog(velocity=4.0, hold_s=HOLD_S))
@@ -83,6 +85,7 @@ async def test_a_jog_is_held_for_longer_than_its_goal_is_ahead(dialect):
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_a_renewal_may_change_the_velocity_and_turn_round(dialect):
     async with ready(dialect) as rig:
         jog = await rig.send(Jog(velocity=4.0, hold_s=HOLD_S))

@@ -70,6 +70,7 @@ async def settled(rig: ChainRig, axis: str = "x") -> None:
 @pytest.mark.parametrize("start", ["adopt", "reset"])
 @pytest.mark.parametrize("how", ["SIGKILL", "SIGTERM"])
 @pytest.mark.parametrize("scope", ["axis", "rig", "quick_stop"])
+@pytest.mark.sweep(5)
 async def test_a_latched_stop_forbids_motion_in_the_next_daemon_until_reset(tmp_path, how, scope, start):
     chain, config = chain_of(), keeping(tmp_path, start=start)
     async with rig_on(chain, config) as rig:
@@ -140,6 +141,7 @@ async def test_a_halt_that_no_drive_has_confirmed_is_sent_by_the_next_daemon(tmp
 
 @pytest.mark.parametrize("start", ["adopt", "reset"])
 @pytest.mark.parametrize("how", ["SIGKILL", "SIGTERM"])
+@pytest.mark.sweep(2)
 async def test_an_axis_in_error_stop_is_in_error_stop_in_the_next_daemon_with_its_cause(tmp_path, how, start):
     chain, config = chain_of(), keeping(tmp_path, start=start)
     async with rig_on(chain, config) as rig:

@@ -95,6 +95,7 @@ async def restarted(
 
 
 @pytest.mark.parametrize("kill", [False, True])
+@pytest.mark.sweep(2)
 async def test_a_reference_outlives_the_daemon_and_moves_go_where_they_are_told(tmp_path, kill):
     chain = chain_of()
     async with restarted(chain, keeping(tmp_path), kill=kill) as rig:
@@ -180,6 +181,7 @@ async def test_turns_of_a_rotary_axis_outlive_the_daemon(tmp_path):
     assert (after.turns, after.value) == (2, pytest.approx(90.0, abs=0.1))
 
 
+@pytest.mark.long
 async def test_a_motion_is_written_once_however_long_it_takes(tmp_path, monkeypatch):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -294,6 +296,7 @@ async def test_a_drive_that_was_reset_and_addressed_by_another_program_has_no_re
         (lambda module: module.loop.renumber(module.loop.position + 500), "it is 500 counts from where it was left"),
     ],
 )
+@pytest.mark.sweep(3)
 async def test_what_another_program_did_meanwhile_costs_the_reference(tmp_path, tamper, why):
     believed, said = await between(chain_of(), keeping(tmp_path), tamper)
     assert (believed, len(said)) == (False, 1)
@@ -321,6 +324,7 @@ async def test_an_axis_that_was_pushed_has_no_reference(tmp_path):
         ({"direction": "reverse"}, "scale, unit or modulo was"),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_another_configuration_costs_the_reference(tmp_path, changed, why):
     chain = chain_of()
     async with rig_on(chain, keeping(tmp_path)) as rig:
@@ -335,6 +339,7 @@ async def test_another_configuration_costs_the_reference(tmp_path, changed, why)
     ("text", "why"),
     [("", "cannot be read"), ("{", "cannot be read"), ('{"format": 9}', "cannot be read"), (None, "another version")],
 )
+@pytest.mark.sweep(3)
 async def test_a_file_that_makes_no_sense_costs_the_reference(tmp_path, text, why):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -557,6 +562,7 @@ async def _live(rig: ChainRig, chain: Chain, dice: random.Random, origins: list[
 
 
 @pytest.mark.parametrize(("lives", "seed"), [(12, 5), pytest.param(500, 7, marks=pytest.mark.soak)])
+@pytest.mark.long
 async def test_whenever_a_daemon_is_killed_no_reference_that_is_believed_is_wrong(tmp_path, lives, seed):
     dice = random.Random(seed)
     chain, config = chain_of(), keeping(tmp_path)

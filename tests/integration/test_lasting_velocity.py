@@ -83,6 +83,7 @@ async def test_a_longer_one_than_configuration_or_counter_allow_is_refused(longe
 @pytest.mark.parametrize("name", ["x", "y", "z", "c"])
 @pytest.mark.parametrize("velocity", [8.0, -8.0])
 @pytest.mark.parametrize("mode", BufferMode)
+@pytest.mark.sweep(7)
 async def test_software_limits_ahead_do_not_make_it_longer(name, velocity, mode):
     async with simulated_rig(load_config(SIMULATED)) as rig:
         client = rig.client.client
@@ -119,6 +120,7 @@ async def test_a_limit_that_was_passed_is_not_returned_to(side):
     ],
 )
 @pytest.mark.parametrize("on_the_fly", [False, True])
+@pytest.mark.sweep(5)
 async def test_one_that_asks_for_no_duration_says_when_it_will_end_and_that_it_has_ended_by_that(
     axis, lasts_s, on_the_fly
 ):

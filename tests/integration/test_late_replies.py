@@ -70,6 +70,7 @@ SOAK = tuple(pytest.param(seed, marks=pytest.mark.soak) for seed in range(100, 2
 
 
 @pytest.mark.parametrize("seed", [120, *range(3), *SOAK])
+@pytest.mark.sweep(4)
 async def test_what_is_confirmed_has_been_heard(seed: int):
     """Judged by the simulated shaft: it comes to rest within the time that it needs."""
     dice, confirmed = random.Random(seed), 0
@@ -105,6 +106,7 @@ NO_DOOR = {"name": "no_door", "of": "rotor", "requires": [{"input": "door_closed
 
 @pytest.mark.promise("inputs-of-their-module")
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.sweep(3)
 async def test_a_late_reply_of_another_module_shows_no_input_that_permits_motion(seed: int):
     """The door is open all the time; the low bytes of the table's position, and the inputs of the store, look shut."""
     late = FaultPlan((LineFault(FaultKind.REPLY_DELAYED, 0.03, from_s=FROM_S, longest_s=0.1),), seed)
@@ -148,6 +150,7 @@ DEAF = (
 @pytest.mark.promise("stop-seen")
 @pytest.mark.parametrize(("motion", "ending"), DEAF)
 @pytest.mark.parametrize("times", [1, 2, 3])
+@pytest.mark.sweep(4)
 async def test_a_stop_that_was_confirmed_and_not_carried_out_is_sent_again(motion, ending, times, monkeypatch):
     """The drive answers and does nothing: so does a line whose late replies stand for those of lost stops."""
     deaf = [True] * times

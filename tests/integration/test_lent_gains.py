@@ -22,6 +22,7 @@ def gains(chain, address):
 @pytest.mark.parametrize("end", ["force", "killed", "released", "daemon ends"])
 @pytest.mark.parametrize(("name", "address"), [("x", 1), ("z", 3)])
 @pytest.mark.parametrize("moving", [False, True], ids=["at rest", "moving"])
+@pytest.mark.sweep(7)
 async def test_a_trial_that_is_cut_short_leaves_the_loop_open_and_the_next_motion_has_the_gains_of_before(
     end, name, address, moving
 ):

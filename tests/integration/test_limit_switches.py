@@ -16,6 +16,7 @@ dialects = pytest.mark.parametrize("dialect", [V3, V4, SC, LS_182AP, LS_182AP_22
 
 @dialects
 @pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.sweep(2)
 async def test_a_move_past_the_switch_stops_there_and_says_so(dialect, side):
     async with dialect_rig(dialect, **GUARDED) as rig:
         await rig.power_on()
@@ -32,6 +33,7 @@ async def test_a_move_past_the_switch_stops_there_and_says_so(dialect, side):
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_leaving_the_switch_is_possible_and_going_on_is_refused(dialect):
     async with dialect_rig(dialect, **GUARDED) as rig:
         await rig.power_on()

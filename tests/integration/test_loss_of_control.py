@@ -163,6 +163,7 @@ FROZEN_S = 3.0
 
 
 @pytest.mark.parametrize("policy", list(LossPolicy))
+@pytest.mark.sweep(2)
 async def test_a_client_that_freezes_in_mid_motion_has_its_axis_do_what_the_policy_says(policy):
     """What it sends when it goes on is refused, whatever the policy."""
     state, enabled, target = ENDS[policy]

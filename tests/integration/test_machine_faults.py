@@ -191,6 +191,7 @@ async def check(machine, step, folder, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["hangs", "hangs forward", "motor reversed", "brake closed", "coupling loose"])
+@pytest.mark.sweep(5)
 async def test_the_step_motor_names_what_is_wrong_or_cannot_tell(kind, tmp_path, monkeypatch):
     found, text, _ = await check(drawn_machine(kind, 0), "motor", tmp_path, monkeypatch)
 
@@ -199,6 +200,7 @@ async def test_the_step_motor_names_what_is_wrong_or_cannot_tell(kind, tmp_path,
 
 
 @pytest.mark.parametrize("kind", ["hangs", "hangs forward"])
+@pytest.mark.sweep(2)
 async def test_a_hanging_load_is_never_said_to_be_held(kind, tmp_path, monkeypatch):
     found, text, _ = await check(drawn_machine(kind, 1), "hold", tmp_path, monkeypatch)
 
@@ -223,6 +225,7 @@ async def test_a_load_is_measured_on_the_side_to_which_the_axis_may_go(tmp_path)
 
 
 @pytest.mark.parametrize("kind", ["hangs", "brake closed", "at its end"])
+@pytest.mark.sweep(3)
 async def test_tuning_names_what_is_wrong_or_cannot_tell(kind, tmp_path, monkeypatch):
     found, _, is_well = await check(drawn_machine(kind, 2), "tune", tmp_path, monkeypatch)
 
@@ -240,6 +243,7 @@ async def test_tuning_names_what_is_wrong_or_cannot_tell(kind, tmp_path, monkeyp
     ],
     ids=["swapped", "reverse stuck", "forward stuck", "not pressed"],
 )
+@pytest.mark.sweep(4)
 async def test_limit_switches_that_are_wrong_are_named_or_cannot_be_told(wrong, stuck, pressed, named, tmp_path):
     async with commissioning_rig(tmp_path, {"has the axis": "y"}, **wrong) as rig:
         if stuck:

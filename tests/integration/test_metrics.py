@@ -34,6 +34,7 @@ async def test_a_daemon_s_reports_become_metrics():
 
 @pytest.mark.real_time
 @pytest.mark.timeout(120)
+@pytest.mark.long
 async def test_metrics_are_served_over_http_by_a_process_of_their_own():
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
         metrics = ("metrics", "-e", endpoint, "--address", "127.0.0.1:0")

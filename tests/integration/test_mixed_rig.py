@@ -272,6 +272,7 @@ async def drive_changes(rig: RunningRig) -> list[tuple[str | None, str | None]]:
 
 
 @pytest.mark.promise("foreign-program-found")
+@pytest.mark.long
 async def test_a_parameter_that_another_program_has_changed_is_found_within_a_minute(tmp_path):
     units = two_drives()
     async with mixed_rig(tmp_path, units) as rig:
@@ -296,6 +297,7 @@ async def test_a_parameter_that_another_program_has_changed_is_found_within_a_mi
     assert cleared.active == ()
 
 
+@pytest.mark.long
 async def test_a_smartstep_that_was_reset_has_lost_what_was_written_to_its_ram_and_that_is_said(tmp_path):
     units = two_drives()
     async with mixed_rig(tmp_path, units) as rig:

@@ -181,6 +181,7 @@ async def test_a_plain_move_after_an_analog_one_ignores_the_sensor():
 
 @named(DIALECTS)
 @pytest.mark.parametrize("duty", [0.1, -0.1])
+@pytest.mark.sweep(2)
 async def test_a_duty_turns_the_motor_for_its_time_and_then_the_axis_holds(dialect, duty):
     async with dialect_rig(dialect, pwm=PWM, acceleration=2000) as rig:
         await rig.power_on()
@@ -244,6 +245,7 @@ async def test_a_stop_ends_a_duty_at_once():
         Track(position=0.1),
     ],
 )
+@pytest.mark.sweep(6)
 async def test_whenever_a_stop_comes_nothing_moves_afterwards(command, turns):
     async with dialect_rig(LS_182AP, pwm=PWM, tracking={"step": 0.5, "rate": 50.0}, acceleration=2000) as rig:
         await rig.power_on()

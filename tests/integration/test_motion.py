@@ -113,6 +113,7 @@ async def test_a_jog_on_a_referenced_axis_ends_at_the_software_limit():
         assert await settled(rig, "x") == pytest.approx(-100.0, abs=0.0011)
 
 
+@pytest.mark.long
 async def test_a_jog_without_a_limit_ends_at_its_horizon():
     async with running_rig() as rig:
         await powered(rig, "c")
@@ -230,6 +231,7 @@ async def test_a_stop_overtakes_a_move_that_came_before_it():
 
 
 @pytest.mark.parametrize("turns", range(1, 12))
+@pytest.mark.sweep(2)
 async def test_whenever_a_stop_comes_nothing_moves_afterwards(turns):
     """The stop arrives after so many turns of the loop or bytes of the line: between load and start, too."""
     async with running_rig() as rig:
@@ -267,6 +269,7 @@ async def test_power_off_in_mid_move_ends_the_move():
 
 
 @pytest.mark.parametrize("axis", ["x", "y", "z", "c"])
+@pytest.mark.sweep(2)
 async def test_homing_finds_the_reference_and_defines_the_position(axis):
     async with running_rig() as rig:
         await powered(rig, axis)

@@ -222,6 +222,7 @@ def instants(dialect: Dialect, name: str, count: int) -> list[float]:
 @pytest.mark.promise("motions-without-end")
 @pytest.mark.parametrize("dialect", MODELS, **names)
 @pytest.mark.parametrize("name", BOUNDED)
+@pytest.mark.sweep(25)
 async def test_a_motion_ends_within_its_bound_when_the_daemon_is_killed(dialect, name):
     if (dialect.name, name) in UNABLE:
         pytest.skip("the model has no such motion")

@@ -4,6 +4,8 @@ import asyncio
 import json
 from pathlib import Path
 
+import pytest
+
 from ldcnd.config.rig import load_config
 from ldcnd.contract.commands import MoveAbsolute, Power, Reset
 from ldcnd.contract.samples import LinkState
@@ -61,6 +63,7 @@ def test_a_daemon_that_ended_in_mid_move_leaves_an_axis_that_says_it_is_not_home
     assert switched_on.code == 1
 
 
+@pytest.mark.long
 def test_a_drive_that_lost_power_has_lost_its_reference_and_a_reset_does_not_bring_it_back(monkeypatch):
     chain = four_drives()
     with virtual_rig(monkeypatch, chains={"line0": chain}) as virtual:

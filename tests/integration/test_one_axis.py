@@ -2,11 +2,14 @@
 
 import asyncio
 
+import pytest
+
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.samples import TelemetryItem
 from tests.support.rig import running_rig
 
 
+@pytest.mark.long
 async def test_what_is_asked_seldom_is_published_though_the_next_question_is_already_another_one():
     axis = {
         "name": "x",

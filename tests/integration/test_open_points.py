@@ -133,6 +133,7 @@ async def compared(model: str, settings: list[ModuleSettings]) -> None:
 
 
 @pytest.mark.parametrize("model", BAUDS)
+@pytest.mark.sweep(2)
 async def test_the_daemon_depends_on_no_open_point(model):
     default = MODELS[model][1]
 

@@ -16,6 +16,7 @@ from tests.support.command_line import virtual_rig
 from tests.support.process import ROOT
 
 
+@pytest.mark.long
 def test_parameters_are_set_saved_compared_and_put_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     text = (ROOT / "config" / "mixed.toml").read_text()
     config = tmp_path / "mixed.toml"

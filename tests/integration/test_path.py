@@ -106,6 +106,7 @@ async def rests(chain: Chain, for_s: float = 0.5) -> bool:
 
 
 @pytest.mark.parametrize(("speed", "corners"), [(8.0, TRIANGLE), (15.0, TRIANGLE), (40.0, TRIANGLE), (15.0, CIRCLE)])
+@pytest.mark.sweep(2)
 async def test_axes_on_a_path_stay_as_near_to_it_as_was_said_before(speed, corners):
     chain = sc_chain()
     async with two_sc(chain) as rig:
@@ -193,6 +194,7 @@ async def underrun(_rig: ChainRig, chain: Chain) -> None:
 @pytest.mark.promise("path-checked-whole")
 @pytest.mark.parametrize("what", [halt_one, stop_one, trip, underrun])
 @pytest.mark.parametrize("after_s", [0.3, 1.7])
+@pytest.mark.sweep(2)
 async def test_whatever_ends_one_axis_of_a_path_ends_all(what: Callable[[ChainRig, Chain], Awaitable[None]], after_s):
     chain = sc_chain()
     async with two_sc(chain) as rig:
@@ -285,6 +287,7 @@ async def test_a_path_whose_sender_has_lost_one_axis_is_fed_no_further(by_force)
 
 
 @pytest.mark.promise("path-checked-whole")
+@pytest.mark.long
 async def test_a_stop_at_any_instant_of_a_path_is_the_last_that_moves():
     for tenth in range(1, 12):
         chain = sc_chain()

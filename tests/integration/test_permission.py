@@ -157,6 +157,7 @@ async def test_a_buffered_move_goes_on_under_a_lease_that_its_holder_has_widened
         MoveVelocity(velocity=1.0, acceleration=0.00001, buffer_mode=BufferMode.ABORTING),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_an_aborting_move_that_is_refused_halts_nothing(command):
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         before = (await rig.client.state("x")).command.command_id
@@ -353,6 +354,7 @@ async def test_nothing_is_moved_until_the_last_of_several_other_daemons_has_gone
 @pytest.mark.parametrize(
     "command", [Jog(velocity=5.0, hold_s=1.0), MoveVelocity(velocity=5.0), Home()], ids=lambda each: each.verb
 )
+@pytest.mark.sweep(3)
 async def test_no_motion_begins_once_the_daemon_ends(command, after_s, tmp_path):
     chain = build_chain(ChainSpec(tuple(ModuleSpec(model) for model in MODELS)))
     settings = simulated_config(baud=19_200).model_copy(update={"state_dir": tmp_path})

@@ -114,6 +114,7 @@ def test_one_fast_axis_does_not_have_to_wait_for_many_slow_ones():
 
 
 @pytest.mark.parametrize("axes", [1, 4, 8])
+@pytest.mark.sweep(3)
 async def test_no_poll_of_the_running_daemon_is_later_than_planned(axes):
     hz = {1: 300.0, 4: 80.0, 8: 40.0}[axes]
     rig_config = config(axes=axes, position=hz, velocity=hz, adc=5.0, state=5.0)

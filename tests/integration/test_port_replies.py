@@ -7,6 +7,8 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
+import pytest
+
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
@@ -114,6 +116,7 @@ async def said(send: Callable[[Packet], Awaitable[str]]) -> list[str]:
     return replies
 
 
+@pytest.mark.long
 async def test_replies_are_those_of_the_bare_line_or_it_is_said_why_not(tmp_path):
     chain, loop = chain_of_machine(), asyncio.get_running_loop()
 

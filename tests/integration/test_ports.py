@@ -118,6 +118,7 @@ def test_a_port_of_a_line_that_is_not_there_is_refused():
         RigConfig.model_validate(document | {"port": [{"name": "old", "bus": "other", "link": "x"}]})
 
 
+@pytest.mark.long
 async def test_a_guest_that_reads_as_fast_as_it_can_leaves_polls_their_rate(tmp_path):
     async with guest(tmp_path, rates={"position": 400, "velocity": 400, "adc": 0, "state": 20}) as (rig, program):
         loop = asyncio.get_running_loop()
@@ -135,6 +136,7 @@ async def test_a_guest_that_reads_as_fast_as_it_can_leaves_polls_their_rate(tmp_
         assert len(sent) - replies >= 0.85 * alone
 
 
+@pytest.mark.long
 async def test_a_stop_waits_for_no_more_than_one_exchange_of_a_guest_that_reads_as_fast_as_it_can(tmp_path):
     async with guest(tmp_path) as (rig, program):
         loop, longest_s = asyncio.get_running_loop(), {False: 0.0, True: 0.0}
@@ -165,6 +167,7 @@ async def test_a_stop_waits_for_no_more_than_one_exchange_of_a_guest_that_reads_
 @pytest.mark.parametrize(
     ("seed", "bursts"), [*((seed, 100) for seed in range(3)), pytest.param(3, 20_000, marks=pytest.mark.soak)]
 )
+@pytest.mark.sweep(2)
 async def test_whatever_a_guest_sends_the_line_is_not_rearranged_and_nothing_moves_by_it(tmp_path, seed, bursts):
     """A random guest beside a client that moves another axis: valid packets, damaged ones, rubbish, resets, rates."""
     chance = random.Random(seed)

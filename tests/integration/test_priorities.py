@@ -34,6 +34,7 @@ def chain_of(drives: int, *faults: LineFault):
 
 
 @orders
+@pytest.mark.sweep(2)
 async def test_of_31_axes_at_50_hz_the_high_one_keeps_its_rate_and_the_others_share_what_remains(order):
     config = ranked_config({"high": Asked(1, 50.0), "normal": Asked(26, 50.0), "low": Asked(4, 50.0)}, order=order)
 
@@ -46,6 +47,7 @@ async def test_of_31_axes_at_50_hz_the_high_one_keeps_its_rate_and_the_others_sh
     assert ALIVE_HZ / 50.0 < seen.of("low")[0] <= seen.of("low")[-1] < seen.of("normal")[0]
 
 
+@pytest.mark.long
 async def test_low_axes_are_polled_now_and_then_even_where_high_ones_want_all_of_a_slow_line():
     config = ranked_config({"high": Asked(1, 200.0), "low": Asked(30, 10.0)}, baud=19_200)
 
@@ -58,6 +60,7 @@ async def test_low_axes_are_polled_now_and_then_even_where_high_ones_want_all_of
 
 
 @orders
+@pytest.mark.sweep(2)
 async def test_a_mute_drive_and_commands_that_are_sent_again_cost_high_axes_nothing(order):
     asked = {"high": Asked(2, 50.0), "normal": Asked(10, 36.0), "low": Asked(2, 36.0)}
     chain, node = chain_of(14, LineFault(FaultKind.REPLY_LOST, 0.005)), Node(5, PROFILES["ls-182ap"])
@@ -88,6 +91,7 @@ async def test_a_mute_drive_and_commands_that_are_sent_again_cost_high_axes_noth
 
 
 @orders
+@pytest.mark.sweep(2)
 async def test_a_trace_as_fast_as_possible_takes_nothing_from_high_axes_of_a_full_line(order):
     asked = {"high": Asked(2, 50.0), "normal": Asked(20, 40.0), "low": Asked(1, 40.0)}
 
@@ -116,6 +120,7 @@ def smartsteps(**priorities: str) -> RigConfig:
     return RigConfig.model_validate({"rig": "sim", "bus": [bus], "sim": [sim]})
 
 
+@pytest.mark.long
 async def test_a_high_smartstep_has_every_second_word_if_it_wants_it_and_a_low_one_is_not_forgotten():
     async with running_rig(
         smartsteps(a="high", b="normal", c="normal", d="low", e="normal", f="normal", g="normal")
@@ -135,6 +140,7 @@ async def test_a_high_smartstep_has_every_second_word_if_it_wants_it_and_a_low_o
     assert 0.05 < per_s["d"] < 0.5 * per_s["b"]
 
 
+@pytest.mark.long
 async def test_a_reload_changes_priorities():
     asked = {"high": Asked(1, 50.0), "normal": Asked(20, 50.0)}
     config = ranked_config(asked)

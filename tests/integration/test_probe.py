@@ -20,6 +20,7 @@ async def latched(rig) -> LatchSample:
 
 @able
 @pytest.mark.parametrize("velocity", [1.0, 10.0])
+@pytest.mark.sweep(12)
 async def test_a_switch_is_latched_within_its_bound_and_the_reference_stays(dialect, velocity):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
@@ -57,6 +58,7 @@ async def test_a_probe_that_finds_nothing_has_failed_and_stands_at_its_end():
         assert await rig.rig.client.last(AXIS, TelemetryItem.LATCH) is None
 
 
+@pytest.mark.long
 async def test_the_limit_switch_ahead_ends_a_probe_for_something_else():
     async with dialect_rig(
         LS_182AP,

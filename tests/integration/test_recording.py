@@ -75,6 +75,7 @@ async def thirty_one_axes_are_in_the_file(path, seconds, position_hz):
 
 
 @pytest.mark.timeout(240)
+@pytest.mark.long
 async def test_every_value_of_31_axes_is_in_the_file_and_fits_the_schema_in_the_file(tmp_path):
     await thirty_one_axes_are_in_the_file(tmp_path / "run.mcap", 6.0, position_hz=5.0)
 
@@ -135,6 +136,7 @@ async def test_a_rig_that_says_little_is_on_the_disk_all_the_same(tmp_path):
 @pytest.mark.real_time
 @pytest.mark.timeout(900)
 @pytest.mark.parametrize(("seconds", "axes"), [(20.4, 4), pytest.param(300.4, 31, marks=pytest.mark.soak)])
+@pytest.mark.long
 async def test_all_but_the_last_chunk_of_a_killed_recorder_is_recovered(tmp_path, seconds, axes):
     path, whole = tmp_path / "run.mcap", tmp_path / "whole.mcap"
     arguments = ("-m", "tests.support.killed_recorder", str(path), str(seconds), str(axes))
@@ -198,6 +200,7 @@ def test_what_is_no_recording_is_refused_and_leaves_nothing_behind(tmp_path):
     assert list(tmp_path.iterdir()) == [text]
 
 
+@pytest.mark.long
 async def test_a_full_file_is_followed_by_the_next_without_a_gap(tmp_path):
     published = await record_a_move(tmp_path / "run.mcap", 20.0, rotate_bytes=50_000)
 

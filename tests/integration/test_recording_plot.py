@@ -29,6 +29,7 @@ async def record_a_move_and_an_outage(path):
         await asyncio.sleep(4.0)
 
 
+@pytest.mark.long
 async def test_a_recorded_axis_is_drawn_with_its_commands_and_without_what_nobody_measured(tmp_path):
     path, picture = tmp_path / "run.mcap", tmp_path / "x.png"
     await record_a_move_and_an_outage(path)

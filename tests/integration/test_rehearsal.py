@@ -56,6 +56,7 @@ def slow_scan(places):
     return found
 
 
+@pytest.mark.long
 async def test_a_blocking_program_waits_on_the_clock_of_the_rig(ldcnd_rig):
     began_s, real_s = ldcnd_rig.now_s, time.perf_counter()
     found = await ldcnd_rig.run_blocking(slow_scan, [1, -1, 2])
@@ -102,6 +103,7 @@ async def scanned(seed):
         return bytes(written)
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_without_pytest_too():
     first, other = run(scanned(7)), run(scanned(8))
     assert len(first) > 300
@@ -261,6 +263,7 @@ async def test_goes_on(ldcnd_rig):
 """
 
 
+@pytest.mark.long
 def test_a_test_that_never_ends_fails_with_what_happened_and_a_fault_that_never_came_is_said(tmp_path):
     (tmp_path / "test_unhappy.py").write_text(UNHAPPY)
     done = subprocess.run(  # noqa: S603
@@ -358,6 +361,7 @@ def in_folder(folder, *words, python=sys.executable):
     return ran.stdout + ran.stderr
 
 
+@pytest.mark.long
 def test_the_lab_of_the_examples_tries_its_own_scripts(tmp_path):
     lab = shutil.copytree(ROOT / "examples" / "lab", tmp_path / "lab")
     told = in_folder(lab, "-m", "pytest", "-q", "-p", "no:cacheprovider")

@@ -59,6 +59,7 @@ def moved_since(rig, seen):
 
 
 @pytest.mark.parametrize("margin_ms", MARGINS_MS)
+@pytest.mark.sweep(2)
 async def test_a_drive_that_lost_power_is_back_within_3_s_and_the_others_finish_without_a_reset(margin_ms):
     chain = chain_of()
     loop = asyncio.get_running_loop()
@@ -310,6 +311,7 @@ NOISE = tuple(
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (2, 11))])
+@pytest.mark.long
 async def test_drives_come_back_and_lines_are_taken_over_through_noise(seed):
     print(f"seed {seed}")
     chain = build_chain(
@@ -341,6 +343,7 @@ async def test_drives_come_back_and_lines_are_taken_over_through_noise(seed):
 
 @pytest.mark.parametrize("silent_s", [0.6, 1.0, 1.5, 2.0, 2.5, 3.0])
 @pytest.mark.parametrize("questions", ["unanswered", "damaged", "another's"])
+@pytest.mark.sweep(4)
 async def test_an_sc_whose_replies_fail_for_a_while_is_not_reset_where_the_port_passes_no_rates_on(questions, silent_s):
     """Neither without an answer at the rate of power-up, nor for a damaged one, nor for one of another model."""
     spec = ChainSpec((ModuleSpec("ls182ap"), ModuleSpec("picservo-sc")), baud_check=False)
@@ -396,6 +399,7 @@ class FailingModule(FaultInjector):
 
 @pytest.mark.promise("address-only-of-its-place")
 @pytest.mark.parametrize(("margin_ms", "within_s"), [(50, 8.0), (300, 20.0), (1000, 60.0)])
+@pytest.mark.sweep(2)
 def test_a_drive_whose_stop_waits_comes_back_though_nobody_answers(margin_ms, within_s):
     """It turned when it lost its power, and the module behind it is deaf: each question to either costs a time-out."""
     line = CENTRIFUGE.bus[0].model_copy(update={"margin_ms": margin_ms})

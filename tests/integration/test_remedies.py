@@ -203,6 +203,7 @@ def send(here: VirtualRig, axis: str, command: AnyCommand) -> Ran:
 
 
 @pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+@pytest.mark.sweep(6)
 def test_what_a_refusal_names_is_a_way_out_of_the_state_that_refused(rig, case):
     for line in case.before:
         led = type_line(rig, line)
@@ -292,6 +293,7 @@ NOT_RUN = {
 """Remedies whose state takes hands, hours or a broken drive, with what that is."""
 
 
+@pytest.mark.long
 def test_every_remedy_that_names_a_command_is_run_or_takes_hands():
     run = {case.says for case in CASES.values()} | BY_OTHER_TESTS
     known = remedies()

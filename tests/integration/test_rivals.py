@@ -205,6 +205,7 @@ async def test_values_of_a_daemon_that_came_back_with_another_unit_are_in_a_file
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_a_plain_zenoh_session_deceives_no_client():
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint, client(endpoint) as rig:
         config = {"mode": "client", "connect": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}

@@ -90,6 +90,7 @@ async def test_set_points_are_followed_through_the_turn():
 
 @pytest.mark.parametrize("dialect", [V1, V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
 @pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.sweep(3)
 async def test_at_the_end_of_its_counter_an_axis_goes_on(dialect, side):
     async with near_the_end(dialect, side, modulo=10.0) as rig:
         before = rig.position_mm

@@ -71,6 +71,7 @@ AGREEING, AFTER_A_GAP = 40, 53
         pytest.param(partial(swapping, AFTER_A_GAP), id="after_a_gap"),
     ],
 )  # fmt: skip
+@pytest.mark.sweep(6)
 async def test_a_rough_line_shows_no_false_position_and_lets_stops_through(line: Callable[[], Chain]):
     loop = asyncio.get_running_loop()
     found: dict[str, list[PositionSample]] = {axis: [] for axis in PLACES}

@@ -170,6 +170,7 @@ async def test_a_daemon_whose_port_is_busy_says_so_and_ends(endpoint: str) -> No
         ("tpc/127.0.0.1:7447", "cannot use tpc/127.0.0.1:7447"),
     ],
 )
+@pytest.mark.sweep(3)
 async def test_a_daemon_with_a_wrong_endpoint_names_it_and_ends(wrong: str, words: str) -> None:
     code, printed = await ended("run", "--config", str(SIMULATED), "--listen", wrong)
 

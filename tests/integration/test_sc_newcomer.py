@@ -42,6 +42,7 @@ def config(baud: int) -> RigConfig:
     ("eeprom", "baud"),
     [("erased", 230_400), ("servo on", 115_200), ("address kept", 115_200), ("address kept, servo on", 230_400)],
 )
+@pytest.mark.sweep(3)
 async def test_an_sc_that_restarts_is_reset_before_it_is_addressed_and_the_others_go_on(eeprom, baud):
     chain = build_chain(ChainSpec((ModuleSpec("pic-servo-sc"),) * 3))
     async with rig_on(chain, config(baud)) as rig:

@@ -14,6 +14,7 @@ MEMORY = 2 << 30
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_a_daemon_that_may_write_no_file_and_has_little_memory_serves_and_stops():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     async with process("run", "--config", str(RIG), "--listen", endpoint) as running:

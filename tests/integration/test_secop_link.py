@@ -119,6 +119,7 @@ def shown_target(updates):
 
 @pytest.mark.parametrize("mover", ["node", "another program"])
 @pytest.mark.parametrize("ending", ["end", "stop", "power off"])
+@pytest.mark.sweep(6)
 async def test_the_target_is_where_the_axis_was_sent_last_by_any_program_or_came_to_rest(mover: str, ending: str):
     async with linked_x() as (running, link, updates), AsyncExitStack() as moving:
         await link.go(1.0)

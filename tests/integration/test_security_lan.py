@@ -207,6 +207,7 @@ async def test_events_tell_whose_certificate_a_command_came_with(rig: SecuredRig
     assert (events[-1].verb, events[-1].client, events[-1].login) == (Verb.STOP, "ann", "operator")
 
 
+@pytest.mark.long
 def test_the_example_of_the_set_up_works_with_certificates_in_files(rig: SecuredRig, tmp_path: Path) -> None:
     folder = copy_setup("lan", tmp_path)
     for name in ("ca.pem", "operator.pem", "operator.key", "viewer.pem", "viewer.key", "daemon.pem", "daemon.key"):

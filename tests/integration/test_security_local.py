@@ -31,5 +31,6 @@ class TestLocal(AccessFacts):
     """Viewers and operators, told apart by the way they come."""
 
 
+@pytest.mark.long
 def test_the_socket_is_for_the_daemons_user_and_group(rig: SecuredRig, socket: Path) -> None:
     assert stat.S_IMODE(socket.stat().st_mode) == 0o660

@@ -40,6 +40,7 @@ async def test_a_wrong_password_is_refused_and_says_so(
             pass
 
 
+@pytest.mark.long
 def test_a_viewer_with_the_operators_name_and_his_own_password_is_refused(rig: SecuredRig) -> None:
     config = rig.config("viewer")
     config.insert_json5("transport/auth/usrpwd/user", '"operator"')

@@ -42,6 +42,7 @@ def speed(rig):
     return abs(rig.truth("rotor").velocity)
 
 
+@pytest.mark.long
 def test_a_whole_cycle_runs_and_is_recorded():
     async def program(rig, made):
         fastest = 0.0
@@ -113,6 +114,7 @@ def test_the_gate_of_the_daemon_judges_each_step():
 
 
 @pytest.mark.parametrize("when_s", [0.5, 3.0, 14.0])
+@pytest.mark.sweep(2)
 def test_a_stop_halts_what_moves_and_a_pause_does_not(when_s):
     async def program(rig, made):
         await made(SEQUENCES["shut"])[0].run()

@@ -83,6 +83,7 @@ def kept():
     return json.loads(memory_file("sim", "x").read_text())
 
 
+@pytest.mark.long
 async def test_a_load_that_doubles_is_said_and_what_was_learnt_outlives_the_observer():
     alarms, said = [], []
     async with working_rig() as (rig, module):
@@ -121,6 +122,7 @@ async def test_a_load_that_doubles_is_said_and_what_was_learnt_outlives_the_obse
     assert kept()["gains"] == {**healthy_gains, "kp": 300}
 
 
+@pytest.mark.long
 async def test_gains_that_are_lent_teach_nothing():
     said = []
     async with working_rig() as (rig, _):

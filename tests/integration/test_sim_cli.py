@@ -147,6 +147,7 @@ def refusal(*arguments):
     return ended.returncode, ended.stderr
 
 
+@pytest.mark.long
 def test_an_independent_host_enumerates_speeds_up_and_moves(tmp_path):
     link = tmp_path / "line"
 
@@ -251,6 +252,7 @@ def test_a_fault_plan_spoils_the_line(tmp_path):
         (["--chain", "ls182ap", "--pty", "/nowhere/at.all"], 1, "no terminal"),
     ],
 )
+@pytest.mark.sweep(3)
 def test_wrong_arguments_are_refused(arguments, code, complaint):
     ended, told = refusal(*arguments)
 

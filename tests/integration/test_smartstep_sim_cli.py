@@ -61,6 +61,7 @@ async def test_drives_of_a_file_answer_behind_a_terminal(tmp_path: Path):
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_what_are_no_units_is_refused():
     for wrong in ("1,1", "16"):
         running = await asyncio.create_subprocess_exec(*LDCND, "sim", "--smartstep", wrong, stderr=PIPE, cwd=ROOT)

@@ -50,6 +50,7 @@ def settings_sent(under_test):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize(("before_s", "wrapped"), [(0.8, False), (1.95, True)])
+@pytest.mark.sweep(6)
 async def test_triggered_trace_equals_what_the_drive_recorded_sample_for_sample(layout, before_s, wrapped):
     async with trace_rig(SimulatedVariant(trace_word_layout=layout)) as under_test:
         trace = await accelerating_trace(under_test, before_s, trace_request(interval_s=0.004))
@@ -103,6 +104,7 @@ def check_against_record(trace, points, layout):
     ],
     ids=["little", "words", "chars", "all", "trailer", "short strings", "constants"],
 )
+@pytest.mark.sweep(5)
 async def test_untriggered_trace_is_read_rightly_from_every_kind_of_drive(variant):
     async with trace_rig(variant) as under_test:
         under_test.pulses(8_000.0)
@@ -124,6 +126,7 @@ async def test_untriggered_trace_is_read_rightly_from_every_kind_of_drive(varian
 
 
 @pytest.mark.parametrize(("gear", "rpm"), [("num/den", 240.0), ("den/num", 15.0), ("none", 60.0)])
+@pytest.mark.sweep(2)
 async def test_command_pulses_are_geared_to_motor_speed_as_configured(gear, rpm):
     async with trace_rig(assumed={"command_pulse_gear": gear}) as under_test:
         under_test.pulses(8_000.0)
@@ -169,6 +172,7 @@ async def test_values_that_cannot_be_make_the_layout_uncertain():
 
 
 @pytest.mark.parametrize("after_s", [0.7, 1.7])
+@pytest.mark.sweep(2)
 async def test_instant_of_the_trigger_is_within_its_error(after_s):
     async with trace_rig() as under_test:
         loop = asyncio.get_running_loop()
@@ -185,6 +189,7 @@ async def test_instant_of_the_trigger_is_within_its_error(after_s):
     assert header.t_error_ns < 600_000_000
 
 
+@pytest.mark.long
 async def test_second_unit_keeps_its_rate_while_a_trace_uploads():
     async def gaps_s(rig, number):
         stamps = []
@@ -283,6 +288,7 @@ async def test_setting_during_a_trace_is_busy_tracing_and_commands_for_others_go
         (trace_request(channels=("run",)), ValueOutOfRange, "which is not recorded"),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_impossible_trace_is_refused_with_the_reason_before_anything_is_sent(request_, error, reason):
     async with trace_rig() as under_test:
         words = under_test.rig.daemon.rig.axes["feed"].driver.words

@@ -173,6 +173,7 @@ async def left_creeping(chain, counts_per_tick):
 
 
 @pytest.mark.parametrize("counts_per_tick", [0.02, 0.3, 0.9, 3.0])
+@pytest.mark.sweep(2)
 async def test_a_drive_that_creeps_is_not_reset_by_the_fallback(counts_per_tick):
     chain = chain_of()
     await left_creeping(chain, counts_per_tick)
@@ -270,6 +271,7 @@ async def test_a_line_that_was_lost_while_its_rate_changed_is_brought_to_one_rat
 @pytest.mark.promise("moving-unknown")
 @pytest.mark.promise("motions-without-end")
 @pytest.mark.parametrize("counts_per_tick", [0.02, 0.3, 0.9, 3.0])
+@pytest.mark.sweep(2)
 async def test_a_motion_without_an_end_that_a_host_has_left_moves_until_it_was_ended(counts_per_tick):
     chain = chain_of()
     await left_creeping(chain, counts_per_tick)
@@ -418,6 +420,7 @@ async def test_drives_that_were_powered_off_and_on_between_two_daemons_are_where
 @pytest.mark.promise("reference-at-reset")
 @pytest.mark.parametrize("place", range(4))
 @pytest.mark.parametrize("baud", [19_200, 115_200])
+@pytest.mark.sweep(2)
 async def test_one_drive_that_was_powered_on_does_not_stand_for_those_that_kept_their_power(place, baud):
     chain = chain_of()
     await referenced_after(chain, baud=baud)

@@ -76,6 +76,7 @@ def stops_while_a_drive_returns(share: float) -> Interruptions:
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.long
 def test_a_stop_while_a_drive_returns_brings_another_one_to_rest():
     assert stops_while_a_drive_returns(0.15).visited > 10
 

@@ -31,6 +31,7 @@ async def together(rig: RunningRig) -> None:
 
 @pytest.mark.parametrize("stopped", [None, "y"])
 @pytest.mark.parametrize("after_s", AFTER_S)
+@pytest.mark.sweep(6)
 async def test_whenever_a_stop_comes_in_a_group_move_what_it_stops_stays(stopped: str | None, after_s: float):
     async with running_rig(GANTRY) as rig:
         for axis in AXES:

@@ -21,6 +21,7 @@ async def moves_until_it_may_not(rig, out):
 
 
 @pytest.mark.parametrize("after_s", [0.3, 0.5, 0.9, 1.7])
+@pytest.mark.sweep(2)
 async def test_whoever_takes_control_moves_at_once_and_the_other_program_is_told(ldcnd_rig, after_s):
     ended = []
     first = asyncio.create_task(moves_until_it_may_not(ldcnd_rig.client, ended))

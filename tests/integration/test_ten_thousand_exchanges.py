@@ -45,6 +45,7 @@ MASKS = (
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (2, 3))])
+@pytest.mark.long
 async def test_every_caller_gets_one_outcome_and_no_value_of_another_node(seed):
     print(f"seed {seed}")
     dice = random.Random(seed)

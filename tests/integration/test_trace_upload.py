@@ -22,6 +22,7 @@ def test_on_an_idle_line_nothing_but_the_silence_before_each_command_comes_betwe
     assert took_s <= limit_s(string_bytes) + strings * SMARTSTEP.quiet_s
 
 
+@pytest.mark.long
 def test_beside_polls_an_upload_has_what_they_leave():
     (left,) = [1 - bus.mean_load for bus in plan_rig(load_config(MIXED)).buses if bus.bus == "steps"]
 

@@ -39,6 +39,7 @@ def named(dialects):
 
 
 @named((V2, V3, V4, SC, LS_173AP, LS_182AP, LS_182AP_22))
+@pytest.mark.sweep(2)
 async def test_an_axis_follows_a_stream_of_set_points(dialect):
     async with dialect_rig(dialect, tracking=TRACKING) as rig:
         await rig.power_on()

@@ -90,6 +90,7 @@ async def measuring(rig, until):
 
 
 @pytest.mark.timeout(300)  # some seconds of processor time, on a machine that may be busy
+@pytest.mark.long
 async def test_an_axis_is_identified_tuned_and_verified_and_worse_gains_are_not_kept():
     said = []
     async with tuned_rig(direction="reverse") as (rig, shaft):
@@ -196,6 +197,7 @@ def test_the_command_tunes_draws_and_prints_its_report_as_json(loop, tmp_path, m
     [({"motor_reversed": True}, "against an output"), ({"encoder_disconnected": True}, "the encoder counted nothing")],
     ids=["reversed motor", "disconnected encoder"],
 )
+@pytest.mark.sweep(2)
 async def test_wrong_wires_end_it_within_the_stated_distance_and_the_gains_come_back(wrong, said):
     places = [0.0]
 

@@ -71,6 +71,7 @@ async def twin_run(state):
         return where, await seen(twin, night), twin.truth("x").registers["kp"]
 
 
+@pytest.mark.long
 def test_a_twin_stands_where_the_rig_does_and_predicts_its_run():
     state, real = run(real_run((-31.25, 17.5)))
     where, rehearsed, kp = run(twin_run(state))
@@ -94,6 +95,7 @@ async def night_on_a_twin_of_a_rig_that_was_never_switched_on():
         return await seen(twin, night)
 
 
+@pytest.mark.long
 def test_the_drives_of_a_rig_that_was_never_switched_on_have_no_gains_and_their_twin_moves_all_the_same():
     report = run(night_on_a_twin_of_a_rig_that_was_never_switched_on())
     assert report.failures == ()
@@ -185,6 +187,7 @@ async def minute(file, *arguments):
 
 
 @pytest.mark.parametrize("source", [BLOCKING, ASYNC], ids=["blocking", "asyncio"])
+@pytest.mark.sweep(2)
 def test_a_program_of_a_minute_is_rehearsed_at_the_pace_of_its_waits(tmp_path, source):
     file = tmp_path / "night.py"
     file.write_text(source)
@@ -193,6 +196,7 @@ def test_a_program_of_a_minute_is_rehearsed_at_the_pace_of_its_waits(tmp_path, s
     assert report.axes["x"].highest == pytest.approx(7.5, abs=0.05)
 
 
+@pytest.mark.long
 def test_a_program_that_fails_has_a_report_too(tmp_path):
     file = tmp_path / "night.py"
     file.write_text(BLOCKING)
@@ -232,6 +236,7 @@ def test_a_write_to_ram_is_no_write_to_eeprom_and_what_is_not_counted_is_unknown
     assert "unknown EEPROM writes" in next(report.lines())
 
 
+@pytest.mark.long
 def test_a_following_error_ten_times_as_large_is_said_either_way():
     _, one = run(real_run((0, 0)))
     x = one.axes["x"]
@@ -241,6 +246,7 @@ def test_a_following_error_ten_times_as_large_is_said_either_way():
     assert ["following error" in text for text in other.differences(one)] == [True]
 
 
+@pytest.mark.long
 def test_a_place_in_between_that_differs_by_a_small_share_of_the_travel_is_said():
     _, one = run(real_run((0, 0)))
     x = one.axes["x"]
@@ -252,6 +258,7 @@ def test_a_place_in_between_that_differs_by_a_small_share_of_the_travel_is_said(
     ]
 
 
+@pytest.mark.long
 def test_a_report_says_where_the_run_differed():
     _, rehearsed = run(real_run((0, 0)))
     other = rehearsed.model_copy(

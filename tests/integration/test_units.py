@@ -95,6 +95,7 @@ def test_a_unit_can_be_typed_wherever_a_value_is(monkeypatch):
         ('home rotor --acceleration "100 rev/s2"', 1, "10 rev/s2"),
     ],
 )
+@pytest.mark.sweep(2)
 def test_a_refusal_names_the_nearest_value_in_the_unit_that_was_typed_and_that_is_accepted(
     monkeypatch, line, code, nearest
 ):

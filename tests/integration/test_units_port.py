@@ -142,6 +142,7 @@ async def test_parameters_are_written_under_a_lease_and_each_eeprom_write_is_cou
         ("W1230000003", "6", "even number"),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_what_is_not_done_has_the_drives_own_error_and_an_event(tmp_path, head, answer, why):
     async with units_guest(tmp_path) as (rig, program, feed):
         before = feed.drive.memory.read(0)
@@ -177,6 +178,7 @@ async def test_a_counter_is_cleared_by_mode_and_execute(tmp_path):
         assert feed.drive.command_counter == 0
 
 
+@pytest.mark.long
 async def test_a_trace_of_the_program_is_one_of_the_axis_and_its_memory_is_read_by_both(tmp_path):
     async with units_guest(tmp_path) as (rig, program, _feed):
         for head in ("W1150008101", "W1150010000", "W1150020014", "W1150030000", "W1150040000"):
@@ -198,6 +200,7 @@ async def test_a_trace_of_the_program_is_one_of_the_axis_and_its_memory_is_read_
         assert read[13:] == "".join(f"{word:04X}" for word in trace.raw[0][:4])
 
 
+@pytest.mark.long
 async def test_a_program_leaves_its_own_trace_and_not_that_of_others(tmp_path):
     async with units_guest(tmp_path) as (rig, program, feed):
         other = await arm_trace(rig.client, "feed", TakeTrace(channels=("speed_feedback",), interval_s=0.05))
@@ -237,6 +240,7 @@ async def test_a_frame_that_is_repeated_before_its_reply_is_carried_out_once(tmp
         assert value.eeprom_writes == 1
 
 
+@pytest.mark.long
 async def test_a_program_that_asks_as_fast_as_it_can_leaves_polls_their_rate(tmp_path):
     async with units_guest(tmp_path) as (rig, program, _feed):
         bus, loop = rig.daemon.rig.buses[0].bus, asyncio.get_running_loop()
@@ -276,6 +280,7 @@ async def test_a_program_comes_in_by_the_network(tmp_path, scheme):
 @pytest.mark.parametrize(
     ("seed", "frames"), [*((seed, 60) for seed in range(2)), pytest.param(3, 3000, marks=pytest.mark.soak)]
 )
+@pytest.mark.sweep(2)
 async def test_whatever_a_program_sends_no_other_mode_is_entered_and_polls_go_on(tmp_path, seed, frames):
     chance = random.Random(seed)
     addresses = (0x0000, 0x0100, 0x1100, 0x2000, 0x2001, 0x3000, 0x5000, 0x5002, 0x8000, 0xC000)

@@ -87,6 +87,7 @@ async def read_at_s(rates: Rates, starts_s: dict[int, float]) -> dict[tuple[int,
 
 
 @pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.sweep(6)
 async def test_no_item_is_read_later_than_planned(seed):
     dice = random.Random(seed)
     rates = filled(dice, dice.randint(1, 4))

@@ -45,6 +45,7 @@ async def test_a_jog_gets_faster_slower_and_turns_round_without_a_stop_in_betwee
 
 @dialects
 @pytest.mark.parametrize("velocity", [10.0, -10.0, 0.5])
+@pytest.mark.sweep(6)
 async def test_a_changed_jog_ends_before_the_software_limit(dialect, velocity):
     async with dialect_rig(dialect, limits=LIMITS, jog_horizon_s=60) as rig:
         await rig.power_on()
@@ -99,6 +100,7 @@ NEVER_A_SWITCH = MotorPlant(reverse_limit_counts=-(2**40), forward_limit_counts=
 
 @dialects
 @pytest.mark.parametrize("velocity", [20.0, -20.0, 7.0])
+@pytest.mark.sweep(2)
 async def test_a_changed_jog_ends_before_the_software_limit_however_seldom_its_axis_is_polled(dialect, velocity):
     async with dialect_rig(dialect, NEVER_A_SWITCH, **EVER) as rig:
         await rig.power_on()
@@ -113,6 +115,7 @@ async def test_a_changed_jog_ends_before_the_software_limit_however_seldom_its_a
 
 @pytest.mark.parametrize("duty", [0.9, 0.2, -0.2])
 @pytest.mark.parametrize("dialect", [V4, LS_182AP], ids=lambda dialect: dialect.name)
+@pytest.mark.sweep(2)
 async def test_a_duty_ends_before_the_software_limit_however_seldom_its_axis_is_polled(dialect, duty):
     limits = {"position_min": -200, "position_max": 200}
     pwm = {"duty": 1.0, "duration_s": 20.0}

@@ -85,6 +85,7 @@ def called(monkeypatch, words):
 
 
 @pytest.mark.parametrize("name", sorted(COMMANDS.keys() - SERVES - HERE))
+@pytest.mark.sweep(5)
 def test_every_option_of_every_command_bears_every_value(name, monkeypatch):
     tried, wrong = 0, list[str]()
     for words, command in leaves(name):

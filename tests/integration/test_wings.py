@@ -74,6 +74,7 @@ def run(folder: Path, *words: str, within_s: float = 60, **more: str) -> subproc
     )
 
 
+@pytest.mark.sweep(7)
 def test_the_rest_is_there_without_a_wing_and_its_command_says_what_is_missing(tree):
     wing, folder = tree
     command = COMMANDS.get(wing, "run --help").split()

@@ -31,6 +31,7 @@ async def test_the_last_second_of_a_line_is_fetched_as_it_was_recorded():
         assert len(fetched.lines) == fetched.next_record - fetched.first_record
 
 
+@pytest.mark.long
 async def test_a_long_log_comes_in_pages_without_gap_or_repetition():
     async with running_rig() as rig:
         await asyncio.sleep(60.0)

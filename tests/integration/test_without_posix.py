@@ -71,6 +71,7 @@ async def printed_by(program, *words):
     return running.returncode, printed.decode(), errors.decode()
 
 
+@pytest.mark.long
 async def test_all_but_the_ports_can_be_imported():
     code, printed, errors = await printed_by(IMPORT_ALL)
 
@@ -86,6 +87,7 @@ async def test_a_rig_is_looked_at_moved_and_stopped():
             assert code == 0, (words, printed, errors)
 
 
+@pytest.mark.long
 async def test_a_key_that_is_held_is_refused_in_one_sentence():
     code, printed, _ = await printed_by(
         """

@@ -115,6 +115,7 @@ async def test_a_wildcard_moves_nothing_and_a_stop_needs_nothing(served):
         assert json.loads(state.payload.to_string())["stop_latched"] is True
 
 
+@pytest.mark.long
 async def test_a_storage_that_answers_with_older_values_deceives_no_client(served):
     """The storage is stock Zenoh: it keeps what was published once, and answers every key with it from then on."""
     with connect(served) as session, connect(served) as storage:
@@ -172,6 +173,7 @@ async def test_published_samples_count_up_and_bear_the_instant_of_measurement(se
         assert abs(sample.timestamp.get_time().timestamp() - value["t"] / 1e9) < 0.001
 
 
+@pytest.mark.long
 async def test_a_json_rig_is_readable_by_tools_that_print_what_they_get(tmp_path):
     # what the examples z_sub, z_get and z_get_liveliness of eclipse-zenoh do, call by call
     config = tmp_path / "json.toml"
@@ -198,6 +200,7 @@ async def test_a_json_rig_is_readable_by_tools_that_print_what_they_get(tmp_path
     assert sum("/axis/" in key for key in shown) == 4
 
 
+@pytest.mark.long
 async def test_the_tour_of_the_readme_runs(tmp_path):
     text = (ROOT / "README.md").read_text()
     commands = re.findall(r"^\.venv/bin/(ldcnd (?!top|run).*)$", text, re.MULTILINE)
@@ -217,6 +220,7 @@ async def test_the_tour_of_the_readme_runs(tmp_path):
     ], ran
 
 
+@pytest.mark.long
 async def test_a_command_without_a_daemon_says_so_and_exits_with_3():
     done = await create_subprocess_exec(
         sys.executable, "-m", "ldcnd", "list", "--connect", "tcp/127.0.0.1:1", stdout=PIPE, stderr=STDOUT

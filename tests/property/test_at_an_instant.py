@@ -121,6 +121,7 @@ def judge(count: int, seed: int, share: float) -> None:
     assert ratio <= 3.0
 
 
+@pytest.mark.long
 def test_the_shaft_was_within_the_bounds_of_an_instant():
     judge(4000, 3, 0.997)
 

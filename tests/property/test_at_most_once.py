@@ -149,6 +149,7 @@ def campaign(seeds: range) -> None:
 
 @pytest.mark.promise("one-id-one-motion")
 @pytest.mark.timeout(300)
+@pytest.mark.long
 def test_one_command_id_makes_one_motion_at_most():
     campaign(range(SCHEDULES // 3))
 

@@ -200,6 +200,7 @@ def refused(status: AxisStatus, verb: Verb) -> bool:
     return False
 
 
+@pytest.mark.sweep(3)
 def test_a_latch_outranks_everything_and_only_a_reset_ends_it(history):
     for before, event, after in lives(history):
         if before.stop_latched and not isinstance(event, events.LatchRecalled):
@@ -264,6 +265,7 @@ def test_an_axis_falls_into_error_stop_without_its_command(history):
             assert after.command or (after.enabled and after.state is AxisState.DISCRETE_MOTION)
 
 
+@pytest.mark.sweep(6)
 def test_an_axis_in_error_takes_no_command_before_its_reset(history):
     for _, _, after in lives(history):
         if after.state is AxisState.ERROR_STOP:
@@ -279,6 +281,7 @@ def test_only_a_reset_leads_out_of_error_stop(history):
             assert after.state is AxisState.ERROR_STOP or isinstance(event, events.ResetDone)
 
 
+@pytest.mark.sweep(2)
 def test_a_fault_keeps_its_instant_and_the_first_stays_until_reset(history):
     for before, event, after in lives(history):
         stood = {entry.code: entry for entry in before.faults}

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule, run_state_machine_as_test
@@ -332,6 +333,7 @@ class UnrulyLine(RuleBasedStateMachine):
         assert not [timer for timer in asyncio.get_running_loop()._scheduled if not timer.cancelled()]
 
 
+@pytest.mark.long
 def test_every_caller_of_an_unruly_line_has_one_outcome_and_it_is_its_own():
     run_state_machine_as_test(
         UnrulyLine,

@@ -211,6 +211,7 @@ def campaign(seeds: Sequence[int], machine: str) -> Interruptions:
 @pytest.mark.promise("kill-moves-nothing-twice")
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("machine", MACHINES)
+@pytest.mark.sweep(5)
 def test_every_motion_of_every_schedule_is_one_that_was_asked_for(machine):
     campaign(range(8), machine)
 
@@ -222,6 +223,7 @@ def test_every_motion_of_every_schedule_ever_is_one_that_was_asked_for(machine, 
     campaign(seeds, machine)
 
 
+@pytest.mark.long
 def test_a_schedule_that_is_wrong_is_shortened_to_what_it_takes(monkeypatch):
     """A judge that takes any stop for wrong finds the one that is left."""
 

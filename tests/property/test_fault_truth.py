@@ -176,6 +176,7 @@ def play(model: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(30))
+@pytest.mark.sweep(5)
 def test_no_cause_is_named_that_the_drive_does_not_have(seed):
     for number in range(10):
         play("ls182ap" if number else "picservo-v4", seed * 10 + number)

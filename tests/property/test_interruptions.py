@@ -527,6 +527,7 @@ EVERYTHING = pytest.mark.parametrize(
 @pytest.mark.promise("kill-moves-nothing-twice")
 @pytest.mark.timeout(300)
 @EVERYTHING
+@pytest.mark.sweep(6)
 def test_a_daemon_may_be_interrupted_at_every_await(stage, how):
     """At each await that the scenario reaches, once; the awaits are found where tasks are suspended."""
     awaits = EveryAwait()

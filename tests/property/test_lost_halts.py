@@ -51,6 +51,7 @@ async def cut_at(instant_s, cut_s, path):
 
 @pytest.mark.parametrize("path", LinePath)
 @pytest.mark.parametrize("cut_s", [0.05, 0.1, 0.3, 1.0])
+@pytest.mark.sweep(8)
 def test_a_halt_of_a_group_that_one_member_does_not_hear_is_sent_until_it_has(path, cut_s):
     apart = []
     for instant_ms in range(3, 15):
@@ -80,6 +81,7 @@ async def stopped_at(instant_s, verb):
 
 
 @pytest.mark.parametrize("verb", [Stop, QuickStop])
+@pytest.mark.sweep(2)
 def test_a_line_that_loses_a_member_before_it_is_answered_is_walked_by_none(verb):
     for instant_ms in range(2, 20):
         answered_before, accepted, x = run(stopped_at(instant_ms / 1000, verb))
@@ -107,6 +109,7 @@ async def reset_within(gap_s, verb, lose):
 
 @pytest.mark.parametrize("verb", [Stop, QuickStop])
 @pytest.mark.parametrize("lose", [False, True], ids=["clear", "replies lost"])
+@pytest.mark.sweep(3)
 def test_a_reset_that_comes_in_the_middle_of_a_stop_leaves_it_latched(verb, lose):
     for gap_ms in (0.1, 0.3, 0.5, 1, 3, 10, 20):
         before, refused, latched = run(reset_within(gap_ms / 1000, verb, lose))
@@ -130,6 +133,7 @@ ENDING = [Jog(velocity=8.0, hold_s=0.6), SetPwm(duty=0.1, duration_s=0.6)]
 
 
 @pytest.mark.parametrize("command", ENDING, ids=["jog", "set_pwm"])
+@pytest.mark.sweep(2)
 def test_an_end_that_falls_into_a_cut_comes_as_soon_as_the_drive_answers(command):
     """The cable is whole again after 0.7 s at the latest; a poll of the rig's rates and the ramp follow."""
     assert max(run(ends_after(command, 0.5 + step / 100)) for step in range(11)) < 1.1

@@ -324,6 +324,7 @@ MOTIONS = ("move", "jog", "slow down", "home")
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("speed", [2.0, 20.0])
 @pytest.mark.parametrize("motion", MOTIONS)
+@pytest.mark.sweep(15)
 def test_a_counter_that_another_host_sets_in_mid_motion_costs_the_reference_and_stops_the_axis(model, speed, motion):
     """To 0, and to places on either side that are just farther away than what is promised."""
     for deed, by in (("zero", 0), ("beyond", 1), ("beyond", -1), ("set", 500_000)):
@@ -347,6 +348,7 @@ def test_a_counter_that_another_host_sets_in_mid_motion_costs_the_reference_and_
     ],
     ids=["slow servo rate", "hunts", "hunts at 100 polls", "breaks free", "wrong divisor", "fast"],
 )
+@pytest.mark.sweep(3)
 def test_a_motion_that_is_not_understood_neither_counts_as_silence_nor_keeps_a_stop_back(deed, values, last):
     story = play(Story(**values), "move", deed, 0.8, last, 90_000)
 

@@ -210,6 +210,7 @@ def test_no_module_ever_has_the_address_of_another_place_and_the_chain_comes_bac
 
 
 @pytest.mark.parametrize("seed", [262, 1398, 1443, 1627])
+@pytest.mark.sweep(2)
 def test_a_module_that_is_deaf_while_others_are_reset_is_found_at_its_waiting_address(seed: int) -> None:
     assert play(seed) == ""
 
@@ -271,6 +272,7 @@ class SurplusHistory(History):
 
 
 @pytest.mark.promise("address-only-of-its-place")
+@pytest.mark.long
 def test_no_module_gets_the_address_of_another_place_on_a_chain_with_more_modules_than_are_configured() -> None:
     print("seeds 0 to 11")
     assert [flaw for seed in range(12) if (flaw := play(seed, SurplusHistory))] == []

@@ -65,6 +65,7 @@ def report_after(names, story, cuts, seed=1, attempts=1):
 @pytest.mark.parametrize("names", CHAINS, ids="+".join)
 @settings(max_examples=20, deadline=None)
 @given(story=st.lists(deeds, max_size=6), cuts=cuts, seed=st.integers(0, 1000))
+@pytest.mark.sweep(3)
 def test_a_clean_host_initialises_after_any_rough_one(names, story, cuts, seed):
     report = report_after(names, story, cuts, seed)
 
@@ -79,6 +80,7 @@ def test_a_clean_host_initialises_after_any_rough_one(names, story, cuts, seed):
     cuts=cuts,
     seed=st.integers(0, 1000),
 )
+@pytest.mark.sweep(2)
 def test_a_chain_split_by_a_reset_at_one_of_its_rates_comes_up_in_three_attempts(names, story, cuts, seed):
     report = report_after(names, story, cuts, seed, attempts=3)
 

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -21,6 +22,7 @@ from tests.support.simulated_axis import ON, ONE, UTILITY_GAINS, SimulatedAxis
     speed=st.integers(ONE // 4, 60 * ONE),
     acceleration=st.integers(200, 8 * ONE),
 )
+@pytest.mark.long
 def test_every_move_keeps_its_limits_and_ends_exactly_on_its_goal(counts, speed, acceleration):
     profiler = ProfileGenerator()
     profiler.go_to(counts, speed, acceleration)

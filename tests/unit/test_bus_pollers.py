@@ -110,6 +110,7 @@ async def test_a_mute_node_that_rejects_a_packet_is_mute_no_longer():
     assert len(rejected) > (30.0 - LONGEST_BACKOFF_S) / 0.02
 
 
+@pytest.mark.long
 async def test_half_a_line_that_falls_mute_costs_the_other_half_little_and_is_back_at_once():
     rig = Rig(lambda packet: toy.answer(packet) if packet == toy.FLUSH or toy.node_of(packet) > 15 else [])
     healthy = ToyPoller(31, 0.002)

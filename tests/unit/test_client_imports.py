@@ -95,6 +95,7 @@ def test_the_client_loads_nothing_of_the_daemon(tmp_path: Path) -> None:
 
 @pytest.mark.real_time
 @pytest.mark.parametrize("words", CALLS)
+@pytest.mark.sweep(3)
 def test_a_call_of_the_command_line_loads_little(words: str, tmp_path: Path) -> None:
     code, *loaded = printed_by(CALL.format(words=[*words.split(), "-e", "127.0.0.1:1"]), tmp_path)
 
@@ -104,6 +105,7 @@ def test_a_call_of_the_command_line_loads_little(words: str, tmp_path: Path) -> 
     assert not (OTHERS - {"click"} | SLOW_TO_LOAD) & set(loaded)
 
 
+@pytest.mark.long
 def test_a_daemon_loads_one_family_and_generates_no_schema(tmp_path: Path) -> None:
     schemas, *loaded = printed_by(DAEMON.format(rig=str(ROOT / "config" / "simulated.toml")), tmp_path)
 

@@ -260,6 +260,7 @@ async def test_readings_come_before_what_is_learnt_of_a_packet_that_a_drive_rece
 
 
 @pytest.mark.parametrize("repeatable", [True, False])
+@pytest.mark.sweep(2)
 async def test_after_a_foreign_reading_no_packet_is_sent_before_the_line_is_proven_to_be_in_step(*, repeatable):
     """Nor is one whose permission made the readings be delivered that waited."""
     rig, flushed = coalescing(), []

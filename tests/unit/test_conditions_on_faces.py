@@ -301,6 +301,7 @@ def wanted(case: Case, face: object) -> str:
 
 @pytest.mark.parametrize("face", FACES, ids=lambda face: face.__name__)
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.sweep(2)
 def test_every_face_says_every_condition(case, face, record_property):
     record_property("cells", len(CASES) * len(FACES))
     told = face(known(case))

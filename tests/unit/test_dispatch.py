@@ -458,6 +458,7 @@ STATES = {
 
 
 @pytest.mark.parametrize("state", STATES)
+@pytest.mark.sweep(3)
 async def test_why_says_of_each_command_what_it_is_refused_with(state):
     pwm, tracking = {"duty": 0.5, "duration_s": 5.0}, {"step": 3.0, "rate": 50.0}
     said, found = {}, {}

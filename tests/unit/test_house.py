@@ -19,6 +19,7 @@ ENDS = {
 
 
 @pytest.mark.parametrize("name", FLOWS)
+@pytest.mark.sweep(2)
 def test_a_flow_is_followed_to_its_end(name):
     way = way_of(name)
 

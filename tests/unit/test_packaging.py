@@ -67,6 +67,7 @@ def test_the_same_source_gives_the_same_bytes(twice: list[dict[str, Path]], kind
     assert one.read_bytes() == other.read_bytes()
 
 
+@pytest.mark.long
 def test_the_wheel_has_the_pages_and_no_tests(twice: list[dict[str, Path]]) -> None:
     with zipfile.ZipFile(twice[0]["wheel"]) as wheel:
         names = set(wheel.namelist())

@@ -124,6 +124,7 @@ async def test_a_saturated_line_of_31_drives_carries_an_eighth_more_and_nobody_w
     assert by_phase.wait_s < by_deadline.wait_s / 2
 
 
+@pytest.mark.long
 async def test_it_still_pays_on_a_host_that_is_late():
     late_s = (0.000_05, 0.000_3)
 

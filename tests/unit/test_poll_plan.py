@@ -152,6 +152,7 @@ def test_no_poll_is_later_than_its_bound_whoever_chooses_among_equals(seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
+@pytest.mark.sweep(2)
 def test_where_a_plan_holds_no_poll_is_later_than_its_bound_whatever_the_priorities(seed):
     dice = random.Random(seed)
     tasks = []

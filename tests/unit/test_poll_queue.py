@@ -193,6 +193,7 @@ def shares(
 @orders
 @pytest.mark.parametrize("load", [1.02, 1.1, 1.5, 3.0])
 @pytest.mark.parametrize("highs_hz", [50.0, 5.0])
+@pytest.mark.sweep(5)
 def test_a_line_that_is_asked_too_much_keeps_the_rates_of_high_ones_and_polls_the_others(order, load, highs_hz):
     priorities = [HIGH] * 3 + [NORMAL] * 24 + [LOW] * 4
     rates_hz = [highs_hz] * 3 + [20.0] * 28

@@ -29,6 +29,7 @@ def newest() -> str:
     return max(KEPT, key=lambda version: [int(part) for part in version.split(".")])
 
 
+@pytest.mark.long
 def test_working_tree_keeps_the_contract_of_the_latest_version_or_announces_the_change():
     version = newest()
     before, now = KEPT[version], facts()

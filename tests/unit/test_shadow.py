@@ -94,6 +94,7 @@ def test_positions_too_far_apart_in_a_motion_give_nothing():
 
 
 @pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.sweep(4)
 def test_a_change_is_found(taught, change):
     print(found(taught, change))
 

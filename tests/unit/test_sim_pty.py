@@ -136,6 +136,7 @@ print("closed", flush=True)
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.sweep(2)
 def test_process_serves_until_it_is_told_to_stop(tmp_path, number):
     link = tmp_path / "line"
     command = [sys.executable, "-c", PROGRAM, str(link)]
@@ -154,6 +155,7 @@ def test_process_serves_until_it_is_told_to_stop(tmp_path, number):
 
 
 @pytest.mark.parametrize("reused", [True, False])
+@pytest.mark.sweep(2)
 def test_the_terminal_of_a_killed_simulator_is_not_opened_even_when_it_is_anothers_by_now(tmp_path, reused):
     link = tmp_path / "line"
     settings = SerialSettings(str(link), 19_200)

@@ -109,6 +109,7 @@ async def test_every_step_is_among_those_that_are_lost(work, tmp_path):
 
 
 @pytest.mark.parametrize(("work", "step", "losses"), CASES)
+@pytest.mark.sweep(4)
 async def test_after_any_loss_the_end_state_is_known_within_seconds(work, step, losses, tmp_path):
     unit = LosingUnit(1, loses(step, losses))
     unit.drive.motor.position = 2800.0

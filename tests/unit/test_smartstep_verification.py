@@ -53,6 +53,7 @@ def person(unit, rate=100_000.0):
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda each: f"{each.trace_word_layout}-{each.trace_byte_order}")
+@pytest.mark.sweep(2)
 async def test_a_drive_shows_how_its_traces_are_laid_out_and_geared(variant, tmp_path):
     unit = simulated(1, variant, {PN202: 4, PN203: 1})
     async with smartstep_line([unit]) as line:

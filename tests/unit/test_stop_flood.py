@@ -120,6 +120,7 @@ async def test_a_stop_that_has_joined_is_sent_after_all_when_a_reset_takes_its_l
     assert rig.axes["x"].tracker.status.stop_latched
 
 
+@pytest.mark.long
 async def test_a_stop_whose_companion_fails_is_told_so():
     rig = SlowRig(fails=True)
     async with asyncio.TaskGroup() as group:

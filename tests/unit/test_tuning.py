@@ -244,6 +244,7 @@ def test_gains_are_not_better_when_they_settle_later_overshoot_or_trip():
 
 @pytest.mark.timeout(300)  # a second or two of processor time, on a machine that may be busy
 @pytest.mark.parametrize("number", CHEAP)
+@pytest.mark.sweep(2)
 def test_of_a_drawn_machine_traces_tell_the_inertia_and_gains_suit_it(number):
     *_, plant = drawn_plants(SEED, number + 1)
     print(plant)
