@@ -404,8 +404,11 @@ class AxisService:
             permit.ask_to_move()
             self._commands.check(move)
             if self._commands.retargets(move):
-                self.stops.overtake(permit, permit.verb)
-                return await execute()
+                await self._motion.read()  # the latest reading may be as old as the rates let it be
+                permit.ask_to_move()
+                if self._commands.goes_on(move):
+                    self.stops.overtake(permit, permit.verb)
+                    return await execute()
             await self.stops.bring_to_rest(StopMode.SMOOTH, by=permit)
             patience_s = HALTS_WITHIN_S
         elif move.buffer_mode is BufferMode.BUFFERED and ahead is not None:

@@ -321,6 +321,18 @@ class AxisCommands:
             and tracker.status.state in (AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION)
         )
 
+    def goes_on(self, request: Move) -> bool:
+        """Tell whether the drive goes on to this motion in mid-move; what could not turn in time is halted first."""
+        if not self.retargets(request):
+            return False
+        if isinstance(request, MoveVelocity):
+            plan = self._motion.plan_at(request.velocity, request.acceleration)
+        else:
+            plan = self._PLANNED[type(request)](self, request)
+            if isinstance(request, MoveAbsolute | MoveRelative):
+                plan = self._motion.before_approach(plan, request.velocity, request.acceleration) or plan
+        return self._motion.follows_on(plan.motion.acceleration_counts_per_s2, plan.motion.target_counts)
+
     def _check_may_start(self, permit: Permit, request: Move) -> None:
         permit.check_state(follows=self.retargets(request))
 
@@ -386,7 +398,7 @@ class AxisCommands:
         """Return the velocity as the drive will have it, a trapezoid that ends even if this host dies, and how."""
         motion = self._motion
         plan = motion.plan_at(request.velocity, request.acceleration)
-        end, ends = motion.run(request.duration_s, plan)
+        end, ends = motion.run(request.duration_s, plan, in_motion=self.goes_on(request))
         return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration), ends
 
     async def _move(

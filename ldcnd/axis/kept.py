@@ -7,6 +7,7 @@ costs the reference, and a file never says more than was true when it was writte
 """
 
 import asyncio
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -17,8 +18,10 @@ from ldcnd import durable
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.samples import PastFault
 from ldcnd.drives.driver import StopMode
+from ldcnd.durable import DamagedFile
 
 FORMAT = 1
+NS = 10**9
 DISK_TIME_S = 2.0
 """A disk that takes longer than this counts as failed."""
 LATCHES = "latches.json"
@@ -61,6 +64,8 @@ class KeptReference(ReferenceEvidence):
     """Format of this file; another one is refused."""
     written: int
     """Time of writing, UTC in ns since 1970."""
+    on_disk: int = 0
+    """The same by the clock that stamps files: one that is stamped much later was put there by somebody else."""
     origin: float
     """Position 0 on the drive's own counter."""
     mark: int
@@ -145,9 +150,18 @@ class KeptFiles:
 
         Raises:
             TimeoutError: the disk takes too long.
-            DamagedFile: it cannot be read, or makes no sense.
+            DamagedFile: it cannot be read, makes no sense, or was put there by another program.
         """
-        return await self._in_thread(_read(self._path("references", axis), KeptReference))
+        path = self._path("references", axis)
+
+        def read() -> KeptReference | None:
+            kept = _read(path, KeptReference)()
+            # neither `cp` nor `tar` can set this stamp: it tells a file that was put back from one that was left
+            if kept and path.stat().st_ctime_ns - kept.on_disk > DISK_TIME_S * NS:
+                raise DamagedFile(f"{path}: is a copy that was put there, and may be older than what it replaced")
+            return kept and kept.model_copy(update={"on_disk": 0})
+
+        return await self._in_thread(read)
 
     async def keep_reference(self, axis: str, reference: KeptReference) -> None:
         """Write the reference of an axis; it is on the disk when this returns.
@@ -155,9 +169,14 @@ class KeptFiles:
         Raises:
             OSError: it cannot be written; what was kept before still is.
         """
-        path, text = self._path("references", axis), reference.model_dump_json()
+        path = self._path("references", axis)
+
+        def write() -> None:
+            now = reference.model_copy(update={"on_disk": time.time_ns()})
+            durable.replace(path, now.model_dump_json())
+
         with self._noted(path):
-            await self._in_thread(lambda: durable.replace(path, text))
+            await self._in_thread(write)
 
     async def remove_reference(self, axis: str) -> None:
         """Remove the reference of an axis; it has gone from the disk when this returns.

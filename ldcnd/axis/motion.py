@@ -39,6 +39,8 @@ from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotio
 
 COUNTER_SHARE = 0.99
 """Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
+LATENCY_S = 0.2
+"""Longest time from a reading to the packet that follows it; what is gone meanwhile must not reach a software limit."""
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
 
@@ -75,6 +77,11 @@ def profile_duration_s(distance: float, velocity: float, acceleration: float) ->
     if distance * acceleration < velocity * velocity:
         return 2 * math.sqrt(distance / acceleration)
     return distance / velocity + velocity / acceleration
+
+
+def braking_way(speed: float, deceleration: float) -> float:
+    """Return how far it is from a speed to rest; any consistent units, the deceleration above 0."""
+    return speed * speed / (2 * deceleration)
 
 
 def rest_of_profile_s(way: float, before: float, after: float, acceleration: float) -> float:
@@ -332,8 +339,13 @@ class AxisMotion:
             )
         return asked_s
 
-    def run(self, asked_s: float | None, plan: MotionPlan) -> tuple[float, str]:
+    def run(self, asked_s: float | None, plan: MotionPlan, *, in_motion: bool = False) -> tuple[float, str]:
         """Return where a motion at a velocity ends that is about to begin, in axis units, and in words what ends it.
+
+        Args:
+            asked_s: for how long it is to have its velocity; None for as long as it may.
+            plan: of the velocity.
+            in_motion: it goes on from the velocity that the axis has.
 
         Raises:
             ValueOutOfRange: as `run_s`.
@@ -342,8 +354,46 @@ class AxisMotion:
         run_s = self.run_s(asked_s, plan.motion.velocity_counts_per_s)
         if asked_s is None and self.config.longest_run_s is None and self.limit_ahead(plan.velocity) is not None:
             run_s = math.inf  # the limit is its end
-        end, at_limit = self.end_ahead(self.here, plan.velocity * (run_s + self.ramp_s(asked_s, plan)))
+        begin = self.turned_from(plan.velocity, plan.acceleration) if in_motion else self.here
+        end, at_limit = self.end_ahead(begin, plan.velocity * (run_s + self.ramp_s(asked_s, plan)))
         return end, self.end_in_words(run_s, plan.velocity, at_limit=at_limit)
+
+    def follows_on(self, acceleration_counts_per_s2: float, target_counts: int | None) -> bool:
+        """Tell whether a drive that takes another trapezoid in mid-move can be given one without leaving the limits.
+
+        It slows down at the new acceleration; where that is too low it overshoots its target, and the limit behind it.
+
+        Args:
+            acceleration_counts_per_s2: of the new motion.
+            target_counts: of the new motion; None for one at a velocity.
+        """
+        reading, scale = self.latest(), self.scale
+        speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
+        forward = reading.velocity_counts_per_s > 0
+        braking = speed * LATENCY_S + braking_way(speed, acceleration_counts_per_s2)
+        limit = self.limit_ahead(reading.velocity_counts_per_s / scale.counts_per_unit)
+        ends = [] if target_counts is None else [target_counts]
+        ways = [end - reading.position_counts if forward else reading.position_counts - end for end in ends]
+        if any(way >= braking for way in ways):
+            return True
+        if limit is not None:
+            room = scale.counts(limit) - reading.position_counts
+            if braking > (room if forward else -room):
+                return False
+        return not any(way > 0 for way in ways)
+
+    def turned_from(self, velocity: float, acceleration: float) -> float:
+        """Return from where a motion at a velocity counts that begins in mid-move, in axis units.
+
+        From there a motion from standstill would be at this velocity where and when this one is.
+
+        Args:
+            velocity: in units a second, negative backwards.
+            acceleration: in units a second squared.
+        """
+        before = self.latest().velocity_counts_per_s / self.scale.counts_per_unit
+        slewing = (velocity**2 - before**2) / math.copysign(2 * acceleration, velocity - before)
+        return self.here + slewing - math.copysign(braking_way(velocity, acceleration), velocity)
 
     @staticmethod
     def ramp_s(asked_s: float | None, plan: MotionPlan) -> float:

@@ -7,6 +7,8 @@ import json
 import os
 import random
 import re
+import subprocess
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -15,6 +17,7 @@ from typing import Any
 import pytest
 
 from ldcnd import durable
+from ldcnd.axis.kept import DISK_TIME_S
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveRelative, Power, Reset, SetPosition
 from ldcnd.contract.errors import LdcndError, NotReferenced, ReplyTimeout, RequestRefused, WrongState
@@ -351,6 +354,29 @@ async def test_a_file_that_makes_no_sense_costs_the_reference(tmp_path, text, wh
     assert not state.referenced
     assert why in said[0]
     assert not file.exists()
+
+
+async def tar(what: str, folder: Path) -> None:
+    command = ["tar", what, "backup.tar", "references"]
+    await asyncio.to_thread(subprocess.run, command, cwd=folder, check=True)
+
+
+async def test_a_backup_that_is_put_back_brings_no_old_origin(tmp_path):
+    """The axis stands where it stood, on the same mark, and has another position 0 by now."""
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+    await tar("cf", tmp_path)
+    async with rig_on(chain, config) as rig:
+        await up(rig, "x")
+        await rig.client.command("x", SetPosition(position=30.0))
+        await asyncio.sleep(1.0)
+    await asyncio.to_thread(time.sleep, DISK_TIME_S + 0.5)  # the disk has the clock of the machine
+    await tar("xf", tmp_path)
+    async with rig_on(chain, config) as rig:
+        state, said = await up(rig, "x"), await refusals(rig)
+    assert not state.referenced
+    assert "a copy that was put there" in said[0]
 
 
 async def test_a_refused_reference_is_seen_where_an_operator_looks_and_stays_refused(tmp_path):

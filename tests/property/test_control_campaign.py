@@ -24,6 +24,7 @@ from ldcnd.contract.leases import Acquire, Release
 from ldcnd.sim.faults import FaultInjector, FaultPlan
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.testing.memory_session import MemoryBroker
+from tests.support.copied_state import copy_state
 from tests.support.interruptions import CopiedLoop, Interruptions, in_new_loop, own_folder, run_with_copies
 from tests.support.schedules import LINE, RIG, Act, Drawing, Play, Rig, all_up, faults_of
 from tests.support.shaft_judge import ShaftJudge, now_ns
@@ -143,8 +144,7 @@ class Campaign:
         if self.machine.keeps:  # what daemons keep is of this copy alone
             shutil.rmtree("copy", ignore_errors=True)
             Path("copy").mkdir()
-            if Path("state").exists():
-                shutil.copytree("state", "copy/state")
+            copy_state(Path("state"), Path("copy/state"))
         if loop.copy(f"seed {seed}"):
             if self.machine.keeps:
                 os.chdir("copy")

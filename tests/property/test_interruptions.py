@@ -11,7 +11,6 @@ import asyncio
 import contextlib
 import os
 import random
-import shutil
 import tempfile
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
@@ -63,6 +62,7 @@ from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.testing.memory_session import MemoryBroker
+from tests.support.copied_state import copy_state
 from tests.support.interruptions import (
     Chosen,
     CopiedLoop,
@@ -413,8 +413,7 @@ class Run:
         assert isinstance(loop, CopiedLoop)
         if self._stage.keeps:  # what a copy keeps is its own
             folder = tempfile.mkdtemp(dir=".")
-            if Path("state").exists():
-                shutil.copytree("state", Path(folder, "state"))
+            copy_state(Path("state"), Path(folder, "state"))
             os.chdir(folder)
         if self._how is How.KILLED:
             self.witness.daemon = None

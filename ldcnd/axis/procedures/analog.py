@@ -7,9 +7,9 @@ limit switches stop it in the drive, where they are armed.
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.motion import LATENCY_S, AxisMotion
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.procedures.endless import LATENCY_S, EndlessMotion
+from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAnalog
 from ldcnd.contract.errors import ValueOutOfRange

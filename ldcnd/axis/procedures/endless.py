@@ -8,15 +8,13 @@ from abc import abstractmethod
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.motion import LATENCY_S, AxisMotion, braking_way
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import NEVER_S, Procedure
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.errors import PositionLimit
 from ldcnd.drives.driver import AxisReading
 
-LATENCY_S = 0.2
-"""Longest time from a reading to the stop that follows it; what is gone meanwhile must not reach the software limit."""
 WATCH_S = 0.05
 """Time between two readings while such a motion runs, seconds, whatever the poll rates."""
 
@@ -68,7 +66,7 @@ class EndlessMotion(Procedure):
 
     def _spare_s(self, way: float, speed: float) -> float:
         """Return for how long it can go on at a speed and still be stopped within a way."""
-        brakes = speed * LATENCY_S + speed * speed / (2 * self.acceleration)
+        brakes = speed * LATENCY_S + braking_way(speed, self.acceleration)
         return (way - brakes) / speed
 
     def check_room(self, velocity: float) -> None:

@@ -8,6 +8,7 @@ comes to rest and goes on from there.
 """
 
 import math
+from dataclasses import dataclass
 from enum import Enum
 
 from typing_extensions import override
@@ -19,6 +20,7 @@ from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, Jog
 from ldcnd.contract.errors import LeaseExpired, Remedy, step
+from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, StopMode
 
@@ -113,6 +115,23 @@ class _Phase(Enum):
     """Its motion is over."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Course:
+    """What a jog is to keep to now.
+
+    Attributes:
+        velocity: in axis units a second.
+        acceleration: in axis units a second squared; None for the default.
+        share: of the velocity that the speed override leaves.
+        limits: of the axis, which a reload may narrow.
+    """
+
+    velocity: float
+    acceleration: float | None
+    share: float
+    limits: AxisLimits
+
+
 class HeldJog(Procedure):
     """A jog, from its first packet to the stop that ends it."""
 
@@ -120,7 +139,7 @@ class HeldJog(Procedure):
         self.permit = permit
         self._motion = motion
         self._hold = hold
-        self._wanted: tuple[float, float | None, float] = (0.0, None, 1.0)  # at what it runs: see `_asked`
+        self._wanted: _Course | None = None  # at what it runs
         self._phase = _Phase.RESTS
         self._extend_at_s = math.inf
 
@@ -150,7 +169,7 @@ class HeldJog(Procedure):
 
     @property
     def wants_step(self) -> bool:
-        """Whether the requested velocity differs from the drive's."""
+        """Whether the drive runs at another velocity, or under other limits, than it is to."""
         return self._phase in (_Phase.RUNS, _Phase.ENDS) and self._wanted != self._asked
 
     def calls_for_step(self, reading: AxisReading) -> bool:
@@ -173,25 +192,37 @@ class HeldJog(Procedure):
         if self._phase is _Phase.ENDS and reading.profile_done and not self.wants_step:
             motion.tracker.take(CommandOver())
             return False
-        if self._phase is not _Phase.RESTS and not motion.driver.retargets:
-            if self.wants_step:
+        if self._phase is not _Phase.RESTS:
+            if self.wants_step and not await self._turns_in_time():
                 await self._slow_down()
-            return True
+                return True
+            if not motion.driver.retargets:
+                return True
         if self._phase is _Phase.RESTS or self.wants_step or motion.clock.now_s() >= self._extend_at_s:
             await self._run()
         return True
 
+    async def _turns_in_time(self) -> bool:
+        """Tell whether the drive takes the requested velocity in mid-move without leaving the software limits."""
+        motion, asked = self._motion, self._asked
+        if not motion.driver.retargets:
+            return False
+        await motion.read()  # the latest reading may be as old as the rates let it be
+        return motion.follows_on(
+            motion.plan_at(asked.velocity, asked.acceleration).motion.acceleration_counts_per_s2, None
+        )
+
     @property
-    def _asked(self) -> tuple[float, float | None, float]:
-        """Velocity and acceleration, and the share of the velocity that the speed override leaves."""
-        return self._hold.velocity, self._hold.acceleration, self._motion.tracker.status.speed_share
+    def _asked(self) -> "_Course":
+        hold, motion = self._hold, self._motion
+        return _Course(hold.velocity, hold.acceleration, motion.tracker.status.speed_share, motion.config.limits)
 
     async def _run(self) -> CommandReply:
         """Have the drive run to a goal that is as far ahead as it may be."""
         motion, asked = self._motion, self._asked
         here = (await motion.read()).position_counts  # the latest reading may be as old as the rates let it be
         self.permit.ask_to_move()
-        plan, velocity, reach_s, at_limit = self._plan(motion.scale.position(here), *asked[:2])
+        plan, velocity, reach_s, at_limit = self._plan(motion.scale.position(here), asked.velocity, asked.acceleration)
         await self.permit.load(plan.motion)
         self._wanted = asked
         self._phase = _Phase.ENDS if at_limit else _Phase.RUNS  # also if it is unknown whether the drive has started

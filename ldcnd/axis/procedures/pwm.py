@@ -6,9 +6,9 @@ the axis must be configured for it.
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.motion import LATENCY_S, AxisMotion
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.procedures.endless import LATENCY_S, WATCH_S, EndlessMotion
+from ldcnd.axis.procedures.endless import WATCH_S, EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import CommandReply, SetPwm

@@ -1,0 +1,160 @@
+"""A motion that follows another one on its way, at a lower acceleration, stays within the software limits all the same.
+
+PIC-SERVO SC takes a new trapezoid in mid-move, and slows down at the new acceleration; other drives are halted first.
+"""
+
+import asyncio
+import contextlib
+import random
+
+import pytest
+
+from ldcnd.contract.commands import (
+    BufferMode,
+    Jog,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+)
+from ldcnd.contract.errors import LdcndError, LeaseExpired
+from ldcnd.contract.samples import AxisState
+from ldcnd.sim.plant import MotorPlant
+from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, Dialect, DialectRig, dialect_rig
+
+LIMIT_MM = 30.0
+BEYOND_MM = 0.3
+"""What a shaft may follow its profile by, and overshoot."""
+WIDE = MotorPlant(stop_margin_counts=400_000, reverse_limit_counts=-400_000, forward_limit_counts=400_000)
+RATES = {"velocity": 45.0, "acceleration": 800.0}
+LIMITS = RATES | {"position_min": -LIMIT_MM, "position_max": LIMIT_MM}
+ABORTING = {"buffer_mode": BufferMode.ABORTING, "acceleration": 20.0}
+dialects = pytest.mark.parametrize("dialect", [SC, V4, LS_182AP], ids=lambda dialect: dialect.name)
+
+
+async def farthest_mm(rig: DialectRig, for_s: float) -> float:
+    """Watch the shaft for a time; return how far from 0 it was."""
+    loop, most = asyncio.get_running_loop(), 0.0
+    until_s = loop.time() + for_s
+    while loop.time() < until_s:
+        most = max(most, abs(rig.position_mm))
+        await asyncio.sleep(0.01)
+    return most
+
+
+async def at_speed(rig: DialectRig, place_mm: float) -> None:
+    """Run forward at 40 mm/s as far as a place."""
+    await rig.power_on()
+    await rig.send(MoveVelocity(velocity=40.0, acceleration=400.0))
+    while rig.position_mm < place_mm:
+        await asyncio.sleep(0.005)
+
+
+@dialects
+@pytest.mark.parametrize(
+    "request_",
+    [
+        MoveVelocity(velocity=-1.0, duration_s=0.5, **ABORTING),
+        MoveVelocity(velocity=1.0, **ABORTING),
+        MoveVelocity(velocity=-40.0, **ABORTING),
+        MoveAbsolute(position=0.0, velocity=10.0, **ABORTING),
+        MoveAbsolute(position=29.0, velocity=40.0, **ABORTING),
+        MoveRelative(distance=-5.0, velocity=40.0, **ABORTING),
+    ],
+    ids=lambda request_: f"{request_.verb.value}",
+)
+async def test_a_motion_that_could_not_turn_before_the_limit_begins_from_rest(dialect: Dialect, request_):
+    async with dialect_rig(dialect, WIDE, limits=LIMITS) as rig:
+        await at_speed(rig, 20.0)
+        reply = await rig.send(request_)
+        most = await farthest_mm(rig, 8.0)
+        state = await rig.rig.client.state(AXIS)
+
+    assert reply.command_id
+    assert most < LIMIT_MM + BEYOND_MM
+    assert state.state is not AxisState.ERROR_STOP
+    if isinstance(request_, MoveAbsolute):
+        assert rig.position_mm == pytest.approx(request_.position, abs=0.1)
+
+
+@dialects
+async def test_a_jog_that_could_not_turn_before_the_limit_comes_to_rest_first(dialect: Dialect):
+    async with dialect_rig(dialect, WIDE, limits=LIMITS) as rig:
+        await rig.power_on()
+        jog = Jog(velocity=40.0, acceleration=400.0, hold_s=1.0)
+        began = await rig.send(jog)
+        while rig.position_mm < 20.0:
+            await asyncio.sleep(0.005)
+        slow = Jog(velocity=-1.0, acceleration=20.0, hold_s=1.0, renews=began.command_id)
+        await rig.send(slow)
+        most = await farthest_mm(rig, 4.0)
+
+    assert most < LIMIT_MM + BEYOND_MM
+
+
+@dialects
+@pytest.mark.parametrize(("acceleration", "velocity"), [(100.0, -1.0), (100.0, -10.0), (400.0, -5.0), (50.0, 5.0)])
+async def test_a_motion_that_turns_on_its_way_has_its_velocity_for_as_long_as_was_asked_for(
+    dialect: Dialect, acceleration, velocity
+):
+    async with dialect_rig(dialect, WIDE, limits=RATES) as rig:
+        loop = asyncio.get_running_loop()
+        await at_speed(rig, 10.0)
+        await rig.send(
+            MoveVelocity(velocity=velocity, duration_s=0.5, acceleration=acceleration, buffer_mode=BufferMode.ABORTING)
+        )
+        at_s, most = loop.time(), 0.0
+        while (await rig.rig.client.state(AXIS)).state is not AxisState.STANDSTILL:
+            most = max(most, rig.position_mm)
+            await asyncio.sleep(0.01)
+        took_s = loop.time() - at_s
+
+    slewing_s = (40.0 + 2 * abs(velocity)) / acceleration
+    assert 0.4 < took_s < 0.5 + slewing_s + 0.6
+    assert velocity < 0 or rig.position_mm >= most - BEYOND_MM  # no way back
+
+
+SOAK = tuple(pytest.param(seed, marks=pytest.mark.soak) for seed in range(100, 300))
+
+
+@dialects
+@pytest.mark.parametrize("seed", [*range(4), *SOAK])
+@pytest.mark.sweep(2)
+async def test_no_row_of_motions_that_follow_each_other_leaves_the_limits(dialect: Dialect, seed: int):
+    dice = random.Random(seed)
+
+    def drawn() -> MoveAbsolute | MoveVelocity:
+        rates = {"acceleration": 10.0 ** dice.uniform(1.0, 2.9), "buffer_mode": BufferMode.ABORTING}
+        velocity = dice.uniform(0.5, 45.0)
+        if dice.random() < 0.5:
+            return MoveAbsolute(position=dice.uniform(-LIMIT_MM, LIMIT_MM), velocity=velocity, **rates)
+        return MoveVelocity(velocity=velocity * dice.choice((-1, 1)), **rates)
+
+    done = 0
+    async with dialect_rig(dialect, WIDE, limits=LIMITS) as rig:
+        await rig.power_on()
+        for _ in range(40):
+            with contextlib.suppress(LdcndError):
+                await rig.send(drawn())
+                done += 1
+            most = await farthest_mm(rig, dice.choice((0.05, 0.2, 0.6, 1.5)))
+            assert most < LIMIT_MM + BEYOND_MM, f"seed {seed}: {most:.2f} mm"
+            assert (await rig.rig.client.state(AXIS)).state is not AxisState.ERROR_STOP, f"seed {seed}"
+    assert done > 20
+
+
+@dialects
+async def test_a_jog_that_is_held_keeps_to_limits_that_a_reload_has_narrowed(dialect: Dialect):
+    async with dialect_rig(dialect, WIDE, limits=LIMITS) as rig:
+        await rig.power_on()
+        jog = Jog(velocity=5.0, hold_s=1.0)
+        renewal = jog.model_copy(update={"renews": (await rig.send(jog)).command_id})
+        axis = rig.rig.daemon.rig.axes[AXIS]
+        axis.reconfigure(
+            axis.config.model_copy(update={"limits": axis.config.limits.model_copy(update={"position_max": 8.0})})
+        )
+        for _ in range(8):
+            with contextlib.suppress(LeaseExpired):  # it has ended at the limit
+                await rig.send(renewal)
+            await asyncio.sleep(0.4)
+
+    assert 7.9 < rig.position_mm < 8.0 + BEYOND_MM
