@@ -7,12 +7,12 @@ command.
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from ldcnd.axis.faults import TELL_OF_THE_PAST
 from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.status import MOTION_STATES, AxisStatus
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
+from ldcnd.contract.condition import is_over, over_in_words
 from ldcnd.contract.errors import (
     AccelerationLimit,
     AxisUnreachable,
@@ -220,8 +220,8 @@ def fault(axis: str, entry: FaultEntry) -> DriveFault:
 def error_stop(axis: AxisTracker, said: Collection[FaultEntry] = ()) -> WrongState:
     """Return the refusal of an axis in error_stop, with its causes but for those that were said before."""
     status, first, in_error = axis.status, axis.status.first_fault, f"axis {axis.name} is in error stop"
-    if first and not status.active_faults and _is_over(status, first):
-        text, remedy = f"{in_error} because of {in_words(status, first)}", Remedy("{}", step("reset"))
+    if first and not status.active_faults and is_over(first, (), status.link):
+        text, remedy = f"{in_error} because of {over_in_words(first)}", Remedy("{}", step("reset"))
     else:
         causes = _said(axis, said) or ("" if said else "a command ended badly")
         text, remedy = (
@@ -233,15 +233,8 @@ def error_stop(axis: AxisTracker, said: Collection[FaultEntry] = ()) -> WrongSta
 
 def in_words(status: AxisStatus, entry: FaultEntry) -> str:
     """Return a fault that has come up since the last reset in words: its text says what is so while it stands."""
-    return (
-        f"{entry.code.replace('_', ' ')}, which is over" if _is_over(status, entry) else f"{entry.code}: {entry.text}"
-    )
-
-
-def _is_over(status: AxisStatus, entry: FaultEntry) -> bool:
-    """Tell whether a fault is seen to stand no more: its axis is read, and does not show it."""
-    stands = any(each.code == entry.code for each in status.active_faults)
-    return status.link is LinkState.UP and not stands and entry.code not in TELL_OF_THE_PAST
+    over = is_over(entry, status.active_faults, status.link)
+    return over_in_words(entry) if over else f"{entry.code}: {entry.text}"
 
 
 def _said(axis: AxisTracker, before: Collection[FaultEntry] = ()) -> str:

@@ -252,11 +252,7 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
     status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=NOTHING_SEEN)
     status = _with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again
-    return (
-        _fail(status, LINK_LOST.text.replace("does not", "did not"))
-        if was_up and status.state is not AxisState.DISABLED
-        else status
-    )
+    return _fail(status, "the drive did not answer") if was_up and status.state is not AxisState.DISABLED else status
 
 
 def _take_unusable(status: AxisStatus, event: ReplyUnusable) -> AxisStatus:

@@ -10,7 +10,7 @@ import click
 from typing_extensions import override
 
 from ldcnd.cli.connection import AXIS, Target, with_target
-from ldcnd.cli.typed import WholeNumber, axis_of
+from ldcnd.cli.typed import WholeNumber, check_there
 from ldcnd.client.events import follow_events
 from ldcnd.client.history import HistoryKind, HistoryRow, history, row_of
 from ldcnd.client.rig_client import RigClient
@@ -41,7 +41,7 @@ class Since(click.ParamType):  # type: ignore[type-arg] # generic in stubs only
 
 @click.command()
 @click.option("--since", type=Since(), help="Nothing before this: 90s, 10m, 2h or 1d ago, or a date and time.")
-@click.option("--axis", type=AXIS, help="Only this axis.")
+@click.option("--axis", type=AXIS, help="Only this axis, I/O module or line.")
 @click.option("--kind", type=click.Choice([kind.value for kind in HistoryKind]), multiple=True, help="Only this kind.")
 @click.option("--count", type=WholeNumber(1, 1000), default=50, show_default=True, help="Maximum number of rows.")
 @click.option("--csv", "as_csv", is_flag=True, help="Print CSV, with a row of names first.")
@@ -71,7 +71,7 @@ def log(
 
     async def work(client: RigClient) -> None:
         if axis is not None:
-            await axis_of(client, axis)
+            await check_there(client, axis, lines=True)
         if writer:
             writer.writerow(HistoryRow.model_fields)
         if not follow:
@@ -92,6 +92,6 @@ def _line(row: HistoryRow) -> str:
     at = datetime.fromtimestamp(row.t / 1e9, UTC).isoformat(timespec="milliseconds")
     who = f" by {row.who}" if row.who else ""
     where = "" if row.position is None else f" at {row.position:.6g}"
-    named = f" ({row.command_id})" if row.command_id and row.kind is not HistoryKind.DRIVE else ""
+    named = f" ({row.command_id})" if row.command_id and row.kind not in (HistoryKind.DRIVE, HistoryKind.FAULT) else ""
     why = f": {row.why}" if row.why else ""
     return f"{at} {row.kind:8}{row.axis:8} {row.what:16} {row.how:10}{who}{where}{named}{why}"

@@ -2,6 +2,7 @@
 
 import asyncio
 import sys
+from contextlib import suppress
 from datetime import UTC, datetime
 from difflib import get_close_matches
 
@@ -11,13 +12,13 @@ from click.shell_completion import CompletionItem
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.names import typed
 from ldcnd.cli.quantities import decimals, sample_text
-from ldcnd.cli.typed import Finite, WholeNumber, axis_of
+from ldcnd.cli.typed import Finite, WholeNumber, axis_of, check_there
 from ldcnd.client.fleet import AxisReport, RigReport, survey
-from ldcnd.client.overview import AxisNow, AxisSeen, overview, seen_of
+from ldcnd.client.overview import AxisNow, AxisSeen, modules_now, overview, seen_of
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
 from ldcnd.contract.commands import Why, WhyReply
-from ldcnd.contract.condition import SILENT_S, assess
+from ldcnd.contract.condition import SILENT_S, Condition, assess
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.fault_pages import codes, page_text
 from ldcnd.contract.meta import AxisInfo
@@ -48,13 +49,20 @@ class AxisRow(AxisSeen, AxisInfo):
 @click.command("list")
 @with_target
 def list_axes(target: Target) -> None:
-    """Show every axis: where it is, its state, whether it moves, and whether its drive answers.
+    """Show every axis: where it is, its state, whether it moves, and whether its drive answers; and I/O modules.
 
     A position in brackets does not say where the axis is; the words behind it say why.
     """
-    axes = target.run(overview)
+
+    async def work(client: RigClient) -> tuple[list[AxisNow], dict[str, tuple[str, Condition]]]:
+        return await overview(client), await modules_now(client)
+
+    axes, modules = target.run(work)
     for now, line in zip(axes, axes_table(axes), strict=True):
         target.show(row(now), line)
+    for name, (bus, condition) in modules.items():
+        if not target.as_json:  # there a row is an axis
+            click.echo(f"{name}  I/O module  {bus}  {condition.summary}")
 
 
 def axes_table(axes: list[AxisNow]) -> list[str]:
@@ -99,17 +107,19 @@ def watch(target: Target, axis: str, item: str | None, count: int | None) -> Non
     """Show the telemetry of AXIS, an axis or an I/O module (or of all), as it comes."""
 
     async def work(client: RigClient) -> None:
-        if axis != "*" and axis not in {module.name for bus in await client.buses() for module in bus.modules}:
-            await axis_of(client, axis)
+        if axis != "*":
+            await check_there(client, axis)
         seen, watched = 0, Watched()
         async with client.samples(axis, item or "*") as samples:
             _say_conditions(watched, await overview(client), axis)
+            await _say_modules(client, axis)
             while seen != count:
                 try:
                     async with asyncio.timeout(SILENT_S):
                         name, sample = await anext(samples)
                 except TimeoutError:
                     await _say_silence(client, axis)
+                    await _say_modules(client, axis)
                     continue
                 target.show(sample, f"{name:8} {watched.text(name, sample)}")
                 seen += 1
@@ -155,6 +165,15 @@ def _say_conditions(watched: Watched, axes: list[AxisNow], wanted: str) -> None:
             watched.begin(now)
             if now.condition.wrong:
                 click.echo(f"{now.info.axis:8} {_all_of(now)}", err=True)
+
+
+async def _say_modules(client: RigClient, wanted: str) -> None:
+    """Say what is wrong with I/O modules."""
+    with suppress(LdcndError):  # that nothing answers is said of the axes
+        for name, (_, condition) in (await modules_now(client)).items():
+            if wanted in ("*", name):
+                for trouble in condition.wrong:
+                    click.echo(f"{name:8} {trouble.text}", err=True)
 
 
 async def _say_silence(client: RigClient, wanted: str) -> None:

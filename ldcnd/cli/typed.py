@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import click
 from typing_extensions import override
 
+from ldcnd.client.overview import last_bus_health
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import ConfigError, UnknownAxis
 from ldcnd.contract.frozen import Frozen
@@ -49,6 +50,20 @@ async def axis_of(client: RigClient, name: str) -> AxisInfo:
     if name not in axes:
         raise unknown("axis", name, axes)
     return axes[name]
+
+
+async def check_there(client: RigClient, name: str, *, lines: bool = False) -> None:
+    """Refuse the name of nothing that the rig has: an axis, an I/O module or, with `lines`, a line.
+
+    Raises:
+        UnknownAxis: the rig has none of that name.
+    """
+    buses = await client.buses()
+    known = {module.name for bus in buses for module in bus.modules}  # none while the line is down
+    known |= {module.module for report in await last_bus_health(client) for module in report.modules}
+    known |= {bus.bus for bus in buses} if lines else set()
+    if name not in known:
+        await axis_of(client, name)
 
 
 def number_of(text: str, written: str) -> TypedNumber:

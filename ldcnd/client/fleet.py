@@ -4,7 +4,7 @@ import asyncio
 
 from ldcnd.client.overview import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient, daemons, find_rigs
-from ldcnd.contract.condition import Condition, assess, line_troubles
+from ldcnd.contract.condition import Condition, assess, assess_module, line_troubles
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth
@@ -136,6 +136,13 @@ def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: t
         problems.append(f"the daemon is late by {health.loop_lag_s:.2f} s")
     problems += [f"{bus.bus}: {trouble.text}" for bus in buses for trouble in line_troubles(up=bus.up)]
     down = {bus.bus for bus in buses if not bus.up}
+    problems += [
+        f"{module.module}: {trouble.text}"
+        for bus in buses
+        if bus.up
+        for module in bus.modules
+        for trouble in assess_module(module).wrong
+    ]
     problems += [
         f"{axis.info.axis}: {trouble.text}"
         for axis in axes

@@ -8,6 +8,8 @@ from ldcnd.contract.events import (
     ALARM_HISTORY,
     DRIVE_CHANGED,
     INTERLOCK,
+    LINK_BACK,
+    LINK_LOST,
     REFERENCE,
     UNSETTLED,
     CommandEvent,
@@ -17,7 +19,7 @@ from ldcnd.contract.meta import AxisInfo, DaemonInfo
 from ldcnd.contract.samples import PastFault
 
 CONTROL = frozenset({"acquire", "renew", "release", "override_interlock"})
-BY_ITSELF = frozenset({ALARM_HISTORY, DRIVE_CHANGED, INTERLOCK, REFERENCE, UNSETTLED})
+BY_ITSELF = frozenset({ALARM_HISTORY, DRIVE_CHANGED, INTERLOCK, LINK_BACK, REFERENCE, UNSETTLED})
 MOST_EVENTS = 1000
 
 
@@ -29,11 +31,11 @@ class HistoryKind(StrEnum):
     CONTROL = "control"
     """Control was taken, lost or refused, or an interlock was overridden."""
     FAULT = "fault"
-    """A fault was seen."""
+    """A fault was seen, or the loss of a line or of an I/O module."""
     DAEMON = "daemon"
     """The daemon was started: what an earlier run of it has seen is not known any more, but for faults."""
     DRIVE = "drive"
-    """A drive did something that no command of the daemon explains."""
+    """A drive did something that no command of the daemon explains; what was lost answers again."""
 
 
 class HistoryRow(Frozen):
@@ -44,7 +46,7 @@ class HistoryRow(Frozen):
     kind: HistoryKind
     """What kind of thing it was."""
     axis: str
-    """The axis, or the I/O module; empty for what concerns the rig."""
+    """The axis, the I/O module or the line; empty for what concerns the rig."""
     what: str
     """The verb of the command, of `power` with on or off, or the code of the fault."""
     how: str
@@ -68,6 +70,8 @@ def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
     kind = HistoryKind.COMMAND
     if event.verb in CONTROL:
         kind = HistoryKind.CONTROL
+    elif event.verb == LINK_LOST:
+        kind = HistoryKind.FAULT
     elif event.verb in BY_ITSELF:
         kind = HistoryKind.DRIVE
     login = f" ({event.login})" if event.login else ""
@@ -76,7 +80,7 @@ def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
         kind=kind,
         axis=event.axis,
         what=event.verb if event.on is None else f"{event.verb} {'on' if event.on else 'off'}",
-        how="" if kind is HistoryKind.DRIVE else event.status.value,
+        how="" if kind in (HistoryKind.DRIVE, HistoryKind.FAULT) else event.status.value,
         who=f"{event.client or ''}{login}".strip(),
         why=event.reason or "",
         code=event.code,

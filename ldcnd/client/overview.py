@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import decode_received
-from ldcnd.contract.condition import Condition, Place, assess
+from ldcnd.contract.condition import Condition, Place, assess, assess_module
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth
 from ldcnd.contract.meta import AxisInfo
@@ -101,6 +101,15 @@ class AxisNow:
     age_s: float | None
     health: AxisHealth | None
     condition: Condition
+
+
+async def modules_now(client: RigClient) -> dict[str, tuple[str, Condition]]:
+    """Return the line and the condition of every I/O module that has a name."""
+    return {
+        module.module: (line.bus, assess_module(module, line_up=line.up))
+        for line in await last_bus_health(client)
+        for module in line.modules
+    }
 
 
 async def overview(client: RigClient) -> list[AxisNow]:

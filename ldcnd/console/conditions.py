@@ -1,4 +1,4 @@
-"""The condition of every axis of one rig, decided here and sent to pages as a value beside the daemon's own.
+"""The condition of every axis and module of one rig, decided here and sent to pages as a value beside the daemon's own.
 
 A page shows it and has no rule of its own. A condition changes without a sample too: positions get old, a daemon falls
 silent. So it is decided again a few times a second, and goes to pages when it is another.
@@ -14,7 +14,16 @@ import msgpack
 from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.contract.codec import Encoding, decode_received
-from ldcnd.contract.condition import SILENT_S, Condition, Place, Severity, Trouble, TroubleKind, assess
+from ldcnd.contract.condition import (
+    SILENT_S,
+    Condition,
+    Place,
+    Severity,
+    Trouble,
+    TroubleKind,
+    assess,
+    assess_module,
+)
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.health import BusHealth
 from ldcnd.contract.keys import Keys
@@ -95,6 +104,10 @@ class Conditions:
         """Decide anew, and send what is another."""
         for name, axis in self._axes.items():
             self._show(name, axis, self._silence)
+        for line in self._lines.values():
+            for module in line.modules:
+                condition = assess_module(module, line_up=line.up, silence=self._silence)
+                self._send(module.module, self._axes.setdefault(module.module, _Axis()), condition)
 
     @property
     def _silence(self) -> str:
@@ -105,7 +118,10 @@ class Conditions:
     def _show(self, name: str, axis: _Axis, silence: str) -> None:
         if axis.state is None and axis.position is None:
             return  # an I/O module
-        payload = msgpack.packb(self._condition(name, axis, silence))
+        self._send(name, axis, self._condition(name, axis, silence))
+
+    def _send(self, name: str, axis: _Axis, condition: Condition) -> None:
+        payload = msgpack.packb(as_payload(condition))
         if payload != axis.shown:
             axis.shown = payload
             key = f"{self._telemetry}{name}/{TOPIC}"
@@ -117,7 +133,7 @@ class Conditions:
             await asyncio.sleep(PERIOD_S)
             self.show()
 
-    def _condition(self, name: str, axis: _Axis, silence: str) -> dict[str, object]:
+    def _condition(self, name: str, axis: _Axis, silence: str) -> Condition:
         state, fault = _decoded(axis.state, StateSample), _decoded(axis.fault, FaultSample)
         position = _decoded(axis.position, PositionSample)
         for sample in (state, position):
@@ -125,7 +141,7 @@ class Conditions:
                 self._clock.note(sample.t, self._now_s())
         line = next((line for line in self._lines.values() if any(each.axis == name for each in line.axes)), None)
         health = next((each for each in line.axes if each.axis == name), None) if line else None
-        condition = assess(
+        return assess(
             state,
             fault,
             health,
@@ -133,7 +149,6 @@ class Conditions:
             line_up=line is None or line.up,
             silence=silence,
         )
-        return as_payload(condition)
 
 
 def as_payload(condition: Condition) -> dict[str, object]:

@@ -1,15 +1,15 @@
-"""The condition of an axis: whether its place is known, and all that is to be said of it, in words.
+"""The condition of an axis, a line or an I/O module: all that is to be said of it, in words.
 
 Every face shows what this module decides: command line, console, gateways, metrics, notebooks. None has a rule or a
 sentence of its own; the console's pages get the result from the console's server.
 """
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum, auto
 from typing import Protocol
 
-from ldcnd.contract.health import AxisHealth
+from ldcnd.contract.health import AxisHealth, ModuleHealth
 from ldcnd.contract.samples import (
     UNKNOWN_HOLDER,
     AxisState,
@@ -17,6 +17,7 @@ from ldcnd.contract.samples import (
     FaultEntry,
     LinkState,
     Moving,
+    PastFault,
     Quality,
     TelemetryItem,
 )
@@ -69,6 +70,7 @@ class TroubleKind(Enum):
     MISSED_POLLS = auto()
     SLOW = auto()
     OVERRIDDEN = auto()
+    FLOATING = auto()
     SLOWED = auto()
 
 
@@ -281,8 +283,12 @@ _OVERRIDE_ZERO = Trouble(
     TroubleKind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: nothing moves", "speed override 0 %"
 )
 _MISSED_POLLS = Trouble(TroubleKind.MISSED_POLLS, _NOTICE, "the drive missed its latest polls", "missed polls")
+_MODULE_SILENT = replace(_NO_ANSWER, text="the module does not answer; check its power and the line")
+_MODULE_MISSES = replace(_MISSED_POLLS, text="the module missed its latest polls")
 SHARED = frozenset({TroubleKind.SILENCE, TroubleKind.NOT_HOMED, TroubleKind.STANDS_BY_OVERRIDE})
 """Troubles of which several axes have one cause, or which are said once for all; so is a line that is down."""
+TELL_OF_THE_PAST = frozenset({"loop_opened"})
+"""Faults that say what has happened and are seen in one reading only; the others say what is so while they stand."""
 _MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
 """Faults whose name says best why the position is lost."""
 _DRIVEN = frozenset({AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION})
@@ -297,6 +303,38 @@ def line_troubles(*, up: bool, problem: str = "") -> tuple[Trouble, ...]:
     """
     text = f"{_ON_DEAD_LINE.text}: {problem}" if problem else _ON_DEAD_LINE.text
     return () if up else (Trouble(TroubleKind.LINE_DOWN, _WRONG, text, _ON_DEAD_LINE.short),)
+
+
+def assess_module(health: ModuleHealth, *, line_up: bool = True, silence: str = "") -> Condition:
+    """Return the condition of an I/O module.
+
+    Args:
+        health: its last report.
+        line_up: its line is up.
+        silence: why nothing comes from its daemon; empty while it reports.
+    """
+    gone = _silent(silence) if silence else None if line_up else _ON_DEAD_LINE
+    if gone is None and health.link is LinkState.DOWN:
+        gone = _MODULE_SILENT
+    if gone:
+        return _unanswered("unknown", (gone,), gone.short)
+    troubles = [_MODULE_MISSES] if health.link is LinkState.DEGRADED else []
+    if health.floating:
+        text = f"{', '.join(health.floating)}: was set before the module lost its power, and floats until it is set"
+        troubles.append(Trouble(TroubleKind.FLOATING, _NOTICE, text, "outputs float"))
+    alarm = Alarm(max((trouble.severity for trouble in troubles), default=_FINE))
+    return Condition(Place.KNOWN, "", "answers", live=True, alarm=alarm, troubles=tuple(troubles))
+
+
+def is_over(fault: PastFault, active: Collection[FaultEntry], link: LinkState) -> bool:
+    """Tell whether a fault is seen to stand no more: its axis is read, and does not show it."""
+    stands = any(each.code == fault.code for each in active)
+    return link is LinkState.UP and not stands and fault.code not in TELL_OF_THE_PAST
+
+
+def over_in_words(fault: PastFault) -> str:
+    """Return a fault that stands no more in words: its text says what is so while it stands."""
+    return f"{_words(fault.code)}, which is over"
 
 
 def assess(
@@ -387,7 +425,11 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     entries = _first_cause_first(faults) if faults else []
     found = [_of_fault(entry, TroubleKind.FAULT, _WRONG) for entry in entries if entry.stops]
     if state.state is AxisState.ERROR_STOP and not found:
-        text = f"in error stop: {state.last_error or 'reset it to go on'}"
+        first = faults.first if faults else None
+        if faults and first and is_over(first, faults.active, state.link):
+            text = f"in error stop because of {over_in_words(first)}: reset it to go on"
+        else:
+            text = f"in error stop: {state.last_error or 'reset it to go on'}"
         found.append(Trouble(TroubleKind.ERROR_STOP, _WRONG, text, "error stop"))
     if place is Place.OLD:
         found.append(_OLD)

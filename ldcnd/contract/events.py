@@ -15,6 +15,11 @@ DRIVE_CHANGED = "drive_changed"
 """The verb of an event that no command has caused: a drive was reset, or changed by another program."""
 INTERLOCK = "interlock"
 """The verb of an event that no command has caused: an interlock has ended a motion."""
+LINK_LOST = "link_lost"
+"""The verb of an event that no command has caused: a line or an I/O module has stopped answering; of a drive, a fault
+says that."""
+LINK_BACK = "link_back"
+"""The verb of an event that no command has caused: a line, an I/O module or a drive answers again."""
 UNSETTLED = "unsettled"
 """The verb of an event beside that of a motion that did not settle in its time."""
 
@@ -61,14 +66,15 @@ class CommandEvent(Frozen):
     number: int = Field(ge=0)
     """Grows by one with every event of the rig: a gap is filled by a request for what is missing."""
     axis: str
-    """The axis, or the I/O module."""
+    """The axis, the I/O module or the line."""
     command_id: str
     """Id of the command."""
     verb: str
     """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
     motion that did not settle, `reference` for what became of a kept reference, `drive_changed` for a drive that was
-    reset or that another program has changed, `interlock` for a motion that an interlock has ended, and of an I/O
-    module the situation for which its outputs were set, or `output_differs`: these have no request."""
+    reset or that another program has changed, `interlock` for a motion that an interlock has ended, `link_lost` and
+    `link_back` for what has stopped answering and answers again, and of an I/O module the situation for which its
+    outputs were set, or `output_differs`: these have no request."""
     on: bool | None = None
     """Direction of `power`: true to close the loop, false to open it; null of every other verb."""
     client: str | None

@@ -78,6 +78,17 @@ class AxisHealth(Frozen):
     """How often its drive's EEPROM was written, ever; null for drives without one and where no ledger is kept."""
 
 
+class ModuleHealth(Frozen):
+    """Whether an I/O module answers, and what it has lost."""
+
+    module: str
+    """The module."""
+    link: LinkState
+    """Whether it answers."""
+    floating: tuple[str, ...] = ()
+    """Named outputs that were set before it lost its power, and that float until they are set again."""
+
+
 class GuestHealth(Frozen):
     """A port on the line, and the program that uses it."""
 
@@ -136,6 +147,8 @@ class BusHealth(LineCounters[Annotated[int, Field(ge=0)]]):
     """How long a stop would have to wait."""
     axes: tuple[AxisHealth, ...]
     """The axes on the line."""
+    modules: tuple[ModuleHealth, ...] = ()
+    """Its I/O modules that have a name."""
     guests: tuple[GuestHealth, ...] = ()
     """Its ports that are served."""
 

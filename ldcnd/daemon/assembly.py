@@ -27,6 +27,7 @@ from ldcnd.daemon.heartbeat import Heartbeat
 from ldcnd.daemon.leases import Authority, random_token
 from ldcnd.daemon.ledger import EventLog, Ledger
 from ldcnd.daemon.line import BusService
+from ldcnd.daemon.link_events import Note
 from ldcnd.daemon.modules import ModuleService
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.axis_config import AxisConfig
@@ -113,9 +114,14 @@ def build_daemon(
 
     open_lines = {name: FAMILIES[name].open_lines(config.state_dir) for name in {bus.family for bus in config.bus}}
     groups = {group.name: group.axes for bus in config.bus for group in bus.group}
-    buses = tuple(_build_bus(config, bus, open_lines[bus.family], make_axis, openers) for bus in config.bus)
+    buses = tuple(
+        _build_bus(config, bus, open_lines[bus.family], make_axis, openers, events.noting(bus.name))
+        for bus in config.bus
+    )
     modules = tuple(
-        ModuleService(driver, publisher, clock, tuple(axis.config.name for axis in bus.axes))
+        ModuleService(
+            driver, publisher, clock, tuple(axis.config.name for axis in bus.axes), events.noting(driver.name)
+        )
         for bus in buses
         for driver in bus.network.io.values()
     )
@@ -189,6 +195,7 @@ def _build_bus(
     open_line: OpenLine[Any],
     make_axis: Callable[[AxisConfig, Bus, Drive], AxisService],
     openers: Mapping[str, Opener],
+    note: Note,
 ) -> BusService:
     opener = openers.get(settings.name)
     if opener is None and settings.simulated:
@@ -201,5 +208,6 @@ def _build_bus(
         axes,
         port=settings.port,
         family=settings.family,
+        note=note,
         stop_probe_hz=demand_of(settings).stop_probe_hz,
     )

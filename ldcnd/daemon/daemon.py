@@ -3,12 +3,12 @@
 import asyncio
 import contextlib
 from collections.abc import Awaitable, Callable, Coroutine
-from functools import partial
 from typing import Any
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.latches import LatchKeeper
+from ldcnd.axis.status import AxisStatus
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.keys import Keys
@@ -20,6 +20,7 @@ from ldcnd.daemon.dispatch import Dispatcher, EarlyStops, Requests
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.heartbeat import Heartbeat
 from ldcnd.daemon.leases import apply_policy
+from ldcnd.daemon.link_events import LinkEvents
 from ldcnd.daemon.meta import Describing
 from ldcnd.daemon.modules import Situation
 from ldcnd.daemon.rig import OwnedRig
@@ -145,7 +146,7 @@ class Daemon:
             leases.group = group
             requests = Requests(self.rig, self._keys, group, self._dispatcher)
             for each in self.rig.axes.values():
-                each.readings.returned = partial(self._returned, each, group)
+                self._watch_link(each, group)
             serving: list[asyncio.Task[None]] = []
             try:
                 await self._declare_stops(declared, requests)
@@ -271,10 +272,27 @@ class Daemon:
             for name, axis in self.rig.axes.items():
                 group.create_task(axis.reference.finish(), name=f"keep {name}")
 
-    def _returned(self, axis: AxisService, group: asyncio.TaskGroup) -> None:
-        """A drive answers again that was out of reach: if it still moves, do what its policy says."""
-        policy = apply_policy(axis, axis.config.loss.bus, "the drive was out of reach")
-        group.create_task(policy, name=f"bus loss {axis.config.name}")
+    def _watch_link(self, axis: AxisService, group: asyncio.TaskGroup) -> None:
+        """Act and tell when a drive answers again that was out of reach; its fault tells that it was."""
+        name = axis.config.name
+        link_events = LinkEvents(self._dispatcher.events.noting(name), "the drive", None)
+
+        def changed(_before: AxisStatus, after: AxisStatus) -> None:
+            if after.link is LinkState.DOWN:
+                link_events.lost()
+
+        async def rest() -> None:
+            """If it still moves, do what its policy says."""
+            cause = "the drive was out of reach"
+            if said := await apply_policy(axis, axis.config.loss.bus, cause):
+                link_events.add(f"{said}, its policy of loss.bus")
+
+        def returned() -> None:
+            link_events.back()
+            group.create_task(rest(), name=f"bus loss {name}")
+
+        axis.tracker.watch(changed, "link")
+        axis.readings.returned = returned
 
     async def _watch_axes(self) -> None:
         """Keep one liveliness token for each axis whose drive answers."""

@@ -178,6 +178,7 @@ class HealthWatch:
             lanes=tuple(_lane(service, lane) for lane in Lane),
             stop_wait=self._stop_wait(service),
             axes=tuple(self._axis(axis, service.asked_hz(axis.config.name), t) for axis in service.axes),
+            modules=tuple(self._rig.modules[each].health for each in service.network.io),
             guests=tuple(self._guest(port, guest, period_s) for port, guest in service.guests.items()),
         )
 

@@ -142,7 +142,6 @@ class Interlocks:
         for module in rig.modules.values():
             module.check = self._check_outputs
             module.changed = self._note_change
-            module.note = partial(self._note, module.name)
 
     def _rule(self, config: InterlockConfig) -> BoundRule:
         age_s = config.within_ms / 1e3 * (1 - 1 / LOOKS)
@@ -161,9 +160,6 @@ class Interlocks:
     def _note_change(self) -> None:
         self._version += 1
         self._changed.set()
-
-    def _note(self, about: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
-        self._events.note(about, verb, status, reason, code=code)
 
     def _obstacle(self, rule: BoundRule, *, watched: bool = False) -> str:
         """Return why a rule forbids what it binds; empty when it does not."""

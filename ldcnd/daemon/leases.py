@@ -384,14 +384,19 @@ class LeaseWatch:
             )
 
 
-async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> None:
-    """Do to an axis that moves, or may move, what its policy says; a latched stop outranks it."""
+async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> str:
+    """Do to an axis that moves, or may move, what its policy says; a latched stop outranks it.
+
+    Returns what was done, in words; empty when nothing was to be done.
+    """
     tracker = axis.tracker
     if tracker.status.stop_pending:
-        return  # it is sent again until the drive confirms it, whatever the policy
+        return ""  # it is sent again until the drive confirms it, whatever the policy
     if policy is LossPolicy.RUN_TO_TARGET and (tracker.status.stop_latched or tracker.status.driven_open):
         policy = LossPolicy.HALT  # a raw duty has no target, and no drive ends it
     if policy is LossPolicy.RUN_TO_TARGET or tracker.status.moving is Moving.NO:
-        return
+        return ""
     log.warning("loss policy", axis=axis.config.name, policy=policy.value, cause=cause)
-    await axis.stops.bring_to_rest(STOP_MODES[policy])
+    if await axis.stops.bring_to_rest(STOP_MODES[policy]):
+        return policy.value
+    return f"{policy.value}, not confirmed yet" if axis.stops.possible else ""

@@ -32,6 +32,7 @@ from ldcnd.contract.errors import (
     step,
 )
 from ldcnd.contract.events import FINAL, CommandEvent, CommandStatus, EventList, ReadEvents
+from ldcnd.daemon.link_events import Note
 from ldcnd.log import LogLimit, get_logger
 from ldcnd.net.publisher import Publisher
 
@@ -377,6 +378,10 @@ class EventLog:
         )
         self._end += 1
         self._deliver(event)
+
+    def noting(self, about: str) -> Note:
+        """Return what enters events of one axis, module or line: it takes verb, status, reason and code."""
+        return lambda verb, status, reason, code: self.note(about, verb, status, reason, code=code)
 
     def _deliver(self, event: CommandEvent) -> None:
         self._kept.append(event)

@@ -14,6 +14,7 @@ from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import BusDown, BusError, LdcndError, NetworkMismatch, WrongState
 from ldcnd.contract.rig_commands import CapturedInputs, SnapshotReply
 from ldcnd.contract.samples import TelemetryItem
+from ldcnd.daemon.link_events import LinkEvents, Note
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import PollsItself, Readable, ReadingListeners, StopMode
 from ldcnd.drives.network import BringUpReport, Network
@@ -57,6 +58,7 @@ class BusService:
         *,
         port: str,
         family: str,
+        note: Note = lambda *_: None,
         stop_probe_hz: float = 0.0,
     ) -> None:
         self.bus = bus
@@ -66,6 +68,7 @@ class BusService:
         self.axes = axes
         self.report: BringUpReport | None = None
         self.problem = "not opened yet"
+        self._link_events = LinkEvents(note, "the line", "bus_down")
         self.guests: dict[str, GuestView] = {}
         self._pollers: dict[str, Poller[Any]] = {}
         self._stop_probe_hz = stop_probe_hz
@@ -197,6 +200,7 @@ class BusService:
             self._connect(report)
             await self._scan_for_lost_drives()
             self.report, self.problem = None, "the line was lost"
+            self._link_events.lost(f"the line was lost: {self.bus.loss_reason}".rstrip(": "))
             self._up.clear()
             self._down.set()
             for axis in self.axes:
@@ -339,6 +343,7 @@ class BusService:
         for watch in self.network.watches:
             self.bus.add_poller(watch)
         self._was_up = True
+        self._link_events.back()
         self._down.clear()
         self._up.set()
 

@@ -8,8 +8,10 @@ from enum import StrEnum
 from ldcnd.axis.clock import Clock
 from ldcnd.contract.errors import BusError, LdcndError, MalformedRequest, ValueOutOfRange
 from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.health import ModuleHealth
 from ldcnd.contract.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer
-from ldcnd.contract.samples import IoReading, Quality, TelemetryItem
+from ldcnd.contract.samples import IoReading, LinkState, Quality, TelemetryItem
+from ldcnd.daemon.link_events import LinkEvents, Note
 from ldcnd.drives.line_config import InputConfig, OutputConfig, OutputLevel
 from ldcnd.drives.network import IoDriver
 from ldcnd.line.exchange import Timing
@@ -90,7 +92,6 @@ class ModuleService:
         before: of outputs that are being written the value that they had, and when that was read, in loop time.
         check: raises what forbids to write outputs, each true for high, false for low and None to let go of it.
         changed: called when one of the values has changed.
-        note: takes an event of the module: verb, status, reason and code.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class ModuleService:
         publisher: Publisher,
         clock: Clock,
         axes: tuple[str, ...],
+        note: Note,
     ) -> None:
         inputs, outputs = driver.inputs, driver.outputs
         self.name = driver.name
@@ -106,7 +108,8 @@ class ModuleService:
         self.read_at_s = -math.inf
         self.check: Callable[[Mapping[str, bool | None]], None] = lambda _levels: None
         self.changed: Callable[[], None] = lambda: None
-        self.note: Callable[[str, CommandStatus, str, str | None], None] = lambda *_: None
+        self._note = note
+        self._link_events = LinkEvents(note, "the module", "link_lost")
         self._driver = driver
         self._inputs = {name: NamedInput(config, driver.period_s) for name, config in inputs.items()}
         self._outputs = outputs
@@ -117,6 +120,8 @@ class ModuleService:
         self.before: dict[str, tuple[bool | None, float]] = {}
         self._differs = dict.fromkeys(outputs, 0)
         self._unread_until_s: dict[str, float] = {}  # outputs of which only what is requested from then on tells
+        self._set: dict[str, bool] = {}  # levels of outputs that were written, until the module loses its power
+        self._floating: dict[str, bool] = {}  # those that it has lost so, until they are written again
         self._reading: IoReading | None = None
         self._clock = clock
         self._topic = publisher.item(driver.name, TelemetryItem.IO)
@@ -133,6 +138,14 @@ class ModuleService:
     def names(self) -> tuple[str, ...]:
         """Names of its inputs and outputs."""
         return tuple(self._lines)
+
+    @property
+    def health(self) -> ModuleHealth:
+        """Whether it answers, and what it has lost."""
+        link = LinkState.DEGRADED if self._misses else LinkState.UP
+        return ModuleHealth(
+            module=self.name, link=link if self._reading else LinkState.DOWN, floating=tuple(self._floating)
+        )
 
     def _level(self, name: str, line: int, reading: IoReading) -> bool | None:
         """Return the level of an output: that of its pin, if it is known to be driven and the pin shows that.
@@ -187,7 +200,7 @@ class ModuleService:
             return before == DIFFERS_AFTER
         reason = f"output {name} was set {_word(written)} and its pin shows {_word(not written)}: check what it drives"
         log.error("output differs", module=self.name, output=name, reason=reason)
-        self.note("output_differs", CommandStatus.FAILED, reason, None)
+        self._note("output_differs", CommandStatus.FAILED, reason, None)
         return True
 
     def _lost(self) -> None:
@@ -198,6 +211,8 @@ class ModuleService:
 
     def _gone(self) -> None:
         """It is out of reach: nothing is known of its lines."""
+        if self._seen:
+            self._link_events.lost()
         self._reading, self.read_at_s = None, -math.inf
         for each in self._inputs.values():
             each.forget()
@@ -268,7 +283,13 @@ class ModuleService:
             self.before = {name: (values[name], self.read_at_s) for name in changes} | self.before
             try:
                 with only_while(permitted):
-                    return await self._driver.set_outputs(levels, inputs, pwm)
+                    reading = await self._driver.set_outputs(levels, inputs, pwm)
+                for name, level in asked.items():
+                    self._floating.pop(name, None)
+                    self._set.pop(name, None)
+                    if level is not None:
+                        self._set[name] = level
+                return reading
             finally:
                 self._unread_until_s |= dict.fromkeys(changes, asyncio.get_running_loop().time())
 
@@ -296,10 +317,15 @@ class ModuleService:
     def _returned(self) -> None:
         """The module answers for the first time, or again after it was out of reach."""
         if self._driver.restarted:
+            self._floating, self._set = self._floating | self._set, {}
+            for name, level in self._floating.items():
+                if Situation.RESET.level_of(self._outputs[name]) is None:
+                    self._link_events.add(f"output {name}, which was {_word(level)}, floats until it is set")
             self.enter(Situation.RESET if self._seen else Situation.START)
         elif self._seen:
             self.enter(Situation.BUS)
         self._driver.restarted, self._seen = False, True
+        self._link_events.back()
 
     def enter(self, situation: Situation) -> None:
         """Have the outputs written that have a level in a situation."""
@@ -334,9 +360,11 @@ class ModuleService:
             except LdcndError as error:
                 complete = complete and not isinstance(error, BusError)
                 log.warning("output not set", module=self.name, output=name, reason=error.message)
-                self.note(situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value)
+                self._note(
+                    situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value
+                )
             else:
-                self.note(situation.value, CommandStatus.DONE, said, None)
+                self._note(situation.value, CommandStatus.DONE, said, None)
         return complete
 
 

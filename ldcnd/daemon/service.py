@@ -17,8 +17,9 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
+from ldcnd.axis.status import AxisStatus
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.condition import TroubleKind, assess, line_troubles
+from ldcnd.contract.condition import Condition, TroubleKind, assess, assess_module, line_troubles
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.rig_commands import Reload, ReloadReply
 from ldcnd.contract.samples import FaultEntry, LinkState
@@ -265,7 +266,7 @@ def _remark(refused: Sequence[str]) -> str:
 
 
 def describe(rig: OwnedRig) -> str:
-    """Return in one line what of a rig works and what does not; what is true of several axes is said once.
+    """Return in one line what of a rig works and what does not; what is true of several is said once.
 
     Polls that a drive missed are left out: a status is for what lasts.
     """
@@ -275,15 +276,19 @@ def describe(rig: OwnedRig) -> str:
         why = bus.problem if bus.bus.is_open else bus.bus.loss_reason or bus.problem
         for trouble in line_troubles(up=up, problem=why):
             wrong.setdefault(trouble.text, []).append(name)
-        for axis in bus.axes if up else ():
-            status = axis.tracker.status
-            troubles = assess(status, _Faults(status.active_faults, status.first_fault)).wrong
-            for trouble in [each for each in troubles if each.kind is not TroubleKind.MISSED_POLLS][:1]:
-                wrong.setdefault(trouble.text, []).append(axis.config.name)
+        found = {axis.config.name: _condition(axis.tracker.status) for axis in bus.axes}
+        found |= {name: assess_module(rig.modules[name].health) for name in bus.network.io}
+        for about, condition in found.items() if up else ():
+            for trouble in [each for each in condition.wrong if each.kind is not TroubleKind.MISSED_POLLS][:1]:
+                wrong.setdefault(trouble.text, []).append(about)
     buses_up = sum(bus.report is not None for bus in rig.buses)
     axes_up = sum(axis.tracker.status.link is not LinkState.DOWN for axis in rig.axes.values())
     parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {axes_up}/{len(rig.axes)} axes up"]
     return "; ".join(parts + [f"{', '.join(names)}: {text}" for text, names in wrong.items()])
+
+
+def _condition(status: AxisStatus) -> Condition:
+    return assess(status, _Faults(status.active_faults, status.first_fault))
 
 
 class _Faults(NamedTuple):

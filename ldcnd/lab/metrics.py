@@ -124,8 +124,11 @@ class HealthCollector(Collector):
         exchanges = CounterMetricFamily("ldcnd_bus_exchanges", "Requests sent", labels=labels)
         resent = CounterMetricFamily("ldcnd_bus_resent", "Exchanges sent again", labels=labels)
         errors = CounterMetricFamily("ldcnd_bus_errors", "What went wrong on a line", labels=[*labels, "kind"])
+        module_up = GaugeMetricFamily("ldcnd_module_up", "1 while an I/O module answers", labels=[*labels, "module"])
         for bus in buses:
             values = [self._rig, bus.bus]
+            for module in bus.modules:
+                module_up.add_metric([*values, module.module], float(bus.up and module.link is LinkState.UP))
             up.add_metric(values, float(bus.up))
             busy.add_metric(values, bus.utilisation)
             exchanges.add_metric(values, bus.exchanges)
@@ -133,7 +136,7 @@ class HealthCollector(Collector):
             counts = bus.model_dump(include=set(ERRORS))
             for kind in ERRORS:
                 errors.add_metric([*values, kind], counts[kind])
-        yield from (up, busy, exchanges, resent, errors)
+        yield from (up, busy, exchanges, resent, errors, module_up)
 
     def _of_lanes(self, buses: list[BusHealth]) -> Iterator[Metric]:
         labels = ["rig", "bus", "lane"]

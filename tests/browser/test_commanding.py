@@ -279,8 +279,8 @@ async def test_an_output_is_set_and_an_instant_taken_from_the_network_page(house
         await module.get_by_label("Line").select_option("4")
         await module.get_by_label("Becomes").select_option("output, low")
         await module.get_by_role("button", name="Set line 4").click()
-        await expect(module.get_by_role("status")).to_contain_text("4 low")
-        await expect(module.get_by_role("status")).to_contain_text("Outputs: 4.")
+        await expect(lines).to_contain_text("4 low")
+        await expect(lines).to_contain_text("outputs4")
         await expect(lines).to_contain_text("lampoff")
 
         await desk.button("Take a snapshot of sim on line0").click()
@@ -289,7 +289,7 @@ async def test_an_output_is_set_and_an_instant_taken_from_the_network_page(house
         await expect(taken.get_by_role("row")).to_have_count(6)
         await module.get_by_label("Becomes").select_option("input")
         await module.get_by_role("button", name="Set line 4").click()
-        await expect(module.get_by_role("status")).to_contain_text("Outputs: none.")
+        await expect(lines).to_contain_text("outputsnone")
 
         await desk.page.evaluate("() => { location.hash = '#/rig'; }")
         await expect(desk.panel("Rig sim").get_by_role("link", name="x", exact=True)).to_be_visible()

@@ -59,6 +59,21 @@ CALM = """() => {
   return ["Nothing needs attention", "Ready to move"].filter((each) => text.includes(each))
     .concat(["Nothing moves"].filter((each) => strip.includes(each)));
 }"""
+UNMARKED_LAST = """() => [...document.querySelectorAll("td [data-known=no] b")]
+  .filter((each) => !each.textContent.startsWith("(") || getComputedStyle(each).fontStyle !== "italic").length"""
+MODULE = """() => [...document.querySelectorAll("section")]
+  .filter((each) => each.querySelector("h2, h3")?.textContent === "Module cabinet")
+  .filter((each) => each.parentElement.closest("section")?.textContent.startsWith("alpha"))
+  .map((each) => each.textContent).join()"""
+ATTENTION = """() => document.querySelector(".attention, main").textContent"""
+EVENTS = """() => [...document.querySelectorAll("tr")].map((each) => each.textContent)
+  .filter((each) => each.includes("cabinet")).join()"""
+EVENT = """
+[[sim.event]]
+at_s = {}
+module = 5
+power = "{}"
+"""
 NAMED = (
     """() => [...document.querySelectorAll(".notices .notice")].some((each) => each.textContent.includes("alpha"))"""
 )
@@ -109,3 +124,34 @@ async def test_no_value_of_a_daemon_that_is_gone_passes_for_a_present_one(house,
             await window.evaluate("(page) => { location.hash = `#/${page}`; }", page)
             await until(window, UNMARKED, part, wanted=lambda found: not found)
             await until(window, CALM, wanted=lambda found: not found)
+
+
+async def test_a_scope_that_was_open_marks_its_last_values(house, window):
+    async with lost_alpha(house, window, "scope/alpha/x", "gone"):
+        await until(window, "() => document.querySelectorAll('td [data-known=no]').length === 3")
+        await until(window, UNMARKED_LAST, wanted=lambda found: not found)
+
+
+async def test_a_module_without_power_is_named_and_shows_no_value_and_its_loss_and_return_are_events(
+    house, window, tmp_path
+):
+    config, before = tmp_path / "alpha.toml", house.alpha.config
+    text = house.sim.config.read_text(encoding="utf-8").partition("[[port]]")[0].replace('rig = "sim"', 'rig = "alpha"')
+    config.write_text(text + "".join(EVENT.format(*each) for each in ((20, "off"), (40, "on"))), encoding="utf-8")
+    house.alpha.config = config
+    await house.alpha.start()
+    try:
+        await window.open("about:blank")
+        await window.open(f"{house.url}/#/network")
+        await until(window, MODULE)
+        await until(window, MODULE, wanted=lambda found: "1 low" in found or "1 high" in found)
+        await until(window, MODULE, wanted=lambda found: "The module does not answer" in found)
+        await until(window, MODULE, wanted=lambda found: "1 low" not in found and "1 high" not in found)
+        await window.evaluate("() => { location.hash = '#/rig'; }")
+        await until(window, ATTENTION, wanted=lambda found: "alpha · cabinet" in found)
+        await until(window, ATTENTION, wanted=lambda found: "alpha · cabinet" not in found)
+        await window.evaluate("() => { location.hash = '#/events'; }")
+        await until(window, EVENTS, wanted=lambda found: "link lost" in found and "link back" in found)
+    finally:
+        await house.alpha.end()
+        house.alpha.config = before

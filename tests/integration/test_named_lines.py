@@ -7,7 +7,7 @@ import pytest
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import MoveVelocity, Power
 from ldcnd.contract.errors import InterlockViolated, ValueOutOfRange
-from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.events import LINK_BACK, LINK_LOST, ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.rig_commands import SetIo
 from ldcnd.daemon.modules import NamedInput
@@ -23,9 +23,9 @@ def with_lock(**levels: object) -> dict[str, object]:
 
 
 async def events(rig: Machine) -> list[tuple[str, str | None]]:
-    """Return what the daemon tells of the module besides who has written to it."""
+    """Return what the daemon tells of the outputs of the module besides who has written to it."""
     page = await rig.client.ask(ReadEvents(axis="cabinet", count=100))
-    return [(event.verb, event.reason) for event in page.events if event.verb != SetIo.verb]
+    return [(event.verb, event.reason) for event in page.events if event.verb not in (SetIo.verb, LINK_LOST, LINK_BACK)]
 
 
 def driven(rig: Machine) -> int | None:

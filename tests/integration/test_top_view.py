@@ -85,7 +85,7 @@ async def test_a_drive_that_lost_power_comes_first_and_says_so():
 
     assert (shown.axes[0].axis, shown.axes[0].link, shown.axes[0].moving) == ("c", LinkState.DOWN, Moving.UNKNOWN)
     assert "the drive does not answer" in "\n".join(as_text(shown))
-    assert headline(shown).endswith("not working: 1")
+    assert headline(shown).endswith("not working: 1 axis")
 
 
 async def test_while_a_line_is_down_ages_grow():

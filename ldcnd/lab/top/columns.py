@@ -2,7 +2,7 @@
 
 from ldcnd.contract.condition import Severity
 from ldcnd.contract.samples import Moving
-from ldcnd.lab.top.glance import AxisGlance, BusGlance, RigGlance
+from ldcnd.lab.top.glance import AxisGlance, BusGlance, ModuleGlance, RigGlance
 
 UNKNOWN = "-"
 MARKS = {Severity.FINE: " ", Severity.NOTICE: "!", Severity.WRONG: "X"}
@@ -57,6 +57,17 @@ def bus_cells(row: BusGlance) -> tuple[str, ...]:
     )
 
 
+def module_cells(row: ModuleGlance) -> tuple[str, ...]:
+    """Return the cells of an I/O module, in the table of its line."""
+    return (MARKS[row.severity], row.module, row.shown_state, *([UNKNOWN] * 6), row.trouble)
+
+
+def line_rows(glance: RigGlance) -> list[tuple[tuple[str, ...], Severity]]:
+    """Return the rows of the table of lines, each with its severity: every line, and every I/O module."""
+    lines = [(bus_cells(row), row.severity) for row in glance.buses]
+    return lines + [(module_cells(row), row.severity) for row in glance.modules]
+
+
 def headline(glance: RigGlance) -> str:
     """Return the rig in one line: who it is, and how much of it is wrong."""
     version = f"ldcnd {glance.version}" if glance.version else "no daemon"
@@ -77,7 +88,7 @@ def _verdict(glance: RigGlance) -> str:
 def as_text(glance: RigGlance) -> tuple[str, ...]:
     """Return everything as lines of plain text, for a terminal that is none."""
     axes = _table(AXIS_TITLES, [axis_cells(row) for row in glance.axes])
-    buses = _table(BUS_TITLES, [bus_cells(row) for row in glance.buses])
+    buses = _table(BUS_TITLES, [cells for cells, _ in line_rows(glance)])
     return (headline(glance), "", *axes, "", *buses)
 
 

@@ -45,6 +45,19 @@ class AxisGlance(Glance, AxisSeen):
     """Who controls or moves it, in words; null where that is not known."""
 
 
+class ModuleGlance(Glance):
+    """One I/O module that has a name."""
+
+    module: str
+    """Its name."""
+    bus: str
+    """The line it is on."""
+    cause: str
+    """As that of an axis."""
+    shown_state: str
+    """Whether it answers, in words."""
+
+
 class BusGlance(Glance):
     """One line."""
 
@@ -81,8 +94,19 @@ class RigGlance(Frozen):
     """All of them."""
     buses: tuple[BusGlance, ...]
     """All of them."""
+    modules: tuple[ModuleGlance, ...] = ()
+    """All of them that have a name."""
 
-    def count(self, severity: Severity) -> int:
-        """Return how many causes have this severity: what several axes have in common counts once."""
-        causes = {row.cause or f"{row.axis}: {row.trouble}" for row in self.axes if row.severity is severity}
-        return len(causes | {row.cause for row in self.buses if row.severity is severity})
+    def count(self, severity: Severity) -> str:
+        """Return what has this severity, in words; empty where nothing has.
+
+        Everything is counted, and the causes where they are fewer: several axes may have one in common.
+        """
+        axes = [row.cause or f"axis {row.axis}" for row in self.axes if row.severity is severity]
+        modules = [row.cause or f"module {row.module}" for row in self.modules if row.severity is severity]
+        lines = [row.cause for row in self.buses if row.severity is severity]
+        kinds = (("axis", "axes", axes), ("module", "modules", modules), ("line", "lines", lines))
+        parts = [f"{len(found)} {one if len(found) == 1 else many}" for one, many, found in kinds if found]
+        causes = len({*axes, *modules, *lines})
+        fewer = causes < len(axes) + len(modules) + len(lines)
+        return ", ".join(parts) + (f" ({causes} cause{'s' if causes > 1 else ''})" if fewer else "")

@@ -10,9 +10,18 @@ from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.network import Publication, SampleKind
 from ldcnd.client.overview import seen_of
 from ldcnd.contract.codec import decode_received
-from ldcnd.contract.condition import SHARED, SILENT_S, Severity, Trouble, TroubleKind, assess, line_troubles
+from ldcnd.contract.condition import (
+    SHARED,
+    SILENT_S,
+    Severity,
+    Trouble,
+    TroubleKind,
+    assess,
+    assess_module,
+    line_troubles,
+)
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.health import BusHealth, DaemonHealth, LaneHealth
+from ldcnd.contract.health import BusHealth, DaemonHealth, LaneHealth, ModuleHealth
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import AxisInfo, DaemonInfo
 from ldcnd.contract.samples import (
@@ -24,7 +33,7 @@ from ldcnd.contract.samples import (
     VelocitySample,
 )
 from ldcnd.contract.units import Dimension, quantity_text
-from ldcnd.lab.top.glance import AxisGlance, BusGlance, RigGlance
+from ldcnd.lab.top.glance import AxisGlance, BusGlance, ModuleGlance, RigGlance
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 
@@ -94,12 +103,14 @@ class RigView:
         reports = {name: report for name in names if (report := self._latest(self._keys.bus_health(name), BusHealth))}
         rows = [self._axis(axis, reports.get(axis.bus), now_s, trouble if self._description else "") for axis in axes]
         lines = [self._bus(report) for report in reports.values()]
+        modules = [_module(each, line, trouble) for line in reports.values() for each in line.modules]
         return RigGlance(
             rig=self._keys.rig,
             version=description.daemon.version if description else None,
             trouble=trouble,
             axes=tuple(sorted(rows, key=lambda row: -row.severity)),
             buses=tuple(sorted(lines, key=lambda line: -line.severity)),
+            modules=tuple(sorted(modules, key=lambda module: -module.severity)),
         )
 
     def _read_clock(self) -> None:
@@ -181,6 +192,19 @@ class RigView:
     @staticmethod
     def _decoded(kept: _Kept, model: type[ModelT]) -> ModelT:
         return decode_received(model, kept.sample.payload, kept.sample.encoding)
+
+
+def _module(report: ModuleHealth, line: BusHealth, silent: str) -> ModuleGlance:
+    condition = assess_module(report, line_up=line.up, silence=silent)
+    worst = next(iter(condition.troubles), None)
+    return ModuleGlance(
+        module=report.module,
+        bus=line.bus,
+        cause=cause_of(worst, line.bus),
+        shown_state=condition.summary,
+        severity=worst.severity if worst else Severity.FINE,
+        trouble=worst.text if worst else "",
+    )
 
 
 def cause_of(worst: Trouble | None, bus: str) -> str:

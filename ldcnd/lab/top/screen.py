@@ -14,7 +14,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import Halt, Reset, StopReply
 from ldcnd.contract.condition import Severity
 from ldcnd.contract.errors import LdcndError
-from ldcnd.lab.top.columns import AXIS_TITLES, BUS_TITLES, NARROW, axis_cells, bus_cells, headline, narrow_cells
+from ldcnd.lab.top.columns import AXIS_TITLES, BUS_TITLES, NARROW, axis_cells, headline, line_rows, narrow_cells
 from ldcnd.lab.top.follow import follow
 from ldcnd.lab.top.rig_view import RigView
 
@@ -123,7 +123,7 @@ class TopScreen(App[None]):
             self._laid_out = columns
         cells = narrow_cells if columns == NARROW else axis_cells
         _fill(axes, [(cells(row), row.severity) for row in glance.axes])
-        _fill(self.query_one("#buses", DataTable), [(bus_cells(row), row.severity) for row in glance.buses])
+        _fill(self.query_one("#buses", DataTable), line_rows(glance))
 
 
 def _fill(table: "DataTable[Text]", rows: Sequence[tuple[tuple[str, ...], Severity]]) -> None:

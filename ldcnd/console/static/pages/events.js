@@ -55,7 +55,7 @@ export function EventsPage() {
 function Row({ rig, event }) {
   return html`<tr key=${`${rig.name}/${event.axis}/${event.seq ?? event.code}/${event.t}`}>
     <td class="time">${dateAndClock(event.t)}</td>
-    <td>${event.axis ? html`<a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a>` : rig.name}</td>
+    <td>${!event.axis ? rig.name : !rig.axes.get(event.axis)?.info ? event.axis : html`<a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a>`}</td>
     <td>${whatOf(event)}</td><td><${Mark}
       level=${LEVELS[event.status] ?? ""}>${event.status}<//></td><td>${event.client ?? "–"}</td>
     <td>${event.reason ?? arrival(event)}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;

@@ -48,11 +48,15 @@ export function Modules({ rig, bus }) {
   return named.map((module) => html`<${Module} key=${module.name} rig=${rig} name=${module.name} />`);
 }
 
-/** Return the named lines of a module, in their order: on, off, or unknown. */
-function namedOf(rig, module) {
+/** Return what the latest reading of a module shows: its named lines in their order, and all lines; unknown when it is old. */
+function readingOf(rig, module) {
   const seen = rig.axis(module);
-  const known = !rig.worth && seen.ageS("io") < OLD_S;
-  return Object.entries(seen.samples.io?.named ?? {}).map(([line, on]) => [line, known && on !== null ? (on ? "on" : "off") : "unknown"]);
+  const { io } = seen.samples;
+  const known = !rig.worth && seen.ageS("io") < OLD_S && io?.quality !== "bad";
+  const named = Object.entries(io?.named ?? {}).map(([line, on]) => [line, known && on !== null ? (on ? "on" : "off") : "unknown"]);
+  const lines = known ? levelsOf(io.levels) : "unknown";
+  const outputs = known && io.outputs ? io.outputs.join(", ") || "none" : "unknown";
+  return { named, all: [["lines", lines], ["outputs", outputs]] };
 }
 
 function Module({ rig, name }) {
@@ -60,12 +64,13 @@ function Module({ rig, name }) {
   const [becomes, setBecomes] = useState("high");
   const [pwm, setPwm] = useState({});
   const [counts, setCounts] = useState("off");
-  const [shown, setShown] = useState(null);
-  const named = namedOf(rig, name);
+  const { named, all } = readingOf(rig, name);
+  const troubles = rig.worth ? [] : rig.axis(name).condition.troubles;
   const lines = [...named.map(([each]) => [each, each]), ...LINES];
   const told = (verb, body) => ofRig(rig, verb, { module: name, ...body });
   return html`<${Panel} title=${`Module ${name}`} note="An output may move something; it keeps its level when this page is gone.">
-    ${named.length > 0 && html`<${Facts} of=${named} />`}
+    ${troubles.map(({ level, text }) => html`<p class="notice mark" data-level=${level}>${text}</p>`)}
+    <${Facts} of=${[...named, ...all]} />
     <div class="fields">
       <${Choice} label="Line" options=${lines} value=${line} onChange=${setLine} />
       <${Choice} label="Becomes" options=${BECOMES} value=${becomes} onChange=${setBecomes} />
@@ -74,11 +79,10 @@ function Module({ rig, name }) {
       <${Choice} label="Counts" options=${TIMER} value=${counts} onChange=${setCounts} />
     </div>
     <p class="row">
-      <${Action} act=${() => told("set_io")} onDone=${setShown}>Read ${name}<//>
-      <${Action} kind="main" act=${() => told("set_io", { [becomes]: [Number(line) || line] })} onDone=${setShown}>Set line ${line}<//>
-      <${Action} act=${() => told("set_io", pwm)} obstacle=${unread({ "PWM 1": pwm.pwm1, "PWM 2": pwm.pwm2 })} onDone=${setShown}>Set PWM<//>
-      <${Action} act=${() => told("set_io_timer", { mode: counts })} onDone=${setShown}>Count<//>
+      <${Action} act=${() => told("set_io")}>Read ${name}<//>
+      <${Action} kind="main" act=${() => told("set_io", { [becomes]: [Number(line) || line] })}>Set line ${line}<//>
+      <${Action} act=${() => told("set_io", pwm)} obstacle=${unread({ "PWM 1": pwm.pwm1, "PWM 2": pwm.pwm2 })}>Set PWM<//>
+      <${Action} act=${() => told("set_io_timer", { mode: counts })}>Count<//>
     </p>
-    ${shown && html`<p role="status">Lines: ${levelsOf(shown.levels)}. Outputs: ${shown.outputs ? shown.outputs.join(", ") || "none" : "not known"}.</p>`}
   <//>`;
 }

@@ -5,6 +5,7 @@ import { Chart } from "./chart.js";
 import { curvesAsCsv } from "./curve.js";
 import { Table } from "./controls.js";
 import { number } from "./format.js";
+import { Mark } from "./state.js";
 
 const ZOOM = 2;
 const STEPS = 1000;
@@ -113,7 +114,7 @@ function Cursors({ curves, cursors, onCursors, span, fixed }) {
     const [first, second] = [at(curve, a), at(curve, b)];
     return html`<tr key=${curve.label}>
       <th scope="row"><${Swatch} curve=${curve} />${curve.label}</th>
-      <td class="number">${number(curve.length ? curve.ys[curve.length - 1] : null, DIGITS)}</td>
+      <td class="number"><${Last} curve=${curve} /></td>
       <td class="number">${number(first, DIGITS)}</td><td class="number">${number(second, DIGITS)}</td>
       <td class="number">${first === null || second === null ? "–" : number(second - first, DIGITS)}</td>
       <td class="unit">${curve.unit || "0 or 1"}</td></tr>`;
@@ -127,6 +128,15 @@ function Cursors({ curves, cursors, onCursors, span, fixed }) {
     }
     <${Table} label="Values of the curves" head=${["Curve", "#Last", "#At A", "#At B", "#B − A", "Unit"]}
       rows=${rows} />`;
+}
+
+/** The last value of a curve: in brackets and with its mark where it is not to be believed any more. */
+function Last({ curve }) {
+  const mark = curve.mark?.();
+  let at = curve.length - 1;
+  while (mark && at > 0 && !Number.isFinite(curve.ys[at])) at -= 1; // a gap, behind the value that was good
+  const value = number(at < 0 ? null : curve.ys[at], DIGITS);
+  return mark ? html`<span class="place" data-known="no"><b>(${value})</b> <${Mark} level="bad">${mark}<//></span>` : value;
 }
 
 /** A piece of the curve's line: its colour and its dashes. */

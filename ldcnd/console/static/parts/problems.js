@@ -45,18 +45,24 @@ function* ofBus(rig, bus) {
   if (errors > ERRORS_A_MINUTE) {
     yield { ...at, level: "warn", text: "Bad or missing replies within the last minute:", detail: errors };
   }
+  for (const { module } of bus.health.modules ?? []) {
+    yield* ofTroubles({ where: `${rig.name} · ${module}`, link: "#/network" }, rig.axis(module).condition, bus);
+  }
   if (bus.up && bus.health.utilisation > BUSY) yield { ...at, level: "warn", text: "The line is full." };
+}
+
+function* ofTroubles(at, { troubles }, bus) {
+  for (const { kind, level, text } of troubles) {
+    if (!level) continue;
+    const onLine = kind === "line_down" && bus; // one cause with the line's own
+    yield { ...at, level, text: onLine ? bus.problem : text };
+  }
 }
 
 function* ofAxis(rig, axis) {
   const at = { where: `${rig.name} · ${axis.name}`, link: `#/axis/${rig.name}/${axis.name}` };
-  const { troubles } = axis.condition;
   if (!axis.samples.condition) yield { ...at, level: "warn", text: "Nothing was received from it yet." };
-  for (const { kind, level, text } of troubles) {
-    if (!level) continue;
-    const onLine = kind === "line_down" && axis.bus; // one cause with the line's own
-    yield { ...at, level, text: onLine ? axis.bus.problem : text };
-  }
+  yield* ofTroubles(at, axis.condition, axis.bus);
   for (const { figure, value, usual, unit, meaning, alarm } of axis.samples.shadow?.figures ?? []) {
     if (alarm) yield { ...at, level: "warn", text: `Motions take another ${figure} than usual: ${meaning}`, detail: `${number(value, 2)}, usual ${number(usual, 2)} ${unit}` };
   }

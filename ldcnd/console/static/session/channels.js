@@ -60,6 +60,7 @@ export class Recording {
       const curve = new GrowingCurve({ label, unit, pane, gapS, ...look(index) }, KEPT);
       const topic = `${channel.axis.rig.name}/tele/${channel.axis.name}/${channel.item}`;
       const { field, axis } = channel;
+      curve.mark = () => (axis.condition.live ? "" : axis.condition.mark); // beside a value that is not to be believed
       this.#byTopic.set(topic, [...(this.#byTopic.get(topic) ?? []), { curve, field, rig: axis.rig }]);
       return curve;
     });
