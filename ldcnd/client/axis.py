@@ -4,8 +4,8 @@ import asyncio
 import contextlib
 import weakref
 from collections import deque
-from collections.abc import AsyncIterator, Mapping
-from typing import TypeVar
+from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
+from typing import Any, TypeVar
 
 import pydantic
 
@@ -13,7 +13,7 @@ from ldcnd.client.lease import Control
 from ldcnd.client.motion import Jogging, Motion, Position, Sent, State, set_point
 from ldcnd.client.notebook import table
 from ldcnd.client.rig_client import RigClient
-from ldcnd.client.traces import Trace, take_trace
+from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
 from ldcnd.client.verbs import AxisVerbs
 from ldcnd.contract.codec import decode_received, explained
 from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
@@ -210,11 +210,38 @@ class Axis(AxisVerbs):
             trigger: what to wait for; starts at once when missing.
             within_s: longest time from its arming to its end.
         """
+        arming = self.tracing(
+            *channels, samples=samples, interval_s=interval_s, pre_trigger=pre_trigger, trigger=trigger
+        )
+        async with arming as taken:
+            return await taken(within_s)
+
+    @contextlib.asynccontextmanager
+    async def tracing(
+        self,
+        *channels: str,
+        samples: int = 500,
+        interval_s: float | None = None,
+        pre_trigger: int = 0,
+        trigger: TraceTrigger | None = None,
+    ) -> AsyncIterator[Callable[[float], Coroutine[Any, Any, Trace]]]:
+        """Record what happens in the context, which begins once the trace is armed; see `take_trace`.
+
+        Yields what waits for the end of the trace, so many seconds at most, and returns it complete.
+        """
         fields = {"channels": channels, "samples": samples, "pre_trigger": pre_trigger, "trigger": trigger}
         every = "fastest" if interval_s is None else interval_s
-        command = await self._made(TakeTrace, {**fields, "interval_s": every})
-        stamped = self.control.stamped(command, self.name) if self.control else command
-        return await take_trace(self._client, self.name, stamped, within_s)
+        request = await self._made(TakeTrace, {**fields, "interval_s": every})
+        client, name = self._client, self.name
+        await client.meet(f"axis {name}: {request.verb}")
+        stamped = self.control.stamped(request, name) if self.control else request
+        async with armed_trace(client, name, stamped) as reply:
+
+            async def taken(within_s: float) -> Trace:
+                await wait_for_trace(client, name, reply.trace_id, within_s)
+                return await fetch_trace(client, name, reply.trace_id)
+
+            yield taken
 
     async def outcome(self, command_id: str) -> CommandOutcome:
         """Query the daemon for the outcome of a command."""

@@ -16,6 +16,7 @@ from ldcnd.client import axis as asynchronous
 from ldcnd.client import motion, rig
 from ldcnd.client.loop_thread import LENT, LoopThread, loop_thread
 from ldcnd.client.notebook import table
+from ldcnd.client.traces import Trace
 from ldcnd.contract.events import CommandEvent
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.rig_commands import LinePath
@@ -117,6 +118,15 @@ class BlockingAxis(Facade[asynchronous.Axis]):
     stop = _waiting(asynchronous.Axis.stop)
     take_trace = _waiting(asynchronous.Axis.take_trace)
     at = _waiting(asynchronous.Axis.at)
+
+    @contextmanager
+    def tracing(
+        self, *channels: str, samples: int = 500, interval_s: float | None = None
+    ) -> Iterator[Callable[[float], Trace]]:
+        """Record what happens in the context; what it yields waits so many seconds at most, and returns the trace."""
+        arming = self._wrapped.tracing(*channels, samples=samples, interval_s=interval_s)
+        with self._loop.inside(arming) as taken:
+            yield lambda within_s: self._loop.run(taken(within_s))
 
     @contextmanager
     def jogging(

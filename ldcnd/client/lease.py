@@ -64,6 +64,8 @@ class Control:
             LeaseExpired: the lease was lost.
             LdcndError: as the daemon refused it.
         """
+        if not command.takes_energy_out:
+            await self._client.meet(f"axis {axis}: {command.verb}")  # from its number on nothing may overtake it
         try:
             return await self._client.command(axis, self.stamped(command, axis), timeout_s)
         except LeaseUnknown as error:

@@ -223,10 +223,10 @@ class Rig:
         limits = {"velocity": velocity, "acceleration": acceleration}
         moves = []
         for name, position in targets.items():
-            control = self._control_of(name)
-            move = await made(self._client, name, AxisMove, {"axis": name, "position": position, **limits})
-            moves.append(control.stamped(move, name))
-        reply = await self._client.ask(MoveTogether(moves=tuple(moves), path=path, max_deviation=max_deviation))
+            self._control_of(name)
+            moves.append(await made(self._client, name, AxisMove, {"axis": name, "position": position, **limits}))
+        stamped = tuple(self._control_of(move.axis).stamped(move, move.axis) for move in moves)
+        reply = await self._client.ask(MoveTogether(moves=stamped, path=path, max_deviation=max_deviation))
         return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
 
     async def path(

@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from ldcnd.client.own_samples import Origin
 from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode
-from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Stop, StopReply
+from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Effect, Stop, StopReply
 from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownAxis, UnknownCommand
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.history import AxisInstant
@@ -239,18 +239,28 @@ class RigClient:
             SessionError: no daemon serves this rig, or access control does not let this login command it.
         """
         if self._instance is None:
-            try:
-                self._instance = (await self.daemon()).instance
-            except OutcomeUnknown as error:  # of a question: the command itself is not on its way
-                raise SessionError(
-                    f"axis {axis}: {command.verb}: the daemon of rig {self.rig} does not answer; nothing was sent"
-                ) from error
+            await self.meet(f"axis {axis}: {command.verb}")
         meant = command if command.instance else command.model_copy(update={"instance": self._instance})
         try:
             return await self._answer(axis, meant, timeout_s)
         except CommandExpired:
             self._instance = None  # the daemon was restarted: this command is lost, the next one may be new
             raise
+
+    async def meet(self, what: str) -> None:
+        """Learn which daemon commands are meant for, unless that is known.
+
+        Args:
+            what: the command that waits for it, for the error.
+
+        Raises:
+            SessionError: none answers.
+        """
+        if self._instance is None:
+            try:
+                self._instance = (await self.daemon()).instance
+            except OutcomeUnknown as error:  # of a question: the command itself is not on its way
+                raise SessionError(f"{what}: the daemon of rig {self.rig} does not answer; nothing was sent") from error
 
     async def ask(self, command: Command[ReplyT], axis: str = RIG_ITSELF, timeout_s: float | None = None) -> ReplyT:
         """Send what is no command of an axis: to the rig as a whole, or a question about an axis.
@@ -276,8 +286,13 @@ class RigClient:
         key = self.keys.command(axis, command.verb)
         longest_s = command.answer_s if timeout_s is None else timeout_s
         answers = await self.session.query(
-            key, payload, encoding=encoding, timeout_s=longest_s, everyone=command.takes_energy_out
-        )  # what takes energy out is for every daemon of the rig: only one has the line
+            key,
+            payload,
+            encoding=encoding,
+            timeout_s=longest_s,
+            everyone=command.takes_energy_out,  # is for every daemon of the rig: only one has the line
+            in_order=command.effect is Effect.MOTION or bool(getattr(command, "sequence", None)),
+        )
         if not answers:
             whose = "" if axis == RIG_ITSELF else f"axis {axis}: "
             raise await self._unanswered(f"{whose}{command.verb}")

@@ -181,6 +181,7 @@ class Session(ABC):
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
         everyone: bool = False,
+        in_order: bool = False,
     ) -> list[Answer]:
         """Send a query, and return all answers; none when there is no queryable or access control forbids it.
 
@@ -192,6 +193,7 @@ class Session(ABC):
             timeout_s: how long to wait for the last answer; what has arrived by then is returned.
             urgent: overtakes everything else on its way, for stops.
             everyone: ask all that match, also where one of them can answer everything.
+            in_order: overtakes none of those that were asked before and are in order, too.
 
         Raises:
             OutcomeUnknown: no answer came in time; the query may be carried out all the same, even later.

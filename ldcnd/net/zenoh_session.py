@@ -151,6 +151,7 @@ class ZenohSession(Session):
         self._session = session
         self._loop = asyncio.get_running_loop()
         self._workers = Workers("zenoh", OTHER_THREADS)
+        self._ordered_workers = Workers("zenoh in order", 1)
         self._urgent_workers = Workers("zenoh stops", ANSWER_THREADS)
         self._command_workers = Workers("zenoh commands", ANSWER_THREADS)
         self._read_workers = Workers("zenoh reads", ANSWER_THREADS)
@@ -310,6 +311,7 @@ class ZenohSession(Session):
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
         everyone: bool = False,
+        in_order: bool = False,
     ) -> list[Answer]:
         """Send a query, to one complete queryable or to all the others, or to everyone; repeated answers are kept."""
         self._must_be_open()
@@ -317,7 +319,7 @@ class ZenohSession(Session):
             raise ValueOutOfRange(f"{key}: a query needs time; {timeout_s:g} s is none", value=timeout_s, limit=0)
         collector = Collector[zenoh.Reply](self._loop)
         token = zenoh.CancellationToken()
-        workers = self._urgent_workers if urgent else self._workers
+        workers = self._urgent_workers if urgent else self._ordered_workers if in_order else self._workers
 
         def ask() -> None:
             self._session.get(
@@ -377,7 +379,7 @@ class ZenohSession(Session):
         try:
             async with asyncio.TaskGroup() as group:
                 answering = (self._urgent_workers, self._command_workers, self._read_workers, self._refusals)
-                for workers in (*answering, self._workers):
+                for workers in (*answering, self._workers, self._ordered_workers):
                     group.create_task(workers.stop(DRAIN_TIME_S), name="drain")
         finally:
             try:

@@ -224,9 +224,10 @@ class MemorySession(Session):
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
         everyone: bool = False,
+        in_order: bool = False,
     ) -> list[Answer]:
         """Query the queryables of the key; nothing is overtaken, because nothing waits on its way."""
-        del urgent
+        del urgent, in_order
         self._must_be_open()
         asked = self._broker.asked(key, everyone=everyone)
         if not asked:

@@ -129,6 +129,7 @@ class _ClientSession(MemorySession):
         timeout_s: float = QUERY_TIMEOUT_S,
         urgent: bool = False,
         everyone: bool = False,
+        in_order: bool = False,
     ) -> list[Answer]:
         if self.cut:
             await asyncio.sleep(timeout_s)
@@ -141,6 +142,7 @@ class _ClientSession(MemorySession):
             timeout_s=timeout_s,
             urgent=urgent,
             everyone=everyone,
+            in_order=in_order,
         )
 
 

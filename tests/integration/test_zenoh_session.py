@@ -337,3 +337,21 @@ async def test_what_a_link_shows_of_its_login_is_kept_until_it_goes(endpoint: st
             return not server._logins
 
         await until(forgotten)
+
+
+async def test_queries_in_order_do_not_overtake_each_other(pair: Pair):
+    """Commands are numbered: one that is overtaken is refused."""
+    came: list[bytes] = []
+
+    def answer(query: Query) -> None:
+        came.append(query.payload)
+        query.reply(b"", JSON)
+
+    sent, key = [str(number).encode() for number in range(600)], KEYS.command("x", "jog")
+    await pair.server.serve(KEYS.all_commands, answer, complete=True)
+    await served(pair.client, key)
+    came.clear()
+    for at in range(0, len(sent), 12):
+        await asyncio.gather(*(pair.client.query(key, each, in_order=True) for each in sent[at : at + 12]))
+
+    assert came == sent

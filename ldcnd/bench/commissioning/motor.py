@@ -5,7 +5,6 @@ error limit. The set-point leads away beyond that limit: a motor that turns the 
 encoder that does not count all end in the drive, which opens its loop.
 """
 
-import asyncio
 import math
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager, suppress
@@ -23,6 +22,8 @@ from ldcnd.contract.errors import CommandAborted, DriveFault, LdcndError, WrongS
 from ldcnd.contract.samples import AxisState
 
 MOST_EL_COUNTS = 200
+TRACE_END_S = 60.0
+"""Longest time from the arming of a trace to its end, seconds."""
 OUTPUTS = (1, 2, 3, 4, 6, 9, 13, 20, 30, 45, 60)
 """Output limits that are tried, in PWM steps of 255. A motor that stood at one gets at most twice its friction next."""
 LEAD = 2.0
@@ -163,19 +164,14 @@ class MotorDirection(Step):
         lead = _lead(site, el)
         await axis.power(on=True)
         samples = math.ceil((lead.distance / lead.velocity * (1 + RAMP_SHARE) + AFTER_S) / TRACE_S)
-        tracing = asyncio.create_task(
-            axis.take_trace("position", samples=samples, interval_s=TRACE_S), name=f"trace {axis.name}"
-        )
-        try:
+        async with axis.tracing("position", samples=samples, interval_s=TRACE_S) as taken:
             motion = await axis.move_relative(
                 way * lead.distance, velocity=lead.velocity, acceleration=lead.acceleration
             )
             with suppress(DriveFault, CommandAborted):  # where the axis is tells more
                 await motion.done()
             refuse_latched(axis)
-            trace = await tracing
-        finally:
-            tracing.cancel()
+            trace = await taken(TRACE_END_S)
         tripped = axis.state.state is AxisState.ERROR_STOP
         held = await rest_counts(axis)
         await open_loop(axis)

@@ -43,7 +43,7 @@ from ldcnd.client.kept_gains import (
 from ldcnd.client.lease import program_name
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
-from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
+from ldcnd.client.traces import Trace
 from ldcnd.contract.errors import (
     DriveFault,
     LdcndError,
@@ -52,7 +52,6 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.samples import AxisState
-from ldcnd.contract.traces import TakeTrace
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import Profile
 
@@ -127,7 +126,7 @@ async def measure(client: RigClient, planned: Plan, bandwidth_hz: float | None, 
     """
     profile = planned.profile
     async with _tuned_axis(client, planned, tell) as (axis, kept), _named(axis.name):
-        tests = _Trials(client, axis, planned, kept.gains)
+        tests = _Trials(axis, planned, kept.gains)
         excitation = Excitation(profile, planned.bounds, await tests.offset_counts())
         tell("pulses: does the encoder count the motor's way?")
         await tests.run(excitation.pulses())
@@ -162,7 +161,7 @@ async def verify(client: RigClient, found: Findings, tell: Tell) -> VerifiedMove
     """
     planned, profile = found.plan, found.plan.profile
     async with _tuned_axis(client, planned, tell) as (axis, kept), _named(axis.name):
-        tests = _Trials(client, axis, planned, kept.gains)
+        tests = _Trials(axis, planned, kept.gains)
         excitation = Excitation(profile, planned.bounds, await tests.offset_counts())
         tell("test move with the proposed gains")
         records = await tests.run(excitation.test(found.proposal.gains, found.move, duration_s(found.move)))
@@ -240,8 +239,7 @@ class _Trials:
         interval_s: time between two samples of the last trace, seconds.
     """
 
-    def __init__(self, client: RigClient, axis: Axis, planned: Plan, old: dict[str, int]) -> None:
-        self._client = client
+    def __init__(self, axis: Axis, planned: Plan, old: dict[str, int]) -> None:
         self._axis = axis
         self._plan = planned
         self._old = old
@@ -268,15 +266,13 @@ class _Trials:
         await axis.power(on=True)
         try:
             samples = math.ceil((trial.lasts_s + LEAD_S) / self.interval_s)
-            request = self._stamped(TakeTrace(channels=("position",), samples=samples))
-            async with armed_trace(self._client, axis.name, request) as armed:
+            async with axis.tracing("position", samples=samples) as taken:
                 motion = await axis.move_relative(
                     trial.move.distance_counts / counts_per_unit,
                     velocity=self._plan.units(trial.move.speed_counts_per_s),
                     acceleration=self._plan.units(trial.move.acceleration_counts_per_s2),
                 )
-                await wait_for_trace(self._client, axis.name, armed.trace_id, TRACE_S)
-                trace = await fetch_trace(self._client, axis.name, armed.trace_id)
+                trace = await taken(TRACE_S)
             if axis.state.stop_latched:
                 raise StopLatched(f"axis {axis.name} was stopped while it was tuned", axis=axis.name)
             tripped = axis.state.state is AxisState.ERROR_STOP
@@ -322,12 +318,9 @@ class _Trials:
     async def rest_counts(self) -> int:
         """Wait until the axis stands, by samples of its own; return where, in counts."""
         for _ in range(STILL_LOOKS):
-            request = self._stamped(
-                TakeTrace(channels=("position",), samples=STILL_SAMPLES, interval_s=STILL_INTERVAL_S)
+            trace = await self._axis.take_trace(
+                "position", samples=STILL_SAMPLES, interval_s=STILL_INTERVAL_S, within_s=TRACE_S
             )
-            async with armed_trace(self._client, self._axis.name, request) as armed:
-                await wait_for_trace(self._client, self._axis.name, armed.trace_id, TRACE_S)
-                trace = await fetch_trace(self._client, self._axis.name, armed.trace_id)
             places = [int(each) for each in trace.raw[0] if each is not None]
             if places and max(places) - min(places) <= 1:
                 return places[-1]
@@ -336,10 +329,6 @@ class _Trials:
             axis=self._axis.name,
             remedy="secure the load; a spindle without friction cannot be tuned by this",
         )
-
-    def _stamped(self, request: TakeTrace) -> TakeTrace:
-        control = self._axis.control
-        return control.stamped(request, self._axis.name) if control else request
 
 
 def _until_rest(trace: Trace, from_counts: int) -> tuple[tuple[float, ...], tuple[int, ...]]:
