@@ -34,7 +34,7 @@ class SlowRig:
             stops=SimpleNamespace(possible=True, latch_is_kept=False),
             config=SimpleNamespace(name="x"),
         )
-        self.axes = {"x": axis}
+        self.axes, self.not_kept = {"x": axis}, {}
         self.buses = (SimpleNamespace(bus=SimpleNamespace(wire_log=self.wire_log), axes=tuple(self.axes.values())),)
 
     def reset(self) -> None:

@@ -203,6 +203,7 @@ class SmartStepAxis(PollsItself):
             start_at_s,
             Listeners(read, monitored, self.identified, listeners.missed, self._hears_itself, history, audited),
             wires_checked=self.wires_checked,
+            is_lost=lambda: self.words.is_lost,
         )
         return self._poller
 

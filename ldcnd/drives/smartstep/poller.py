@@ -128,6 +128,7 @@ class UnitPoller(Poller[int | Refusal]):
         listeners: Listeners,
         *,
         wires_checked: bool = True,
+        is_lost: Callable[[], bool] = lambda: False,
     ) -> None:
         """Prepare the polls; sends nothing.
 
@@ -140,6 +141,8 @@ class UnitPoller(Poller[int | Refusal]):
             listeners: its callbacks.
             wires_checked: the drive is known not to receive its own replies; otherwise that is checked before a word is
                 read that may be zero.
+            is_lost: tells whether the line has given the drive up, so that who answers has to be identified; it counts
+                exchanges of others, too.
         """
         self.node = unit
         self.due_at_s = start_at_s
@@ -147,6 +150,7 @@ class UnitPoller(Poller[int | Refusal]):
         self._loop = asyncio.get_running_loop()
         self._profile = profile
         self._listeners = listeners
+        self._is_lost = is_lost
         self._periods_s: dict[Item, float] = {item: 1.0 / rate for item, rate in rates_hz.items() if rate > 0}
         periods_s = self._periods_s
         self.rates_hz = {item: 1.0 / periods_s[basic] for basic, item in PUBLISHED.items() if basic in periods_s}
@@ -190,8 +194,10 @@ class UnitPoller(Poller[int | Refusal]):
 
     @override
     def deliver(self, reply: int | Refusal, timing: Timing) -> None:
-        if self._misses >= MISSES_BEFORE_BACKOFF:
+        identifies = self._item is Basic.IDENTITY or self._due_s[Basic.IDENTITY] < NEVER_S
+        if self._misses >= MISSES_BEFORE_BACKOFF or (self._is_lost() and not identifies):
             self._misses = 0
+            self._abandon()
             self._back(timing.received_at_s)
             return
         self._misses = 0

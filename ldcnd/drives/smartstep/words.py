@@ -105,6 +105,11 @@ class Words:
             raise drive_error(self.axis, answer, mode)
         return answer
 
+    @property
+    def is_lost(self) -> bool:
+        """Whether the line has given the drive up because it was silent; it counts again once it was identified."""
+        return not (self._proof.holds or self._proof.is_another)
+
     def forget(self) -> None:
         """The line comes up: any drive may be there."""
         self._type = None
