@@ -3,6 +3,7 @@
 import asyncio
 import sys
 import time
+from collections.abc import Iterable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -77,6 +78,7 @@ def _carry_out(
 
         async def work(client: RigClient) -> None:
             run = SequenceRun(Rig(client, await client.daemon()), wanted, positions, report, time.time_ns)
+            await _check_means(client, rig, run.used)
             async with asyncio.TaskGroup() as group:
                 pausing = group.create_task(_pause_by_key(run.going), name="pause")
                 try:
@@ -86,6 +88,34 @@ def _carry_out(
 
         end_as_interrupted()
         target.run(work)
+
+
+async def _check_means(client: RigClient, rig: RigConfig, axes: Iterable[str]) -> None:
+    """Refuse a file whose numbers mean other places to the daemon, before anything moves or is written.
+
+    Raises:
+        WrongState: it is of another rig, or an axis of the daemon has another unit or another scale.
+    """
+    if client.rig != rig.rig:
+        raise WrongState(
+            f"the file is of rig {rig.rig}, and the daemon runs rig {client.rig}",
+            value=rig.rig,
+            limit=client.rig,
+            remedy="give the configuration of that rig, or its endpoint with --connect",
+        )
+    there = {info.axis: info for info in await client.axes()}
+    for config in (axis for bus in rig.bus for axis in bus.axis if axis.name in set(axes)):
+        info = there.get(config.name)
+        means = (config.unit, config.counts_per_unit, config.direction, config.modulo)
+        if info is None or means != (info.unit, info.counts_per_unit, info.direction, info.modulo):
+            raise WrongState(
+                f"axis {config.name}: its unit, scale, direction or modulo in the file ({config.unit}) is not what the"
+                f" daemon has ({info.unit if info else 'no such axis'}); nothing has moved",
+                axis=config.name,
+                value=config.unit,
+                limit=info.unit if info else None,
+                remedy="start the daemon with this file, or give the one that it was started with",
+            )
 
 
 async def _pause_by_key(going: asyncio.Event) -> None:
@@ -125,6 +155,7 @@ def teach_position(target: Target, file: Path, name: str, axes: tuple[str, ...])
     """
 
     async def work(client: RigClient) -> NamedPosition:
+        await _check_means(client, load_config(file), axes)
         places = {}
         for axis in axes:
             info, state, place = await axis_of(client, axis), await client.state(axis), await client.position(axis)

@@ -62,7 +62,7 @@ class SequenceRun:
         steps = self._sequence.step
         if not 1 <= first <= len(steps):
             raise ConfigError(f"sequence {self._sequence.name} has no step {first}", value=first, limit=len(steps))
-        axes = () if any(step.set for step in steps) else tuple(dict.fromkeys(self._used()))
+        axes = () if any(step.set for step in steps) else self.used
         who = f"sequence {self._sequence.name}"
         async with AsyncExitStack() as held:
             controlled = await held.enter_async_context(self._rig.controlled(axes, who, LEASE_S, force=force))
@@ -71,13 +71,15 @@ class SequenceRun:
             for number in range(first, len(steps) + 1):
                 await self._carry_out(number, steps[number - 1])
 
-    def _used(self) -> list[str]:
+    @property
+    def used(self) -> tuple[str, ...]:
+        """The axes that it moves, or waits for."""
         used: list[str] = []
         for step in self._sequence.step:
             used += [step.axis] if step.axis else []
             used += [*self._positions[step.go].axes] if step.go else []
             used += step.standstill
-        return used
+        return tuple(dict.fromkeys(used))
 
     async def _lines(self) -> dict[str, str]:
         lines: dict[str, str] = {}

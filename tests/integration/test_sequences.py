@@ -175,6 +175,38 @@ def test_it_is_typed_and_taught(monkeypatch, tmp_path):
     assert "door_open is false" in failed.errors
 
 
+def test_numbers_of_a_file_go_to_no_rig_that_understands_them_otherwise(monkeypatch, tmp_path):
+    """The daemon has millimetres, and one file of it centimetres by now; the other one is of another rig."""
+    text = (ROOT / "config" / "simulated.toml").read_text(encoding="utf-8")
+    text += '\n[[position]]\nname = "park"\naxes = { x = 1 }\n'
+    text += '\n[[sequence]]\nname = "out"\nstep = [{ go = "park" }]\n'
+    here = tmp_path / "rig.toml"
+    here.write_text(text, encoding="utf-8")
+    changed = {
+        "unit": text.replace('unit = "mm"', 'unit = "cm"', 1),
+        "rig": text.replace('rig = "sim"', 'rig = "cell"', 1),
+    }
+    with virtual_rig(monkeypatch, load_config(here)) as rig:
+        rig.wait(asyncio.sleep(2))
+        for line in ("power on x", "axis set-position x 0"):
+            assert rig.run(line).code == 0
+        refused = {}
+        for what, other in changed.items():
+            assert other != text
+            here.write_text(other, encoding="utf-8")
+            for words in ("position go {} park", "sequence run {} out", "position teach {} there x"):
+                refused[what, words] = rig.run(words.format(here))
+        here.write_text(text, encoding="utf-8")
+        place = rig.run("list --json").printed
+        went = rig.run(f"position go {here} park")
+
+    for (what, _), each in refused.items():
+        assert each.code == 1, each
+        assert ("its unit" if what == "unit" else "is of rig cell") in each.errors
+    assert json.loads(place.splitlines()[0])["position"] == pytest.approx(0.0, abs=0.01)
+    assert went.code == 0
+
+
 def _toml(step):
     return f"{{ until = {{ door_open = true }}, timeout_s = {step.timeout_s:g} }}"
 
