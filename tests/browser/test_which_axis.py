@@ -61,9 +61,8 @@ async def go(window, house, place):
 
 @asynccontextmanager
 async def new_console(house, window):
-    """Run a console that has never seen the rig alpha; it has its own host, so that the other one keeps its cookies."""
-    async with console(house.mixed.endpoint, house.alpha.endpoint) as printed:
-        link = printed.replace("127.0.0.1", "localhost")
+    """Run a console that has never seen the rig alpha."""
+    async with console(house.mixed.endpoint, house.alpha.endpoint) as link:
         await window.open(link)
         yield SimpleNamespace(url=link.split("/?", maxsplit=1)[0].rstrip("/"))
 

@@ -17,6 +17,7 @@ import { AxisStrip, PlaceAndTarget } from "./parts/strip.js";
 import { overrideOf, slowed } from "./pages/rig_speed.js";
 import { StopAll, Stops } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
+import { loginIsGone } from "./session/api.js";
 import { feed } from "./session/feed.js";
 import { axesOf, axisNamed, commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
 
@@ -81,6 +82,9 @@ function Strip({ at }) {
 
 function Notices() {
   return html`<div class="notices" role="alert">
+    ${loginIsGone() && html`<p class="notice mark" data-level="bad">The login of this page is gone from the browser: its cookies were
+      cleared or replaced. Halt and every stop still work from here, nothing else does. Load the page again; if that is refused, open
+      it with a new link of ldcnd console.</p>`}
     ${failure && html`<p class="notice mark" data-level="bad">${failure.message} ${failure.remedy ?? ""}</p>`}
     ${[...rigs.values()].filter((rig) => rig.worth).map((rig) => html`<p class="notice mark" key=${rig.name} data-level="bad"
       >${rig.name}: no new values. ${rig.worth.why}</p>`)}
