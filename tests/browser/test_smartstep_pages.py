@@ -154,3 +154,21 @@ async def test_a_drive_is_tuned_by_its_parameters_and_its_recorder(house):
         await expect(row).to_contain_text("Pn102 47", timeout=UPLOAD_MS)
         top_speed = float(await row.get_by_role("cell").nth(2).inner_text())
         assert top_speed == pytest.approx(6.0, abs=1.0)  # 200 command units a second, geared by 4, of 8000 counts
+
+
+async def test_a_stop_names_what_it_does_not_reach_on_every_page(house):
+    """The feed turns by pulses that are not the daemon's."""
+    await house.mixed.until("feed", lambda state: state.moving == "yes")
+    try:
+        async with house.desk() as desk:
+            await desk.open("axis/mixed/x")
+            await expect(desk.panel("Now")).to_be_visible()
+            await desk.page.keyboard.press("Escape")
+            stops = desk.page.locator(".stops", has_text="mixed: ")
+            for place in ("axis/mixed/x", "events"):
+                await desk.open(place)
+                await expect(stops).to_contain_text("NOT stopped, may move: feed")
+                await expect(stops).not_to_contain_text("Nothing moves before Reset")
+    finally:
+        await house.mixed.quiet("x")
+        await house.sim.quiet("x", "y", "z", "c")

@@ -247,6 +247,11 @@ async def test_a_rig_wide_stop_says_which_drive_it_could_not_stop(tmp_path):
 
     assert reply.confirmed == ("x",)
     assert set(reply.axes) == {"x", "feed", "spool"}
+    assert reply.unstoppable == ("feed", "spool")
+    assert reply.shortfall == (
+        "NOT stopped: feed, spool; the drive takes no stop over its line and has no latch."
+        " Use the machine's emergency stop."
+    )
     assert isinstance(state, StateSample)
     assert not state.stop_latched
 
