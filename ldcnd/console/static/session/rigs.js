@@ -23,6 +23,9 @@ const FINAL = new Set(["done", "aborted", "refused", "failed", "unknown"]);
 /** An observer speaks every ten seconds: an hour and a half. */
 const SHADOWS_KEPT = 540;
 
+/** The unit in which a sample of an axis of some unit is. */
+const UNIT_OF = { position: (unit) => unit, latch: (unit) => unit, state: (unit) => unit, velocity: (unit) => `${unit}/s` };
+
 /** One axis: its description and its latest samples. */
 export class Axis {
   samples = {};
@@ -31,6 +34,13 @@ export class Axis {
   /** What a command for all axes was refused with here, in words; null when it was not. */
   refusal = null;
   shadows = [];
+  /** The unit that it had before, since when it has another, and whether the operator has seen that; null while it had none. */
+  unitChange = null;
+  /** How often its units have changed: what was typed before means something else now. */
+  unitChanges = 0;
+  #info = null;
+  #units = null;
+  #told = {};
   #positions = [];
   #motion = { key: null, sinceNs: 0 };
   #ends = new Map();
@@ -39,7 +49,23 @@ export class Axis {
   constructor(rig, name) {
     this.rig = rig;
     this.name = name;
-    this.info = null;
+  }
+
+  /** Its description; null where the rig has none of it. */
+  get info() {
+    return this.#info;
+  }
+
+  set info(told) {
+    const before = this.#units;
+    this.#info = told;
+    if (!told) return;
+    this.#units = { unit: told.unit, all: JSON.stringify([told.unit, told.units, told.g_velocity]) };
+    if (before && before.all !== this.#units.all) {
+      this.unitChange = { from: before.unit, since: this.rig.daemon?.started ?? 0, seen: false };
+      this.unitChanges += 1;
+    }
+    for (const [item, sample] of Object.entries(this.#told)) this.#judge(item, sample);
   }
 
   get bus() {
@@ -92,7 +118,10 @@ export class Axis {
     if (item === "state" && sample?.state !== this.state?.state) this.refusal = null; // of a state that is over
     if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
     else if (item === "trace") this.trace = sample;
-    else if (kind !== "trace" && kind !== "event") this.#keep(this.samples, item, sample);
+    else if (kind !== "trace" && kind !== "event") {
+      this.#keep(this.#told, item, sample);
+      this.#judge(item, sample);
+    }
     if (item === "position") this.#remember(sample);
     if (item === "state" && sample) this.#noteMotion(sample);
     if (item === "shadow" && sample) this.shadows = [...this.shadows, sample].slice(-SHADOWS_KEPT);
@@ -128,7 +157,7 @@ export class Axis {
 
   #remember(sample) {
     const good = sample && sample.quality !== "bad";
-    const before = this.#positions.filter(({ t }) => t >= this.#motion.sinceNs && t < sample?.t);
+    const before = this.#positions.filter(({ t, unit }) => unit === sample?.unit && t >= this.#motion.sinceNs && t < sample?.t);
     const recent = before.filter(({ t }) => sample.t - t <= SLOPE_S * 1e9);
     this.#positions = good ? [...(recent.length ? recent : before.slice(-1)), sample] : [];
   }
@@ -153,6 +182,14 @@ export class Axis {
     if (key === this.#motion.key) return;
     this.#motion = { key, sinceNs: t };
     this.#positions = this.#positions.filter((each) => each.t >= t);
+  }
+
+  /** Keep a sample as far as it is in the units of the description: a restart of the daemon may bring others. */
+  #judge(item, sample) {
+    const unit = this.#info?.unit;
+    const fits = !unit || !sample || !UNIT_OF[item] || !sample.unit || sample.unit === UNIT_OF[item](unit);
+    const fitting = fits ? sample : item === "state" ? { ...sample, command: sample.command && { ...sample.command, target: null } } : null;
+    this.#keep(this.samples, item, fitting);
   }
 
   #keep(where, name, sample) {
