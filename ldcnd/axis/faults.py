@@ -71,8 +71,6 @@ OF_DAEMON = (
     REPLIES_UNUSABLE,
     STOP_UNCONFIRMED,
 )
-TELL_OF_THE_PAST = frozenset({LOOP_OPENED.code})
-"""Faults that say what has happened and are seen in one reading only; the others say what is so while they stand."""
 OF_DAEMON_CODES = frozenset(fault.code for fault in OF_DAEMON)
 
 

@@ -7,12 +7,12 @@ command.
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from ldcnd.axis.faults import TELL_OF_THE_PAST
 from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.status import MOTION_STATES, AxisStatus
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
+from ldcnd.contract.condition import TELL_OF_THE_PAST
 from ldcnd.contract.errors import (
     AccelerationLimit,
     AxisUnreachable,

@@ -285,6 +285,9 @@ SHARED = frozenset({TroubleKind.SILENCE, TroubleKind.NOT_HOMED, TroubleKind.STAN
 """Troubles of which several axes have one cause, or which are said once for all; so is a line that is down."""
 _MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
 """Faults whose name says best why the position is lost."""
+TELL_OF_THE_PAST = frozenset({"loop_opened"})
+"""Codes of faults that say what has happened and are seen in one reading only; the others say what is so while they
+stand."""
 _DRIVEN = frozenset({AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION})
 
 
@@ -387,7 +390,11 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     entries = _first_cause_first(faults) if faults else []
     found = [_of_fault(entry, TroubleKind.FAULT, _WRONG) for entry in entries if entry.stops]
     if state.state is AxisState.ERROR_STOP and not found:
-        text = f"in error stop: {state.last_error or 'reset it to go on'}"
+        first = faults.first if faults else None
+        if first is None or not first.stops or first.code in TELL_OF_THE_PAST:
+            text = f"in error stop: {state.last_error or 'reset it to go on'}"
+        else:
+            text = f"in error stop because of {_words(first.code)}, which is over: reset it to go on"
         found.append(Trouble(TroubleKind.ERROR_STOP, _WRONG, text, "error stop"))
     if place is Place.OLD:
         found.append(_OLD)

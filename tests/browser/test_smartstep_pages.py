@@ -28,7 +28,8 @@ FAULTS_OF_A_DRIVE = """async ({ reset }) => {
   const { FaultPanel } = await import('/static/pages/axis_faults.js');
   const fault = { code: "alarm_0010", text: "A.10: Overcurrent", since: 0, source: "drive", stops: true };
   const rig = { commands: new Map() };
-  const axis = { name: "feed", can: (verb) => verb !== "reset" || reset, faults: [fault], samples: {}, rig };
+  const can = (verb) => verb !== "reset" || reset;
+  const axis = { name: "feed", can, faults: [fault], samples: {}, rig, condition: { live: true } };
   const place = document.createElement("div");
   render(html`<${FaultPanel} axis=${axis} />`, place);
   return { text: place.innerText || place.textContent, buttons: place.querySelectorAll("button").length };
@@ -45,6 +46,26 @@ async def test_a_reset_is_offered_only_where_the_drive_has_one(house):
     assert "reset at the drive, not over its line" in without["text"]
     assert "stops the axis" in without["text"]
     assert "motor off" not in without["text"]
+
+
+REGISTERS_OF_A_DRIVE = """async ({ live }) => {
+  const { html, render } = await import('/static/html.js');
+  const { GainsPanel } = await import('/static/pages/axis_gains.js');
+  const kp = { name: "kp", value: 200, provenance: "written_and_acknowledged" };
+  const rig = { commands: new Map(), worth: null };
+  const axis = { name: "y", can: () => true, samples: {}, rig, info: { registers: [kp] }, condition: { live } };
+  const place = document.createElement("div");
+  render(html`<${GainsPanel} axis=${axis} />`, place);
+  return [place.querySelector("section").dataset.stale, place.textContent.includes("old values")];
+}"""
+
+
+async def test_gains_are_old_while_their_drive_does_not_answer(house):
+    async with house.desk() as desk:
+        await desk.open("rig")
+
+        assert await desk.page.evaluate(REGISTERS_OF_A_DRIVE, {"live": True}) == ["no", False]
+        assert await desk.page.evaluate(REGISTERS_OF_A_DRIVE, {"live": False}) == ["yes", True]
 
 
 async def test_a_signal_is_shown_by_its_active_level(house):
@@ -117,6 +138,25 @@ async def test_what_is_in_use_is_saved_and_a_drive_is_cloned_by_the_page(house):
 
     saved = await house.mixed.rig.command("spool", ReadParameter(parameter="Pn401"), 60)
     assert saved.value.stored == 77
+
+
+async def test_what_was_read_says_when_and_that_another_client_has_written_since(house):
+    async with house.desk() as desk:
+        await desk.open("parameters/mixed/spool")
+        await desk.button("Read all").click()
+        memories = desk.panel("Memories of spool")
+        await expect(memories).to_contain_text(re.compile(r"Read at \d\d:\d\d:\d\d\."))
+        await expect(memories).not_to_contain_text("old values")
+        await desk.open("tuning/mixed/spool")
+        gains = desk.panel("Gains")
+        await expect(gains).to_contain_text("Read at")
+
+        await house.mixed.rig.command("spool", WriteParameter(parameter="Pn102", value=61, client="ann"), 60)
+
+        await expect(gains).to_contain_text("old values: ann has written since then.")
+        await gains.get_by_role("button", name="Read again").click()
+        await expect(gains.get_by_label(re.compile("^Pn102 "))).to_have_value("61")
+        await expect(gains).not_to_contain_text("old values")
 
 
 async def test_the_alarm_history_is_numbered_as_in_the_manual(house):

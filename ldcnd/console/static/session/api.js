@@ -26,6 +26,8 @@ export class Refusal extends Error {
     this.nearest = reply.nearest ?? null;
     this.retryable = reply.retryable ?? false;
     this.status = status;
+    /** Whether it is certain that nothing was carried out. */
+    this.refused = status >= 400 && status < 500;
   }
 }
 

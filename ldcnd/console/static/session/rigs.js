@@ -38,6 +38,7 @@ export class Axis {
   unitChange = null;
   /** How often its units have changed: what was typed before means something else now. */
   unitChanges = 0;
+  #outNs = 0;
   #info = null;
   #units = null;
   #told = {};
@@ -122,6 +123,7 @@ export class Axis {
       this.#keep(this.#told, item, sample);
       this.#judge(item, sample);
     }
+    if ((item === "state" && sample?.link === "down") || (item === "condition" && sample?.live === false)) this.#outNs = this.rig.nowNs();
     if (item === "position") this.#remember(sample);
     if (item === "state" && sample) this.#noteMotion(sample);
     if (item === "shadow" && sample) this.shadows = [...this.shadows, sample].slice(-SHADOWS_KEPT);
@@ -132,6 +134,25 @@ export class Axis {
   ageS(item) {
     const arrived = this.#arrived.get(item);
     return arrived ? arrived.ageS + (performance.now() - arrived.atMs) / 1e3 : null;
+  }
+
+  /** When something is read of its drive, for `doubt`. */
+  now() {
+    return { t: this.rig.nowNs(), run: this.rig.daemon?.instance };
+  }
+
+  /** Why what was read of its drive at `now()` may not hold any more; null while nothing tells so.
+   *
+   * `client` is the one whose own writes are known here.
+   */
+  doubt({ t, run }, client) {
+    if (run !== this.rig.daemon?.instance) return "the daemon was started again since then.";
+    if (!this.condition.live) return "the drive does not answer.";
+    if (this.#outNs > t) return "the drive did not answer for a while since then, and may have lost its power.";
+    const since = this.rig.events.filter((event) => event.axis === this.name && event.t > t);
+    if (since.some(({ verb }) => verb === "drive_changed")) return "the drive was reset or changed since then.";
+    const other = since.findLast((event) => event.verb === "write_parameter" && event.client !== client && event.status !== "refused");
+    return other ? `${other.client ?? "another client"} has written since then.` : null;
   }
 
   /** Whether its place is known and what is to be said of it, as the console process has decided; see `condition.py`. */
@@ -325,7 +346,12 @@ export class Rig {
   #telemetry(name, item, sample) {
     if (item === "event") {
       if (sample) this.happened(sample);
-    } else this.axis(name).take(item, sample);
+    } else {
+      const axis = this.axis(name);
+      const before = [axis.state?.link, axis.faults.length].join();
+      axis.take(item, sample);
+      if ((item === "state" || item === "fault") && before !== [axis.state?.link, axis.faults.length].join()) describeSoon(); // its registers
+    }
   }
 }
 
@@ -416,8 +442,13 @@ export const describe = unlessUnderWay(async () => {
 
 /** Read them again as soon as a change can be seen: the console process asks a daemon once a second at most. */
 export function describeSoon() {
-  setTimeout(describe, DESCRIBED_ANEW_MS);
+  describedSoon ||= setTimeout(() => {
+    describedSoon = 0;
+    describe();
+  }, DESCRIBED_ANEW_MS);
 }
+
+let describedSoon = 0;
 
 /** Begin to watch; once for a page. */
 export function watch() {
