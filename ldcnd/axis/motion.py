@@ -567,6 +567,8 @@ class AxisMotion:
     ) -> None:
         """Say what the axis is about to do; readings count again once it has started, see `MotionStarted`."""
         target, duration_s = (self.shown(plan.position), plan.duration_s) if plan else (None, None)
+        if state is AxisState.CONTINUOUS_MOTION and self.config.modulo:
+            target = None  # turns lie between: within one it would be passed again and again
         now_ns = self.clock.now_ns()
         settling, way = self._ends(plan.motion) if plan and completion is Completion.PROFILE else (None, None)
         command = ActiveCommand(

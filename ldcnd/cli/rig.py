@@ -62,16 +62,12 @@ def stop_rig(target: Target, axis: str | None) -> None:
             codes.add(UNREACHABLE if isinstance(reply, SessionError) else FAILED)
             show_error(reply, f"{whose}{NOT_STOPPED}")
             continue
-        unconfirmed = sorted(set(reply.axes) - set(reply.confirmed))
         target.show(reply, f"{whose}stopped and latched: {', '.join(reply.confirmed) or 'none'}", rig=rig)
         if reply.warning:
             show_lines(f"{whose}{reply.warning}", err=True)
-        if unconfirmed:
+        if reply.shortfall:
             codes.add(FAILED)
-            names = ", ".join(unconfirmed)
-            show_lines(
-                f"{whose}NOT confirmed: {names}; the latch holds, look at the machine, use its emergency stop", err=True
-            )
+            show_lines(f"{whose}{reply.shortfall}", err=True)
     if codes:
         sys.exit(min(codes))
 

@@ -312,14 +312,12 @@ class RigClient:
             return self._one(answers, StopReply)
         # the drives confirm it to the daemon that has the line: whichever of them says so, it is so
         axes = tuple(dict.fromkeys(name for reply in replies for name in reply.axes))
-        confirmed, kept = (
-            {name for reply in replies for name in getattr(reply, what)} for what in ("confirmed", "kept")
+        confirmed, unstoppable, kept = (
+            {name for reply in replies for name in getattr(reply, what)}
+            for what in ("confirmed", "unstoppable", "kept")
         )
-        return StopReply(
-            axes=axes,
-            confirmed=tuple(name for name in axes if name in confirmed),
-            kept=tuple(name for name in axes if name in kept),
-        )
+        warning = next((reply.warning for reply in replies if reply.warning), "")
+        return StopReply.of(axes, confirmed=confirmed, unstoppable=unstoppable, kept=kept, warning=warning)
 
     async def position(self, axis: str) -> PositionSample | None:
         """Return the axis's last position, or None when there is none yet."""

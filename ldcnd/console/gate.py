@@ -2,9 +2,13 @@
 
 Only `/static/` is served without a visitor's cookie. What changes anything needs the cookie, a header that only the
 console's own pages can set, and the console's own origin; a WebSocket needs cookie and origin, because browsers let any
-page open one.
+page open one. What only brings axes to rest needs no cookie: a page that was let in keeps its header, whatever becomes
+of the cookies of its browser, and may have axes under way.
+
+Browsers keep one set of cookies for all ports of a host, so the names of these have the port that the browser sees.
 """
 
+import re
 from collections.abc import Iterable
 from urllib.parse import parse_qs
 
@@ -14,11 +18,14 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ldcnd.console.visitors import Visitor, Visitors, is_csrf_of
+from ldcnd.contract.catalogue import BY_VERB
 from ldcnd.contract.codec import error_reply
+from ldcnd.contract.commands import About, Effect
 from ldcnd.contract.errors import NotPermitted
 
-SESSION_COOKIE = "ldcnd_session"
-CSRF_COOKIE = "ldcnd_csrf"
+SESSION_COOKIE = "ldcnd_session_"
+CSRF_COOKIE = "ldcnd_csrf_"
+"""Both are followed by the port in the console's address; by nothing where that is the usual one of its scheme."""
 CSRF_HEADER = "x-ldcnd-csrf"
 POLICY = (
     "default-src 'self'; img-src 'self' blob: data:; object-src 'none'; frame-ancestors 'none'; base-uri 'none';"
@@ -32,6 +39,8 @@ HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
 }
 SAFE_METHODS = frozenset({"GET", "HEAD"})
+_REST_VERBS = [verb for verb, command in BY_VERB[About.AXIS].items() if command.effect is Effect.REST]
+BRINGS_TO_REST = re.compile(rf"/api/(stop|rigs/[^/]+/(stop|axes/[^/]+/({'|'.join(_REST_VERBS)})))")
 WEBSOCKET_POLICY_VIOLATION = 1008
 
 STRANGER_PAGE = """<!doctype html>
@@ -84,15 +93,18 @@ class RequestGate:
         """Return the answer to what does not get through; note the visitor of what does."""
         headers = Headers(scope=scope)
         host = headers.get("host", "")
-        if _without_port(host) not in self._hosts:
+        name, port = _parts(host)
+        if name not in self._hosts:
             return _refusal(400, f"this console is not known as {host[:80]!r}")
         if scope["type"] == "http" and scope["path"].startswith("/static/"):
             return None
+        visitor = self._visitors.find(HTTPConnection(scope).cookies.get(SESSION_COOKIE + port, ""))
         if scope["type"] == "http" and scope["path"] == "/" and scope["method"] == "GET":
             token = parse_qs(scope["query_string"].decode("latin-1")).get("link")
             if token:
-                return self._let_in(token[-1])
-        visitor = self._visitors.find(HTTPConnection(scope).cookies.get(SESSION_COOKIE, ""))
+                return self._let_in(token[-1], visitor, port)
+        if scope["type"] == "http" and scope["method"] == "POST" and BRINGS_TO_REST.fullmatch(scope["path"]):
+            visitor = self._visitors.of_page(headers.get(CSRF_HEADER, "")) or visitor
         if visitor is None:
             return _stranger(scope["path"])
         if scope["type"] == "websocket" or scope["method"] not in SAFE_METHODS:
@@ -103,18 +115,16 @@ class RequestGate:
         scope.setdefault("state", {})["visitor"] = visitor
         return None
 
-    def _let_in(self, token: str) -> Response:
-        visitor = self._visitors.enter(token)
+    def _let_in(self, token: str, known: Visitor | None, port: str) -> Response:
+        """Let a browser in; one that is in remains who it is, because its pages may control axes."""
+        visitor = self._visitors.enter(token, known)
         if visitor is None:
             return _stranger("/")
-        response = RedirectResponse("/", status_code=303)
-        self._give(response, visitor)
+        response, secure = RedirectResponse("/", status_code=303), self._scheme == "https"
+        session, csrf = SESSION_COOKIE + port, CSRF_COOKIE + port
+        response.set_cookie(session, visitor.token, path="/", secure=secure, httponly=True, samesite="strict")
+        response.set_cookie(csrf, visitor.csrf, path="/", secure=secure, samesite="strict")
         return response
-
-    def _give(self, response: Response, visitor: Visitor) -> None:
-        secure = self._scheme == "https"
-        response.set_cookie(SESSION_COOKIE, visitor.token, path="/", secure=secure, httponly=True, samesite="strict")
-        response.set_cookie(CSRF_COOKIE, visitor.csrf, path="/", secure=secure, samesite="strict")
 
 
 def _stranger(path: str) -> Response:
@@ -128,6 +138,7 @@ def _refusal(status: int, message: str) -> Response:
     return Response(reply.model_dump_json(), status, media_type="application/json")
 
 
-def _without_port(host: str) -> str:
+def _parts(host: str) -> tuple[str, str]:
+    """Return name and port, which is empty where none is said."""
     name, colon, port = host.rpartition(":")
-    return (name if colon and (port.isdecimal() or not port) else host).lower()
+    return (name.lower(), port) if colon and (not port or (port.isascii() and port.isdecimal())) else (host.lower(), "")

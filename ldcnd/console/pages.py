@@ -76,6 +76,8 @@ class PageJog(Frozen):
     """Units a second, signed."""
     acceleration: float | None = Field(default=None, gt=0)
     """Units a second squared; the axis default when missing."""
+    instance: str | None = None
+    """The run of the daemon that it is meant for: another one may have other units."""
 
 
 class FromPage(Frozen):
@@ -248,6 +250,7 @@ class PageControl:
             velocity=wanted.velocity,
             acceleration=wanted.acceleration,
             client=self.client,
+            instance=wanted.instance,
             hold_s=HELD_S,
             buffer_mode=BufferMode.ABORTING,
         )

@@ -64,15 +64,22 @@ class Visitors:
         self._links = [*self._links, link][-MOST_LINKS:]
         return link.token
 
-    def enter(self, token: str) -> Visitor | None:
-        """Let a browser in that brings a link; None for one that is unknown, used or too old."""
+    def enter(self, token: str, known: Visitor | None = None) -> Visitor | None:
+        """Let a browser in that brings a link; None for one that is unknown, used or too old.
+
+        Args:
+            token: of the link.
+            known: who the browser is if it was let in before; it stays that.
+        """
         now_s = self._now_s()
         if not self._standing_token_is(token):
             # every link is compared, so that the time it takes tells nothing
-            known = [link for link in self._links if _same(link.token, token)]
-            self._links = [link for link in self._links if link not in known and link.until_s > now_s]
-            if not known or known[0].until_s <= now_s:
+            used = [link for link in self._links if _same(link.token, token)]
+            self._links = [link for link in self._links if link not in used and link.until_s > now_s]
+            if not used or used[0].until_s <= now_s:
                 return None
+        if known:
+            return known
         self._count += 1
         visitor = Visitor(self._count, secrets.token_urlsafe(TOKEN_BYTES), secrets.token_urlsafe(TOKEN_BYTES), now_s)
         self._visitors = [*self._visitors, visitor]
@@ -82,17 +89,26 @@ class Visitors:
 
     def find(self, token: str) -> Visitor | None:
         """Return the visitor whose cookie has this token, and record the time."""
-        now_s = self._now_s()
-        self._visitors = [each for each in self._visitors if each.seen_at_s > now_s - IDLE_S]
-        known = [each for each in self._visitors if _same(each.token, token)]
-        if not known:
-            return None
-        self.see(known[0])
-        return known[0]
+        return self._seen([each for each in self._present() if _same(each.token, token)])
+
+    def of_page(self, csrf: str) -> Visitor | None:
+        """Return the visitor whose page sends this, and record the time."""
+        return self._seen([each for each in self._present() if is_csrf_of(each, csrf)])
 
     def see(self, visitor: Visitor) -> None:
         """Note that a visitor has a page open."""
         visitor.seen_at_s = self._now_s()
+
+    def _present(self) -> list[Visitor]:
+        now_s = self._now_s()
+        self._visitors = [each for each in self._visitors if each.seen_at_s > now_s - IDLE_S]
+        return self._visitors
+
+    def _seen(self, known: list[Visitor]) -> Visitor | None:
+        if not known:
+            return None
+        self.see(known[0])
+        return known[0]
 
     def _standing_token_is(self, token: str) -> bool:
         return self._standing_token is not None and _same(self._standing_token, token)

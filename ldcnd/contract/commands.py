@@ -6,10 +6,11 @@ and the documentation are derived from its attributes. Commands about parameters
 their replies; `ldcnd.contract.catalogue` has them all.
 """
 
+from collections.abc import Collection
 from enum import StrEnum
 from functools import cache
 from types import GenericAlias
-from typing import TYPE_CHECKING, ClassVar, Generic, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, ClassVar, Generic, Literal, Self, TypeVar, get_args
 
 from pydantic import ConfigDict, Field
 
@@ -276,11 +277,42 @@ class StopReply(Frozen):
     """The axes concerned."""
     confirmed: tuple[str, ...]
     """The axes whose drives acknowledged the stop."""
+    unstoppable: tuple[str, ...] = ()
+    """The axes that no stop reaches over their line, and that no latch holds: what moves them goes on."""
     kept: tuple[str, ...] = ()
     """The axes whose latch is on the disk of the daemon: it outlasts a restart. The others lose it when the daemon
     ends: none is kept without a `state_dir`."""
     warning: str = ""
     """That the latches cannot be written to the `state_dir`, and why, for a person; empty where they are."""
+    shortfall: str = ""
+    """What may move on, and what to do, for a person; empty when every drive has confirmed the stop."""
+
+    @classmethod
+    def of(
+        cls,
+        axes: tuple[str, ...],
+        *,
+        confirmed: Collection[str],
+        unstoppable: Collection[str],
+        kept: Collection[str],
+        warning: str = "",
+    ) -> Self:
+        """Return the reply about these axes, in their order, in words too."""
+        pending = [name for name in axes if name not in confirmed and name not in unstoppable]
+        out_of_reach = tuple(name for name in axes if name in unstoppable)
+        said = [f"NOT confirmed: {', '.join(pending)}; the latch holds, look at the machine"] if pending else []
+        if out_of_reach:
+            said.append(
+                f"NOT stopped: {', '.join(out_of_reach)}; the drive takes no stop over its line and has no latch"
+            )
+        return cls(
+            axes=axes,
+            confirmed=tuple(name for name in axes if name in confirmed),
+            unstoppable=out_of_reach,
+            kept=tuple(name for name in axes if name in kept),
+            warning=warning,
+            shortfall=f"{'. '.join(said)}. Use the machine's emergency stop." if said else "",
+        )
 
 
 class RemedyStep(Frozen):

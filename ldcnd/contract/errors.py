@@ -174,7 +174,7 @@ class LdcndError(Exception):
                 self.remedy = Remedy.of(text, ())
 
     def although(self, done: str) -> Self:
-        """Return this error about a request that was carried out all the same; `done` begins its message."""
+        """Return this error with other words before its message: what was carried out all the same, or what for."""
         return type(self)(
             f"{done} {self.message}",
             axis=self.axis,

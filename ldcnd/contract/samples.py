@@ -280,7 +280,7 @@ class CurrentCommand(Frozen):
     """Instant at which it was accepted, UTC in ns since 1970."""
     target: float | None = None
     """Position at which it ends, in axis units; the distance left is from the position to here. Null without an end
-    of its own."""
+    of its own, and for a motion at a velocity on an axis with a modulo."""
     expected_end: int | None = None
     """Instant at which its profile should end, UTC in ns since 1970; settling comes on top. Null without an end of
     its own."""

@@ -246,9 +246,10 @@ class Requests:
             log.exception("stop not recorded", key=query.key)  # it is carried out all the same
         confirmed = await self._stop_once(names, query)
         kept = tuple(each for each in names if self._rig.axes[each].stops.latch_is_kept)
+        unstoppable = tuple(each for each in names if not self._rig.axes[each].stops.possible)
         trouble = self._rig.not_kept.get(LATCHES)
         warning = f"The latch is not on the disk ({trouble}): it is lost when the daemon ends." if trouble else ""
-        return StopReply(axes=names, confirmed=confirmed, kept=kept, warning=warning)
+        return StopReply.of(names, confirmed=confirmed, unstoppable=unstoppable, kept=kept, warning=warning)
 
     async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
         """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.

@@ -293,13 +293,26 @@ class RigCommands:
             self._admit(name, self._own(name, command.leases) or command.lease)
             guards.check_not_latched(self._rig.axes[name].tracker)
 
+    def _admit_faster(self, axes: Iterable[AxisService], leases: tuple[str, ...]) -> None:
+        """Refuse faster motions, with the names of all axes in the way; one that takes no motions is none of them."""
+        refused: dict[str, LdcndError] = {}
+        moved = [axis.config.name for axis in axes if verbs_for(Capability.MOTION) & axis.driver.capabilities]
+        for name in moved:
+            try:
+                self._admit(name, self._own(name, leases))
+            except LdcndError as error:
+                refused[name] = error
+        if refused:
+            first = next(iter(refused.values()))
+            names = ", ".join(refused)
+            raise first if len(refused) == 1 else first.although(f"raising the speed needs control of {names}:")
+
     async def _set_speed_override(self, command: SetSpeedOverride) -> SpeedOverrideReply:
         """Scale the velocities of all axes; to lower them needs no right, as a stop needs none."""
         share = command.percent / 100.0
         axes = list(self._rig.axes.values())
         if any(share > axis.tracker.status.speed_share for axis in axes):
-            for name in self._rig.axes:
-                self._admit(name, self._own(name, command.leases))
+            self._admit_faster(axes, command.leases)
         log.info("speed override", percent=command.percent, client=command.client)
         for axis in axes:
             name = axis.config.name

@@ -7,7 +7,7 @@ import signal
 import pytest
 
 from ldcnd.contract.leases import ListHolders
-from tests.browser.house import Desk, open_browser
+from tests.browser.house import Desk, console, open_browser
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
@@ -133,3 +133,29 @@ async def test_a_page_whose_axis_moves_asks_before_it_goes(house):
         await house.sim.until("x", lambda state: state.moving == "no")
 
     assert asked == ["beforeunload"]
+
+
+async def test_a_second_console_on_the_host_takes_no_login_from_a_page_that_moves_an_axis(house):
+    async with house.desk() as desk, console(house.mixed.endpoint) as link:
+        await jogging(house, desk)
+        other = await desk.page.context.new_page()
+        await other.goto(link)
+        await expect(other.get_by_role("heading", name="mixed", exact=True)).to_be_visible()
+
+        await desk.page.keyboard.press("Escape")
+
+        await house.sim.until("x", lambda state: state.stop_latched and state.moving == "no")
+        await expect(desk.page.get_by_text("You control x")).to_be_visible()
+
+
+async def test_a_page_whose_cookies_are_gone_says_so_and_still_ends_motions(house):
+    async with house.desk() as desk:
+        await jogging(house, desk)
+        await desk.page.context.clear_cookies()
+        await expect(desk.page.get_by_text("The login of this page is gone")).to_be_visible()
+
+        await desk.button("Halt").click()
+        await house.sim.until("x", lambda state: state.moving == "no")
+        await desk.page.keyboard.press("Escape")
+
+        await house.sim.until("x", lambda state: state.stop_latched)

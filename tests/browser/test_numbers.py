@@ -69,6 +69,7 @@ TOLD = """(text) => {
   const story = document.querySelector(".story").textContent;
   return story.includes(text) && story.includes("settled");
 }"""
+SAID = "(text) => document.querySelector('main').textContent.includes(text)"
 PLACES = [
     ("axis/sim/x", None, None),
     ("axis/sim/x", ("Move", "by a distance"), "Move"),
@@ -175,6 +176,15 @@ async def test_the_shaft_stands_where_the_text_says(house, window):
         await type_over(window, refused)
         await window.keys(ENTER, ENTER)
         assert (await window.evaluate(READ, None))[at]["refusal"]
+    assert abs(await house.sim.position("x") - stands) < 0.01
+    await window.evaluate(FOCUS, None, at)
+    await type_over(window, "5000")  # beyond the limit: the daemon refuses it, each time
+    await until(window, windows.PRESSABLE, "Move")
+    await window.keys(ENTER)
+    await until(window, SAID, "position_limit")
+    await window.keys(ENTER)
+    assert not await window.evaluate(SAID, "sent just now")
+    await until(window, SAID, "position_limit")
     assert abs(await house.sim.position("x") - stands) < 0.01
     for text in MOVED:
         stands = read_quantity(text, SLIDE, Dimension.POSITION)

@@ -28,7 +28,8 @@ FAULTS_OF_A_DRIVE = """async ({ reset }) => {
   const { FaultPanel } = await import('/static/pages/axis_faults.js');
   const fault = { code: "alarm_0010", text: "A.10: Overcurrent", since: 0, source: "drive", stops: true };
   const rig = { commands: new Map() };
-  const axis = { name: "feed", can: (verb) => verb !== "reset" || reset, faults: [fault], samples: {}, rig };
+  const can = (verb) => verb !== "reset" || reset;
+  const axis = { name: "feed", can, faults: [fault], samples: {}, rig, condition: { live: true } };
   const place = document.createElement("div");
   render(html`<${FaultPanel} axis=${axis} />`, place);
   return { text: place.innerText || place.textContent, buttons: place.querySelectorAll("button").length };
@@ -45,6 +46,26 @@ async def test_a_reset_is_offered_only_where_the_drive_has_one(house):
     assert "reset at the drive, not over its line" in without["text"]
     assert "stops the axis" in without["text"]
     assert "motor off" not in without["text"]
+
+
+REGISTERS_OF_A_DRIVE = """async ({ live }) => {
+  const { html, render } = await import('/static/html.js');
+  const { GainsPanel } = await import('/static/pages/axis_gains.js');
+  const kp = { name: "kp", value: 200, provenance: "written_and_acknowledged" };
+  const rig = { commands: new Map(), worth: null };
+  const axis = { name: "y", can: () => true, samples: {}, rig, info: { registers: [kp] }, condition: { live } };
+  const place = document.createElement("div");
+  render(html`<${GainsPanel} axis=${axis} />`, place);
+  return [place.querySelector("section").dataset.stale, place.textContent.includes("old values")];
+}"""
+
+
+async def test_gains_are_old_while_their_drive_does_not_answer(house):
+    async with house.desk() as desk:
+        await desk.open("rig")
+
+        assert await desk.page.evaluate(REGISTERS_OF_A_DRIVE, {"live": True}) == ["no", False]
+        assert await desk.page.evaluate(REGISTERS_OF_A_DRIVE, {"live": False}) == ["yes", True]
 
 
 async def test_a_signal_is_shown_by_its_active_level(house):
@@ -119,6 +140,25 @@ async def test_what_is_in_use_is_saved_and_a_drive_is_cloned_by_the_page(house):
     assert saved.value.stored == 77
 
 
+async def test_what_was_read_says_when_and_that_another_client_has_written_since(house):
+    async with house.desk() as desk:
+        await desk.open("parameters/mixed/spool")
+        await desk.button("Read all").click()
+        memories = desk.panel("Memories of spool")
+        await expect(memories).to_contain_text(re.compile(r"Read at \d\d:\d\d:\d\d\."))
+        await expect(memories).not_to_contain_text("old values")
+        await desk.open("tuning/mixed/spool")
+        gains = desk.panel("Gains")
+        await expect(gains).to_contain_text("Read at")
+
+        await house.mixed.rig.command("spool", WriteParameter(parameter="Pn102", value=61, client="ann"), 60)
+
+        await expect(gains).to_contain_text("old values: ann has written since then.")
+        await gains.get_by_role("button", name="Read again").click()
+        await expect(gains.get_by_label(re.compile("^Pn102 "))).to_have_value("61")
+        await expect(gains).not_to_contain_text("old values")
+
+
 async def test_the_alarm_history_is_numbered_as_in_the_manual(house):
     async with house.desk() as desk:
         await desk.open("parameters/mixed/feed")
@@ -154,3 +194,21 @@ async def test_a_drive_is_tuned_by_its_parameters_and_its_recorder(house):
         await expect(row).to_contain_text("Pn102 47", timeout=UPLOAD_MS)
         top_speed = float(await row.get_by_role("cell").nth(2).inner_text())
         assert top_speed == pytest.approx(6.0, abs=1.0)  # 200 command units a second, geared by 4, of 8000 counts
+
+
+async def test_a_stop_names_what_it_does_not_reach_on_every_page(house):
+    """The feed turns by pulses that are not the daemon's."""
+    await house.mixed.until("feed", lambda state: state.moving == "yes")
+    try:
+        async with house.desk() as desk:
+            await desk.open("axis/mixed/x")
+            await expect(desk.panel("Now")).to_be_visible()
+            await desk.page.keyboard.press("Escape")
+            stops = desk.page.locator(".stops", has_text="mixed: ")
+            for place in ("axis/mixed/x", "events"):
+                await desk.open(place)
+                await expect(stops).to_contain_text("NOT stopped, may move: feed")
+                await expect(stops).not_to_contain_text("Nothing moves before Reset")
+    finally:
+        await house.mixed.quiet("x")
+        await house.sim.quiet("x", "y", "z", "c")

@@ -10,6 +10,8 @@ from ldcnd.contract.leases import Acquire, Release
 from tests.support.marionette import ENTER, ESCAPE, TAB
 
 windows = pytest.importorskip("tests.browser.windows", reason="the browser tests need playwright")
+playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
+expect = playwright.expect
 until, console = windows.until, windows.console
 
 pytestmark = [
@@ -61,9 +63,8 @@ async def go(window, house, place):
 
 @asynccontextmanager
 async def new_console(house, window):
-    """Run a console that has never seen the rig alpha; it has its own host, so that the other one keeps its cookies."""
-    async with console(house.mixed.endpoint, house.alpha.endpoint) as printed:
-        link = printed.replace("127.0.0.1", "localhost")
+    """Run a console that has never seen the rig alpha."""
+    async with console(house.mixed.endpoint, house.alpha.endpoint) as link:
         await window.open(link)
         yield SimpleNamespace(url=link.split("/?", maxsplit=1)[0].rstrip("/"))
 
@@ -184,3 +185,48 @@ async def test_a_trigger_whose_channel_is_not_recorded_any_more_is_still_shown(h
     assert "position" in await until(window, SELECTED, "Trigger")
     assert "Record" not in await window.evaluate(BUTTONS)
     await window.keys(ESCAPE, ENTER)
+
+
+@asynccontextmanager
+async def alpha_in_cm(house):
+    """Start the rig again with an axis in another unit; it stands where it stood."""
+    config = house.alpha.config
+    text = config.read_text(encoding="utf-8")
+    config.write_text(
+        text.replace('unit = "mm"\ncounts_per_unit = 1000', 'unit = "cm"\ncounts_per_unit = 10000', 1), encoding="utf-8"
+    )
+    try:
+        await house.alpha.start()
+        yield
+    finally:
+        await house.alpha.end()
+        config.write_text(text, encoding="utf-8")
+
+
+async def test_what_was_typed_for_one_unit_is_not_there_for_another(house):
+    async with house.desk() as desk:
+        async with alpha_runs(house):
+            await desk.open("axis/alpha/x")
+            await desk.panel("Move").get_by_label("Position mm").fill("12")
+            await desk.panel("Jog").get_by_label("Speed mm/s").fill("3")
+            await expect(desk.panel("Move")).to_contain_text("moves x to 12 mm")
+
+        async with alpha_in_cm(house):
+            await expect(desk.page.get_by_text("x in cm, was in mm. What was typed for it is cleared.")).to_be_visible()
+            await expect(desk.panel("Move").get_by_label("Position cm")).to_have_value("")
+            await expect(desk.panel("Jog").get_by_label("Speed cm/s")).not_to_have_value("3")
+            assert "to 12 cm" not in await desk.page.inner_text("main")
+
+
+async def test_the_scope_says_values_in_the_unit_that_they_have(house):
+    async with house.desk() as desk:
+        async with alpha_runs(house):
+            await desk.open("scope/alpha/x")
+            live = desk.panel("Live")
+            await expect(live.locator("tr", has_text="alpha · x position")).to_contain_text("mm")
+
+        async with alpha_in_cm(house):
+            await expect(live.locator("tr", has_text="alpha · x position")).to_contain_text("cm")
+
+        async with alpha_runs(house):
+            await expect(live.locator("tr", has_text="alpha · x position")).to_contain_text("mm")

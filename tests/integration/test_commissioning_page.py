@@ -264,6 +264,14 @@ async def test_a_second_page_is_told_who_has_the_axis(rig, console):
     assert axis["page"] == "console-1, page 1,"
 
 
+async def test_the_overview_names_the_open_steps_that_are_for_the_axis(rig, console):
+    """Before its list was ever opened."""
+    (axis,) = (await console.browser.get("/api/commissioning")).document["axes"]
+
+    assert "Unit, scale and first gains" not in axis["open"]
+    assert "Motor against encoder" in axis["open"]
+
+
 async def test_only_pages_of_this_console_have_part_in_it(rig, console):
     path = f"/api/commissioning/axes/{AXIS}"
     for stranger in (console.browser.forging(origin="http://elsewhere.example"), console.browser.without_cookies()):

@@ -55,7 +55,9 @@ async def test_strangers_command_nothing(console):
     assert await untouched(console)
 
 
-@pytest.mark.parametrize("cookie", ["ldcnd_session=guess", "ldcnd_session=", "ldcnd_session=\xe9", "nonsense"])
+@pytest.mark.parametrize(
+    "cookie", ["ldcnd_session_8470=guess", "ldcnd_session_8470=", "ldcnd_session_8470=\xe9", "nonsense"]
+)
 async def test_a_wrong_cookie_is_a_stranger_s(console, cookie):
     answer = await console.browser.forging(cookie=cookie).post(POWER, ON)
 
@@ -87,7 +89,7 @@ async def test_a_command_without_the_token_of_its_visitor_is_refused(console, to
 async def test_the_token_of_another_visitor_does_not_help(console):
     other = await console.enter()
 
-    answer = await console.browser.forging(x_ldcnd_csrf=other.cookies["ldcnd_csrf"]).post(POWER, ON)
+    answer = await console.browser.forging(x_ldcnd_csrf=other.csrf).post(POWER, ON)
 
     assert answer.status == 403
     assert await untouched(console)
@@ -108,9 +110,43 @@ async def test_a_name_that_is_not_the_console_s_is_refused(console, host):
 @pytest.mark.parametrize("host", ["localhost:8470", "[::1]:8470", "LOCALHOST:9000", "127.0.0.1:9000"])
 async def test_a_tunnel_may_come_through_any_port_of_this_machine(console, host):
     """`ssh -L 9000:127.0.0.1:8470` changes the port that the browser sees."""
-    answer = await console.browser.forging(host=host, origin=f"http://{host}").post(POWER, ON)
+    origin = f"http://{host}"
+    stranger = Browser(console.browser.ask, origin)
+    browser = await stranger.enter(f"{origin}/?link={console.visitors.new_link()}")
 
-    assert answer.status == 200
+    assert (await browser.post(POWER, ON)).status == 200
+
+
+async def test_a_page_without_its_cookies_goes_on_ending_motions_and_does_nothing_else(console):
+    page_of_old = console.browser.forging(cookie="ldcnd_session_8471=another", x_ldcnd_csrf=console.browser.csrf)
+
+    ended = [await page_of_old.post(f"/api/rigs/sim/axes/x/{verb}") for verb in ("halt", "quick_stop")]
+    ended += [await page_of_old.post(path, {}) for path in ("/api/rigs/sim/stop", "/api/stop")]
+    refused = [await page_of_old.post(path, ON) for path in (POWER, "/api/rigs/sim/axes/x/reset", "/api/link")]
+    refused.append(await page_of_old.get("/api/rigs"))
+    elsewhere = await page_of_old.forging(origin="http://127.0.0.1:8471").post("/api/stop")
+
+    assert [each.status for each in ended] == [200] * 4
+    assert [each.status for each in refused] == [401] * 4
+    assert elsewhere.status == 403
+
+
+async def test_a_browser_that_is_in_stays_who_it_is_with_another_link(console):
+    """Its pages may control axes."""
+    link = path_of((await console.browser.post("/api/link")).document["link"])
+
+    again, late = await console.browser.get(link), await console.browser.without_cookies().get(link)
+
+    assert (again.status, again.cookies) == (303, console.browser.cookies)
+    assert late.status == 401
+
+
+async def test_consoles_on_one_host_keep_their_logins_apart(console):
+    """A browser hands all cookies of a host to each of its ports."""
+    origin = "http://127.0.0.1:8471"
+    other = await Browser(console.browser.ask, origin).enter(f"{origin}/?link={console.visitors.new_link()}")
+
+    assert not console.browser.cookies.keys() & other.cookies.keys()
 
 
 async def test_a_websocket_of_a_stranger_is_refused_before_it_opens(console):
@@ -148,8 +184,8 @@ async def test_cookies_are_for_this_site_only_and_the_session_is_not_for_scripts
 
     given = [text.lower() for name, text in (await raw_headers(console, link)) if name == "set-cookie"]
 
-    session = next(text for text in given if text.startswith("ldcnd_session="))
-    csrf = next(text for text in given if text.startswith("ldcnd_csrf="))
+    session = next(text for text in given if text.startswith("ldcnd_session_="))
+    csrf = next(text for text in given if text.startswith("ldcnd_csrf_="))
     assert "httponly" in session
     assert "httponly" not in csrf
     assert all("samesite=strict" in text and "path=/" in text for text in given)

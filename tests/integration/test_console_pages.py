@@ -90,7 +90,7 @@ async def test_a_page_that_takes_nothing_for_long_is_given_up_and_leaves_nothing
 
 
 async def test_a_visitor_is_heard_of_as_long_as_a_page_is_open(console):
-    visitor = console.visitors.find(console.browser.cookies["ldcnd_session"])
+    visitor = console.visitors.find(console.browser.session)
     heard_at_s = visitor.seen_at_s
     async with page(console.app, console.browser):
         await asyncio.sleep(5)

@@ -11,6 +11,7 @@ from ldcnd.client.events import latest_events
 from ldcnd.config.rig import load_config
 from ldcnd.contract.commands import MoveVelocity, Power, Reset
 from ldcnd.contract.errors import DataRefused, EepromBudgetSpent, LdcndError, NotSupported, ValueOutOfRange
+from ldcnd.contract.leases import Acquire
 from ldcnd.contract.parameters import (
     AlarmReport,
     ClearCounter,
@@ -26,6 +27,7 @@ from ldcnd.contract.parameters import (
     ReadParameter,
     WriteParameter,
 )
+from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import (
     AxisState,
     FaultSample,
@@ -247,8 +249,23 @@ async def test_a_rig_wide_stop_says_which_drive_it_could_not_stop(tmp_path):
 
     assert reply.confirmed == ("x",)
     assert set(reply.axes) == {"x", "feed", "spool"}
+    assert reply.unstoppable == ("feed", "spool")
+    assert reply.shortfall == (
+        "NOT stopped: feed, spool; the drive takes no stop over its line and has no latch."
+        " Use the machine's emergency stop."
+    )
     assert isinstance(state, StateSample)
     assert not state.stop_latched
+
+
+async def test_who_controls_a_drive_that_takes_no_motions_is_not_asked_for_the_speed_of_the_others(tmp_path):
+    async with mixed_rig(tmp_path, two_drives()) as rig:
+        await rig.client.ask(Acquire(client="bob", axes=("feed",), lease_s=60))
+        held = await rig.client.ask(Acquire(client="ann", axes=("x",), lease_s=60))
+        await rig.client.ask(SetSpeedOverride(percent=25))
+        raised = await rig.client.ask(SetSpeedOverride(percent=100, leases=(held.lease,)))
+
+    assert raised.percent == 100
 
 
 async def test_a_drive_that_loses_power_is_down_and_comes_back_by_itself(tmp_path):

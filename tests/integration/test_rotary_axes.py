@@ -7,7 +7,16 @@ from contextlib import asynccontextmanager
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.contract.commands import Direction, Home, MoveAbsolute, MoveRelative, MoveVelocity, SetPosition, Track
+from ldcnd.contract.commands import (
+    Direction,
+    Home,
+    MoveAbsolute,
+    MoveRelative,
+    MoveVelocity,
+    Preview,
+    SetPosition,
+    Track,
+)
 from ldcnd.contract.errors import NotSupported, OutcomeUnknown, WrongState
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from ldcnd.drives.ldcn.packet import CommandCode
@@ -64,6 +73,19 @@ async def test_an_axis_turns_the_shortest_way_or_as_it_is_told(start, target, di
         assert reply.position == pytest.approx(ends_at % 10.0, abs=0.001)
         assert sample.turns * 10.0 + sample.value == pytest.approx(ends_at, abs=0.05)
         assert 0.0 <= sample.value < 10.0
+
+
+async def test_a_motion_at_a_velocity_has_no_end_within_a_turn():
+    async with dialect_rig(V4, ENDLESS, **ROTARY) as rig:
+        await rig.power_on()
+        planned = await rig.rig.client.ask(Preview(velocity=4.0), AXIS)
+        reply = await rig.send(MoveVelocity(velocity=4.0))
+        state = await rig.rig.client.state(AXIS)
+
+    assert planned.position is None
+    assert planned.ends == reply.ends == "runs until it is stopped, for at most 60 s unless it is sent again"
+    assert state.command.verb == "move_velocity"
+    assert state.command.target is None
 
 
 async def test_a_position_where_the_axis_is_told_to_be_is_no_turn():

@@ -11,6 +11,7 @@ from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
+from tests.support.rig import running_rig
 
 dialects = pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
 PWM = {"duty": 0.1, "duration_s": 5.0}
@@ -140,6 +141,15 @@ async def test_anyone_may_lower_it_and_raising_it_needs_control():
         with pytest.raises(LeaseHeld):
             await override(rig, 50)
         assert (await override(rig, 50, leases=(held.lease,))).percent == 50
+
+
+async def test_who_may_not_raise_it_learns_all_axes_of_which_control_is_missing():
+    async with running_rig() as rig:
+        held = await rig.client.ask(Acquire(client="ann", axes=("x", "z"), lease_s=60))
+        await rig.client.ask(SetSpeedOverride(percent=10))
+        with pytest.raises(LeaseHeld, match="needs control of x, z: axis x is controlled by ann"):
+            await rig.client.ask(SetSpeedOverride(percent=50))
+        assert (await rig.client.ask(SetSpeedOverride(percent=50, leases=(held.lease,)))).percent == 50
 
 
 async def test_the_expected_end_follows_the_speed_of_a_move_under_way():

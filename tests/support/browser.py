@@ -68,6 +68,21 @@ class Browser:
     cookies: Mapping[str, str] = field(default_factory=dict)
     extra: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def session(self) -> str:
+        """What proves who it is."""
+        return self._cookie("ldcnd_session_")
+
+    @property
+    def csrf(self) -> str:
+        """What proves that its pages send a command."""
+        return self._cookie("ldcnd_csrf_")
+
+    def _cookie(self, name: str) -> str:
+        """Return one of the cookies; its name has the port as a browser sees it."""
+        port = urlsplit(self.origin).port
+        return self.cookies.get(f"{name}{port or ''}", "")
+
     def forging(self, **headers: str) -> "Browser":
         """Return one that sends other headers; underscores stand for hyphens."""
         return replace(self, extra={**self.extra, **{name.replace("_", "-"): text for name, text in headers.items()}})
@@ -89,7 +104,7 @@ class Browser:
     async def post(self, path: str, body: JsonObject | bytes | None = None) -> WebAnswer:
         """POST as the console's own pages do."""
         payload = body if isinstance(body, bytes) else json.dumps(body or {}).encode()
-        usual = {"origin": self.origin, "x-ldcnd-csrf": self.cookies.get("ldcnd_csrf", "")}
+        usual = {"origin": self.origin, "x-ldcnd-csrf": self.csrf}
         return await self.ask(WebQuestion("POST", path, self.headers(usual), payload))
 
     def headers(self, usual: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -116,6 +116,16 @@ def test_an_error_stop_whose_fault_is_over_is_wrong_all_the_same(last_error, tex
     assert said(troubles_of(state(state=AxisState.ERROR_STOP, last_error=last_error), faults(), None)) == wrong(text)
 
 
+def test_an_error_stop_says_that_its_fault_is_over():
+    over = faults().model_copy(update={"first": entry("stop_input")})
+    opened = faults().model_copy(update={"first": entry("loop_opened")})
+    stopped = state(state=AxisState.ERROR_STOP, last_error="the drive reports a fault")
+
+    text = "in error stop because of stop input, which is over: reset it to go on"
+    assert said(troubles_of(stopped, over, None)) == wrong(text)
+    assert said(troubles_of(stopped, opened, None)) == wrong("in error stop: the drive reports a fault")
+
+
 def test_how_the_last_command_ended_is_no_trouble_of_an_axis_that_could_move_on():
     assert troubles_of(state(last_error="home: no switch"), faults(), None) == ()
 

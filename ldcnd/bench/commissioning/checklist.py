@@ -18,7 +18,7 @@ from ldcnd.bench.commissioning.limit_switches import LimitSwitches
 from ldcnd.bench.commissioning.motor import MotorDirection
 from ldcnd.bench.commissioning.record import CommissioningRecord, ConfigProposal, Result, StepRecord, StepState
 from ldcnd.bench.commissioning.speed import HighestSpeed
-from ldcnd.bench.commissioning.step import Step, StepContext
+from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext
 from ldcnd.bench.person import Left, Person, said
 from ldcnd.client.axis import seen
 from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, put_back_by_hand
@@ -238,7 +238,9 @@ class Checklist:
         if self._axis not in infos:
             raise UnknownAxis(f"rig {self._rig.name} has no axis {self._axis!r}", axis=self._axis)
         self.record = records.read(self.path, self._rig.name, self._axis)  # another session may have added to it
-        return StepContext(self._rig, infos[self._axis], config, self._person, self.record)
+        return StepContext(
+            info=infos[self._axis], config=config, rig=self._rig, person=self._person, record=self.record
+        )
 
     def _kept(self, step: Step, site: StepContext, result: Result) -> StepRecord:
         at = self._now().isoformat(timespec="seconds")
@@ -284,7 +286,20 @@ def axis_of(rig: RigConfig, name: str) -> AxisConfig:
     return axes[name]
 
 
-def _without_run(step: Step, site: StepContext) -> Result | None:
+def open_steps(record: records.CommissioningRecord, config: AxisConfig, info: AxisInfo | None) -> list[str]:
+    """Return the steps of an axis that are neither done nor settled otherwise.
+
+    Args:
+        record: what is known of it.
+        config: the axis, as the file has it.
+        info: as the daemon describes it, which tells those that are not for it; None while none does.
+    """
+    still = [name for name in STEPS if record.of(name).result.state not in SETTLED]
+    site = info and AxisContext(info=info, config=config)
+    return [name for name in still if not site or _without_run(STEPS[name], site) is None]
+
+
+def _without_run(step: Step, site: AxisContext) -> Result | None:
     """Return the result of a step that cannot be run, or need not be; None for any other."""
     if obstacle := step.obstacle(site):
         return Result(state=StepState.NOT_POSSIBLE, text=obstacle)

@@ -7,6 +7,7 @@ from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, PlotSeries, Result, StepState
 from ldcnd.bench.commissioning.step import (
+    AxisContext,
     Step,
     StepContext,
     closed_loop,
@@ -44,7 +45,7 @@ class Scale(Step):
     depends = ("direction", "counts_per_unit", "unit")
 
     @override
-    def obstacle(self, site: StepContext) -> str:
+    def obstacle(self, site: AxisContext) -> str:
         if site.info.counts_per_unit is None and not super().obstacle(site):
             return "not possible while the axis works in counts: give it `unit` and a guess of `counts_per_unit`"
         return super().obstacle(site)
@@ -131,7 +132,7 @@ class HomeRepeatability(Step):
     depends = ("direction", "counts_per_unit", "home")
 
     @override
-    def obstacle(self, site: StepContext) -> str:
+    def obstacle(self, site: AxisContext) -> str:
         if site.config.home is None and not super().obstacle(site):
             return "not possible without `home` in the configuration: say there what marks the reference position"
         return super().obstacle(site)
@@ -237,7 +238,7 @@ class Travel(Step):
     depends = ("direction", "counts_per_unit", "home")
 
     @override
-    def obstacle(self, site: StepContext) -> str:
+    def obstacle(self, site: AxisContext) -> str:
         if site.config.modulo is not None:
             return "a rotary axis turns endlessly: it has no ends"
         return super().obstacle(site)

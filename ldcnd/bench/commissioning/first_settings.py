@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, Result, StepState
-from ldcnd.bench.commissioning.step import Step, StepContext, done
+from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext, done
 from ldcnd.client.axis import Axis
 from ldcnd.contract.commands import Verb
 from ldcnd.drives.axis_config import AxisConfig, LossPolicy
@@ -84,7 +84,7 @@ class FirstSettings(Step):
     needs = (Verb.SET_GAINS,)
 
     @override
-    def unneeded(self, site: StepContext) -> str:
+    def unneeded(self, site: AxisContext) -> str:
         config = site.config
         known = config.gains is not None and config.counts_per_unit is not None
         return "unit, scale and gains are in the configuration" if known else ""

@@ -3,7 +3,7 @@
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, PlotSeries, Result, StepState
-from ldcnd.bench.commissioning.step import Step, StepContext
+from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext
 from ldcnd.bench.known import BENCHES
 from ldcnd.client.axis import Axis
 from ldcnd.client.kept_gains import LEASE_S, open_loop
@@ -32,7 +32,7 @@ class GainsStep(Step):
     needs = (Verb.SET_GAINS,)
 
     @override
-    def obstacle(self, site: StepContext) -> str:
+    def obstacle(self, site: AxisContext) -> str:
         gains_are_parameters = Verb.WRITE_PARAMETER in site.info.capabilities
         return "" if gains_are_parameters else super().obstacle(site)
 

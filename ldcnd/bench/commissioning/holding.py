@@ -29,7 +29,7 @@ from ldcnd.bench.commissioning.motor import (
     lent_gains,
 )
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
-from ldcnd.bench.commissioning.step import Step, StepContext, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext, refuse_latched, refuse_previewed, rest_counts
 from ldcnd.bench.machine_faults import STANDS, MachineFault, named
 from ldcnd.client.axis import Axis, seen
 from ldcnd.client.kept_gains import open_loop
@@ -71,7 +71,7 @@ class HoldingOutput(Step):
     depends = ("direction",)
 
     @override
-    def obstacle(self, site: StepContext) -> str:
+    def obstacle(self, site: AxisContext) -> str:
         if super().obstacle(site):
             return super().obstacle(site)
         if site.config.gains is None:

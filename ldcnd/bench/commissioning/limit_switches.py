@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import ConfigProposal, Figure, Result, StepState
-from ldcnd.bench.commissioning.step import Step, StepContext, done
+from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext, done
 from ldcnd.bench.machine_faults import MachineFault, fault_found, named
 from ldcnd.client.axis import Axis
 from ldcnd.contract.errors import WrongState
@@ -35,7 +35,7 @@ class LimitSwitches(Step):
     depends = ("direction", "home.switch_active", "limit_switches")
 
     @override
-    def obstacle(self, site: StepContext) -> str:
+    def obstacle(self, site: AxisContext) -> str:
         shows = TelemetryItem.INPUTS.value in site.info.items
         return "" if shows else f"not possible on this model: a {site.info.model} shows no limit switch inputs"
 

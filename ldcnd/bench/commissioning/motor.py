@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing_extensions import override
 
 from ldcnd.bench.commissioning.record import Figure, PlotSeries, Result, StepState
-from ldcnd.bench.commissioning.step import Step, StepContext, refuse_latched, refuse_previewed, rest_counts
+from ldcnd.bench.commissioning.step import AxisContext, Step, StepContext, refuse_latched, refuse_previewed, rest_counts
 from ldcnd.bench.machine_faults import STANDS, MachineFault, named
 from ldcnd.client.axis import Axis, seen
 from ldcnd.client.kept_gains import KeptGains, gains_in, keep, open_loop, restore
@@ -72,7 +72,7 @@ class MotorDirection(Step):
     needs = (Verb.POWER, Verb.MOVE_RELATIVE, Verb.SET_GAINS)
 
     @override
-    def obstacle(self, site: StepContext) -> str:
+    def obstacle(self, site: AxisContext) -> str:
         if site.config.gains is None and not super().obstacle(site):
             return "not possible without `gains` in the configuration: the loop stays open"
         return super().obstacle(site)

@@ -23,21 +23,30 @@ STILL_COUNTS = 2
 """Two positions that differ by no more are the same place."""
 
 
-@dataclass(frozen=True, slots=True)
-class StepContext:
+@dataclass(frozen=True, kw_only=True, slots=True)
+class AxisContext:
+    """What decides whether a step is for an axis.
+
+    Attributes:
+        info: the axis, as the daemon describes it.
+        config: the axis, as the file has it.
+    """
+
+    info: AxisInfo
+    config: AxisConfig
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class StepContext(AxisContext):
     """What a step works on.
 
     Attributes:
         rig: of the axis.
-        info: the axis, as the daemon describes it.
-        config: the axis, as the file has it.
         person: answers, and allows motion.
         record: what is known of the axis so far.
     """
 
     rig: Rig
-    info: AxisInfo
-    config: AxisConfig
     person: Person
     record: CommissioningRecord
 
@@ -66,12 +75,12 @@ class Step(ABC):
     depends: ClassVar[tuple[str, ...]] = ()
     """Settings of the axis, such as `direction`, whose change opens it again; the drive's identity always does."""
 
-    def obstacle(self, site: StepContext) -> str:
+    def obstacle(self, site: AxisContext) -> str:
         """Return why it is not possible with this axis; empty when it is."""
         missing = [verb.value for verb in self.needs if verb not in site.info.capabilities]
         return f"not possible on this model: a {site.info.model} has no {', '.join(missing)}" if missing else ""
 
-    def unneeded(self, site: StepContext) -> str:  # noqa: ARG002 - most steps are needed
+    def unneeded(self, site: AxisContext) -> str:  # noqa: ARG002 - most steps are needed
         """Return why there is nothing to do; empty when there is."""
         return ""
 

@@ -18,7 +18,7 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from ldcnd.bench.commissioning import record as records
-from ldcnd.bench.commissioning.checklist import SETTLED, STEPS, axis_of
+from ldcnd.bench.commissioning.checklist import STEPS, axis_of, open_steps
 from ldcnd.bench.commissioning.gains import GainsStep
 from ldcnd.bench.commissioning.report import html_of
 from ldcnd.config.rig import RigConfig, load_config
@@ -28,6 +28,7 @@ from ldcnd.console.commissioning.messages import FromCommissioningPage, ToCommis
 from ldcnd.console.commissioning.scan_conversation import ScanConversation
 from ldcnd.console.errors import answering_errors
 from ldcnd.console.reading import NOTHING_TO_SAY, SEND_TIME_S
+from ldcnd.console.replies import RigReply
 from ldcnd.console.requests import json_reply
 from ldcnd.console.rigs import Rigs
 from ldcnd.console.visitors import Visitor
@@ -158,14 +159,14 @@ class Commissioning:
             connected=bool(config and config.rig in described and described[config.rig].connected),
             command=self._command,
             numpy=find_spec("numpy") is not None,
-            axes=tuple(self._axes(config)) if config else (),
+            axes=tuple(self._axes(config, described.get(config.rig))) if config else (),
         )
 
-    def _axes(self, config: RigConfig) -> list[AxisOverview]:
-        found = []
+    def _axes(self, config: RigConfig, rig: RigReply | None) -> list[AxisOverview]:
+        found, infos = [], {info.axis: info for info in rig.axes} if rig else {}
         for each in (axis for bus in config.bus for axis in bus.axis):
             record = records.read(records.file_of(self._config, config.rig, each.name), config.rig, each.name)
-            still = [name for name in STEPS if record.of(name).result.state not in SETTLED]
+            still = open_steps(record, each, infos.get(each.name))
             found.append(
                 AxisOverview(
                     axis=each.name,

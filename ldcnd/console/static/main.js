@@ -17,8 +17,9 @@ import { AxisStrip, PlaceAndTarget } from "./parts/strip.js";
 import { overrideOf, slowed } from "./pages/rig_speed.js";
 import { StopAll, Stops } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
+import { loginIsGone } from "./session/api.js";
 import { feed } from "./session/feed.js";
-import { axesOf, axisNamed, commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
+import { axesOf, axisNamed, changed, commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
 
 const PAGES = [
   ["rig", "Rig", RigPage],
@@ -81,13 +82,30 @@ function Strip({ at }) {
 
 function Notices() {
   return html`<div class="notices" role="alert">
+    ${loginIsGone() && html`<p class="notice mark" data-level="bad">The login of this page is gone from the browser: its cookies were
+      cleared or replaced. Halt and every stop still work from here, nothing else does. Load the page again; if that is refused, open
+      it with a new link of ldcnd console.</p>`}
     ${failure && html`<p class="notice mark" data-level="bad">${failure.message} ${failure.remedy ?? ""}</p>`}
     ${[...rigs.values()].filter((rig) => rig.worth).map((rig) => html`<p class="notice mark" key=${rig.name} data-level="bad"
       >${rig.name}: no new values. ${rig.worth.why}</p>`)}
     ${lost.size > 0 && html`<p class="notice mark" data-level="bad">${lostInWords().join(" ")}
       <button type="button" class="plain" onClick=${dismissLost}>Dismiss</button></p>`}
+    <${OtherUnits} />
     <${Stops} />
   </div>`;
+}
+
+/** Which axes are in another unit than before. */
+function OtherUnits() {
+  const axes = axesOf().filter(({ info, unitChange }) => info && unitChange?.seen === false);
+  if (!axes.length) return null;
+  const dismiss = () => {
+    for (const { unitChange } of axes) unitChange.seen = true;
+    changed();
+  };
+  return html`<p class="notice mark" data-level="warn">The daemon has other units than before: ${axes
+    .map(({ name, info, unitChange: { from } }) => (from === info.unit ? name : `${name} in ${info.unit}, was in ${from}`)).join("; ")}. What was typed for ${axes.length > 1 ? "them" : "it"} is
+    cleared. <button type="button" class="plain" onClick=${dismiss}>Dismiss</button></p>`;
 }
 
 /** A page that fails must not take the stop away. */
@@ -140,7 +158,7 @@ function Console() {
       <${Notices} />
     </header>
     <main id="main" tabindex="-1" ref=${main}>
-      <${Guarded} key=${location.hash}><${Page} at=${at} /><//>
+      <${Guarded} key=${`${location.hash} ${rigs.get(at.rig)?.axes.get(at.axis)?.unitChanges ?? 0}`}><${Page} at=${at} /><//>
     </main>`;
 }
 

@@ -142,10 +142,5 @@ def _fill(table: "DataTable[Text]", rows: Sequence[tuple[tuple[str, ...], Severi
 
 def _stopped(reply: StopReply) -> str:
     """Return what became of a stop."""
-    missing = [axis for axis in reply.axes if axis not in reply.confirmed]
-    if missing:
-        return (
-            f"STOP NOT CONFIRMED BY {', '.join(missing)}: nothing else starts, but use the machine's emergency stop."
-            f" Confirmed by {', '.join(reply.confirmed) or 'none'}."
-        )
-    return f"stopped and latched: {', '.join(reply.confirmed)}{reply.warning and f'. {reply.warning}'}"
+    stopped = f"stopped and latched: {', '.join(reply.confirmed) or 'none'}"
+    return ". ".join(part for part in (reply.shortfall.removesuffix("."), stopped, reply.warning) if part)

@@ -22,8 +22,13 @@ export function ProvenanceWord({ provenance }) {
   return html`<${Mark} level=${level}>${words(provenance)}<//>`;
 }
 
+/** Why the daemon may be wrong about registers that cannot be read; null while nothing tells so. */
+export function registersDoubt(axis) {
+  return axis.condition.live ? null : "the drive does not answer; without power it has forgotten them.";
+}
+
 export function GainsPanel({ axis }) {
-  return html`<${Panel} title="Gains" of=${axis.rig} note="Register values as in the drive's manual. Nothing is written without a click.">
+  return html`<${Panel} title="Gains" of=${axis.rig} old=${registersDoubt(axis)} note="Register values as in the drive's manual. Nothing is written without a click.">
     <${GainsTable} axis=${axis} />
   <//>`;
 }

@@ -32,7 +32,7 @@ export function JogPanel({ axis }) {
         reason=${reason}>Hold to run + ▶<//>
     </p></div>
     ${axis.can("move_relative") && html`<p class="row steps" role="group" aria-label=${`Steps of ${axis.name}`}>
-      ${STEPS.map((step) => html`<${Action} key=${step} of=${[speed, axis.state?.state].join()} obstacle=${stepWay} reason=${reason}
+      ${STEPS.map((step) => html`<${Action} key=${step} of=${[speed, axis.state?.state, unit].join()} obstacle=${stepWay} reason=${reason}
         act=${() => command(axis, "move_relative", { distance: step, velocity: speed })}
         >${step > 0 ? "+" : ""}${number(step, Math.abs(step) < 1 ? 1 : 0)} ${unit}<//>`)}
     </p>`}

@@ -5,7 +5,7 @@ import { Facts, Panel, Table } from "../parts/controls.js";
 import { number } from "../parts/format.js";
 import { shownQuantity } from "../parts/number_text.js";
 import { GAINS } from "../session/contract.js";
-import { ProvenanceWord } from "./axis_gains.js";
+import { ProvenanceWord, registersDoubt } from "./axis_gains.js";
 
 export function LimitsPanel({ axis }) {
   const { limits, unit, counts_per_unit: scale, direction, adc_full_scale: full } = axis.info;
@@ -32,7 +32,7 @@ export function RegistersPanel({ axis }) {
       ({ name, value, provenance }) => html`<tr>
     <th scope="row">${name}</th><td class="number">${number(value, 0)}</td><td><${ProvenanceWord} provenance=${provenance} /></td></tr>`,
     );
-  return html`<${Panel} title="Registers" of=${axis.rig}
+  return html`<${Panel} title="Registers" of=${axis.rig} old=${registersDoubt(axis)}
     note="These drives cannot be read back: this is what the daemon knows of the rest of their registers.">
     <${Table} label=${`Registers of ${axis.name}`} head=${["Register", "#Raw value", "Known by"]} rows=${rows} />
   <//>`;

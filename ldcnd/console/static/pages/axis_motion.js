@@ -212,7 +212,7 @@ function Planned({ axis, plan, field, onNearest }) {
   const { known, mark } = axis.condition;
   const end = known ? `${number(plan.position, decimals)} ${unit}` : `(${number(plan.position, decimals)}) ${unit}, ${mark}`;
   const override = axis.state?.speed_override ?? 100;
-  return html`<p>${plan.position === null ? "Runs until stopped or to the soft limit" : `Ends at ${end}`},
+  return html`<p>${plan.ends ? `${axis.name} ${plan.ends}` : `Ends at ${end}`},
     ${" "}at ${held(plan.velocity, plan.velocity_error, "velocity")}${override === 100 ? "" : ` by the speed override of ${number(override, 0)} %`}, with ${held(plan.acceleration, plan.acceleration_error, "acceleration")}${
       plan.duration_s === null ? "" : `, in ${duration(plan.duration_s)} without settling`
     }.

@@ -3,10 +3,11 @@
 import { html, useEffect, useState } from "../html.js";
 import { save } from "../parts/chart_view.js";
 import { Action, Choice, Panel, RefusalText, Table, Tick } from "../parts/controls.js";
+import { clock } from "../parts/format.js";
 import { NumberField, TextField, unread } from "../parts/number_field.js";
 import { OneAxis } from "../parts/one_axis.js";
 import { Mark } from "../parts/state.js";
-import { command } from "../session/control.js";
+import { client, command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { asToml, driverTypeOf, fromToml } from "../session/parameter_file.js";
 import { axesOf } from "../session/rigs.js";
@@ -44,17 +45,22 @@ function Memories({ axis }) {
       ...last,
       values: last.values.map((each) => ({ ...each, eeprom_total: total, eeprom_writes: 0 })),
     }));
-  const readAll = () => command(axis, "read_all_parameters", {}, PATIENCE_MS);
+  const readAll = async () => {
+    const read = axis.now();
+    return { ...(await command(axis, "read_all_parameters", {}, PATIENCE_MS)), read };
+  };
+  const doubt = dump && axis.doubt(dump.read, client);
   const rows = merged(listed, values, file).filter((row) => matches(row, only));
 
   return html`
-    <${Panel} title=${`Memories of ${axis.name}`} of=${axis.rig}
+    <${Panel} title=${`Memories of ${axis.name}`} of=${axis.rig} old=${doubt && `${doubt} Read all again.`}
       note="RAM is in use and forgotten at power-off. EEPROM endures 10,000 writes.">
       <p class="row">
         <${Action} act=${readAll} onDone=${setDump} obstacle=${obstacle(axis, "parameters")}
           kind="main">${values ? "Read all again" : "Read all"}<//>
         <${Action} act=${() => save(new Blob([asToml(axis.name, dump)], { type: "text/plain" }), `${axis.name}.toml`)}
           obstacle=${values ? null : "Read all first."}>Save to a file<//>
+        ${dump && html`<span class="quiet">Read at ${clock(dump.read.t).slice(0, -4)}.</span>`}
       </p>
       <${FilePicker} file=${file} onFile=${setFile} />
       <div class="fields">

@@ -2,8 +2,9 @@
 
 import { html, useState } from "../html.js";
 import { Action, Panel, Table } from "../parts/controls.js";
+import { clock } from "../parts/format.js";
 import { Mark } from "../parts/state.js";
-import { command } from "../session/control.js";
+import { client, command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 
 const LEVELS = { alarm: "bad", warning: "warn", unknown: "warn" };
@@ -11,10 +12,15 @@ const LEVELS = { alarm: "bad", warning: "warn", unknown: "warn" };
 export function AlarmPanel({ axis }) {
   const [report, setReport] = useState(null);
   const [cleared, setCleared] = useState(null);
-  return html`<${Panel} title="Alarms and counters">
+  const read = async () => {
+    const at = axis.now();
+    return { ...(await command(axis, "read_alarms")), at };
+  };
+  return html`<${Panel} title="Alarms and counters" of=${axis.rig} old=${report && axis.doubt(report.at, client)}>
     <p class="row">
-      <${Action} act=${() => command(axis, "read_alarms")} onDone=${setReport}
+      <${Action} act=${read} onDone=${setReport}
         obstacle=${obstacle(axis, "parameters")}>Read alarms<//>
+      ${report && html`<span class="quiet">Read at ${clock(report.at.t).slice(0, -4)}.</span>`}
     </p>
     <p class="row">${["command", "feedback"].map(
       (counter) => html`<${Action} act=${() => command(axis, "clear_counter", { counter })} onDone=${setCleared}

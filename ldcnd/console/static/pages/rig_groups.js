@@ -15,7 +15,7 @@ export function GroupMoves({ rig }) {
   const grouped = [...rig.axes.values()].filter((axis) => axis.info?.group);
   return [...new Set(grouped.map((axis) => axis.info.group))].map((group) => {
     const axes = grouped.filter((axis) => axis.info.group === group);
-    return html`<${GroupMove} key=${group} group=${group} axes=${axes} />`;
+    return html`<${GroupMove} key=${`${group} ${axes.map(({ unitChanges }) => unitChanges).join()}`} group=${group} axes=${axes} />`;
   });
 }
 

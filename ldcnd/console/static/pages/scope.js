@@ -91,6 +91,6 @@ function useRecording(axes, keys) {
     const begun = new Recording(channels);
     setRecording(begun);
     return () => begun.close();
-  }, [axes.length > 0, channels.map(({ key }) => key).join()]);
+  }, [axes.length > 0, channels.map(({ key, unit }) => `${key} ${unit}`).join()]);
   return recording;
 }

@@ -13,7 +13,7 @@ import { look } from "../session/channels.js";
 import { obstacle } from "../session/obstacles.js";
 import { MOVES, runs, runTest } from "../session/test_moves.js";
 import { AuthorityPanel } from "./axis_authority.js";
-import { gainsOf, GainsTable } from "./axis_gains.js";
+import { gainsOf, GainsTable, registersDoubt } from "./axis_gains.js";
 import { hasGainParameters, ParameterBench } from "./tuning_parameters.js";
 
 export function TuningPage({ at }) {
@@ -28,7 +28,7 @@ function Bench({ axis }) {
     <div>
       <${TestMove} axis=${axis} />
       <${AuthorityPanel} axis=${axis} />
-      <${Panel} title="Gains" of=${axis.rig} note="Nothing is written without a click.">
+      <${Panel} title="Gains" of=${axis.rig} old=${registersDoubt(axis)} note="Nothing is written without a click.">
         <${GainsTable} axis=${axis} wanted=${wanted} onWanted=${setWanted} />
       <//>
     </div>

@@ -2,11 +2,11 @@
 
 import { html, useEffect, useState } from "../html.js";
 import { Action, Panel, RefusalText, Table } from "../parts/controls.js";
-import { number } from "../parts/format.js";
+import { clock, number } from "../parts/format.js";
 import { NumberField, unread } from "../parts/number_field.js";
 import { TraceProgress } from "../parts/trace_progress.js";
 import { arm } from "../session/captures.js";
-import { command } from "../session/control.js";
+import { client, command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { AuthorityPanel } from "./axis_authority.js";
 
@@ -22,19 +22,23 @@ export function ParameterBench({ axis }) {
   const [gains, setGains] = useState([]);
   const [runs, setRuns] = useState([]);
   const [refusal, setRefusal] = useState(null);
+  const [readAt, setReadAt] = useState(null);
   const read = async () => {
-    const values = [];
+    const [values, at] = [[], axis.now()];
     for (const parameter of GAINS) values.push((await command(axis, "read_parameter", { parameter }, PATIENCE_MS)).value);
-    return values;
+    setGains(values);
+    setReadAt(at);
   };
   useEffect(() => {
-    read().then(setGains, setRefusal);
+    read().catch(setRefusal);
   }, [axis]);
   const renew = (value) => setGains((last) => last.map((each) => (each.parameter === value.parameter ? value : each)));
   const keep = (run) => setRuns((last) => [{ ...run, number: (last[0]?.number ?? 0) + 1 }, ...last].slice(0, MOST_RUNS));
   return html`<${AuthorityPanel} axis=${axis} />
-    <${Panel} title="Gains" of=${axis.rig} note="Written to RAM: in use at once, lost at power-off. Save them on the parameters page.">
+    <${Panel} title="Gains" of=${axis.rig} old=${readAt && axis.doubt(readAt, client)} note="Written to RAM: in use at once, lost at power-off. Save them on the parameters page.">
       <${RefusalText} refusal=${refusal} />
+      ${readAt && html`<p class="row"><${Action} act=${read} obstacle=${obstacle(axis, "parameters")}>Read again<//>
+        <span class="quiet">Read at ${clock(readAt.t).slice(0, -4)}.</span></p>`}
       ${gains.map((value) => html`<${Gain} key=${value.parameter} axis=${axis} value=${value} onWritten=${renew} />`)}
     <//>
     <${Record} axis=${axis} gains=${gains} onRun=${keep} />

@@ -96,8 +96,12 @@ export function useOnce() {
   const send = (body, moving, act) => {
     const again = obstacle(body, moving);
     if (again) throw new Error(again);
-    last.current = { text: JSON.stringify(body), atMs: performance.now() };
-    return act();
+    const sent = { text: JSON.stringify(body), atMs: performance.now() };
+    last.current = sent;
+    return act().catch((error) => {
+      if (error.refused && last.current === sent) last.current = { text: null, atMs: 0 }; // it was not sent on: it moves nothing
+      throw error;
+    });
   };
   return { obstacle, send };
 }
@@ -170,12 +174,14 @@ export function Tick({ label, checked, onChange }) {
  *
  * With `of` it has values of that rig; while nothing comes from there, it says that they are the last known ones.
  */
-export function Panel({ title, note, of, children, ...more }) {
+/** A part of a page. `of` is the rig of its values; `old` says why they may not hold any more, of a rig that is there. */
+export function Panel({ title, note, of, old = null, children, ...more }) {
   const id = useId();
-  const stale = of && { "data-stale": of.worth ? "yes" : "no" };
+  const stale = of && { "data-stale": of.worth || old ? "yes" : "no" };
   return html`<section class="panel" aria-labelledby=${id} ...${stale} ...${more}>
     <header><h2 id=${id}>${title}</h2>${note && html`<p class="quiet">${note}</p>`}
-      ${of?.worth && html`<p class="mark" data-level="bad">last known values</p>`}</header>
+      ${of?.worth && html`<p class="mark" data-level="bad">last known values</p>`}
+      ${!of?.worth && old && html`<p class="mark" data-level="warn">old values: ${old}</p>`}</header>
     ${children}
   </section>`;
 }

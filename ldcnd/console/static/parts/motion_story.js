@@ -13,7 +13,7 @@ export function EndOfMotion({ axis, event }) {
   const position = restOf(axis, event);
   const decimals = decimalsOf(axis.info);
   const place = position == null ? "" : html` at ${number(position, decimals)} <span class="unit">${axis.info.unit}</span>`;
-  const target = settled == null || off == null ? "" : ` to ${number(position + off, decimals)}`;
+  const target = settled == null || off == null || position == null ? "" : ` to ${number(position + off, decimals)}`;
   const at = html` <span class="quiet">${clock(event.t).slice(0, -4)}</span>`;
   if (status === "done") {
     const tookS = axis.settlingS(event);
@@ -28,6 +28,7 @@ export function EndOfMotion({ axis, event }) {
 
 /** Where a motion came to rest; null while that is not known. One that was cut off is still moving at its own end. */
 function restOf(axis, event) {
+  if (event.t < (axis.unitChange?.since ?? 0)) return null; // it was in another unit
   if (event.position != null) return event.position;
   const after = axis.rig.events.slice(axis.rig.events.indexOf(event) + 1).filter((each) => each.axis === axis.name);
   const ending = after.find((each) => each.position != null);
@@ -44,7 +45,7 @@ export function StoryOf({ axis, sent }) {
   if (ended) return html`<${EndOfMotion} axis=${axis} event=${ended} />`;
   const to = sent.position == null ? "" : ` to ${number(sent.position, decimalsOf(axis.info))} ${axis.info.unit}`;
   if (rig.worth) return html`${words(sent.verb)}${to}: <${Mark} level="bad">not known how far it is.<//> ${rig.worth.why}`;
-  if (rig.daemon?.instance !== sent.run) return html`${words(sent.verb)}${to}: <${Mark} level="warn">not known how it ended<//>, the daemon was started again.`;
+  if (rig.daemon?.instance !== sent.run) return html`${words(sent.verb)}: <${Mark} level="warn">not known how it ended<//>, the daemon was started again.`;
   if (state?.command?.command_id === sent.command_id) return `${axis.name} moves${to}.`;
   return `Accepted: ${words(sent.verb)}${to}.`;
 }

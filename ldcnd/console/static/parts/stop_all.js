@@ -71,15 +71,11 @@ function isNews({ answered }) {
 
 function outcome(rig, reply) {
   if (!reply.axes) return { level: "bad", text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.` };
-  const missing = reply.axes.filter((axis) => !reply.confirmed.includes(axis));
   const warning = reply.warning ? ` ${reply.warning}` : "";
   const confirmed = reply.confirmed.length ? `confirmed by ${reply.confirmed.join(", ")}` : "confirmed by no drive";
-  if (!missing.length) return { answered: rig, level: warning && "warn", text: `${rig}: stop latched; ${confirmed}.${warning}` };
-  return {
-    answered: rig,
-    level: "bad",
-    text: `${rig}: NOT confirmed by ${missing.join(", ")}; ${confirmed}. The latch holds; look at the machine.${warning}`,
-  };
+  const told = reply.unstoppable.length < reply.axes.length ? { answered: rig } : {}; // without a latch no state tells of it
+  if (!reply.shortfall) return { ...told, level: warning && "warn", text: `${rig}: stop latched; ${confirmed}.${warning}` };
+  return { ...told, level: "bad", text: `${rig}: ${reply.shortfall} Stop latched; ${confirmed}.${warning}` };
 }
 
 /** The stops that are latched now, as the axes say it: by this page, another one, or any other program. */
@@ -93,13 +89,18 @@ function StopsOf({ rig }) {
   const latched = axes.filter(({ state }) => !state.stop_pending);
   const [moving, stopped] = [true, false].map((is) => latched.filter(({ state }) => (state.moving === "yes") === is));
   if (!axes.length) return null;
+  // what no stop reaches goes on beside those that are latched
+  const free = [...rig.axes.values()].filter((axis) => axis.info && !axis.can("stop"));
+  const [going, standing] = [true, false].map((is) => free.filter((axis) => (!axis.condition.live || axis.state?.moving !== "no") === is));
   const of = rigs.size > 1 ? `${rig.name}: ` : "";
   const ready = latched.filter((axis) => obstacle(axis, "reset") === null);
   const reset = () => Promise.all(ready.map((axis) => command(axis, "reset")));
-  return html`<p class="notice mark stops" data-level=${pending.length ? "bad" : "warn"}>
+  return html`<p class="notice mark stops" data-level=${pending.length || going.length ? "bad" : "warn"}>
     ${pending.length > 0 && html`<span>${of}stop NOT confirmed by ${named(pending)}: use the machine’s emergency stop.</span> `}
     ${moving.length > 0 && html`<span>${of}stop latched, moving still: ${named(moving)}.</span> `}
-    ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}. Nothing moves before Reset.</span> `}
+    ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}. ${free.length ? "They do not move before Reset." : "Nothing moves before Reset."}</span> `}
+    ${going.length > 0 && html`<span>${of}NOT stopped, may move: ${named(going)}. No stop reaches it over its line: use the machine’s emergency stop.</span> `}
+    ${standing.length > 0 && html`<span>${of}No stop reaches ${named(standing)} over its line.</span> `}
     ${ready.length > 0 && html`<${Action} act=${reset}>Reset stopped axes<//>`}
   </p>`;
 }

@@ -4,6 +4,11 @@ const PATIENCE_MS = 15_000;
 /** A browser keeps six connections to a host; three are left for stops, which wait for nothing. */
 const MOST_AT_ONCE = 3;
 
+/** As the console's gate names it: cookies are shared by all ports of a host. */
+const CSRF_COOKIE = `ldcnd_csrf_${location.port}`;
+/** As of the loading of this page, so that it may go on ending motions whatever becomes of the cookies. */
+const csrf = cookie(CSRF_COOKIE);
+
 let page = null;
 
 /** Say which page sends what is asked from now on: what it may move depends on it. */
@@ -21,7 +26,14 @@ export class Refusal extends Error {
     this.nearest = reply.nearest ?? null;
     this.retryable = reply.retryable ?? false;
     this.status = status;
+    /** Whether it is certain that nothing was carried out. */
+    this.refused = status >= 400 && status < 500;
   }
+}
+
+/** Whether the browser has forgotten that this page was let in: the console then carries out its stops only. */
+export function loginIsGone() {
+  return cookie(CSRF_COOKIE) !== csrf;
 }
 
 const waiting = [];
@@ -45,7 +57,7 @@ export function askAtOnce(path, body = {}, { patienceMs = PATIENCE_MS, keepalive
     method: "POST",
     headers: {
       "Content-Type": "application/json",
-      "X-Ldcnd-Csrf": cookie("ldcnd_csrf"),
+      "X-Ldcnd-Csrf": csrf,
       ...(page && { "X-Ldcnd-Page": page }),
     },
     body: asJson(body),

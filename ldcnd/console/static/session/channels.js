@@ -59,9 +59,9 @@ export class Recording {
       const { label, unit, pane, gapS } = channel;
       const curve = new GrowingCurve({ label, unit, pane, gapS, ...look(index) }, KEPT);
       const topic = `${channel.axis.rig.name}/tele/${channel.axis.name}/${channel.item}`;
-      const { field, axis } = channel;
+      const { axis } = channel;
       curve.mark = () => (axis.condition.live ? "" : axis.condition.mark); // beside a value that is not to be believed
-      this.#byTopic.set(topic, [...(this.#byTopic.get(topic) ?? []), { curve, field, rig: axis.rig }]);
+      this.#byTopic.set(topic, [...(this.#byTopic.get(topic) ?? []), { curve, channel }]);
       return curve;
     });
     this.#leave = feed.listen((rig, topic, sample) => this.#take(`${rig}/${topic}`, sample));
@@ -79,9 +79,10 @@ export class Recording {
   }
 
   #take(topic, sample) {
-    for (const { curve, field, rig } of this.#byTopic.get(topic) ?? []) {
-      const good = sample && sample.quality !== "bad" && sample[field] !== null;
-      if (!sample) continue;
+    for (const { curve, channel } of this.#byTopic.get(topic) ?? []) {
+      if (!sample || (sample.unit && sample.unit !== channel.unit)) continue; // of a daemon that is not described yet
+      const { field, axis: { rig } } = channel;
+      const good = sample.quality !== "bad" && sample[field] !== null;
       if (!this.#zeroNs.has(rig)) this.#zeroNs.set(rig, rig.nowNs() - this.now() * 1e9);
       curve.push((sample.t - this.#zeroNs.get(rig)) / 1e9, good ? sample[field] : NaN);
     }

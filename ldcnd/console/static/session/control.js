@@ -57,14 +57,20 @@ export async function release(axes) {
 
 /** Send a command once, under this page's control if it has it, meant for this run of the daemon. */
 export function command(axis, verb, body = {}, patienceMs = undefined) {
-  const instance = rigs.get(axis.rig.name)?.daemon?.instance;
-  const envelope = { ...(instance && { instance }), command_id: crypto.randomUUID() };
+  const envelope = { ...runOf(axis), command_id: crypto.randomUUID() };
   return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, { ...given(body), ...envelope }, patienceMs);
+}
+
+/** The run of the daemon whose values and units this page shows: another one may mean something else by a number. */
+function runOf(axis) {
+  const instance = axis.rig.daemon?.instance;
+  return instance ? { instance } : {};
 }
 
 /** Start absolute moves of the members of a group in the same servo cycle; `targets` are positions by axis name. */
 export function moveTogether(axes, targets, velocities, straight = false) {
-  const moves = shares(axes, targets, velocities).map((move) => ({ ...move, command_id: crypto.randomUUID() }));
+  const run = runOf(axes[0]);
+  const moves = shares(axes, targets, velocities).map((move) => ({ ...move, ...run, command_id: crypto.randomUUID() }));
   return ask(`${rigPath(axes[0].rig.name)}/rig/move_together`, { moves, ...(straight && { path: "linear" }) });
 }
 
@@ -97,7 +103,7 @@ export function question(axis, verb, body = {}) {
 export function beginJog(axis, velocity) {
   endJog();
   jogRefusal = null;
-  say({ jog: { rig: axis.rig.name, axis: axis.name, velocity } });
+  say({ jog: { rig: axis.rig.name, axis: axis.name, velocity, ...runOf(axis) } });
   holding = setInterval(() => say({ held: true }), HELD_EACH_MS);
   changed();
 }

@@ -23,6 +23,9 @@ const FINAL = new Set(["done", "aborted", "refused", "failed", "unknown"]);
 /** An observer speaks every ten seconds: an hour and a half. */
 const SHADOWS_KEPT = 540;
 
+/** The unit in which a sample of an axis of some unit is. */
+const UNIT_OF = { position: (unit) => unit, latch: (unit) => unit, state: (unit) => unit, velocity: (unit) => `${unit}/s` };
+
 /** One axis: its description and its latest samples. */
 export class Axis {
   samples = {};
@@ -31,6 +34,14 @@ export class Axis {
   /** What a command for all axes was refused with here, in words; null when it was not. */
   refusal = null;
   shadows = [];
+  /** The unit that it had before, since when it has another, and whether the operator has seen that; null while it had none. */
+  unitChange = null;
+  /** How often its units have changed: what was typed before means something else now. */
+  unitChanges = 0;
+  #outNs = 0;
+  #info = null;
+  #units = null;
+  #told = {};
   #positions = [];
   #motion = { key: null, sinceNs: 0 };
   #ends = new Map();
@@ -39,7 +50,23 @@ export class Axis {
   constructor(rig, name) {
     this.rig = rig;
     this.name = name;
-    this.info = null;
+  }
+
+  /** Its description; null where the rig has none of it. */
+  get info() {
+    return this.#info;
+  }
+
+  set info(told) {
+    const before = this.#units;
+    this.#info = told;
+    if (!told) return;
+    this.#units = { unit: told.unit, all: JSON.stringify([told.unit, told.units, told.g_velocity]) };
+    if (before && before.all !== this.#units.all) {
+      this.unitChange = { from: before.unit, since: this.rig.daemon?.started ?? 0, seen: false };
+      this.unitChanges += 1;
+    }
+    for (const [item, sample] of Object.entries(this.#told)) this.#judge(item, sample);
   }
 
   get bus() {
@@ -92,7 +119,11 @@ export class Axis {
     if (item === "state" && sample?.state !== this.state?.state) this.refusal = null; // of a state that is over
     if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
     else if (item === "trace") this.trace = sample;
-    else if (kind !== "trace" && kind !== "event") this.#keep(this.samples, item, sample);
+    else if (kind !== "trace" && kind !== "event") {
+      this.#keep(this.#told, item, sample);
+      this.#judge(item, sample);
+    }
+    if ((item === "state" && sample?.link === "down") || (item === "condition" && sample?.live === false)) this.#outNs = this.rig.nowNs();
     if (item === "position") this.#remember(sample);
     if (item === "state" && sample) this.#noteMotion(sample);
     if (item === "shadow" && sample) this.shadows = [...this.shadows, sample].slice(-SHADOWS_KEPT);
@@ -103,6 +134,25 @@ export class Axis {
   ageS(item) {
     const arrived = this.#arrived.get(item);
     return arrived ? arrived.ageS + (performance.now() - arrived.atMs) / 1e3 : null;
+  }
+
+  /** When something is read of its drive, for `doubt`. */
+  now() {
+    return { t: this.rig.nowNs(), run: this.rig.daemon?.instance };
+  }
+
+  /** Why what was read of its drive at `now()` may not hold any more; null while nothing tells so.
+   *
+   * `client` is the one whose own writes are known here.
+   */
+  doubt({ t, run }, client) {
+    if (run !== this.rig.daemon?.instance) return "the daemon was started again since then.";
+    if (!this.condition.live) return "the drive does not answer.";
+    if (this.#outNs > t) return "the drive did not answer for a while since then, and may have lost its power.";
+    const since = this.rig.events.filter((event) => event.axis === this.name && event.t > t);
+    if (since.some(({ verb }) => verb === "drive_changed")) return "the drive was reset or changed since then.";
+    const other = since.findLast((event) => event.verb === "write_parameter" && event.client !== client && event.status !== "refused");
+    return other ? `${other.client ?? "another client"} has written since then.` : null;
   }
 
   /** Whether its place is known and what is to be said of it, as the console process has decided; see `condition.py`. */
@@ -128,7 +178,7 @@ export class Axis {
 
   #remember(sample) {
     const good = sample && sample.quality !== "bad";
-    const before = this.#positions.filter(({ t }) => t >= this.#motion.sinceNs && t < sample?.t);
+    const before = this.#positions.filter(({ t, unit }) => unit === sample?.unit && t >= this.#motion.sinceNs && t < sample?.t);
     const recent = before.filter(({ t }) => sample.t - t <= SLOPE_S * 1e9);
     this.#positions = good ? [...(recent.length ? recent : before.slice(-1)), sample] : [];
   }
@@ -153,6 +203,14 @@ export class Axis {
     if (key === this.#motion.key) return;
     this.#motion = { key, sinceNs: t };
     this.#positions = this.#positions.filter((each) => each.t >= t);
+  }
+
+  /** Keep a sample as far as it is in the units of the description: a restart of the daemon may bring others. */
+  #judge(item, sample) {
+    const unit = this.#info?.unit;
+    const fits = !unit || !sample || !UNIT_OF[item] || !sample.unit || sample.unit === UNIT_OF[item](unit);
+    const fitting = fits ? sample : item === "state" ? { ...sample, command: sample.command && { ...sample.command, target: null } } : null;
+    this.#keep(this.samples, item, fitting);
   }
 
   #keep(where, name, sample) {
@@ -288,7 +346,12 @@ export class Rig {
   #telemetry(name, item, sample) {
     if (item === "event") {
       if (sample) this.happened(sample);
-    } else this.axis(name).take(item, sample);
+    } else {
+      const axis = this.axis(name);
+      const before = [axis.state?.link, axis.faults.length].join();
+      axis.take(item, sample);
+      if ((item === "state" || item === "fault") && before !== [axis.state?.link, axis.faults.length].join()) describeSoon(); // its registers
+    }
   }
 }
 
@@ -379,8 +442,13 @@ export const describe = unlessUnderWay(async () => {
 
 /** Read them again as soon as a change can be seen: the console process asks a daemon once a second at most. */
 export function describeSoon() {
-  setTimeout(describe, DESCRIBED_ANEW_MS);
+  describedSoon ||= setTimeout(() => {
+    describedSoon = 0;
+    describe();
+  }, DESCRIBED_ANEW_MS);
 }
+
+let describedSoon = 0;
 
 /** Begin to watch; once for a page. */
 export function watch() {
