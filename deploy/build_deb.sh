@@ -116,6 +116,7 @@ main_package() {
     install -Dm644 "$here/modules-load.d/ldcnd.conf" "$root/usr/lib/modules-load.d/ldcnd.conf"
     install -Dm644 -t "$doc/examples" "$here/drop-ins/"{realtime,nice,lan,single-line}.conf "$source"/config/*.toml
     install -Dm644 -t "$doc/examples/grafana" "$here"/grafana/*
+    (cd "$source/config" && find zenoh -type f -exec install -Dm644 {} "$doc/examples/{}" \;)
     install -Dm644 -t "$doc" "$here/INSTALL.md"
     gzip -9nc "$source/CHANGELOG.md" > "$doc/CHANGELOG.md.gz"
     ln -s /opt/ldcnd/bin/ldcnd "$root/usr/bin/ldcnd"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import Serving, Target, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import on_end
 from ldcnd.cli.quantities import save_figure, stacked_rows
@@ -61,7 +61,7 @@ def record(target: Target, out: Path | None, rotate_mb: int) -> None:
     require("mcap")
     out = dated(out, datetime.now(UTC))
     try:
-        target.run(lambda client: _record(client, out, rotate_mb * 1_000_000))
+        target.serve(lambda client, service: _record(client, service, out, rotate_mb * 1_000_000))
     except OSError as error:
         raise click.ClickException(f"{error.filename or out}: cannot be written: {error.strerror}") from error
 
@@ -101,7 +101,7 @@ def dated(pattern: Path, start: datetime) -> Path:
     return Path(start.strftime(str(pattern)))
 
 
-async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
+async def _record(client: RigClient, service: Serving, out: Path, rotate_bytes: int) -> None:
     from ldcnd.lab.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder  # noqa: PLC0415 - needs an optional package
 
     recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes, client.descriptions)
@@ -109,7 +109,7 @@ async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
     try:
         with recorder:
             async with client.published(recorder.take, KEPT_SAMPLES, LINGER_S) as gave_way:
-                click.echo(f"recording rig {client.rig} to {out}", err=True)
+                service.serves(f"recording rig {client.rig} to {out}", err=True)
                 await recorder.run(gave_way)
     finally:
         click.echo(recorder.summary, err=True)  # only now: until the subscriptions are gone, more is recorded

@@ -11,14 +11,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from ldcnd.contract.keys import ALL_CLIENTS, ALL_COMMANDS, ALL_READABLE, ALL_STOPS
+from ldcnd.contract.catalogue import COMMANDS
+from ldcnd.contract.commands import About, Effect
+from ldcnd.contract.keys import ALL_CLIENTS, ALL_COMMANDS, ALL_READABLE, ALL_STOPS, RIG_ITSELF, ROOT
 
 
 class CertificateRole(StrEnum):
     """The purpose of a login."""
 
     VIEWER = "viewer"
-    """Reads everything, and may stop."""
+    """Reads and asks everything, and may stop."""
     OPERATOR = "operator"
     """Reads, stops and commands."""
     DAEMON = "daemon"
@@ -68,6 +70,18 @@ COMMAND = (
     Rule("command_in", Flow.INGRESS, ("query",), (ALL_COMMANDS,)),
     Rule("command_out", Flow.EGRESS, ANSWERING, (ALL_COMMANDS,)),
 )
+QUESTIONS = tuple(
+    f"{ROOT}/*/@cmd/{'*' if each.about is About.AXIS else RIG_ITSELF}/{each.verb}"
+    for each in COMMANDS
+    if each.effect is Effect.QUESTION
+)
+"""Keys of what changes nothing."""
+ASK = (
+    Rule("ask_in", Flow.INGRESS, ("query",), QUESTIONS),
+    Rule("ask_out", Flow.EGRESS, ("reply",), QUESTIONS),
+    # the daemon has one queryable for all commands, and this is how a viewer's questions find it
+    Rule("ask_whom", Flow.EGRESS, ("declare_queryable",), (ALL_COMMANDS,)),
+)
 PRESENCE = (
     Rule("presence_in", Flow.INGRESS, ("liveliness_token",), (ALL_CLIENTS,)),
     Rule("presence_out", Flow.EGRESS, ("declare_liveliness_subscriber", "liveliness_query"), (ALL_CLIENTS,)),
@@ -80,10 +94,10 @@ CARRY = (
     Rule("carry_out", Flow.EGRESS, EVERYTHING, EVERYWHERE),
 )
 
-RULES = (*WATCH, *STOP, *COMMAND, *PRESENCE)
+RULES = (*WATCH, *STOP, *ASK, *COMMAND, *PRESENCE)
 PERMITTED: Mapping[CertificateRole, tuple[Rule, ...]] = {
-    CertificateRole.VIEWER: (*WATCH, *STOP),
-    CertificateRole.OPERATOR: RULES,
+    CertificateRole.VIEWER: (*WATCH, *STOP, *ASK),
+    CertificateRole.OPERATOR: (*WATCH, *STOP, *COMMAND, *PRESENCE),
 }
 """At a daemon that people connect to."""
 PERMITTED_BEHIND_ROUTER: Mapping[CertificateRole, tuple[Rule, ...]] = {**PERMITTED, CertificateRole.ROUTER: CARRY}
