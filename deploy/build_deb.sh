@@ -153,6 +153,10 @@ if [ "$1" = remove ] && [ -d /run/systemd/system ]; then
     systemctl disable --now --quiet ldcnd.service
     systemctl stop 'ldcnd@*.service' 'ldcnd-*@*.service'
 fi
+if [ "$1" = remove ]; then # what was enabled is so no more, as ldcnd.service
+    find /etc/systemd/system -path '*.wants/ldcnd*.service' -type l -delete
+    find /etc/systemd/system -name 'ldcnd*.wants' -type d -empty -delete
+fi
 PRERM
     cat > "$root/DEBIAN/postrm" <<'POSTRM'
 #!/bin/sh

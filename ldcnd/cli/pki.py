@@ -12,7 +12,7 @@ from ldcnd.ops.pki.access import CertificateRole
 from ldcnd.parts import require
 
 FOLDER = click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
-DAYS = 730
+DAYS = click.option("--days", type=WholeNumber(1, 3650), default=730, show_default=True, help="How long it is valid.")
 
 
 @click.group(cls=CommandGroup)
@@ -43,7 +43,7 @@ def init(folder: Path, name: str) -> None:
 )
 @click.option("--host", "hosts", multiple=True, help="Host name at which a daemon or router is found; may be repeated.")
 @click.option("--ip", "addresses", multiple=True, help="The same, an IP address.")
-@click.option("--days", type=WholeNumber(1, 3650), default=DAYS, show_default=True, help="How long it is valid.")
+@DAYS
 def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: tuple[str, ...], days: int) -> None:
     """Give NAME a login: a certificate and a Zenoh configuration, in one file to hand over."""
     require("cryptography")
@@ -60,6 +60,19 @@ def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: t
         click.echo(f"{file}: hand it over on a safe way; use it as --config {file.name}")
     if login.role is not CertificateRole.DAEMON:
         _say_restart(other for other in site.listener_files() if other != file)
+
+
+@command.command()
+@FOLDER
+@click.argument("name")
+@DAYS
+def renew(folder: Path, name: str, days: int) -> None:
+    """Give NAME another certificate before its own ends; the old one stays valid until then."""
+    require("cryptography")
+    from ldcnd.ops.pki.site import Site  # noqa: PLC0415 - needs an optional package
+
+    file = Site(folder).renew(name, _now(), days)
+    click.echo(f"{file}: put it in the place of the one before, and restart what uses it")
 
 
 @command.command()

@@ -1,5 +1,6 @@
 """A site's logins: certificates, roster and access rules; and that the delivered set-ups say the same."""
 
+import base64
 import datetime as dt
 import json
 import stat
@@ -9,7 +10,7 @@ import pytest
 import zenoh
 from click.testing import CliRunner
 from cryptography import x509
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID, NameOID
 
 from ldcnd.cli.main import cli
 from ldcnd.contract.errors import ConfigError
@@ -121,6 +122,37 @@ def test_to_a_daemon_a_router_is_trusted_and_another_daemon_is_nobody(site: Site
 def test_a_daemon_is_not_revoked_because_clients_would_trust_it_all_the_same(site: Site) -> None:
     with pytest.raises(ConfigError, match="cannot be revoked"):
         site.revoke("bench")
+
+
+@pytest.mark.parametrize("name", ["bench", "vic"])
+def test_a_login_is_renewed_under_its_name_hosts_and_role(site: Site, tmp_path: Path, name: str) -> None:
+    before, rules = certificate(tmp_path, name), subjects(tmp_path)
+
+    file = site.renew(name, NOW + dt.timedelta(days=29), 30)
+
+    after = certificate(tmp_path, name)
+    tls = configuration(tmp_path, name)["transport"]["link"]["tls"]
+    assert file == tmp_path / "site" / f"{name}.json5"
+    assert base64.b64decode(tls["connect_certificate_base64"]) == (file.with_suffix(".pem")).read_bytes()
+    assert after.not_valid_after_utc == NOW + dt.timedelta(days=59)
+    assert (after.subject, after.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value) == (
+        before.subject,
+        before.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value,
+    )
+    assert [each.value for each in after.extensions if each.oid == ExtensionOID.SUBJECT_ALTERNATIVE_NAME] == [
+        each.value for each in before.extensions if each.oid == ExtensionOID.SUBJECT_ALTERNATIVE_NAME
+    ]
+    assert after.serial_number != before.serial_number
+    assert subjects(tmp_path) == rules
+
+
+def test_a_revoked_login_is_not_renewed(site: Site, tmp_path: Path) -> None:
+    site.revoke("ada")
+
+    done = CliRunner().invoke(cli, ["pki", "renew", str(tmp_path / "site"), "ada"], standalone_mode=False)
+
+    assert isinstance(done.exception, ConfigError)
+    assert "there is no such login; there are: bench, vic" in done.exception.message
 
 
 def test_only_a_daemons_certificate_is_good_for_listening(site: Site, tmp_path: Path) -> None:

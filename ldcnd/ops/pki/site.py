@@ -115,11 +115,28 @@ class Site:
                 if known.revoked
                 else "exists"
             )
-            raise ConfigError(f"{login.name}: this login {why}; choose another name")
+            remedy = None if known.revoked else f"ldcnd pki renew {self._folder} {login.name}, for another certificate"
+            raise ConfigError(f"{login.name}: this login {why}; choose another name", remedy=remedy)
         if login.role in LISTENERS and not login.hosts:
             raise ConfigError(
                 f"{login.name}: a {login.role} needs a host name or an IP address at which clients find it"
             )
+        return self._issue(login, now, days)
+
+    def renew(self, name: str, now: dt.datetime, days: int) -> Path:
+        """Give a login another certificate, and return the Zenoh configuration to hand over; the old one stays valid.
+
+        Args:
+            name: whose.
+            now: the present.
+            days: for how long the new certificate is valid.
+
+        Raises:
+            ConfigError: there is no such login.
+        """
+        return self._issue(self._living(name), now, days)
+
+    def _issue(self, login: Login, now: dt.datetime, days: int) -> Path:
         if login.role in LISTENERS:
             made = issue_daemon(self._authority, login.name, login.hosts, now, days)
         else:
@@ -131,15 +148,19 @@ class Site:
             self._write_configuration(login.name, self._client(made))
         return self._folder / f"{login.name}.json5"
 
+    def _living(self, name: str) -> Login:
+        login = self._roster.find(name)
+        if login is None or login.revoked:
+            raise ConfigError(f"{name}: there is no such login; there are: {', '.join(self._present()) or 'none'}")
+        return login
+
     def revoke(self, name: str) -> None:
         """Take a viewer's or operator's rights back; who listens learns of it when restarted with the new file.
 
         Raises:
             ConfigError: there is no such login, or it listens, and clients would trust its certificate all the same.
         """
-        login = self._roster.find(name)
-        if login is None or login.revoked:
-            raise ConfigError(f"{name}: there is no such login; there are: {', '.join(self._present()) or 'none'}")
+        login = self._living(name)
         if login.role in LISTENERS:
             raise ConfigError(
                 f"{name}: a {login.role} cannot be revoked, clients trust its certificate until it ends;"
