@@ -12,21 +12,8 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from ldcnd.contract.catalogue import COMMANDS
-from ldcnd.contract.commands import About, Effect
+from ldcnd.contract.commands import About, Role
 from ldcnd.contract.keys import ALL_CLIENTS, ALL_COMMANDS, ALL_READABLE, ALL_STOPS, RIG_ITSELF, ROOT
-
-
-class CertificateRole(StrEnum):
-    """The purpose of a login."""
-
-    VIEWER = "viewer"
-    """Reads and asks everything, and may stop."""
-    OPERATOR = "operator"
-    """Reads, stops and commands."""
-    DAEMON = "daemon"
-    """Serves a rig; listens."""
-    ROUTER = "router"
-    """Carries messages between the others, and keeps viewers and operators apart; listens."""
 
 
 class Flow(StrEnum):
@@ -73,7 +60,7 @@ COMMAND = (
 QUESTIONS = tuple(
     f"{ROOT}/*/@cmd/{'*' if each.about is About.AXIS else RIG_ITSELF}/{each.verb}"
     for each in COMMANDS
-    if each.effect is Effect.QUESTION
+    if each.role() is Role.VIEWER
 )
 """Keys of what changes nothing."""
 ASK = (
@@ -95,24 +82,24 @@ CARRY = (
 )
 
 RULES = (*WATCH, *STOP, *ASK, *COMMAND, *PRESENCE)
-PERMITTED: Mapping[CertificateRole, tuple[Rule, ...]] = {
-    CertificateRole.VIEWER: (*WATCH, *STOP, *ASK),
-    CertificateRole.OPERATOR: (*WATCH, *STOP, *COMMAND, *PRESENCE),
+PERMITTED: Mapping[Role, tuple[Rule, ...]] = {
+    Role.VIEWER: (*WATCH, *STOP, *ASK),
+    Role.OPERATOR: (*WATCH, *STOP, *COMMAND, *PRESENCE),
 }
 """At a daemon that people connect to."""
-PERMITTED_BEHIND_ROUTER: Mapping[CertificateRole, tuple[Rule, ...]] = {**PERMITTED, CertificateRole.ROUTER: CARRY}
+PERMITTED_BEHIND_ROUTER: Mapping[Role, tuple[Rule, ...]] = {**PERMITTED, Role.ROUTER: CARRY}
 """At a daemon that routers connect to as well: they have checked the client."""
-PERMITTED_AT_ROUTER: Mapping[CertificateRole, tuple[Rule, ...]] = {
+PERMITTED_AT_ROUTER: Mapping[Role, tuple[Rule, ...]] = {
     **PERMITTED_BEHIND_ROUTER,
-    CertificateRole.DAEMON: CARRY,
+    Role.DAEMON: CARRY,
 }
 """At a router. The rig of a daemon is not checked."""
 
 
 def access_control(
     subject: Subject,
-    logins: Mapping[CertificateRole, tuple[str, ...]],
-    permitted: Mapping[CertificateRole, tuple[Rule, ...]] = PERMITTED,
+    logins: Mapping[Role, tuple[str, ...]],
+    permitted: Mapping[Role, tuple[Rule, ...]] = PERMITTED,
 ) -> dict[str, object]:
     """Return the value of Zenoh's `access_control`: each login may do what its role permits, and nothing else.
 

@@ -15,16 +15,10 @@ from typing import Annotated
 from pydantic import Field, ValidationError
 
 from ldcnd.client.network import LEASE_MS, RETRY_MS
+from ldcnd.contract.commands import Role
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
-from ldcnd.ops.pki.access import (
-    PERMITTED_AT_ROUTER,
-    PERMITTED_BEHIND_ROUTER,
-    CertificateRole,
-    Rule,
-    Subject,
-    access_control,
-)
+from ldcnd.ops.pki.access import PERMITTED_AT_ROUTER, PERMITTED_BEHIND_ROUTER, Rule, Subject, access_control
 from ldcnd.ops.pki.certificates import Credentials, issue_client, issue_daemon, new_authority
 
 FILE = "roster.json"
@@ -39,7 +33,7 @@ class Login(Frozen):
 
     name: LoginName
     """The common name of its certificate, and of its files."""
-    role: CertificateRole
+    role: Role
     """Its permissions."""
     hosts: tuple[str, ...] = ()
     """Where a daemon or a router can be found: host names and IP addresses."""
@@ -53,7 +47,7 @@ class Roster(Frozen):
 
     logins: tuple[Login, ...] = ()
 
-    def names(self, role: CertificateRole) -> tuple[str, ...]:
+    def names(self, role: Role) -> tuple[str, ...]:
         """Return who has a role now."""
         return tuple(login.name for login in self.logins if login.role is role and not login.revoked)
 
@@ -85,7 +79,7 @@ def read_roster(folder: Path) -> Roster:
 PORT = 7447
 AUTHORITY = "ca"
 PRIVATE = 0o600
-LISTENERS = (CertificateRole.DAEMON, CertificateRole.ROUTER)
+LISTENERS = (Role.DAEMON, Role.ROUTER)
 
 
 class Site:
@@ -182,9 +176,9 @@ class Site:
         """Write the roster, and the access rules that follow from it."""
         _write(self._folder / FILE, roster.model_dump_json(indent=2).encode())
         self._roster = roster
-        for name in roster.names(CertificateRole.DAEMON):
+        for name in roster.names(Role.DAEMON):
             self._write_configuration(name, self._daemon(self._credentials(name)))
-        for name in roster.names(CertificateRole.ROUTER):
+        for name in roster.names(Role.ROUTER):
             self._write_configuration(name, self._router(self._credentials(name)))
 
     def _daemon(self, own: Credentials) -> dict[str, object]:
@@ -197,10 +191,8 @@ class Site:
             "connect": {"retry": {"period_init_ms": RETRY_MS[0], "period_max_ms": RETRY_MS[1]}},
         }
 
-    def _listener(
-        self, own: Credentials, mode: str, permitted: Mapping[CertificateRole, tuple[Rule, ...]]
-    ) -> dict[str, object]:
-        logins = {role: self._roster.names(role) for role in CertificateRole}
+    def _listener(self, own: Credentials, mode: str, permitted: Mapping[Role, tuple[Rule, ...]]) -> dict[str, object]:
+        logins = {role: self._roster.names(role) for role in Role}
         return {
             "mode": mode,
             "listen": {"endpoints": [f"tls/[::]:{PORT}"]},
@@ -210,12 +202,7 @@ class Site:
 
     def _client(self, own: Credentials) -> dict[str, object]:
         present = [login for login in self._roster.logins if not login.revoked]
-        listeners = [
-            login
-            for role in (CertificateRole.ROUTER, CertificateRole.DAEMON)
-            for login in present
-            if login.role is role
-        ]
+        listeners = [login for role in (Role.ROUTER, Role.DAEMON) for login in present if login.role is role]
         return {
             "mode": "client",
             "connect": {"endpoints": [f"tls/{_bracketed(login.hosts[0])}:{PORT}" for login in listeners]},
@@ -268,7 +255,7 @@ def set_up(folder: Path, name: str, now: dt.datetime) -> Site:
     return Site(folder)
 
 
-def new_login(name: str, role: CertificateRole, hosts: tuple[str, ...]) -> Login:
+def new_login(name: str, role: Role, hosts: tuple[str, ...]) -> Login:
     """Return a login.
 
     Raises:
