@@ -116,6 +116,7 @@ main_package() {
     install -Dm644 "$here/modules-load.d/ldcnd.conf" "$root/usr/lib/modules-load.d/ldcnd.conf"
     install -Dm644 -t "$doc/examples" "$here/drop-ins/"{realtime,nice,lan,single-line}.conf "$source"/config/*.toml
     install -Dm644 -t "$doc/examples/grafana" "$here"/grafana/*
+    (cd "$source/config" && find zenoh -type f -exec install -Dm644 {} "$doc/examples/{}" \;)
     install -Dm644 -t "$doc" "$here/INSTALL.md"
     gzip -9nc "$source/CHANGELOG.md" > "$doc/CHANGELOG.md.gz"
     ln -s /opt/ldcnd/bin/ldcnd "$root/usr/bin/ldcnd"
@@ -151,6 +152,10 @@ set -e
 if [ "$1" = remove ] && [ -d /run/systemd/system ]; then
     systemctl disable --now --quiet ldcnd.service
     systemctl stop 'ldcnd@*.service' 'ldcnd-*@*.service'
+fi
+if [ "$1" = remove ]; then # what was enabled is so no more, as ldcnd.service
+    find /etc/systemd/system -path '*.wants/ldcnd*.service' -type l -delete
+    find /etc/systemd/system -name 'ldcnd*.wants' -type d -empty -delete
 fi
 PRERM
     cat > "$root/DEBIAN/postrm" <<'POSTRM'

@@ -21,7 +21,16 @@ from ldcnd.cli.connection import AXIS, AxisName, Target, with_target
 from ldcnd.cli.output import FAILED, end_as_interrupted, on_end, show_lines
 from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
-from ldcnd.cli.typed import Finite, NewFile, Quantity, TypedNumber, axis_of, force_option, in_unit
+from ldcnd.cli.typed import (
+    CONFIGURATION,
+    Finite,
+    NewFile,
+    Quantity,
+    TypedNumber,
+    axis_of,
+    force_option,
+    in_unit,
+)
 from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
 from ldcnd.client.kept_gains import put_back as put_back_gains
 from ldcnd.client.lease import program_name
@@ -45,7 +54,7 @@ if TYPE_CHECKING:
 @click.argument("axis", type=AxisName("login"))
 @click.option(
     "--config",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=CONFIGURATION,
     required=True,
     help="The rig's configuration (TOML); the record is kept beside it.",
 )
@@ -65,7 +74,7 @@ if TYPE_CHECKING:
 @click.option(
     "--connect", "-e", multiple=True, envvar="LDCND_CONNECT", help="Zenoh endpoint of the daemon, or HOST:PORT."
 )
-@click.option("--login", type=click.Path(path_type=Path), help="Zenoh configuration file, as `ldcnd pki` makes it.")
+@click.option("--login", type=CONFIGURATION, help="Zenoh configuration file, as `ldcnd pki` makes it.")
 def commission(
     axis: str,
     config: Path,

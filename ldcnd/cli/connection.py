@@ -4,8 +4,8 @@ import asyncio
 import json
 import os
 import shlex
-from collections.abc import AsyncIterator, Awaitable, Callable
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial, wraps
 from pathlib import Path
@@ -17,14 +17,17 @@ from click.shell_completion import CompletionItem
 from pydantic import ValidationError
 
 from ldcnd.cli.names import OPTIONS_TYPED
-from ldcnd.cli.output import show_lines
+from ldcnd.cli.output import leaves_of, show_lines
+from ldcnd.cli.typed import CONFIGURATION
 from ldcnd.client.lease import inherited_lease
+from ldcnd.client.presence import tell_absence
 from ldcnd.client.rig_client import RigClient, find_rig, no_rig_answers, on_each_rig
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, ZenohSettings, reached_at, user_settings
+from ldcnd.systemd import Beside
 
 CONFIG_HELP = "Zenoh configuration file to start from; or the daemon's own configuration, a .toml."
 COMPLETION_S = 2.0
@@ -89,6 +92,34 @@ class TargetOption(click.Option):
     """An option that `with_target` gives to a command; the reference explains them once."""
 
 
+class Serving:
+    """What a program that serves others says of itself: to its service manager, and in its journal or terminal."""
+
+    def __init__(self) -> None:
+        self._beside = Beside()
+
+    def serves(self, what: str, *, err: bool = False) -> None:
+        """Say what it serves now; on standard error where the output is for something else."""
+        show_lines(what, err=err)
+        self._beside.serves(what)
+
+    def lacks(self, problem: str | None) -> None:
+        """Say what is missing, or None once nothing is."""
+        show_lines(problem or "a daemon is heard again", err=True)
+        self._beside.lacks(problem)
+
+    @contextmanager
+    def last_words(self) -> Iterator[None]:
+        """Leave behind what has ended the program: its journal has that from who prints the error."""
+        try:
+            yield
+        except BaseException as error:
+            for leaf in leaves_of(error):
+                if isinstance(leaf, LdcndError | OSError):
+                    self._beside.lacks(getattr(leaf, "message", str(leaf)))
+            raise
+
+
 @dataclass(frozen=True, slots=True)
 class Target:
     """The session's connection to the daemon.
@@ -132,6 +163,24 @@ class Target:
                 return await work(client)
 
         return asyncio.run(within())
+
+    def serve(self, work: Callable[[RigClient, Serving], Awaitable[None]]) -> None:
+        """Do the same for a program that serves others until it is ended; it says when it does, and what it lacks."""
+        service = Serving()
+
+        async def watch(client: RigClient) -> None:
+            with suppress(LdcndError):
+                await tell_absence(client.session, self._settings(), service.lacks, (client.rig,))
+
+        async def within(client: RigClient) -> None:
+            watching = asyncio.create_task(watch(client), name="presence of the daemon")
+            try:
+                await work(client, service)
+            finally:
+                watching.cancel()
+
+        with service.last_words():
+            self.run(within)
 
     def run_on_each(self, work: Callable[[RigClient], Awaitable[ResultT]]) -> dict[str, ResultT | LdcndError]:
         """Do the same with the rig that is named, unsearched, or with every one that can be reached.
@@ -181,7 +230,7 @@ def _target_options(command: CommandT) -> CommandT:
     for given in (
         option("--json", "as_json", is_flag=True, help="Print JSON lines."),
         option("--rig", help="Which rig, when several can be reached."),
-        option("--config", type=click.Path(path_type=Path), help=CONFIG_HELP),
+        option("--config", type=CONFIGURATION, help=CONFIG_HELP),
         option("--listen", "-l", multiple=True, help="Zenoh endpoint to listen on; may be repeated."),
         option(
             "--connect",

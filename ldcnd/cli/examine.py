@@ -15,7 +15,7 @@ from ldcnd.bench.begun import begun_with, scan_port, write
 from ldcnd.bench.family import BenchFamily, TrialMove
 from ldcnd.bench.known import BENCHES, line_of, ports_here, show_findings
 from ldcnd.cli.main import CommandGroup
-from ldcnd.cli.typed import Finite, WholeNumber
+from ldcnd.cli.typed import CONFIGURATION, Finite, WholeNumber
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError, NotSupported
 from ldcnd.contract.health import Finding, Verdict
@@ -150,9 +150,7 @@ def _examination(family_name: str, family: BenchFamily[Any]) -> click.Command:
         sys.exit(1 if wrong else 0)
 
     options: list[click.Parameter] = [
-        click.Option(
-            ["--config"], type=click.Path(path_type=Path), required=True, help="The rig's configuration (TOML)."
-        ),
+        click.Option(["--config"], type=CONFIGURATION, required=True, help="The rig's configuration (TOML)."),
         click.Option(["--bus", "name"], required=True, help="The line to examine."),
         click.Option(["--json", "as_json"], is_flag=True, help="Print JSON lines."),
     ]

@@ -97,13 +97,17 @@ def _remedy(error: LdcndError) -> list[str]:
     return [f"  {error.remedy.phrased(lambda step: typed(step, error.axis))}"] if error.remedy else []
 
 
+def leaves_of(error: BaseException) -> list[BaseException]:
+    """Return what an error is made of: what each of a group of tasks failed for, or the error itself."""
+    if not isinstance(error, BaseExceptionGroup):
+        return [error]
+    return [leaf for each in error.exceptions for leaf in leaves_of(each)]
+
+
 def _single(group: BaseExceptionGroup[BaseException]) -> BaseException:
     """Return what a group of tasks failed for, if it is one thing; the group otherwise."""
-    leaves = list[BaseException]()
-    for error in group.exceptions:
-        leaves += [_single(error)] if isinstance(error, BaseExceptionGroup) else [error]
-    kinds = {type(leaf) for leaf in leaves}
-    if len(kinds) > 1 or isinstance(leaves[0], BaseExceptionGroup):
+    leaves = leaves_of(group)
+    if len({type(leaf) for leaf in leaves}) > 1:
         raise group
     return leaves[0]
 

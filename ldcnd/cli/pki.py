@@ -8,11 +8,11 @@ import click
 
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.typed import WholeNumber
-from ldcnd.ops.pki.access import CertificateRole
+from ldcnd.contract.commands import Role
 from ldcnd.parts import require
 
 FOLDER = click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
-DAYS = 730
+DAYS = click.option("--days", type=WholeNumber(1, 3650), default=730, show_default=True, help="How long it is valid.")
 
 
 @click.group(cls=CommandGroup)
@@ -38,28 +38,39 @@ def init(folder: Path, name: str) -> None:
 @command.command()
 @FOLDER
 @click.argument("name")
-@click.option(
-    "--role", type=click.Choice([role.value for role in CertificateRole]), required=True, help="What it may do."
-)
+@click.option("--role", type=click.Choice([role.value for role in Role]), required=True, help="What it may do.")
 @click.option("--host", "hosts", multiple=True, help="Host name at which a daemon or router is found; may be repeated.")
 @click.option("--ip", "addresses", multiple=True, help="The same, an IP address.")
-@click.option("--days", type=WholeNumber(1, 3650), default=DAYS, show_default=True, help="How long it is valid.")
+@DAYS
 def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: tuple[str, ...], days: int) -> None:
     """Give NAME a login: a certificate and a Zenoh configuration, in one file to hand over."""
     require("cryptography")
     from ldcnd.ops.pki.site import Site, new_login  # noqa: PLC0415 - needs an optional package
 
-    login = new_login(name, CertificateRole(role), (*hosts, *addresses))
+    login = new_login(name, Role(role), (*hosts, *addresses))
     site = Site(folder)
     file = site.add(login, _now(), days)
-    if login.role is CertificateRole.DAEMON:
+    if login.role is Role.DAEMON:
         click.echo(f'{file}: in the rig\'s configuration, [zenoh] config_file = "{file.resolve()}"')
-    elif login.role is CertificateRole.ROUTER:
+    elif login.role is Role.ROUTER:
         click.echo(f"{file}: start the router with it, `zenohd --config {file.name}`")
     else:
         click.echo(f"{file}: hand it over on a safe way; use it as --config {file.name}")
-    if login.role is not CertificateRole.DAEMON:
+    if login.role is not Role.DAEMON:
         _say_restart(other for other in site.listener_files() if other != file)
+
+
+@command.command()
+@FOLDER
+@click.argument("name")
+@DAYS
+def renew(folder: Path, name: str, days: int) -> None:
+    """Give NAME another certificate before its own ends; the old one stays valid until then."""
+    require("cryptography")
+    from ldcnd.ops.pki.site import Site  # noqa: PLC0415 - needs an optional package
+
+    file = Site(folder).renew(name, _now(), days)
+    click.echo(f"{file}: put it in the place of the one before, and restart what uses it")
 
 
 @command.command()

@@ -3,13 +3,14 @@
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ldcnd.cli.connection import Target, with_target
+from ldcnd.cli.connection import Serving, Target, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import on_end
 from ldcnd.cli.quantities import save_figure, stacked_rows
@@ -27,6 +28,15 @@ if TYPE_CHECKING:
 RECORDING = click.Path(path_type=Path, exists=True, dir_okay=False)
 EXIT_INCOMPLETE = 1
 """The recording is damaged; what could be read of it was used."""
+
+
+@contextmanager
+def a_failure() -> Iterator[None]:
+    """Let a recording that cannot be read or written be a failure, not a configuration that cannot work."""
+    try:
+        yield
+    except ConfigError as error:
+        raise click.ClickException("\n  ".join(filter(None, [error.message, error.remedy]))) from error
 
 
 def tell_damages(path: Path, damages: Sequence[object]) -> None:
@@ -61,7 +71,7 @@ def record(target: Target, out: Path | None, rotate_mb: int) -> None:
     require("mcap")
     out = dated(out, datetime.now(UTC))
     try:
-        target.run(lambda client: _record(client, out, rotate_mb * 1_000_000))
+        target.serve(lambda client, service: _record(client, service, out, rotate_mb * 1_000_000))
     except OSError as error:
         raise click.ClickException(f"{error.filename or out}: cannot be written: {error.strerror}") from error
 
@@ -74,7 +84,8 @@ def recover_file(damaged: Path, whole: Path) -> None:
     require("mcap")
     from ldcnd.lab.recording.recovery import recover  # noqa: PLC0415 - needs an optional package
 
-    saved = recover(damaged, whole)
+    with a_failure():
+        saved = recover(damaged, whole)
     tell_damages(damaged, saved.damages)
     until = f", the last of {utc(saved.last_ns)}" if saved.messages else ""
     click.echo(f"{saved.messages} messages recovered{until}; {saved.losses.missing.total()} missing in between")
@@ -89,7 +100,8 @@ def export(recording: Path, folder: Path, parquet: bool) -> None:  # noqa: FBT00
     require("mcap", *(["pyarrow"] if parquet else []))
     from ldcnd.lab.recording.tables import export_tables  # noqa: PLC0415 - needs an optional package
 
-    done = export_tables(recording, folder, parquet=parquet)
+    with a_failure():
+        done = export_tables(recording, folder, parquet=parquet)
     click.echo(f"{done.rows} messages in {len(done.tables)} tables in {folder}")
     if done.damages:
         tell_damages(recording, done.damages)
@@ -101,7 +113,7 @@ def dated(pattern: Path, start: datetime) -> Path:
     return Path(start.strftime(str(pattern)))
 
 
-async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
+async def _record(client: RigClient, service: Serving, out: Path, rotate_bytes: int) -> None:
     from ldcnd.lab.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder  # noqa: PLC0415 - needs an optional package
 
     recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes, client.descriptions)
@@ -109,7 +121,7 @@ async def _record(client: RigClient, out: Path, rotate_bytes: int) -> None:
     try:
         with recorder:
             async with client.published(recorder.take, KEPT_SAMPLES, LINGER_S) as gave_way:
-                click.echo(f"recording rig {client.rig} to {out}", err=True)
+                service.serves(f"recording rig {client.rig} to {out}", err=True)
                 await recorder.run(gave_way)
     finally:
         click.echo(recorder.summary, err=True)  # only now: until the subscriptions are gone, more is recorded
@@ -131,7 +143,8 @@ def plot(recording: Path, axis: str, output: Path) -> None:
     from ldcnd.lab.recording.reading import Recording, axis_history  # noqa: PLC0415 - needs an optional package
 
     file = Recording(recording)
-    history = axis_history(file, axis)
+    with a_failure():
+        history = axis_history(file, axis)
     plot_axis(history, output)
     if history.not_understood:
         click.echo(f"{history.not_understood} messages of another version were left out", err=True)

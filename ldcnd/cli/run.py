@@ -15,7 +15,7 @@ from pathlib import Path
 import click
 
 from ldcnd.cli.output import Terminal, show_lines
-from ldcnd.cli.typed import CONSOLE_ADDRESS, parsed_address
+from ldcnd.cli.typed import CONFIGURATION, CONSOLE_ADDRESS, parsed_address
 from ldcnd.config.plan import plan_rig, require_plan
 from ldcnd.config.rig import RigConfig, example, load_config, single_line
 from ldcnd.contract.errors import ConfigError
@@ -24,12 +24,12 @@ from ldcnd.contract.plan import BusPlan
 from ldcnd.daemon.assembly import open_daemon, session_settings
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap
-from ldcnd.daemon.systemd import Notifier
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 from ldcnd.log import configure_logging, get_logger
 from ldcnd.net.zenoh_config import zenoh_config
 from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, reached_at
 from ldcnd.net.zenoh_threads import senders_wait
+from ldcnd.systemd import Notifier
 
 LINK_S = 20.0
 """Longest time that the console takes to print its link."""
@@ -107,7 +107,7 @@ log = get_logger("run")
 @click.command()
 @click.option(
     "--config",
-    type=click.Path(path_type=Path),
+    type=CONFIGURATION,
     help="The rig's configuration (TOML); without one, a terminal is asked whether a simulated rig will do.",
 )
 @click.option("--listen", "-l", multiple=True, help="Listen here instead of the configured endpoints; may be repeated.")
@@ -226,7 +226,7 @@ def write_captures(daemon: Daemon) -> None:
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("config", type=CONFIGURATION)
 @click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 def check_config(config: Path, *, as_json: bool) -> None:
     """Validate CONFIG whole, without opening anything; exits with 78 when it cannot work."""
@@ -250,7 +250,7 @@ EXIT_OVERFULL = 1
 
 
 @click.command()
-@click.argument("config", type=click.Path(path_type=Path))
+@click.argument("config", type=CONFIGURATION)
 @click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
 def plan(config: Path, *, as_json: bool) -> None:
     """Show how much of each line CONFIG uses and how late polls and stops can be; exits with 1 when it cannot hold."""

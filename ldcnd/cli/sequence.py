@@ -13,7 +13,14 @@ from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import end_as_interrupted, keys, show_lines
 from ldcnd.cli.quantities import decimals, seconds
-from ldcnd.cli.typed import NewFile, WholeNumber, axis_of, force_option, unknown
+from ldcnd.cli.typed import (
+    CONFIGURATION,
+    NewFile,
+    WholeNumber,
+    axis_of,
+    force_option,
+    unknown,
+)
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.edit import teach
@@ -23,7 +30,6 @@ from ldcnd.contract.samples import Moving
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
 from ldcnd.lab.sequences import SequenceRun
 
-FILE = click.Path(path_type=Path, dir_okay=False)
 PAUSE = " "
 
 
@@ -33,7 +39,7 @@ def sequence() -> None:
 
 
 @sequence.command("list")
-@click.argument("file", type=FILE)
+@click.argument("file", type=CONFIGURATION)
 def list_sequences(file: Path) -> None:
     """Show the sequences of FILE, a rig's configuration, and their steps."""
     for each in load_config(file).sequence:
@@ -41,7 +47,7 @@ def list_sequences(file: Path) -> None:
 
 
 @sequence.command("run")
-@click.argument("file", type=FILE)
+@click.argument("file", type=CONFIGURATION)
 @click.argument("name")
 @click.option("--from", "first", type=WholeNumber(1), default=1, show_default=True, help="Begin with this step.")
 @click.option("--record", type=NewFile(), help="Write what happens to each step to this file, as JSON lines.")
@@ -134,7 +140,7 @@ def position() -> None:
 
 
 @position.command("list")
-@click.argument("file", type=FILE)
+@click.argument("file", type=CONFIGURATION)
 def list_positions(file: Path) -> None:
     """Show the named positions of FILE, a rig's configuration."""
     rig = load_config(file)
@@ -144,7 +150,7 @@ def list_positions(file: Path) -> None:
 
 
 @position.command("teach")
-@click.argument("file", type=FILE)
+@click.argument("file", type=CONFIGURATION)
 @click.argument("name")
 @click.argument("axes", type=AXIS, nargs=-1, required=True, metavar="AXIS...")
 @with_target
@@ -172,7 +178,7 @@ def teach_position(target: Target, file: Path, name: str, axes: tuple[str, ...])
 
 
 @position.command("go")
-@click.argument("file", type=FILE)
+@click.argument("file", type=CONFIGURATION)
 @click.argument("name")
 @click.option("--take", is_flag=True, help="Take control from its holder.")
 @with_target

@@ -3,16 +3,22 @@
 import asyncio
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from contextlib import AsyncExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from ldcnd.cli.connection import CONFIG_HELP, Target, with_target
+from ldcnd.cli.connection import CONFIG_HELP, Serving, Target, with_target
 from ldcnd.cli.output import on_end
-from ldcnd.cli.typed import CONSOLE_ADDRESS, WholeNumber, address_option, parsed_address
+from ldcnd.cli.typed import (
+    CONFIGURATION,
+    CONSOLE_ADDRESS,
+    WholeNumber,
+    address_option,
+    parsed_address,
+)
 from ldcnd.client.overview import health_reports
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient, Samples
@@ -28,23 +34,22 @@ if TYPE_CHECKING:
     from ldcnd.lab.metrics import HealthCollector
 
 
-FILE = click.Path(path_type=Path, dir_okay=False)
-
-
 @click.command()
 @click.option(
     "--connect", "-e", multiple=True, help=f"Zenoh endpoint of a daemon or router; repeatable [{DEFAULT_ENDPOINT}]."
 )
-@click.option("--config", type=FILE, help=CONFIG_HELP)
+@click.option("--config", type=CONFIGURATION, help=CONFIG_HELP)
 @click.option("--rig", multiple=True, help="Show this rig only; may be repeated.")
 @address_option("--listen", CONSOLE_ADDRESS)
 @click.option("--host", multiple=True, help="Name under which browsers reach it, beside that; may be repeated.")
-@click.option("--certificate", type=FILE, help="PEM file: serve HTTPS with this certificate.")
-@click.option("--key", type=FILE, help="PEM file with its key.")
-@click.option("--token-file", type=FILE, help="File with the token that lets browsers in, instead of one-time links.")
+@click.option("--certificate", type=CONFIGURATION, help="PEM file: serve HTTPS with this certificate.")
+@click.option("--key", type=CONFIGURATION, help="PEM file with its key.")
+@click.option(
+    "--token-file", type=CONFIGURATION, help="File with the token that lets browsers in, instead of one-time links."
+)
 @click.option(
     "--commission",
-    type=FILE,
+    type=CONFIGURATION,
     help="Serve the commissioning page for this configuration of a rig: it writes the file, and its steps move axes.",
 )
 @click.option("--link", is_flag=True, help="Print another link of the console that listens at --listen.")
@@ -125,10 +130,10 @@ METRICS_ADDRESS = "127.0.0.1:9464"
 @with_target
 def metrics(target: Target, address: ListenAddress) -> None:
     """Serve metrics over HTTP until SIGTERM or SIGINT; the daemon itself never waits for a scraper."""
-    target.run(lambda client: _serve_metrics(client, address))
+    target.serve(lambda client, service: _serve_metrics(client, service, address))
 
 
-async def _serve_metrics(client: RigClient, address: ListenAddress) -> None:
+async def _serve_metrics(client: RigClient, service: Serving, address: ListenAddress) -> None:
     require("prometheus_client")
     from prometheus_client import CollectorRegistry  # noqa: PLC0415 - an optional package
 
@@ -158,7 +163,7 @@ async def _serve_metrics(client: RigClient, address: ListenAddress) -> None:
                 group.create_task(_follow(samples, collector), name="samples")
                 for samples in (shadows, states, faults, positions)
             ]
-            click.echo(f"metrics on http://{address.in_url}:{port}/metrics")
+            service.serves(f"metrics on http://{address.in_url}:{port}/metrics")
             await ending.wait()
             for task in following:
                 task.cancel()
@@ -206,11 +211,12 @@ def epics(
 
     Clients are not authenticated: with --moves, any client that reaches an address moves axes.
     """
-    target.run(lambda client: _serve_epics(client, address, axes, prefix, pva, moves=moves))
+    target.serve(lambda client, service: _serve_epics(client, service, address, axes, prefix, pva, moves=moves))
 
 
 async def _serve_epics(
     client: RigClient,
+    service: Serving,
     address: ListenAddress,
     axes: tuple[str, ...],
     prefix: str | None,
@@ -230,19 +236,34 @@ async def _serve_epics(
             from ldcnd.lab.epics.pva import serve_pva  # noqa: PLC0415 - likewise
 
             await faces.enter_async_context(serve_pva(records, pva))
-        serving = asyncio.create_task(serve(records, address), name="channel access")
-        on_end(lambda: _cancel(serving))
-        click.echo(
-            f"{'motor records' if moves else 'read-only motor records'} {named}{{{','.join(axes or rig.axes)}}}"
-            f" on {address.in_url}:{address.port}"
+        await _serve_until_ended(
+            service,
+            lambda ready: serve(records, address, ready),
+            address,
+            f"{'motor records' if moves else 'read-only motor records'} {named}{{{','.join(axes or rig.axes)}}}",
         )
-        try:
-            await serving
-        except asyncio.CancelledError:
-            return
-        except OSError as error:
-            where = f"{address.in_url}:{address.port}"
-            raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
+
+
+async def _serve_until_ended(
+    service: Serving, serve: Callable[[asyncio.Event], Coroutine[None, None, None]], address: ListenAddress, what: str
+) -> None:
+    """Run a server until SIGTERM or SIGINT, and say what it serves once it has set its event.
+
+    Raises:
+        ConfigError: the address cannot be had.
+    """
+    ready, where = asyncio.Event(), f"{address.in_url}:{address.port}"
+    serving = asyncio.create_task(serve(ready), name=what)
+    on_end(lambda: _cancel(serving))
+    await asyncio.wait({serving, asyncio.create_task(ready.wait())}, return_when=asyncio.FIRST_COMPLETED)
+    if ready.is_set():
+        service.serves(f"{what} on {where}")
+    try:
+        await serving
+    except asyncio.CancelledError:
+        return
+    except OSError as error:
+        raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
 
 
 SECOP_ADDRESS = "127.0.0.1:10767"
@@ -260,29 +281,22 @@ def secop(target: Target, address: ListenAddress, axes: tuple[str, ...], moves: 
 
     SECoP does not authenticate clients: with --moves, any client that reaches the address moves axes.
     """
-    target.run(lambda client: _serve_secop(client, address, axes, moves=moves))
+    target.serve(lambda client, service: _serve_secop(client, service, address, axes, moves=moves))
 
 
-async def _serve_secop(client: RigClient, address: ListenAddress, axes: tuple[str, ...], *, moves: bool) -> None:
+async def _serve_secop(
+    client: RigClient, service: Serving, address: ListenAddress, axes: tuple[str, ...], *, moves: bool
+) -> None:
     require("frappy")
     from ldcnd.lab.secop.node import serve  # noqa: PLC0415 - needs an optional package, under the GPL
 
-    rig, ready = Rig(client, await client.daemon()), asyncio.Event()
-    serving = asyncio.create_task(serve(rig, address, axes, (axes or rig.axes) if moves else (), ready), name="secop")
-    on_end(lambda: _cancel(serving))
-    await asyncio.wait({serving, asyncio.create_task(ready.wait())}, return_when=asyncio.FIRST_COMPLETED)
-    if ready.is_set():
-        served = ",".join(axes or rig.axes)
-        click.echo(
-            f"{'SECoP modules' if moves else 'read-only SECoP modules'} {{{served}}} on {address.in_url}:{address.port}"
-        )
-    try:
-        await serving
-    except asyncio.CancelledError:
-        return
-    except OSError as error:
-        where = f"{address.in_url}:{address.port}"
-        raise ConfigError(f"cannot serve on {where}: {error.strerror}", value=where) from error
+    rig = Rig(client, await client.daemon())
+    await _serve_until_ended(
+        service,
+        lambda ready: serve(rig, address, axes, (axes or rig.axes) if moves else (), ready),
+        address,
+        f"{'SECoP modules' if moves else 'read-only SECoP modules'} {{{','.join(axes or rig.axes)}}}",
+    )
 
 
 def _cancel(task: asyncio.Task[None]) -> None:
@@ -304,10 +318,12 @@ def ros2(target: Target, axes: tuple[str, ...], router: str, domain: int, namesp
         raise click.BadParameter(
             "a namespace is / or names behind slashes, such as /lab/stage", param_hint="--namespace"
         )
-    target.run(lambda client: _serve_ros2(client, axes, router, domain, namespace))
+    target.serve(lambda client, service: _serve_ros2(client, service, axes, router, domain, namespace))
 
 
-async def _serve_ros2(client: RigClient, axes: tuple[str, ...], router: str, domain: int, namespace: str) -> None:
+async def _serve_ros2(
+    client: RigClient, service: Serving, axes: tuple[str, ...], router: str, domain: int, namespace: str
+) -> None:
     from ldcnd.lab.ros2.bridge import run_bridge  # noqa: PLC0415
     from ldcnd.net.zenoh_session import open_zenoh_session  # noqa: PLC0415 - loads Zenoh
     from ldcnd.net.zenoh_settings import ZenohSettings  # noqa: PLC0415
@@ -322,7 +338,7 @@ async def _serve_ros2(client: RigClient, axes: tuple[str, ...], router: str, dom
     async with open_zenoh_session(ZenohSettings(mode="client", connect=(endpoint,))) as session:
         running = asyncio.create_task(run_bridge(rig, session, axes, domain, namespace), name="bridge")
         on_end(lambda: _cancel(running))
-        click.echo(f"rig {rig.name} in ROS domain {domain} through {endpoint}")
+        service.serves(f"rig {rig.name} in ROS domain {domain} through {endpoint}")
         try:
             await running
         except asyncio.CancelledError:
@@ -337,10 +353,10 @@ FOXGLOVE_ADDRESS = "127.0.0.1:8765"
 @with_target
 def foxglove(target: Target, address: ListenAddress) -> None:
     """Show a rig in Foxglove until SIGTERM or SIGINT; read-only, and open to everyone who can reach the address."""
-    target.run(lambda client: _serve_foxglove(client, address))
+    target.serve(lambda client, service: _serve_foxglove(client, service, address))
 
 
-async def _serve_foxglove(client: RigClient, address: ListenAddress) -> None:
+async def _serve_foxglove(client: RigClient, service: Serving, address: ListenAddress) -> None:
     require("foxglove")
     from ldcnd.lab.recording.live_view import LiveView  # noqa: PLC0415 - needs an optional package
 
@@ -348,5 +364,5 @@ async def _serve_foxglove(client: RigClient, address: ListenAddress) -> None:
     on_end(ending.set)
     with LiveView(f"ldcnd {client.rig}", address.host, address.port) as view:
         async with client.published(view.take):
-            click.echo(f"rig {client.rig} on ws://{address.in_url}:{view.port}")
+            service.serves(f"rig {client.rig} on ws://{address.in_url}:{view.port}")
             await ending.wait()

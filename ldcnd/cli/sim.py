@@ -9,7 +9,7 @@ from typing import Any, Self, TextIO
 
 import click
 
-from ldcnd.cli.typed import ForceOption, NewFile, WholeNumber
+from ldcnd.cli.typed import CONFIGURATION, ForceOption, NewFile, WholeNumber
 from ldcnd.drives.known import FAMILIES
 from ldcnd.drives.toml import read_toml
 from ldcnd.line.capture import CaptureHeader, capture_lines
@@ -73,9 +73,7 @@ command = click.Command(
             ["--pty", "link"], type=click.Path(path_type=Path), help="Make this symbolic link to the terminal."
         ),
         *(option for family in SIMULATED.values() for option in family.sim_options()),
-        click.Option(
-            ["--fault-plan"], type=click.Path(path_type=Path), help="What else may go wrong on the wires (TOML)."
-        ),
+        click.Option(["--fault-plan"], type=CONFIGURATION, help="What else may go wrong on the wires (TOML)."),
         click.Option(["--baud-check"], is_flag=True, help="Bytes at another rate than a module's are garbage to it."),
         click.Option(
             ["--seed"], type=WholeNumber(), help="Of everything that is random: instead of the file's, or of 1."

@@ -11,7 +11,7 @@ import click
 
 from ldcnd.cli.connection import Target, with_target
 from ldcnd.cli.output import on_end, show_lines
-from ldcnd.cli.typed import NewFile
+from ldcnd.cli.typed import CONFIGURATION, NewFile
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import ConfigError
 from ldcnd.log import configure_logging
@@ -24,7 +24,7 @@ from ldcnd.testing.twin import RigState, read_state
 
 
 @click.command()
-@click.argument("file", type=click.Path(path_type=Path, dir_okay=False), required=False)
+@click.argument("file", type=CONFIGURATION, required=False)
 @click.argument("arguments", nargs=-1)
 @click.option("--at", "endpoint", help="Where the twin listens, such as tcp/127.0.0.1:7600; a free port when missing.")
 @click.option(

@@ -209,6 +209,9 @@ def _keep_force(context: click.Context, _parameter: click.Parameter, force: bool
 force_option = click.option("--force", cls=ForceOption)
 
 
+CONFIGURATION = click.Path(path_type=Path, readable=False)
+"""What configures a program. Its reader says what is wrong with it, as with one that cannot work: click would call a
+file that may not be read a wrong usage, which a service manager is told nothing of."""
 CONSOLE_ADDRESS = "127.0.0.1:8470"
 OptionT = TypeVar("OptionT", bound=Callable[..., object])
 

@@ -131,6 +131,6 @@ async def overview(client: RigClient) -> list[AxisNow]:
         health = next((each for each in line.axes if each.axis == info.axis), None) if line else None
         age_s = clock.age_s(position.t, 0.0) if position else None
         fault: FaultSample | None = faults.get(info.axis)
-        condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up)
+        condition = assess(state, fault, health, age_s=age_s, line_up=line.up if line else None)
         found.append(AxisNow(info, state, position, age_s, health, condition))
     return found

@@ -414,16 +414,15 @@ class RigClient:
     async def _unanswered(self, what: str) -> LdcndError:
         """Return the error for a command without an answer: absence, access control, or an answer that was lost.
 
-        They look alike. Who is not permitted to command gets no answer to a question of the same kind either.
+        They look alike. A lease that does not exist cannot be renewed, which changes nothing; who is not permitted to
+        command is not even refused that.
         """
-        from ldcnd.contract.leases import ListHolders  # noqa: PLC0415 - clients that only read need no model of leases
+        from ldcnd.contract.leases import Renew  # noqa: PLC0415 - clients that only read need no model of leases
 
-        payload, encoding = encode(ListHolders(), Encoding.MSGPACK)
+        payload, encoding = encode(Renew(lease="none"), Encoding.MSGPACK)
         try:
             await self.daemon()
-            heard = await self.session.query(
-                self.keys.command(RIG_ITSELF, ListHolders.verb), payload, encoding=encoding
-            )
+            heard = await self.session.query(self.keys.command(RIG_ITSELF, Renew.verb), payload, encoding=encoding)
         except SessionError:
             return OutcomeUnknown(f"{what}: no answer, and no daemon serves rig {self.rig} now")
         except OutcomeUnknown:

@@ -146,7 +146,7 @@ class Conditions:
             fault,
             health,
             age_s=self._clock.age_s(position.t, self._now_s()) if position else None,
-            line_up=line is None or line.up,
+            line_up=line.up if line else None,
             silence=silence,
         )
 

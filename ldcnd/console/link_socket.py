@@ -1,6 +1,7 @@
 """The socket on which a console gives another link to its own user, so that nothing has to be stopped for one.
 
-It lies in the user's runtime folder, where nobody else may look: whoever can open it could read the console's memory.
+It lies in the user's runtime folder, where nobody else may look but root: whoever can open it could read the console's
+memory.
 """
 
 import asyncio
@@ -19,6 +20,8 @@ from ldcnd.listen_address import ListenAddress
 ANSWER_S = 5.0
 RUNTIME_FOLDERS = ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR")
 """Where services and users have a folder of their own for sockets (systemd.exec, XDG base directories)."""
+SERVICES = Path("/run/ldcnd-console")
+"""Where the services of the package have theirs, each in a folder of its own (deploy/units/beside@.service)."""
 PRIVATE = 0o700
 EVERY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - a console there listens on the address that is asked for
 _PREFIX, _SUFFIX = "ldcnd-console-", ".sock"
@@ -50,9 +53,14 @@ def _folder() -> Path:
     return folder
 
 
-def _socket_at(host: str, port: int) -> Path:
-    """Return where the console gives links that listens on an IP address and a port."""
-    return _folder() / f"{_PREFIX}{host}-{port}{_SUFFIX}"
+def _folders() -> list[Path]:
+    """Return where consoles give links to this user; root may ask those that are services."""
+    return [_folder(), *(SERVICES.glob("*") if os.getuid() == 0 else ())]
+
+
+def _name_of(host: str, port: int) -> str:
+    """Return the name of the socket of the console that listens on an IP address and a port."""
+    return f"{_PREFIX}{host}-{port}{_SUFFIX}"
 
 
 @asynccontextmanager
@@ -72,7 +80,7 @@ async def giving_links(host: str, port: int, new_link: Callable[[], GivenLink]) 
         writer.close()
 
     try:
-        path = _socket_at(host, port)
+        path = _folder() / _name_of(host, port)
         path.unlink(missing_ok=True)  # of a console that was killed: the address was free
         server = await asyncio.start_unix_server(give, path)
     except (OSError, ConfigError):
@@ -92,16 +100,19 @@ async def ask_for_link(address: ListenAddress) -> GivenLink:
     Raises:
         ConfigError: there is none, or it does not answer.
     """
-    for host in (_ip_of(address.host), *EVERY_ADDRESS):
+    folders = _folders()
+    names = [_name_of(host, address.port) for host in (_ip_of(address.host), *EVERY_ADDRESS)]
+    for path in [folder / name for name in names for folder in folders]:
         try:
             async with asyncio.timeout(ANSWER_S):
-                reader, writer = await asyncio.open_unix_connection(_socket_at(host, address.port))
+                reader, writer = await asyncio.open_unix_connection(path)
                 line = await reader.readline()
                 writer.close()
             return GivenLink.model_validate(json.loads(line))
         except (OSError, TimeoutError, ValueError):
             continue
-    named = (each.name.removeprefix(_PREFIX).removesuffix(_SUFFIX).rpartition("-") for each in _folder().glob(_ANY))
+    found = [each for folder in folders for each in folder.glob(_ANY)]
+    named = (each.name.removeprefix(_PREFIX).removesuffix(_SUFFIX).rpartition("-") for each in found)
     others = ", ".join(sorted(f"{ListenAddress(host, int(port)).in_url}:{port}" for host, _, port in named))
     raise ConfigError(
         f"no console of this user gives links at {address.in_url}:{address.port}"

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 
 from ldcnd.client.network import Session, ZenohSettings, open_session
+from ldcnd.client.presence import tell_absence
 from ldcnd.client.rig_client import RigClient, daemons
 from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.replies import EndpointReply, RigReply
@@ -39,13 +40,17 @@ class Rigs:
     Args:
         values: takes what they publish.
         wanted: these only; none means all.
+        lacks: is told what keeps an endpoint from being shown, and None once nothing does.
 
     Attributes:
         lease_of: gives the lease under which a page controls an axis of a rig, or None.
     """
 
-    def __init__(self, values: LatestValues, wanted: Collection[str] = ()) -> None:
+    def __init__(
+        self, values: LatestValues, wanted: Collection[str] = (), lacks: Callable[[str | None], None] = lambda _: None
+    ) -> None:
         self._values = values
+        self._lacks = lacks
         self._wanted = frozenset(wanted)
         self.lease_of: Callable[[str, str], str | None] = lambda _rig, _axis: None
         self._watches: dict[str, RigWatch] = {}
@@ -93,10 +98,13 @@ class Rigs:
 
     async def run(self, endpoint: Endpoint) -> None:
         """Watch what is behind an endpoint until cancelled."""
-        self._note(endpoint, problem="not connected yet")
+        self._endpoints[endpoint.name] = EndpointReply(
+            endpoint=endpoint.name, connected=False, problem="not connected yet"
+        )
         while True:
             try:
-                async with open_session(endpoint.settings) as session:
+                async with open_session(endpoint.settings) as session, asyncio.TaskGroup() as group:
+                    group.create_task(self._follow_absence(session, endpoint), name=f"daemons at {endpoint.name}")
                     await self.watch(session, endpoint)
             except (SessionError, ConfigError) as error:
                 self._note(endpoint, problem=error.message)
@@ -132,6 +140,15 @@ class Rigs:
                     self._note(endpoint, problem=error.message)
                     await asyncio.sleep(OPEN_AGAIN_S)
 
+    async def _follow_absence(self, session: Session, endpoint: Endpoint) -> None:
+        while True:
+            try:
+                await tell_absence(
+                    session, endpoint.settings, lambda problem: self._note(endpoint, problem=problem), self._wanted
+                )
+            except SessionError:
+                await asyncio.sleep(OPEN_AGAIN_S)
+
     def _lease(self, rig: str, axis: str) -> str | None:
         return self.lease_of(rig, axis)
 
@@ -146,5 +163,6 @@ class Rigs:
         opened = problem is None or (before is not None and before.connected)
         now = EndpointReply(endpoint=endpoint.name, connected=opened, problem=problem)
         if now != before:
-            log.info("endpoint", endpoint=endpoint.name, problem=problem)
+            (log.warning if problem else log.info)("endpoint", endpoint=endpoint.name, problem=problem)
             self._endpoints[endpoint.name] = now
+            self._lacks(next((each.problem for each in self._endpoints.values() if each.problem), None))

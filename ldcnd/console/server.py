@@ -36,6 +36,7 @@ from ldcnd.console.visitors import LINK_S, Visitors
 from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
 from ldcnd.parts import ENDS, on_signals
+from ldcnd.systemd import Beside
 
 END_TIME_S = 1.0
 """Time for open pages to close when the console ends, seconds; then their connections are aborted."""
@@ -95,7 +96,8 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
         check_settings(endpoint.settings)  # an error in it is raised now, not retried for ever
     loop = asyncio.get_running_loop()
     values = LatestValues()
-    rigs = Rigs(values, settings.rigs)
+    beside = Beside()
+    rigs = Rigs(values, settings.rigs, beside.lacks)
     visitors = Visitors(loop.time, settings.token)
     listening = _listen(settings.address)
     host, port = listening.getsockname()[:2]
@@ -118,6 +120,7 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
             group.create_task(rigs.run(endpoint), name=f"endpoint {endpoint.name}") for endpoint in settings.endpoints
         ]
         show_link(give_link(), as_json=settings.as_json)
+        beside.serves(f"console on {settings.scheme}://{settings.shown_host}:{port}")
         await server.serve(sockets=[listening])
         for task in watching:
             task.cancel()

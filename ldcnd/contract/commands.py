@@ -129,7 +129,7 @@ class Role(StrEnum):
     """Permissions of a login."""
 
     VIEWER = "viewer"
-    """Reads everything, and may stop."""
+    """Reads and asks everything, and may stop."""
     OPERATOR = "operator"
     """Reads, stops and commands."""
     DAEMON = "daemon"
@@ -157,7 +157,6 @@ class Command(Frozen, Generic[ReplyT_co]):
         needs_lease: where leases are required, it is refused without one.
         ends: when it is over.
         answer_s: longest wait of a client for its reply, in seconds.
-        role: the lowest role of a login that may send it.
     """
 
     model_config = ConfigDict(model_title_generator=_schema_title)
@@ -168,7 +167,6 @@ class Command(Frozen, Generic[ReplyT_co]):
     needs_lease: ClassVar[bool] = False
     ends: ClassVar[Ends] = Ends.WITH_REPLY
     answer_s: ClassVar[float] = ANSWER_S
-    role: ClassVar[Role] = Role.OPERATOR
 
     if not TYPE_CHECKING:  # the reply is no part of the fields: pydantic need not make a model for each
 
@@ -180,6 +178,11 @@ class Command(Frozen, Generic[ReplyT_co]):
     def takes_energy_out(self) -> bool:
         """Whether it does nothing but bring an axis to rest or switch it off: nothing refuses such a command."""
         return self.effect is Effect.REST
+
+    @classmethod
+    def role(cls) -> Role:
+        """Return the lowest role of a login that may send it."""
+        return Role.VIEWER if cls.effect is Effect.QUESTION else Role.OPERATOR
 
     @classmethod
     def reply_model(cls) -> type[ReplyT_co]:

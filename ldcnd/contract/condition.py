@@ -255,6 +255,7 @@ _NOT_CONFIRMED = Trouble(
 )
 _NO_ANSWER = Trouble(TroubleKind.NO_ANSWER, _WRONG, "the drive does not answer", "no answer")
 _ON_DEAD_LINE = Trouble(TroubleKind.LINE_DOWN, _WRONG, "the line is not up", "line down")
+_OPENING = Trouble(TroubleKind.UNKNOWN, _NOTICE, "its daemon has just begun to open its line", "line is being opened")
 _NOT_IDENTIFIED = Trouble(
     TroubleKind.NOT_IDENTIFIED,
     _WRONG,
@@ -343,7 +344,7 @@ def assess(
     health: AxisHealth | None = None,
     *,
     age_s: float | None = None,
-    line_up: bool = True,
+    line_up: bool | None = True,
     silence: str = "",
 ) -> Condition:
     """Return the condition of an axis.
@@ -356,17 +357,18 @@ def assess(
         faults: its last faults; None when they are not known.
         health: its last report; None when there is none.
         age_s: age of its position, seconds; None where the face cannot tell.
-        line_up: its line is up, as far as the face knows.
+        line_up: its line is up, as far as the face knows; None while its daemon has not reported about it.
         silence: why nothing comes from its daemon; empty while it reports.
     """
     if state is None:
-        lost = (_silent(silence),) if silence else () if line_up else (_ON_DEAD_LINE,)
+        dead = _OPENING if line_up is None else _ON_DEAD_LINE
+        lost = (_silent(silence),) if silence else () if line_up else (dead,)
         return _unanswered("unknown", lost or (_NEVER_SEEN,), lost[0].short if lost else "no data")
     presumed = state.link is LinkState.DOWN and state.state is AxisState.ERROR_STOP  # that only says that it is lost
     word, last = state.state.words, "unknown, may move" if presumed else f"unknown, was {state.state.words}"
     holder = UNKNOWN_HOLDER if silence else state.holder
     control = _control(holder, moves=state.moving is Moving.YES and state.command is not None)
-    gone = _unreachable(state, faults, silence=silence, line_up=line_up)
+    gone = _unreachable(state, faults, silence=silence, line_up=line_up is not False)
     pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
     if gone:
         return replace(_unanswered(last, (*pending, gone), gone.short), holder=holder, control=control)

@@ -17,19 +17,19 @@ from pathlib import Path
 from types import FrameType
 from typing import NamedTuple
 
+from ldcnd import systemd
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.condition import Condition, TroubleKind, assess, assess_module, line_troubles
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.rig_commands import Reload, ReloadReply
 from ldcnd.contract.samples import FaultEntry, LinkState
-from ldcnd.daemon import systemd
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.reload import Reloader
 from ldcnd.daemon.rig import OwnedRig
-from ldcnd.daemon.systemd import Notifier
 from ldcnd.log import get_logger
 from ldcnd.parts import missing
+from ldcnd.systemd import Notifier
 
 log = get_logger("service")
 

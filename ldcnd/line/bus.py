@@ -428,7 +428,7 @@ class Bus:
     async def run(self) -> None:
         """Own the port until cancelled: open it, and open it again with bounded back-off whenever it is lost."""
         delay_s = pause_s = FIRST_REOPEN_S  # after one that does not open, and after one that does not stay open
-        failure = ""
+        failure, stayed = "", True
         while True:
             self._tried_at_s = self._loop.time()
             try:
@@ -442,7 +442,7 @@ class Bus:
                 continue
             opened_s = self._loop.time()
             # of a port that did not stay the last time, the log says nothing before it has stayed
-            said = self._loop.call_later(STAYS_S if failure else 0.0, self._say_open)
+            said = self._loop.call_later(0.0 if stayed else STAYS_S, self._say_open)
             try:
                 await self._use(transport)
             finally:

@@ -10,6 +10,8 @@ import ssl
 from collections.abc import AsyncIterator, Sequence
 
 PROBE_TIME_S = 1.0
+INTERNET = frozenset({"tcp", "tls", "udp", "quic", "ws"})
+"""Protocols whose endpoints name a host."""
 
 
 async def refusals(endpoints: Sequence[str], root: str | None) -> list[str]:
@@ -21,6 +23,28 @@ async def refusals(endpoints: Sequence[str], root: str | None) -> list[str]:
     """
     found = [await _refusal(endpoint, root) for endpoint in endpoints]
     return [sentence for sentence in found if sentence]
+
+
+async def unresolved(endpoints: Sequence[str]) -> list[str]:
+    """Return the names of hosts among these endpoints that no name server and no file of this machine knows."""
+    hosts = dict.fromkeys(_host_of(each) for each in endpoints if each.partition("/")[0] in INTERNET)
+    return [host for host in hosts if await _is_unknown(host)]
+
+
+def _host_of(endpoint: str) -> str:
+    address = endpoint.partition("#")[0].partition("?")[0].partition("/")[2]
+    return address.rpartition(":")[0].strip("[]")
+
+
+async def _is_unknown(host: str) -> bool:
+    try:
+        async with asyncio.timeout(PROBE_TIME_S):
+            await asyncio.get_running_loop().getaddrinfo(host, None)
+    except TimeoutError:  # an OSError as well
+        return False
+    except (OSError, UnicodeError):
+        return True
+    return False
 
 
 async def _refusal(endpoint: str, root: str | None) -> str | None:

@@ -12,6 +12,9 @@ from ldcnd.contract.errors import ConfigError, LdcndError, OutcomeUnknown, Sessi
 _SOURCE_LOCATION = re.compile(r",? at /\S+\.rs:\d+\.?")
 
 
+UNKNOWN_NAME = "correct the name, enter it in /etc/hosts or with the name server, or write the address instead"
+
+
 def is_about_connecting(reason: str) -> bool:
     """Tell whether Zenoh has failed to connect, rather than to listen."""
     return "Unable to connect" in reason
@@ -29,8 +32,10 @@ def login_refused(refusals: Sequence[str]) -> SessionError:
     )
 
 
-def opening_failed(reason: str, listen: Sequence[str], connect: Sequence[str]) -> LdcndError:
-    """Return the error for a session that could not be opened, given Zenoh's reason."""
+def opening_failed(
+    reason: str, listen: Sequence[str], connect: Sequence[str], unresolved: Sequence[str] = ()
+) -> LdcndError:
+    """Return the error for a session that could not be opened, given Zenoh's reason, and the names of unknown hosts."""
     endpoint = _named(reason, listen) or ", ".join(listen)
     if "Address already in use" in reason:
         return SessionError(
@@ -50,6 +55,17 @@ def opening_failed(reason: str, listen: Sequence[str], connect: Sequence[str]) -
             value=endpoint,
             remedy="choose a port above 1023, or a socket path that this user may write",
         )
+    if "Unable to open lock file" in reason:
+        folder = Path(endpoint.partition("/")[2]).parent
+        return ConfigError(
+            f"cannot listen on {endpoint}: there is no folder {folder}",
+            value=endpoint,
+            remedy="make it, or name one that is there: the service has /run/ldcnd, the rig NAME /run/ldcnd/NAME",
+        )
+    if "failed to lookup address" in reason:
+        return SessionError(
+            f"cannot listen on {endpoint}: its host name does not resolve", value=endpoint, remedy=UNKNOWN_NAME
+        )
     if "not supported for" in reason:
         endpoint = ", ".join((*listen, *connect))
         return SessionError(
@@ -61,10 +77,11 @@ def opening_failed(reason: str, listen: Sequence[str], connect: Sequence[str]) -
         return SessionError(f"cannot listen on {endpoint}: {_plain(reason)}", value=endpoint)
     if is_about_connecting(reason) or "No peer specified" in reason:
         endpoint = ", ".join(connect) or "any endpoint: none is configured"
+        names = f": the name {', '.join(unresolved)} does not resolve" if unresolved else ""
         return SessionError(
-            f"cannot connect to {endpoint}",
+            f"cannot connect to {endpoint}{names}",
             value=endpoint,
-            remedy="check that the other side runs, and its address",
+            remedy=UNKNOWN_NAME if unresolved else "check that the other side runs, and its address",
         )
     return SessionError(f"cannot open the Zenoh session: {_plain(reason)}")
 

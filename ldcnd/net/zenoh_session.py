@@ -37,7 +37,7 @@ from ldcnd.net.hand_over import (
     TokenChanges,
     no_key,
 )
-from ldcnd.net.login_probe import refusals
+from ldcnd.net.login_probe import refusals, unresolved
 from ldcnd.net.reads import ReadIntake, Reads
 from ldcnd.net.session import (
     NO_PARAMETERS,
@@ -114,7 +114,8 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
         about_connecting = zenoh_failures.is_about_connecting(str(error))
         if about_connecting and (refused := await refusals(connect, root_certificate(config))):
             raise zenoh_failures.login_refused(refused) from error
-        raise zenoh_failures.opening_failed(str(error), listen, connect) from error
+        unknown = await unresolved(connect) if about_connecting else ()
+        raise zenoh_failures.opening_failed(str(error), listen, connect, unknown) from error
     except TimeoutError:
         raise zenoh_failures.opening_timed_out(OPEN_TIME_S, listen, connect) from None
     finally:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.support.booted_machine import Machine, booted_machine, why_no_machine
+from tests.support.booted_machine import Machine, booted_machine, eventually, why_no_machine
 from tests.support.package import ROOT, build, package, snapshot, why_no_package
 
 DEPLOY = ROOT / "deploy"
@@ -99,6 +99,8 @@ def test_package_holds_what_the_service_needs_and_touches_nothing_else(deb: Path
         "./usr/share/doc/ldcnd/copyright",
         f"./usr/lib/{sysconfig.get_config_var('MULTIARCH')}/wireshark/plugins/ldcnd.lua",
         "./usr/share/doc/ldcnd/examples/simulated.toml",
+        "./usr/share/doc/ldcnd/examples/zenoh/local/daemon.json5",
+        "./usr/share/doc/ldcnd/examples/zenoh/segment/users.txt",
         "./usr/share/doc/ldcnd/sbom.cdx.json",
         "./usr/share/man/man1/ldcnd.1.gz",
         "./usr/share/man/man1/ldcnd-axis.1.gz",
@@ -159,10 +161,28 @@ def test_every_command_of_the_guide_works(deb: Path):
         for each in deb.parent.glob("*.deb"):
             (machine.root / "root" / each.name).write_bytes(each.read_bytes())
         for command in commands:
-            machine.must("sh", "-euxc", f"cd /root\n{command}", timeout_s=20)
+            machine.must("sh", "-euxc", f"umask 022\ncd /root\n{command}", timeout_s=40)
+            if "ldcnd list --config site/monitor.json5" in command:
+                require_helpers_to_serve(machine)
 
+        left = machine.run("find", "/etc/systemd/system", "-name", "ldcnd*@*.service").stdout
+        assert left.split() == []
         assert machine.run("ldcnd", "--version").returncode != 0
         assert (machine.root / "etc/ldcnd/ldcnd.toml").exists()
+
+
+def require_helpers_to_serve(machine: Machine) -> None:
+    """Check that what is beside the daemon of a secured rig reaches it."""
+    for name, serves in (("console", "console on"), ("record", "recording rig sim"), ("metrics", "metrics on")):
+        unit = f"ldcnd-{name}@ldcnd"
+        machine.until_shown(unit, "StatusText", lambda text, serves=serves: text.startswith(serves))  # type: ignore[misc]
+        assert machine.show(unit, "ActiveState") == "active"
+    scrape = "from urllib.request import *; print(urlopen('http://127.0.0.1:9464/metrics', timeout=5).read().decode())"
+    eventually(
+        lambda: machine.run("/opt/ldcnd/bin/python", "-c", scrape).stdout,
+        lambda text: 'ldcnd_daemon_up{rig="sim"} 1.0' in text,
+        20.0,
+    )
 
 
 @booted

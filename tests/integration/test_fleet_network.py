@@ -25,14 +25,13 @@ from ldcnd.client.events import Events, follow_events
 from ldcnd.client.fleet import RigReport, survey
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.commands import CommandReply, MoveRelative, MoveVelocity, Power, Reset
+from ldcnd.contract.commands import CommandReply, MoveRelative, MoveVelocity, Power, Reset, Role
 from ldcnd.contract.errors import LeaseExpired, OutcomeUnknown, SessionError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, PositionSample, StateSample
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
-from ldcnd.ops.pki.access import CertificateRole
 from ldcnd.ops.pki.site import Site, new_login, set_up
 from tests.support.network import Network, NoNamespaces, router_config, router_words
 from tests.support.process import LDCND
@@ -124,15 +123,15 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SiteNetwork]:
 
 def make_logins(site: Site, network: Network) -> None:
     for host, role in (
-        ("mill", CertificateRole.DAEMON),
-        ("lathe", CertificateRole.DAEMON),
-        ("gate1", CertificateRole.ROUTER),
-        ("gate2", CertificateRole.ROUTER),
+        ("mill", Role.DAEMON),
+        ("lathe", Role.DAEMON),
+        ("gate1", Role.ROUTER),
+        ("gate2", Role.ROUTER),
     ):
         addresses = tuple(address for (here, _), address in network.address.items() if here == host)
         site.add(new_login(host, role, (*addresses, "127.0.0.1")), NOW, 10)
-    site.add(new_login("vic", CertificateRole.VIEWER, ()), NOW, 10)
-    site.add(new_login("ada", CertificateRole.OPERATOR, ()), NOW, 10)
+    site.add(new_login("vic", Role.VIEWER, ()), NOW, 10)
+    site.add(new_login("ada", Role.OPERATOR, ()), NOW, 10)
 
 
 @asynccontextmanager

@@ -2,8 +2,10 @@
 
 import asyncio
 import re
+import resource
 import signal
 from asyncio.subprocess import PIPE
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -79,3 +81,59 @@ async def test_a_damaged_recording_is_recovered_and_exported_as_far_as_it_goes_a
     assert recovered.stdout.startswith("1 messages recovered, the last of 1970-01-01T00:00:00")
     assert exported.stdout.startswith("1 messages in 1 tables")
     assert "cut short" in exported.stderr
+
+
+@contextmanager
+def full_disk(free_bytes):
+    """Let no file of this process become longer: the kernel refuses that as it refuses a full disk."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (free_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+@pytest.mark.parametrize("free_bytes", [0, 20, 300])
+@pytest.mark.parametrize("document", [b"", b"{}" * 100_000])
+def test_a_recorder_leaves_nothing_of_a_file_that_it_cannot_begin(tmp_path, free_bytes, document):
+    with (
+        full_disk(free_bytes),
+        pytest.raises(OSError, match="too large"),
+        Recorder(tmp_path / "run.mcap", {"configuration": document}, lambda: 0, 1 << 30) as recorder,
+    ):
+        recorder.take(POSITION)
+
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_what_a_recorder_has_on_the_disk_stays_when_that_is_full(tmp_path):
+    recorder = Recorder(tmp_path / "run.mcap", {}, lambda: 0, 1 << 30)
+    recorder.take(POSITION)
+    running = asyncio.create_task(recorder.run(lambda: 0))
+    while not is_on_the_disk(tmp_path / "run.mcap.part", "/ldcn/sim/tele/x/position"):
+        await asyncio.sleep(0.2)  # nothing tells when a file has grown
+    recorder.end()
+    await running
+
+    part = tmp_path / "run.mcap.part"
+    recorder.take(POSITION)
+    with full_disk(part.stat().st_size), pytest.raises(OSError, match="too large"):
+        recorder.__exit__(None, None, None)
+
+    saved = CliRunner().invoke(cli, ["record", "recover", str(part), str(tmp_path / "whole.mcap")])
+    assert saved.stdout.startswith("1 messages recovered")
+
+
+@pytest.mark.parametrize(
+    ("content", "said"), [(b"", "nothing was recorded\n  delete it"), (b"x" * 99, "not an MCAP file")]
+)
+@pytest.mark.parametrize("command", ["record recover {} whole.mcap", "record export {} tables", "plot {} x -o x.png"])
+def test_what_is_no_recording_is_a_failure_and_no_configuration(tmp_path, monkeypatch, content, said, command):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "run.mcap.part").write_bytes(content)
+
+    done = CliRunner().invoke(cli, command.format("run.mcap.part").split())
+
+    assert f"run.mcap.part: {said}" in done.stderr
+    assert done.exit_code == 1

@@ -10,11 +10,10 @@ import zenoh
 
 from ldcnd.client.events import latest_events
 from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.commands import Halt, Power, Verb
+from ldcnd.contract.commands import Halt, Power, Role, Verb
 from ldcnd.contract.errors import SessionError
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
-from ldcnd.ops.pki.access import CertificateRole
 from ldcnd.ops.pki.site import Site, new_login, set_up
 from tests.support.access_facts import AccessFacts, alive
 from tests.support.process import free_port
@@ -29,8 +28,8 @@ TLS = "transport/link/tls"
 def people(folder: Path) -> Site:
     """Set up a site with a daemon, and a login for each role that is called as the role."""
     site = set_up(folder, "test site", NOW)
-    site.add(new_login("daemon", CertificateRole.DAEMON, ("127.0.0.1", "localhost")), NOW, 10)
-    for role in (CertificateRole.VIEWER, CertificateRole.OPERATOR):
+    site.add(new_login("daemon", Role.DAEMON, ("127.0.0.1", "localhost")), NOW, 10)
+    for role in (Role.VIEWER, Role.OPERATOR):
         site.add(new_login(role.value, role, ()), NOW, 10)
     return site
 
@@ -40,7 +39,7 @@ def rig(tmp_path_factory: pytest.TempPathFactory) -> Iterator[SecuredRig]:
     folder = tmp_path_factory.mktemp("site")
     site = people(folder)
     # certificates that the authority has signed, of somebody whom the policy does not know
-    site.add(new_login("stranger", CertificateRole.VIEWER, ()), NOW, 10)
+    site.add(new_login("stranger", Role.VIEWER, ()), NOW, 10)
     stranger = (folder / "stranger.json5").read_text()
     site.revoke("stranger")
     (folder / "stranger.json5").write_text(stranger)
@@ -144,7 +143,7 @@ async def test_an_operator_of_another_authority_is_refused_and_says_so(rig: Secu
 
 
 async def test_a_certificate_that_has_ended_is_refused_and_says_so(rig: SecuredRig, tmp_path: Path) -> None:
-    Site(rig.folder).add(new_login("late", CertificateRole.OPERATOR, ()), NOW - dt.timedelta(days=9), 1)
+    Site(rig.folder).add(new_login("late", Role.OPERATOR, ()), NOW - dt.timedelta(days=9), 1)
 
     assert "one that has ended" in await refused(rig, rig.folder / "late.json5")
 

@@ -118,7 +118,7 @@ async def test_what_cannot_be_adopted_stays_down_and_says_why():
         sent = commands_in(rig.sent)
 
     assert not bus.up
-    assert "address 1 (axis x): expected Logosol LS-182AP, nothing there" in bus.problem
+    assert "address 1 (axis x): expected Logosol LS-182AP, found nothing" in bus.problem
     assert sent <= HARMLESS
 
 

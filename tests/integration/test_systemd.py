@@ -217,6 +217,88 @@ def test_rig_of_several_may_write_to_its_own_place_only(service: Machine):
     service.must("systemctl", "stop", "ldcnd@cell")
 
 
+def test_the_local_set_up_starts_and_its_socket_outlives_other_rigs(service: Machine):
+    local = ("/usr/share/doc/ldcnd/examples/zenoh/local/daemon.json5", "/etc/ldcnd/local.json5")
+    service.must("cp", *local)
+    listen = 'listen = ["tcp/127.0.0.1:7447"]'
+    service.write(CONFIG, SIMULATED.replace(listen, 'config_file = "local.json5"'))
+    service.write(
+        "/etc/ldcnd/cell.json5", service.read(local[1]).replace("7447", "7448").replace("/ldcnd/o", "/ldcnd/cell/o")
+    )
+    cell = SIMULATED.replace('rig = "sim"', 'rig = "cell"').replace(listen, 'config_file = "cell.json5"')
+    service.write("/etc/ldcnd/cell.toml", cell)
+    sockets = {
+        rig: f"unixsock-stream//run/ldcnd/{place}operator.sock" for rig, place in (("sim", ""), ("cell", "cell/"))
+    }
+
+    for unit in ("ldcnd@cell", UNIT):
+        service.must("systemctl", "restart", unit)
+    service.must("systemctl", "restart", "ldcnd@cell")
+    service.must("systemctl", "kill", "-s", "KILL", UNIT)
+    service.until_shown(UNIT, "NRestarts", lambda restarts: restarts != "0")
+    for unit in ("ldcnd@cell", UNIT):
+        service.until_shown(unit, "StatusText", lambda text: "4/4 axes up" in text)
+
+    for socket in sockets.values():
+        service.must("ldcnd", "power", "on", "x", "--connect", socket)
+        service.must("runuser", "-u", "nobody", "-g", "ldcnd", "--", "ldcnd", "power", "off", "x", "--connect", socket)
+        assert service.run("runuser", "-u", "nobody", "--", "ldcnd", "list", "--connect", socket).returncode != 0
+    assert "x" in service.must("ldcnd", "list", "--connect", "tcp/127.0.0.1:7447")
+    service.must("systemctl", "stop", "ldcnd@cell")
+
+
+def test_a_socket_without_a_folder_is_not_tried_again(service: Machine):
+    service.must("systemctl", "stop", UNIT)
+    local = service.read("/usr/share/doc/ldcnd/examples/zenoh/local/daemon.json5")
+    service.write("/etc/ldcnd/local.json5", local.replace("/run/ldcnd/", "/run/nowhere/"))
+    service.write(CONFIG, SIMULATED.replace('listen = ["tcp/127.0.0.1:7447"]', 'config_file = "local.json5"'))
+
+    assert service.run("systemctl", "start", UNIT).returncode != 0
+    assert service.show(UNIT, "ExecMainStatus") == "78"
+    assert "there is no folder /run/nowhere" in log_of(service)
+
+
+def test_a_console_is_asked_for_its_link_as_soon_as_it_is_started(service: Machine):
+    unit = "ldcnd-console@ldcnd"
+    for _ in range(3):
+        service.must("systemctl", "start", unit)
+        service.must("systemctl", "kill", "-s", "USR1", unit)
+        link = LINK.findall(service.must("ldcnd", "console", "--link"))[-1]
+        assert "<html" in fetched(service, link)
+        assert service.show(unit, "NRestarts") == "0"
+        service.must("systemctl", "stop", unit)
+
+
+def test_a_recorder_says_that_its_disk_is_full_leaves_nothing_and_goes_on_when_it_is_not(service: Machine):
+    unit = "ldcnd-record@ldcnd"
+    service.must("systemctl", "start", unit)
+    service.must("systemctl", "stop", unit)
+    service.must("mount", "-t", "tmpfs", "-o", "size=64k,mode=777", "full", RECORDINGS)
+    try:
+        service.must("dd", "if=/dev/zero", f"of={RECORDINGS}/full", "bs=1k", "count=64")
+        service.run("systemctl", "start", unit)
+        service.until_shown(unit, "StatusText", lambda text: "No space left on device" in text)
+        service.until_shown(unit, "NRestarts", lambda restarts: int(restarts) >= 2)
+        assert service.must("ls", RECORDINGS).split() == ["full"]
+        service.must("mount", "-o", "remount,size=64m", RECORDINGS)
+        service.until_shown(unit, "StatusText", lambda text: text.startswith("recording rig sim"))
+    finally:
+        service.must("systemctl", "stop", unit)
+        service.must("umount", "--lazy", RECORDINGS)
+
+
+def test_a_file_that_the_service_may_not_read_is_not_tried_again(machine: Machine):
+    machine.write(CONFIG, SIMULATED)
+    machine.must("chmod", "600", CONFIG)
+    try:
+        machine.run("systemctl", "start", UNIT)
+        machine.until_shown(UNIT, "ActiveState", lambda state: state == "failed")
+        assert machine.show(UNIT, "ExecMainStatus") == "78"
+    finally:
+        machine.must("chmod", "644", CONFIG)
+        machine.must("systemctl", "reset-failed", UNIT)
+
+
 def test_realtime_drop_in_moves_only_the_event_loop_ahead(service: Machine):
     service.write(f"{DROP_INS}/realtime.conf", (DEPLOY / "drop-ins/realtime.conf").read_text(encoding="utf-8"))
     service.must("systemctl", "daemon-reload")
@@ -307,7 +389,8 @@ def test_console_recording_and_metrics_run_beside_the_daemon(service: Machine):
         assert all(name.endswith(".mcap") for name in service.must("ls", RECORDINGS).split())  # none cut off
         service.must("systemctl", "start", UNIT)
         eventually(lambda: fetched(service, METRICS), lambda text: 'axis="x"' in text, 20.0)
-        assert {service.show(unit, "ActiveState") for unit in beside} == {"active"}
+        for unit in beside:
+            service.until_shown(unit, "ActiveState", lambda state: state == "active")
     finally:
         service.run("systemctl", "disable", "--now", *beside)
 

@@ -230,6 +230,11 @@ async def test_a_busy_port_is_explained(pair: Pair, endpoint: str) -> None:
             "cannot listen on tcp/192.0.2.1:7447: this machine has no such",
         ),
         (ZenohSettings(connect=("tcp/127.0.0.1:9",), mode="client"), "cannot connect to tcp/127.0.0.1:9"),
+        (
+            ZenohSettings(connect=("tcp/127.0.0.1:9", "tls/bench.invalid:7447"), mode="client"),
+            "tls/bench.invalid:7447: the name bench.invalid does not resolve",
+        ),
+        (ZenohSettings(listen=("tcp/bench.invalid:7447",)), "tcp/bench.invalid:7447: its host name does not resolve"),
         (ZenohSettings(mode="client"), "none is configured"),
         (ZenohSettings(listen=("carrier/pigeon",)), "carrier"),
     ],
@@ -255,6 +260,12 @@ async def test_a_configuration_file_that_cannot_be_used_is_named(tmp_path: Path,
 
     assert str(file) in caught.value.message
     assert ".rs:" not in caught.value.message
+
+
+async def test_a_socket_whose_folder_is_missing_is_a_configuration_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=f"there is no folder {tmp_path}/run$"):
+        async with open_zenoh_session(ZenohSettings(listen=(f"unixsock-stream/{tmp_path}/run/operator.sock",))):
+            pass
 
 
 async def test_a_malformed_endpoint_is_a_configuration_error() -> None:

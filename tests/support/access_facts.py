@@ -6,6 +6,8 @@ import time
 import pytest
 import zenoh
 
+from ldcnd.contract.catalogue import COMMANDS
+from ldcnd.contract.commands import About, Effect
 from tests.support.secured_rig import SecuredRig, answers, refusals
 
 LOGINS = ("viewer", "operator")
@@ -58,6 +60,38 @@ class AccessFacts:
 
         assert (got, refused) == ({}, [])
         assert state["enabled"] is False
+
+    @pytest.mark.parametrize("login", LOGINS)
+    @pytest.mark.parametrize("verb", ["x/why", "_/events", "_/holders", "_/wire_log"])
+    def test_questions_are_answered(self, rig: SecuredRig, login: str, verb: str) -> None:
+        asked = {"bus": "line0"} if verb.endswith("wire_log") else {}
+        with rig.login(login) as session:
+            got = answers(session, f"ldcn/sim/@cmd/{verb}", asked)
+
+        assert list(got) == [f"ldcn/sim/@cmd/{verb}"]
+
+    def test_viewer_is_told_what_is_wrong_with_a_question(self, rig: SecuredRig) -> None:
+        with rig.login("viewer") as viewer:
+            refused = refusals(viewer, "ldcn/sim/@cmd/nothing/why", {})
+
+        assert [json.loads(error)["code"] for error in refused] == ["unknown_axis"]
+
+    @pytest.mark.parametrize(
+        "verb",
+        sorted(
+            f"{'y' if each.about is About.AXIS else '_'}/{each.verb}"
+            for each in COMMANDS
+            if each.effect is not Effect.QUESTION
+        ),
+    )
+    def test_nothing_else_of_a_viewer_is_executed_and_no_one_waits_for_that(self, rig: SecuredRig, verb: str) -> None:
+        asked_s = time.monotonic()
+        with rig.login("viewer") as viewer:
+            got = answers(viewer, f"ldcn/sim/@cmd/{verb}", {})
+            refused = refusals(viewer, f"ldcn/sim/@cmd/{verb}", {})
+
+        assert (got, refused) == ({}, [])
+        assert time.monotonic() < asked_s + 4
 
     def test_operator_motion_query_is_executed(self, rig: SecuredRig) -> None:
         with rig.login("operator") as operator:

@@ -262,6 +262,18 @@ async def test_a_port_that_is_lost_as_soon_as_it_is_open_is_tried_ever_more_slow
     assert (said.count("line lost"), said.count("line open")) == (1, 2)
 
 
+async def test_an_adapter_that_comes_late_is_said_to_be_open_before_anything_is_sent(capsys):
+    rig = Rig()
+    rig.opener.refusals = 2
+
+    async with running(rig):
+        await rig.bus.wait_opened()
+        await asyncio.sleep(0.1)
+
+    said = capsys.readouterr().out
+    assert (said.count("port not open"), said.count("line open")) == (1, 1)
+
+
 async def test_a_far_end_with_its_own_rate_refuses_before_anything_is_sent():
     rig = Rig()
     rig.opener.fixed_baud = True

@@ -166,3 +166,10 @@ def test_of_a_drive_that_misses_polls_the_last_place_is_soon_not_its_own(link, p
     condition = assess(state(link=LinkState(link)), faults(), health(20.0), age_s=0.5)
 
     assert (condition.place, condition.state) == (place, word)
+
+
+def test_an_axis_whose_daemon_has_only_begun_is_being_reached() -> None:
+    condition = assess(None, line_up=None)
+
+    assert condition.mark == "line is being opened"
+    assert said(condition.troubles) == notice("its daemon has just begun to open its line")

@@ -202,7 +202,7 @@ async def test_a_missing_module_is_named():
     chain = chain_of("ls182ap", "picservo-v4")
     expecting_io = LineSpec(modules=(ModuleConfig(address=3, model="pic-io"),))
     async with bare_network(chain, PAIR, line=expecting_io) as line:
-        with pytest.raises(NetworkMismatch, match=r"address 3 \(module\): expected PIC-I/O.*nothing there"):
+        with pytest.raises(NetworkMismatch, match=r"address 3 \(module\): expected PIC-I/O.*found nothing"):
             await line.network.bring_up()
 
 
@@ -369,8 +369,8 @@ def test_differences_are_told_by_address():
     told = differences(expected, {1: Identity(90, 1), 3: Identity(0, 11)})
 
     assert told == (
-        "address 1 (axis x): expected Logosol LS-182AP, Logosol LS-173AP (id 90, version 1)",
-        "address 2 (axis y): expected PIC-SERVO version 4, nothing there",
+        "address 1 (axis x): expected Logosol LS-182AP, found Logosol LS-173AP (id 90, version 1)",
+        "address 2 (axis y): expected PIC-SERVO version 4, found nothing",
     )
 
 

@@ -1,5 +1,6 @@
 """A site's logins: certificates, roster and access rules; and that the delivered set-ups say the same."""
 
+import base64
 import datetime as dt
 import json
 import stat
@@ -9,18 +10,19 @@ import pytest
 import zenoh
 from click.testing import CliRunner
 from cryptography import x509
-from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+from cryptography.x509.oid import ExtendedKeyUsageOID, ExtensionOID, NameOID
 
 from ldcnd.cli.main import cli
+from ldcnd.contract.commands import Role
 from ldcnd.contract.errors import ConfigError
-from ldcnd.ops.pki.access import PERMITTED, CertificateRole, Subject, access_control
+from ldcnd.ops.pki.access import PERMITTED, Subject, access_control
 from ldcnd.ops.pki.site import Login, Site, new_login, read_roster, set_up
 
 NOW = dt.datetime(2026, 3, 1, tzinfo=dt.UTC)
 SETUPS = Path(__file__).parents[2] / "config" / "zenoh"
-DAEMON = Login(name="bench", role=CertificateRole.DAEMON, hosts=("10.0.0.5", "bench.example", "fe80::1"))
-ADA = Login(name="ada", role=CertificateRole.OPERATOR)
-VIC = Login(name="vic", role=CertificateRole.VIEWER)
+DAEMON = Login(name="bench", role=Role.DAEMON, hosts=("10.0.0.5", "bench.example", "fe80::1"))
+ADA = Login(name="ada", role=Role.OPERATOR)
+VIC = Login(name="vic", role=Role.VIEWER)
 
 
 @pytest.fixture
@@ -55,7 +57,7 @@ def test_revoking_takes_a_login_out_of_the_policy_and_its_files_away(site: Site,
 
     assert subjects(tmp_path) == {"viewers": ["vic"]}
     assert list((tmp_path / "site").glob("ada.*")) == []
-    assert read_roster(tmp_path / "site").names(CertificateRole.OPERATOR) == ()
+    assert read_roster(tmp_path / "site").names(Role.OPERATOR) == ()
 
 
 def test_a_role_that_nobody_has_is_left_out_because_zenoh_refuses_an_empty_list(site: Site, tmp_path: Path) -> None:
@@ -81,9 +83,9 @@ def test_a_revoked_name_is_not_given_again(site: Site, tmp_path: Path) -> None:
     ("login", "words"),
     [
         (VIC, "exists"),
-        (Login(name="bob", role=CertificateRole.DAEMON), "needs a host"),
-        (Login(name="gate", role=CertificateRole.ROUTER), "a router needs a host"),
-        (Login(name="ca", role=CertificateRole.VIEWER), "reserved"),
+        (Login(name="bob", role=Role.DAEMON), "needs a host"),
+        (Login(name="gate", role=Role.ROUTER), "a router needs a host"),
+        (Login(name="ca", role=Role.VIEWER), "reserved"),
     ],
 )
 def test_a_login_that_cannot_be_is_refused(site: Site, login: Login, words: str) -> None:
@@ -94,26 +96,26 @@ def test_a_login_that_cannot_be_is_refused(site: Site, login: Login, words: str)
 @pytest.mark.parametrize("name", ["", "../x", "Ada", "a/b", ".hidden", "a" * 64, "a b"])
 def test_a_name_that_is_no_file_name_is_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="cannot be a login"):
-        new_login(name, CertificateRole.VIEWER, ())
+        new_login(name, Role.VIEWER, ())
 
 
 def test_a_router_tells_people_apart_and_carries_for_daemons_and_routers(site: Site, tmp_path: Path) -> None:
-    site.add(Login(name="gate", role=CertificateRole.ROUTER, hosts=("10.0.0.1",)), NOW, 30)
-    site.add(Login(name="bob", role=CertificateRole.OPERATOR), NOW, 30)
+    site.add(Login(name="gate", role=Role.ROUTER, hosts=("10.0.0.1",)), NOW, 30)
+    site.add(Login(name="bob", role=Role.OPERATOR), NOW, 30)
 
     router = configuration(tmp_path, "gate")
     policies = {tuple(policy["subjects"]): policy["rules"] for policy in router["access_control"]["policies"]}
     assert router["mode"] == "router"
     assert router["access_control"]["default_permission"] == "deny"
-    assert policies[("viewers",)] == [rule.name for rule in PERMITTED[CertificateRole.VIEWER]]
-    assert policies[("operators",)] == [rule.name for rule in PERMITTED[CertificateRole.OPERATOR]]
+    assert policies[("viewers",)] == [rule.name for rule in PERMITTED[Role.VIEWER]]
+    assert policies[("operators",)] == [rule.name for rule in PERMITTED[Role.OPERATOR]]
     assert policies[("daemons",)] == policies[("routers",)] == ["carry_in", "carry_out"]
     assert configuration(tmp_path, "bob")["connect"] == {"endpoints": ["tls/10.0.0.1:7447", "tls/10.0.0.5:7447"]}
 
 
 def test_to_a_daemon_a_router_is_trusted_and_another_daemon_is_nobody(site: Site, tmp_path: Path) -> None:
-    site.add(Login(name="gate", role=CertificateRole.ROUTER, hosts=("10.0.0.1",)), NOW, 30)
-    site.add(Login(name="other", role=CertificateRole.DAEMON, hosts=("10.0.0.6",)), NOW, 30)
+    site.add(Login(name="gate", role=Role.ROUTER, hosts=("10.0.0.1",)), NOW, 30)
+    site.add(Login(name="other", role=Role.DAEMON, hosts=("10.0.0.6",)), NOW, 30)
 
     assert subjects(tmp_path) == {"viewers": ["vic"], "operators": ["ada"], "routers": ["gate"]}
 
@@ -121,6 +123,37 @@ def test_to_a_daemon_a_router_is_trusted_and_another_daemon_is_nobody(site: Site
 def test_a_daemon_is_not_revoked_because_clients_would_trust_it_all_the_same(site: Site) -> None:
     with pytest.raises(ConfigError, match="cannot be revoked"):
         site.revoke("bench")
+
+
+@pytest.mark.parametrize("name", ["bench", "vic"])
+def test_a_login_is_renewed_under_its_name_hosts_and_role(site: Site, tmp_path: Path, name: str) -> None:
+    before, rules = certificate(tmp_path, name), subjects(tmp_path)
+
+    file = site.renew(name, NOW + dt.timedelta(days=29), 30)
+
+    after = certificate(tmp_path, name)
+    tls = configuration(tmp_path, name)["transport"]["link"]["tls"]
+    assert file == tmp_path / "site" / f"{name}.json5"
+    assert base64.b64decode(tls["connect_certificate_base64"]) == (file.with_suffix(".pem")).read_bytes()
+    assert after.not_valid_after_utc == NOW + dt.timedelta(days=59)
+    assert (after.subject, after.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value) == (
+        before.subject,
+        before.extensions.get_extension_for_class(x509.ExtendedKeyUsage).value,
+    )
+    assert [each.value for each in after.extensions if each.oid == ExtensionOID.SUBJECT_ALTERNATIVE_NAME] == [
+        each.value for each in before.extensions if each.oid == ExtensionOID.SUBJECT_ALTERNATIVE_NAME
+    ]
+    assert after.serial_number != before.serial_number
+    assert subjects(tmp_path) == rules
+
+
+def test_a_revoked_login_is_not_renewed(site: Site, tmp_path: Path) -> None:
+    site.revoke("ada")
+
+    done = CliRunner().invoke(cli, ["pki", "renew", str(tmp_path / "site"), "ada"], standalone_mode=False)
+
+    assert isinstance(done.exception, ConfigError)
+    assert "there is no such login; there are: bench, vic" in done.exception.message
 
 
 def test_only_a_daemons_certificate_is_good_for_listening(site: Site, tmp_path: Path) -> None:
@@ -191,19 +224,19 @@ def test_the_command_line_makes_a_site_and_says_what_to_do_next(tmp_path: Path) 
 
     assert f'config_file = "{folder}/bench.json5"' in printed
     assert printed.count(f"restart what runs with {folder}/bench.json5") == 2
-    assert read_roster(tmp_path / "site").find("ada") == Login(name="ada", role=CertificateRole.OPERATOR, revoked=True)
+    assert read_roster(tmp_path / "site").find("ada") == Login(name="ada", role=Role.OPERATOR, revoked=True)
 
 
 @pytest.mark.parametrize(
     ("setup", "subject", "names"),
     [
-        ("local", Subject.LINKS, {CertificateRole.VIEWER: ("tcp",), CertificateRole.OPERATOR: ("unixsock-stream",)}),
-        ("lan", Subject.CERTIFICATES, {CertificateRole.VIEWER: ("viewer",), CertificateRole.OPERATOR: ("operator",)}),
-        ("segment", Subject.USERS, {CertificateRole.VIEWER: ("viewer",), CertificateRole.OPERATOR: ("operator",)}),
+        ("local", Subject.LINKS, {Role.VIEWER: ("tcp",), Role.OPERATOR: ("unixsock-stream",)}),
+        ("lan", Subject.CERTIFICATES, {Role.VIEWER: ("viewer",), Role.OPERATOR: ("operator",)}),
+        ("segment", Subject.USERS, {Role.VIEWER: ("viewer",), Role.OPERATOR: ("operator",)}),
     ],
 )
 def test_the_delivered_set_ups_have_the_same_rules(
-    setup: str, subject: Subject, names: dict[CertificateRole, tuple[str, ...]]
+    setup: str, subject: Subject, names: dict[Role, tuple[str, ...]]
 ) -> None:
     delivered = zenoh.Config.from_file(SETUPS / setup / "daemon.json5")
 

@@ -135,8 +135,8 @@ async def test_a_command_that_nobody_answers_although_the_daemon_is_there_is_not
 
 async def test_a_command_whose_answer_was_lost_has_an_unknown_outcome(newer: Newer) -> None:
     def lose_answers_of_motors(query: Query) -> None:
-        if query.key == KEYS.command("_", "holders"):
-            query.reply(text({"required": True, "holders": []}), JSON)
+        if query.key == KEYS.command("_", "renew"):
+            query.reply_error(text({"code": "lease_unknown", "message": "there is no such lease"}), JSON)
         else:
             query.finish()
 

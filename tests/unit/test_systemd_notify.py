@@ -19,9 +19,9 @@ from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.service import Service, describe
-from ldcnd.daemon.systemd import Notifier, reloading, status
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.line.line import Phase
+from ldcnd.systemd import Notifier, reloading, status
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.rig import EPOCH_NS, SIMULATED
 

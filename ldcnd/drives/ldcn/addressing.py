@@ -73,7 +73,7 @@ class Expected:
         """Return in words how what was found differs; None when it does not."""
         if found is not None and self.accepts(found):
             return None
-        return f"address {self.address} ({self.what}): expected {self.profile.title}, {found or 'nothing there'}"
+        return f"address {self.address} ({self.what}): expected {self.profile.title}, found {found or 'nothing'}"
 
 
 def differences(expected: tuple[Expected, ...], found: Mapping[int, Identity]) -> tuple[str, ...]:

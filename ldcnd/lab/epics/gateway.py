@@ -210,8 +210,8 @@ async def gateway(
         raise errors.exceptions[0] from None
 
 
-async def serve(records: Gateway, address: ListenAddress) -> None:
-    """Answer Channel Access clients until cancelled.
+async def serve(records: Gateway, address: ListenAddress, ready: asyncio.Event) -> None:
+    """Answer Channel Access clients until cancelled; `ready` is set when they can connect.
 
     Beacons go to the loopback interface when that is where the gateway listens, and otherwise where EPICS_CAS_* says.
     """
@@ -222,7 +222,11 @@ async def serve(records: Gateway, address: ListenAddress) -> None:
     logging.getLogger("caproto").setLevel(logging.CRITICAL)  # it logs every refused put with a traceback
     context = Context(records.variables, [address.host])
     records.circuits = context.circuits
-    await context.run()
+
+    async def begun(_: object) -> None:
+        ready.set()
+
+    await context.run(startup_hook=begun)
 
 
 async def _defaults(rig: Rig, info: AxisInfo) -> Defaults | None:

@@ -6,7 +6,8 @@ Source: MCAP specification (mcap.dev), version 0; message encoding `json`, schem
 
 import os
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
@@ -38,6 +39,8 @@ class McapFile:
         self._writer = start_writer(self._stream)
         self._schemas: dict[str, int] = {}
         self._channels: dict[str, int] = {}
+        self._has_values = False
+        self._is_bare = True  # on the disk
 
     @property
     def size_bytes(self) -> int:
@@ -55,20 +58,34 @@ class McapFile:
             schema = self._schema(entry.message)
             channel = self._channels[key] = self._writer.register_channel(f"/{key}", "json", schema)
         self._writer.add_message(channel, now_ns, entry.data, publish_time=entry.t, sequence=entry.seq & 0xFFFFFFFF)
+        self._has_values = True
 
     def flush(self) -> None:
         """Put what was added on the disk; returns when it is there."""
         self._writer.flush()  # type: ignore[no-untyped-call] # the package leaves its result open
         os.fsync(self._stream.fileno())
+        self._is_bare = not self._has_values
 
     def complete(self, facts: Mapping[str, str]) -> None:
-        """End the file, with what is to be known of it, and give it its name."""
-        with self._stream:
+        """End the file, with what is to be known of it, and give it its name; see `discard_bare`."""
+        with self.discard_bare(), self._stream:
             self._writer.add_metadata(FACTS, dict(facts))
             self._writer.finish()  # type: ignore[no-untyped-call] # as above
             self._stream.flush()
             os.fsync(self._stream.fileno())
         self._part.rename(self.path)
+
+    @contextmanager
+    def discard_bare(self) -> Iterator[None]:
+        """Leave nothing behind of a file that cannot be written and has no value on the disk: a full one stays so."""
+        try:
+            yield
+        except OSError:
+            with suppress(OSError):
+                self._stream.close()
+            if self._is_bare:
+                self._part.unlink(missing_ok=True)
+            raise
 
     def _schema(self, message: type[Frozen]) -> int:
         name, text = schema_of(message)

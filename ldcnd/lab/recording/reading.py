@@ -74,7 +74,12 @@ class Recording:
                     record = next(records, None)
                 except _UNREADABLE as error:
                     if at == 0:
-                        raise ConfigError(f"{self.path}: not an MCAP file", value=str(self.path)) from error
+                        empty = not self.path.stat().st_size
+                        raise ConfigError(
+                            f"{self.path}: {'nothing was recorded' if empty else 'not an MCAP file'}",
+                            value=str(self.path),
+                            remedy="delete it" if empty else None,
+                        ) from error
                     short = isinstance(error, _SHORT)
                     self._damaged(at, "the file was cut short here" if short else str(error))
                     return

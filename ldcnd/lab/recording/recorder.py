@@ -174,8 +174,9 @@ class Recorder:
         number = self._files + 1
         file = McapFile(self._path if number == 1 else self._path.with_stem(f"{self._path.stem}-{number}"))
         self._files = number
-        for name, document in self._descriptions.items():
-            file.attach(name, document, self._now_ns())
+        with file.discard_bare():
+            for name, document in self._descriptions.items():
+                file.attach(name, document, self._now_ns())
         return file
 
     def _facts(self) -> dict[str, str]:

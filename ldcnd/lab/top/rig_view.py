@@ -138,7 +138,7 @@ class RigView:
         state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
         health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
         age_s = self._clock.age_s(position.t, now_s) if position else None
-        condition = assess(state, fault, health, age_s=age_s, line_up=line is None or line.up, silence=silent)
+        condition = assess(state, fault, health, age_s=age_s, line_up=line.up if line else None, silence=silent)
         worst = next(iter(condition.troubles), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(

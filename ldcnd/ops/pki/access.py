@@ -11,20 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 
-from ldcnd.contract.keys import ALL_CLIENTS, ALL_COMMANDS, ALL_READABLE, ALL_STOPS
-
-
-class CertificateRole(StrEnum):
-    """The purpose of a login."""
-
-    VIEWER = "viewer"
-    """Reads everything, and may stop."""
-    OPERATOR = "operator"
-    """Reads, stops and commands."""
-    DAEMON = "daemon"
-    """Serves a rig; listens."""
-    ROUTER = "router"
-    """Carries messages between the others, and keeps viewers and operators apart; listens."""
+from ldcnd.contract.catalogue import COMMANDS
+from ldcnd.contract.commands import About, Role
+from ldcnd.contract.keys import ALL_CLIENTS, ALL_COMMANDS, ALL_READABLE, ALL_STOPS, RIG_ITSELF, ROOT
 
 
 class Flow(StrEnum):
@@ -68,6 +57,18 @@ COMMAND = (
     Rule("command_in", Flow.INGRESS, ("query",), (ALL_COMMANDS,)),
     Rule("command_out", Flow.EGRESS, ANSWERING, (ALL_COMMANDS,)),
 )
+QUESTIONS = tuple(
+    f"{ROOT}/*/@cmd/{'*' if each.about is About.AXIS else RIG_ITSELF}/{each.verb}"
+    for each in COMMANDS
+    if each.role() is Role.VIEWER
+)
+"""Keys of what changes nothing."""
+ASK = (
+    Rule("ask_in", Flow.INGRESS, ("query",), QUESTIONS),
+    Rule("ask_out", Flow.EGRESS, ("reply",), QUESTIONS),
+    # the daemon has one queryable for all commands, and this is how a viewer's questions find it
+    Rule("ask_whom", Flow.EGRESS, ("declare_queryable",), (ALL_COMMANDS,)),
+)
 PRESENCE = (
     Rule("presence_in", Flow.INGRESS, ("liveliness_token",), (ALL_CLIENTS,)),
     Rule("presence_out", Flow.EGRESS, ("declare_liveliness_subscriber", "liveliness_query"), (ALL_CLIENTS,)),
@@ -80,25 +81,25 @@ CARRY = (
     Rule("carry_out", Flow.EGRESS, EVERYTHING, EVERYWHERE),
 )
 
-RULES = (*WATCH, *STOP, *COMMAND, *PRESENCE)
-PERMITTED: Mapping[CertificateRole, tuple[Rule, ...]] = {
-    CertificateRole.VIEWER: (*WATCH, *STOP),
-    CertificateRole.OPERATOR: RULES,
+RULES = (*WATCH, *STOP, *ASK, *COMMAND, *PRESENCE)
+PERMITTED: Mapping[Role, tuple[Rule, ...]] = {
+    Role.VIEWER: (*WATCH, *STOP, *ASK),
+    Role.OPERATOR: (*WATCH, *STOP, *COMMAND, *PRESENCE),
 }
 """At a daemon that people connect to."""
-PERMITTED_BEHIND_ROUTER: Mapping[CertificateRole, tuple[Rule, ...]] = {**PERMITTED, CertificateRole.ROUTER: CARRY}
+PERMITTED_BEHIND_ROUTER: Mapping[Role, tuple[Rule, ...]] = {**PERMITTED, Role.ROUTER: CARRY}
 """At a daemon that routers connect to as well: they have checked the client."""
-PERMITTED_AT_ROUTER: Mapping[CertificateRole, tuple[Rule, ...]] = {
+PERMITTED_AT_ROUTER: Mapping[Role, tuple[Rule, ...]] = {
     **PERMITTED_BEHIND_ROUTER,
-    CertificateRole.DAEMON: CARRY,
+    Role.DAEMON: CARRY,
 }
 """At a router. The rig of a daemon is not checked."""
 
 
 def access_control(
     subject: Subject,
-    logins: Mapping[CertificateRole, tuple[str, ...]],
-    permitted: Mapping[CertificateRole, tuple[Rule, ...]] = PERMITTED,
+    logins: Mapping[Role, tuple[str, ...]],
+    permitted: Mapping[Role, tuple[Rule, ...]] = PERMITTED,
 ) -> dict[str, object]:
     """Return the value of Zenoh's `access_control`: each login may do what its role permits, and nothing else.
 

@@ -15,16 +15,10 @@ from typing import Annotated
 from pydantic import Field, ValidationError
 
 from ldcnd.client.network import LEASE_MS, RETRY_MS
+from ldcnd.contract.commands import Role
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
-from ldcnd.ops.pki.access import (
-    PERMITTED_AT_ROUTER,
-    PERMITTED_BEHIND_ROUTER,
-    CertificateRole,
-    Rule,
-    Subject,
-    access_control,
-)
+from ldcnd.ops.pki.access import PERMITTED_AT_ROUTER, PERMITTED_BEHIND_ROUTER, Rule, Subject, access_control
 from ldcnd.ops.pki.certificates import Credentials, issue_client, issue_daemon, new_authority
 
 FILE = "roster.json"
@@ -39,7 +33,7 @@ class Login(Frozen):
 
     name: LoginName
     """The common name of its certificate, and of its files."""
-    role: CertificateRole
+    role: Role
     """Its permissions."""
     hosts: tuple[str, ...] = ()
     """Where a daemon or a router can be found: host names and IP addresses."""
@@ -53,7 +47,7 @@ class Roster(Frozen):
 
     logins: tuple[Login, ...] = ()
 
-    def names(self, role: CertificateRole) -> tuple[str, ...]:
+    def names(self, role: Role) -> tuple[str, ...]:
         """Return who has a role now."""
         return tuple(login.name for login in self.logins if login.role is role and not login.revoked)
 
@@ -85,7 +79,7 @@ def read_roster(folder: Path) -> Roster:
 PORT = 7447
 AUTHORITY = "ca"
 PRIVATE = 0o600
-LISTENERS = (CertificateRole.DAEMON, CertificateRole.ROUTER)
+LISTENERS = (Role.DAEMON, Role.ROUTER)
 
 
 class Site:
@@ -115,11 +109,28 @@ class Site:
                 if known.revoked
                 else "exists"
             )
-            raise ConfigError(f"{login.name}: this login {why}; choose another name")
+            remedy = None if known.revoked else f"ldcnd pki renew {self._folder} {login.name}, for another certificate"
+            raise ConfigError(f"{login.name}: this login {why}; choose another name", remedy=remedy)
         if login.role in LISTENERS and not login.hosts:
             raise ConfigError(
                 f"{login.name}: a {login.role} needs a host name or an IP address at which clients find it"
             )
+        return self._issue(login, now, days)
+
+    def renew(self, name: str, now: dt.datetime, days: int) -> Path:
+        """Give a login another certificate, and return the Zenoh configuration to hand over; the old one stays valid.
+
+        Args:
+            name: whose.
+            now: the present.
+            days: for how long the new certificate is valid.
+
+        Raises:
+            ConfigError: there is no such login.
+        """
+        return self._issue(self._living(name), now, days)
+
+    def _issue(self, login: Login, now: dt.datetime, days: int) -> Path:
         if login.role in LISTENERS:
             made = issue_daemon(self._authority, login.name, login.hosts, now, days)
         else:
@@ -131,15 +142,19 @@ class Site:
             self._write_configuration(login.name, self._client(made))
         return self._folder / f"{login.name}.json5"
 
+    def _living(self, name: str) -> Login:
+        login = self._roster.find(name)
+        if login is None or login.revoked:
+            raise ConfigError(f"{name}: there is no such login; there are: {', '.join(self._present()) or 'none'}")
+        return login
+
     def revoke(self, name: str) -> None:
         """Take a viewer's or operator's rights back; who listens learns of it when restarted with the new file.
 
         Raises:
             ConfigError: there is no such login, or it listens, and clients would trust its certificate all the same.
         """
-        login = self._roster.find(name)
-        if login is None or login.revoked:
-            raise ConfigError(f"{name}: there is no such login; there are: {', '.join(self._present()) or 'none'}")
+        login = self._living(name)
         if login.role in LISTENERS:
             raise ConfigError(
                 f"{name}: a {login.role} cannot be revoked, clients trust its certificate until it ends;"
@@ -161,9 +176,9 @@ class Site:
         """Write the roster, and the access rules that follow from it."""
         _write(self._folder / FILE, roster.model_dump_json(indent=2).encode())
         self._roster = roster
-        for name in roster.names(CertificateRole.DAEMON):
+        for name in roster.names(Role.DAEMON):
             self._write_configuration(name, self._daemon(self._credentials(name)))
-        for name in roster.names(CertificateRole.ROUTER):
+        for name in roster.names(Role.ROUTER):
             self._write_configuration(name, self._router(self._credentials(name)))
 
     def _daemon(self, own: Credentials) -> dict[str, object]:
@@ -176,10 +191,8 @@ class Site:
             "connect": {"retry": {"period_init_ms": RETRY_MS[0], "period_max_ms": RETRY_MS[1]}},
         }
 
-    def _listener(
-        self, own: Credentials, mode: str, permitted: Mapping[CertificateRole, tuple[Rule, ...]]
-    ) -> dict[str, object]:
-        logins = {role: self._roster.names(role) for role in CertificateRole}
+    def _listener(self, own: Credentials, mode: str, permitted: Mapping[Role, tuple[Rule, ...]]) -> dict[str, object]:
+        logins = {role: self._roster.names(role) for role in Role}
         return {
             "mode": mode,
             "listen": {"endpoints": [f"tls/[::]:{PORT}"]},
@@ -189,12 +202,7 @@ class Site:
 
     def _client(self, own: Credentials) -> dict[str, object]:
         present = [login for login in self._roster.logins if not login.revoked]
-        listeners = [
-            login
-            for role in (CertificateRole.ROUTER, CertificateRole.DAEMON)
-            for login in present
-            if login.role is role
-        ]
+        listeners = [login for role in (Role.ROUTER, Role.DAEMON) for login in present if login.role is role]
         return {
             "mode": "client",
             "connect": {"endpoints": [f"tls/{_bracketed(login.hosts[0])}:{PORT}" for login in listeners]},
@@ -247,7 +255,7 @@ def set_up(folder: Path, name: str, now: dt.datetime) -> Site:
     return Site(folder)
 
 
-def new_login(name: str, role: CertificateRole, hosts: tuple[str, ...]) -> Login:
+def new_login(name: str, role: Role, hosts: tuple[str, ...]) -> Login:
     """Return a login.
 
     Raises:

@@ -1,6 +1,6 @@
-"""The service manager's side door: datagrams that say how the daemon is, and how often they are expected.
+"""The service manager's side door: datagrams that say how a program is, and how often they are expected.
 
-Only the protocol; what is worth saying is in service.py.
+Only the protocol, and what every program beside a daemon says; what the daemon has to say is in `daemon/service.py`.
 Source: sd_notify(3), sd_watchdog_enabled(3), systemd.service(5) "Type=notify-reload".
 """
 
@@ -28,7 +28,7 @@ def status(text: str) -> str:
 
 
 class Notifier:
-    """Tells the service manager, if there is one; never blocks, never fails the daemon."""
+    """Tells the service manager, if there is one; never fails its program, and blocks only where that is wanted."""
 
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")
@@ -41,12 +41,18 @@ class Notifier:
         """Whether a service manager listens."""
         return bool(self._address)
 
-    def tell(self, *messages: str) -> bool:
-        """Send messages as one datagram; return whether it was taken or there is no service manager."""
+    def tell(self, *messages: str, wait_s: float = 0.0) -> bool:
+        """Send messages as one datagram; return whether it was taken or there is no service manager.
+
+        Args:
+            messages: what to say.
+            wait_s: longest time to wait for a service manager that is too busy to take it, seconds.
+        """
         if not self._address or not messages:
             return True
         try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK | socket.SOCK_CLOEXEC) as door:
+            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as door:
+                door.settimeout(wait_s)
                 door.sendto("\n".join(messages).encode(), self._address)
         except OSError as error:
             if not self._failed:
@@ -55,6 +61,30 @@ class Notifier:
             return False
         self._failed = False
         return True
+
+
+BUSY_S = 5.0
+"""Longest time that a program beside a daemon waits for its service manager, seconds."""
+
+
+class Beside:
+    """A program beside a daemon as its service manager shows it: started once it serves, and what keeps it from that.
+
+    The same is said to people, by whoever uses this.
+    """
+
+    def __init__(self, notifier: Notifier | None = None) -> None:
+        self._notifier = notifier or Notifier()
+        self._serves = ""
+
+    def serves(self, what: str) -> None:
+        """Say that the program serves now, and what: whoever has started it may use it."""
+        self._serves = what
+        self._notifier.tell(READY, status(what), wait_s=BUSY_S)
+
+    def lacks(self, problem: str | None) -> None:
+        """Say what is missing, or None once nothing is."""
+        self._notifier.tell(status(problem or self._serves), wait_s=BUSY_S)
 
 
 def _watchdog_s(environment: Mapping[str, str], pid: int) -> float | None:
