@@ -8,9 +8,9 @@ import os
 import socket
 from collections.abc import Mapping
 
-from ldcnd.log import get_logger
+from ldcnd.log import get_lazy_logger
 
-log = get_logger("systemd")
+log = get_lazy_logger("systemd")
 
 READY = "READY=1"
 STOPPING = "STOPPING=1"
