@@ -4,6 +4,7 @@ Every face shows what this module decides: command line, console, gateways, metr
 sentence of its own; the console's pages get the result from the console's server.
 """
 
+import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum, auto
@@ -69,6 +70,7 @@ class TroubleKind(Enum):
     WARNING = auto()
     MISSED_POLLS = auto()
     SLOW = auto()
+    INTERLOCK = auto()
     OVERRIDDEN = auto()
     FLOATING = auto()
     SLOWED = auto()
@@ -292,6 +294,8 @@ TELL_OF_THE_PAST = frozenset({"loop_opened"})
 """Faults that say what has happened and are seen in one reading only; the others say what is so while they stand."""
 _MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
 """Faults whose name says best why the position is lost."""
+_BY_INTERLOCK = re.compile(r"\binterlock \S+: .+")
+"""How the message of `interlock_violated` names the rule and what it lacks."""
 _DRIVEN = frozenset({AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION})
 
 
@@ -350,7 +354,8 @@ def assess(
     """Return the condition of an axis.
 
     Of an axis that does not answer nothing else is said but a stop that it has not confirmed: what was known of it may
-    be over. How its last command ended is an event, not a state: it is given only where it explains an error stop.
+    be over. How its last command ended is an event, not a state: it is given only where it explains an error stop, or
+    where an interlock ended it.
 
     Args:
         state: its last state; None before the first.
@@ -426,13 +431,7 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     """Return what deserves attention on an axis that answers."""
     entries = _first_cause_first(faults) if faults else []
     found = [_of_fault(entry, TroubleKind.FAULT, _WRONG) for entry in entries if entry.stops]
-    if state.state is AxisState.ERROR_STOP and not found:
-        first = faults.first if faults else None
-        if faults and first and is_over(first, faults.active, state.link):
-            text = f"in error stop because of {over_in_words(first)}: reset it to go on"
-        else:
-            text = f"in error stop: {state.last_error or 'reset it to go on'}"
-        found.append(Trouble(TroubleKind.ERROR_STOP, _WRONG, text, "error stop"))
+    found += _ended(state, faults, in_fault=bool(found))
     if place is Place.OLD:
         found.append(_OLD)
     if state.has_reference and not state.referenced and place is not Place.CONTRADICTED:  # that is its cause
@@ -453,6 +452,22 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     elif health:
         found += _slowness(health)
     return tuple(sorted(found, key=lambda trouble: -trouble.severity))
+
+
+def _ended(state: KnownState, faults: Faults | None, *, in_fault: bool) -> tuple[Trouble, ...]:
+    """Return how a motion ended that leaves an axis in error stop, or that an interlock has ended."""
+    if state.state is not AxisState.ERROR_STOP:
+        by = _BY_INTERLOCK.search(state.last_error or "")
+        text = f"its motion was ended by {by[0]}" if by else ""
+        return (Trouble(TroubleKind.INTERLOCK, _NOTICE, text, "ended by interlock"),) if by else ()
+    if in_fault:
+        return ()
+    first = faults.first if faults else None
+    if faults and first and first.stops and is_over(first, faults.active, state.link):
+        text = f"in error stop because of {over_in_words(first)}: reset it to go on"
+    else:
+        text = f"in error stop: {state.last_error or 'reset it to go on'}"
+    return (Trouble(TroubleKind.ERROR_STOP, _WRONG, text, "error stop"),)
 
 
 def _overridden(health: AxisHealth | None) -> tuple[Trouble, ...]:

@@ -85,7 +85,7 @@ class CommandEvent(Frozen):
     status: CommandStatus
     """How far it has got."""
     reason: str | None = None
-    """Why, when it did not end as requested."""
+    """Why, when it did not end as requested; of one that moves nothing and is done, the values that it has set."""
     code: str | None = None
     """The error code, when there is one."""
     position: float | None = None

@@ -11,9 +11,11 @@ from ldcnd.axis.latches import LatchKeeper
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
+from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import API, DaemonInfo
 from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.rig_commands import Reload
 from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.capture import CaptureStore, CaptureWatch, Run, capture_of, snapshot_of
 from ldcnd.daemon.dispatch import Dispatcher, EarlyStops, Requests
@@ -120,6 +122,10 @@ class Daemon:
         axes = {axis.name: axis for bus in config.bus for axis in bus.axis}
         for bus in self.rig.buses:
             bus.reconfigure(axes)
+
+    def note_reload(self, axis: str, what: str) -> None:
+        """Enter into the events what a reload has changed of an axis."""
+        self._dispatcher.events.note(axis, Reload.verb, CommandStatus.DONE, what)
 
     def serve_reloads(self, answer: AnswerReload) -> None:
         """Let clients have the configuration read again."""

@@ -18,7 +18,7 @@ from ldcnd.axis.clock import Clock
 from ldcnd.axis.readings import Arrival
 from ldcnd.axis.status import ActiveCommand
 from ldcnd.contract.codec import to_json
-from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, CommandReply, Power, Verb
+from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, Capability, CommandReply, Effect, Power, Verb
 from ldcnd.contract.errors import (
     CommandAborted,
     CommandIdReused,
@@ -166,7 +166,8 @@ class Ledger:
         if entry is None:
             return
         error = answer if isinstance(answer, LdcndError) else None
-        self._reached(entry, answer, status, error.message if error else None, error)
+        reason = error.message if error else _changed_by(entry.command) if status is CommandStatus.DONE else None
+        self._reached(entry, answer, status, reason, error)
 
     def ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None, arrival: Arrival | None) -> None:
         """Take from an axis that a command is over; a final status is kept."""
@@ -254,10 +255,21 @@ def _fingerprint(command_id: str) -> int:
     return int.from_bytes(hashlib.blake2b(command_id.encode(), digest_size=8).digest(), "big")
 
 
+PROOFS = ("client", "lease", "sequence", "instance", "not_after")
+"""Fields of a request that only authorise it."""
+
+
 def _content(command: AxisCommand[CommandReply]) -> AxisCommand[CommandReply]:
     """Return the request without the fields that only authorise it."""
-    proofs = dict.fromkeys(("client", "lease", "sequence", "instance", "not_after"))
-    return command.model_copy(update=proofs)
+    return command.model_copy(update=dict.fromkeys(PROOFS))
+
+
+def _changed_by(command: AxisCommand[CommandReply]) -> str | None:
+    """Return in words what a command has set that moves nothing: its verb alone does not tell it."""
+    if command.effect is not Effect.CHANGE or command.verb is Verb.POWER or command.capability is Capability.TRACES:
+        return None
+    values = command.model_dump(mode="json", exclude={"command_id", *PROOFS}, exclude_none=True)
+    return ", ".join(f"{name} {value}" for name, value in values.items() if value is not False) or None
 
 
 log = get_logger("events")

@@ -103,6 +103,8 @@ class Reloader:
     def _take(self, reload: "ReloadPlan", budget: RigBudget) -> None:
         self._daemon.reconfigure(reload.config, budget)
         log.info("configuration reloaded", changed=reload.changed)
+        for axis in reload.axes:
+            self._daemon.note_reload(axis, reload.of_axis(axis))
         if reload.refused:
             log.warning("changes need a restart", keys=reload.refused)
 
@@ -136,6 +138,12 @@ class ReloadPlan:
         """Axes that get another value."""
         names = [axis.name for bus in self.config.bus for axis in bus.axis]
         return tuple(name for name in names if any(f".axis.{name}." in key for key in self.changed))
+
+    def of_axis(self, name: str) -> str:
+        """Return in words what an axis gets."""
+        mark = f".axis.{name}."
+        keys = [(each.key.partition(mark)[2], each) for each in self.changes if mark in each.key and not each.restart]
+        return ", ".join(f"{key} {each.before or 'none'} -> {each.after or 'none'}" for key, each in keys)
 
 
 def plan_reload(running: RigConfig, wanted: RigConfig) -> ReloadPlan:

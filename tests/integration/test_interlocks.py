@@ -19,6 +19,7 @@ from ldcnd.contract.commands import (
     Stop,
     Why,
 )
+from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseHeld, LeaseUnknown
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, Release
@@ -226,6 +227,8 @@ async def test_a_motion_is_ended_when_a_requirement_is_lost(reaction):
 
         state = await rig.client.state("rotor")
         assert state.state is (AxisState.DISABLED if reaction == "power_off" else AxisState.STANDSTILL)
+        noticed = [each.text for each in assess(state, None, None).troubles if "interlock" in each.text]
+        assert noticed == ["its motion was ended by interlock door_shut: input door_closed is false"]
         (said,) = await events(rig, "interlock")
         assert said == f"axis rotor: interlock door_shut: input door_closed is false; reaction: {reaction}"
         (*_, ended) = await events(rig, "move_velocity")

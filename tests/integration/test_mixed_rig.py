@@ -149,6 +149,7 @@ async def test_parameters_are_listed_read_written_and_dumped(tmp_path):
         listed = await rig.client.command("feed", ListParameters())
         await rig.client.command("feed", WriteParameter(parameter="Pn100", value=120))
         saved = await rig.client.command("feed", WriteParameter(parameter="Pn102", value=50, memory=Memory.EEPROM))
+        said = [each.reason for each in await latest_events(rig.client, 100, "feed") if each.status == "done"]
         dump = await rig.client.command("feed", ReadAllParameters(), timeout_s=60)
 
     assert isinstance(listed, ParameterList)
@@ -160,6 +161,7 @@ async def test_parameters_are_listed_read_written_and_dumped(tmp_path):
     assert units[0].drive.memory.active(PN100) == 120
     assert units[1].drive.memory.active(PN100) == 80
     assert (tmp_path / "eeprom-writes.json").exists()
+    assert said == ["parameter Pn100, value 120, memory ram", "parameter Pn102, value 50, memory eeprom"]
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from ldcnd.client.events import latest_events
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
@@ -269,7 +270,9 @@ async def test_a_client_is_shown_what_a_reload_changes_and_gets_that(manager: Ma
         done = await rig.reload(revision=shown.revision)
         taken = daemon.config.bus[0].axis[0]
         again = await rig.reload(dry_run=True)
+        told = [(each.axis, each.reason) for each in await latest_events(client, 100) if each.verb == "reload"]
 
+    assert told == [("x", "velocity 20.0 -> 4.0")]
     assert not shown.applied
     assert info.axis == "x"
     assert [(each.key, each.before, each.after, each.restart) for each in shown.changes] == [
