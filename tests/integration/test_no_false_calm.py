@@ -110,7 +110,8 @@ def test_a_dead_line_shows_no_bare_number_and_watch_says_at_once_what_is_wrong(m
 
 
 def test_what_is_said_of_a_drive_without_motions_names_no_command_that_it_does_not_take(monkeypatch):
-    with virtual_rig(monkeypatch, load_config(CONFIGS / "mixed.toml")) as virtual:
+    config = load_config(CONFIGS / "mixed.toml").model_copy(update={"state_dir": None})
+    with virtual_rig(monkeypatch, config) as virtual:
         up(virtual, "feed")
         told = virtual.run("why feed")
         listed = virtual.run("list").printed
