@@ -27,6 +27,7 @@ class SlowRig:
     stops: int = 0
     fails: bool = False
     wire_log: Mock = field(default_factory=Mock)
+    not_kept: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         axis = SimpleNamespace(

@@ -82,9 +82,8 @@ function Strip({ at }) {
 
 function Notices() {
   return html`<div class="notices" role="alert">
-    ${loginIsGone() && html`<p class="notice mark" data-level="bad">The login of this page is gone from the browser: its cookies were
-      cleared or replaced. Halt and every stop still work from here, nothing else does. Load the page again; if that is refused, open
-      it with a new link of ldcnd console.</p>`}
+    ${loginIsGone() && html`<p class="notice mark" data-level="bad">The login of this page is gone: its cookies were cleared or
+      replaced. Halt and stop work on. For all else load the page again, or open it with a new link of ldcnd console.</p>`}
     ${failure && html`<p class="notice mark" data-level="bad">${failure.message} ${failure.remedy ?? ""}</p>`}
     ${[...rigs.values()].filter((rig) => rig.worth).map((rig) => html`<p class="notice mark" key=${rig.name} data-level="bad"
       >${rig.name}: no new values. ${rig.worth.why}</p>`)}

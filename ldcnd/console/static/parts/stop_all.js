@@ -91,16 +91,15 @@ function StopsOf({ rig }) {
   if (!axes.length) return null;
   // what no stop reaches goes on beside those that are latched
   const free = [...rig.axes.values()].filter((axis) => axis.info && !axis.can("stop"));
-  const [going, standing] = [true, false].map((is) => free.filter((axis) => (!axis.condition.live || axis.state?.moving !== "no") === is));
+  const going = free.filter((axis) => !axis.condition.live || axis.state?.moving !== "no");
   const of = rigs.size > 1 ? `${rig.name}: ` : "";
   const ready = latched.filter((axis) => obstacle(axis, "reset") === null);
   const reset = () => Promise.all(ready.map((axis) => command(axis, "reset")));
   return html`<p class="notice mark stops" data-level=${pending.length || going.length ? "bad" : "warn"}>
     ${pending.length > 0 && html`<span>${of}stop NOT confirmed by ${named(pending)}: use the machine’s emergency stop.</span> `}
     ${moving.length > 0 && html`<span>${of}stop latched, moving still: ${named(moving)}.</span> `}
-    ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}. ${free.length ? "They do not move before Reset." : "Nothing moves before Reset."}</span> `}
-    ${going.length > 0 && html`<span>${of}NOT stopped, may move: ${named(going)}. No stop reaches it over its line: use the machine’s emergency stop.</span> `}
-    ${standing.length > 0 && html`<span>${of}No stop reaches ${named(standing)} over its line.</span> `}
+    ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}.${free.length ? "" : " Nothing moves before Reset."}</span> `}
+    ${free.length > 0 && html`<span>NOT stopped: ${named(free)}${going.length ? `; ${named(going)} may move: use the machine’s emergency stop` : ""}.</span> `}
     ${ready.length > 0 && html`<${Action} act=${reset}>Reset stopped axes<//>`}
   </p>`;
 }
