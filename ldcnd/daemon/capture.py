@@ -18,6 +18,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.config.rig import CapturesConfig, RigConfig, ZenohConfig
 from ldcnd.contract.errors import ConfigError
@@ -211,7 +212,7 @@ class CaptureWatch:
                 if clock.now_s() < self._last_s.get(name, -PAUSE_S) + PAUSE_S:
                     continue
                 causes = frozenset(_causes(line, clock.now_s()))
-                news = causes - self._known.get(name, frozenset())
+                news = causes - self._known.get(name, frozenset()) - frozenset(_inherited(line))
                 self._known[name] = causes
                 if news:
                     await asyncio.sleep(AFTERMATH_S)
@@ -228,14 +229,25 @@ class CaptureWatch:
         self._store.write(capture_of(snapshot, self._config(), cause))
 
 
+def _causes_of(axis: AxisService) -> Iterator[str]:
+    status = axis.tracker.status
+    if status.first_fault is not None:
+        yield f"{axis.config.name} {status.first_fault.code}"
+    for fault in status.active_faults:
+        yield f"{axis.config.name} {fault.code}"
+
+
+def _inherited(line: BusService) -> Iterator[str]:
+    """Yield what is wrong with axes whose drives have not answered yet: an earlier run has captured how it came."""
+    for axis in line.axes:
+        if axis.tracker.reading is None:
+            yield from _causes_of(axis)
+
+
 def _causes(line: BusService, now_s: float) -> Iterator[str]:
     """Yield what is wrong with a line now, or was since its axes were reset last."""
     for axis in line.axes:
-        tracker = axis.tracker
-        if (first := tracker.status.first_fault) is not None:
-            yield f"{axis.config.name} {first.code}"
-        for fault in tracker.status.active_faults:
-            yield f"{axis.config.name} {fault.code}"
+        yield from _causes_of(axis)
     if line.bus.statistics.losses:
         yield f"line down {line.bus.statistics.losses}"
     if not line.bus.on_time(now_s):

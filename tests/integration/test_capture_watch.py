@@ -7,9 +7,12 @@ import signal
 import pytest
 
 from ldcnd.config.rig import CapturesConfig, load_config
+from ldcnd.contract.samples import LinkState
 from ldcnd.line.capture import parse_capture
 from ldcnd.testing.jumping_loop import JumpingLoop
+from tests.integration.test_kept_references import chain_of, keeping
 from tests.support.captures import FOLDER, replayed
+from tests.support.chain_rig import rig_on
 from tests.support.process import LDCND, answering, free_port
 from tests.support.rig import running_rig
 
@@ -34,6 +37,24 @@ async def test_a_drive_that_loses_power_leaves_a_capture_that_shows_it(tmp_path)
     assert "link_lost" in capture.header.cause
     assert capture.header.first_record == 0
     assert capture.header.config["bus"][0]["name"] == "line0"
+
+
+async def test_what_an_earlier_run_has_left_behind_is_not_captured_at_each_start(tmp_path):
+    """Captures of an incident would make room for those of every start after it."""
+    chain, config = chain_of(), keeping(tmp_path)
+    async with rig_on(chain, config) as rig:
+        await rig.until("x", lambda state: state.link is LinkState.UP)
+        await rig.client.stop()
+        await asyncio.sleep(2.0)
+        await rig.kill()
+    before = set((tmp_path / "captures").glob("*"))
+    for _ in range(3):
+        async with rig_on(chain, config) as rig:
+            await rig.until("x", lambda state: state.link is LinkState.UP and not state.stop_pending)
+            await asyncio.sleep(15.0)
+            await rig.kill()
+
+    assert set((tmp_path / "captures").glob("*")) == before
 
 
 async def test_a_line_that_goes_down_leaves_a_capture(tmp_path):
