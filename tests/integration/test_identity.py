@@ -71,7 +71,7 @@ async def test_outputs_are_not_set_in_a_servo_that_holds_the_address_of_the_modu
     async with two_servos() as (rig, chain):
         for request in (SetIo(module="cabinet", pwm1=0.565), SetIo(module="cabinet", high=(4,), low=(9,))):
             with pytest.raises(
-                NotIdentified, match=r"module cabinet .* address 2 .*expected PIC-I/O, PIC-SERVO version 4"
+                NotIdentified, match=r"module cabinet .* address 2 .*expected PIC-I/O, found PIC-SERVO version 4"
             ):
                 await rig.client.ask(request)
         with pytest.raises(NotIdentified, match="cabinet"):

@@ -99,7 +99,7 @@ function StopsOf({ rig }) {
     ${pending.length > 0 && html`<span>${of}stop NOT confirmed by ${named(pending)}: use the machine’s emergency stop.</span> `}
     ${moving.length > 0 && html`<span>${of}stop latched, moving still: ${named(moving)}.</span> `}
     ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}.${free.length ? "" : " Nothing moves before Reset."}</span> `}
-    ${free.length > 0 && html`<span>NOT stopped: ${named(free)}${going.length ? `; ${named(going)} may move: use the machine’s emergency stop` : ""}.</span> `}
+    ${free.length > 0 && html`<span>NOT stopped: ${named(free)}${going.length ? `; ${named(going)} may move: emergency stop` : ""}.</span> `}
     ${ready.length > 0 && html`<${Action} act=${reset}>Reset stopped axes<//>`}
   </p>`;
 }

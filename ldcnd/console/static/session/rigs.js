@@ -119,10 +119,10 @@ export class Axis {
     if (item === "state" && sample?.state !== this.state?.state) this.refusal = null; // of a state that is over
     if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
     else if (item === "trace") this.trace = sample;
-    else if (kind !== "trace" && kind !== "event") {
+    else if (UNIT_OF[item]) {
       this.#keep(this.#told, item, sample);
       this.#judge(item, sample);
-    }
+    } else if (kind !== "trace" && kind !== "event") this.#keep(this.samples, item, sample);
     if ((item === "state" && sample?.link === "down") || (item === "condition" && sample?.live === false)) this.#outNs = this.rig.nowNs();
     if (item === "position") this.#remember(sample);
     if (item === "state" && sample) this.#noteMotion(sample);
@@ -208,7 +208,7 @@ export class Axis {
   /** Keep a sample as far as it is in the units of the description: a restart of the daemon may bring others. */
   #judge(item, sample) {
     const unit = this.#info?.unit;
-    const fits = !unit || !sample || !UNIT_OF[item] || !sample.unit || sample.unit === UNIT_OF[item](unit);
+    const fits = !unit || !sample?.unit || sample.unit === UNIT_OF[item](unit);
     const fitting = fits ? sample : item === "state" ? { ...sample, command: sample.command && { ...sample.command, target: null } } : null;
     this.#keep(this.samples, item, fitting);
   }
