@@ -349,7 +349,7 @@ class AxisCommands:
 
     async def _move_absolute(self, permit: Permit, request: MoveAbsolute) -> CommandReply:
         self._check_may_start(permit, request)
-        return await self._move_to(permit, request, self._plan_absolute(request))
+        return await self._move_to(permit, request, self._from_now(request, self._plan_absolute(request)))
 
     async def _move_relative(self, permit: Permit, request: MoveRelative) -> CommandReply:
         self._check_may_start(permit, request)
@@ -358,7 +358,10 @@ class AxisCommands:
             permit.still_wanted()
             self._check_may_start(permit, request)
             return await self._move_to(permit, request, self._plan_relative(request, here))
-        return await self._move_to(permit, request, self._plan_relative(request))
+        return await self._move_to(permit, request, self._from_now(request, self._plan_relative(request)))
+
+    def _from_now(self, request: Move, plan: MotionPlan) -> MotionPlan:
+        return self._motion.in_mid_move(plan) if self.goes_on(request) else plan
 
     async def _move_to(self, permit: Permit, request: MoveAbsolute | MoveRelative, goal: MotionPlan) -> CommandReply:
         """Go to a goal, from the configured side where there is one."""
@@ -373,7 +376,7 @@ class AxisCommands:
             return await self._undertake(VelocityChange(self._motion, permit, request))
         self._check_may_start(permit, request)
         velocity, bounded, ends = self._plan_velocity(request)
-        reply = await self._move(permit, bounded, AxisState.CONTINUOUS_MOTION)
+        reply = await self._move(permit, self._from_now(request, bounded), AxisState.CONTINUOUS_MOTION)
         return reply.model_copy(update={"velocity": velocity, "ends": ends})
 
     async def _jog(self, permit: Permit, request: Jog) -> CommandReply:

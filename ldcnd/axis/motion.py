@@ -382,6 +382,22 @@ class AxisMotion:
                 return False
         return not any(way > 0 for way in ways)
 
+    def in_mid_move(self, plan: MotionPlan) -> MotionPlan:
+        """Return a plan with the time that it takes from the velocity that the axis has."""
+        motion, reading, target = plan.motion, self.latest(), plan.motion.target_counts
+        if target is None:
+            return plan
+        way = abs(target - reading.position_counts)
+        before = math.copysign(1.0, target - reading.position_counts) * reading.velocity_counts_per_s
+        speed, rate = motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
+        after_turning = way - math.copysign(braking_way(before, rate), before)
+        if before < 0 or after_turning < 0:
+            return replace(plan, duration_s=abs(before) / rate + profile_duration_s(abs(after_turning), speed, rate))
+        highest = math.sqrt(rate * way + before * before / 2)
+        short = highest < speed
+        there_s = (2 * highest - before) / rate if short else rest_of_profile_s(way, before, speed, rate)
+        return replace(plan, duration_s=there_s)
+
     def turned_from(self, velocity: float, acceleration: float) -> float:
         """Return from where a motion at a velocity counts that begins in mid-move, in axis units.
 
