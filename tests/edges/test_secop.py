@@ -8,7 +8,7 @@ from typing import Self
 
 import pytest
 from frappy.client import SecopClient
-from frappy.errors import ImpossibleError, RangeError
+from frappy.errors import CommunicationFailedError, ImpossibleError, RangeError
 
 from ldcnd.contract.commands import Power
 from ldcnd.contract.samples import Moving
@@ -133,6 +133,29 @@ async def test_a_read_only_node_has_readables():
     async with node() as (endpoint, uri), client(endpoint) as rig:
         await rig.command("x", Power(on=True))
         await asyncio.to_thread(use, uri)
+
+
+async def test_what_is_read_of_a_silent_axis_is_an_error_and_no_value_of_before():
+    def follow(there: Client) -> None:
+        until_s = time.monotonic() + LONGEST_S
+        while there.cache["x", "value"].readerror is None:
+            assert time.monotonic() < until_s
+            time.sleep(0.1)
+        assert isinstance(there.getParameter("x", "value").readerror, CommunicationFailedError)
+
+    config = str(ROOT / "config" / "simulated.toml")
+    endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
+    async with process("run", "--config", config, "--listen", endpoint) as daemon:
+        await answering(daemon, endpoint)
+        async with process("secop", "x", "-e", endpoint, "--address", f"127.0.0.1:{port}") as node:
+            assert node.stdout
+            await node.stdout.readline()
+            there = Client(f"tcp://127.0.0.1:{port}", log=None)
+            await asyncio.to_thread(there.connect, 10)
+            daemon.terminate()
+            await daemon.wait()
+            await asyncio.to_thread(follow, there)
+            await asyncio.to_thread(there.disconnect)
 
 
 async def test_a_daemon_with_another_unit_is_described_anew_and_not_moved_by_numbers_of_the_former_one(tmp_path):

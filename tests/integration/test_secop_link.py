@@ -2,6 +2,7 @@
 
 import asyncio
 from contextlib import AsyncExitStack, asynccontextmanager
+from types import MappingProxyType
 
 import pytest
 
@@ -12,14 +13,15 @@ from ldcnd.contract.errors import LdcndError, LeaseRequired, PositionLimit
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.lab.secop.link import StatusCode, linked
+from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.rig import running_rig, two_axes
 
 
 @asynccontextmanager
-async def linked_x():
+async def linked_x(chains=MappingProxyType({})):
     updates = []
-    async with running_rig(two_axes()) as running:
+    async with running_rig(two_axes(), chains) as running:
         await running.until("x", lambda state: state.link is LinkState.UP)
         rig = Rig(running.client, await running.client.daemon())
         infos = {info.axis: info for info in await rig.describe() if info.axis == "x"}
@@ -111,6 +113,21 @@ async def test_a_daemon_that_says_nothing_is_an_error():
                 await asyncio.sleep(0.1)
 
         assert link.status()[0] == StatusCode.ERROR
+
+
+async def test_an_axis_that_moves_out_of_sight_has_no_target_at_the_place_where_it_was_seen_last():
+    chain = build_chain(ChainSpec((ModuleSpec("ls182ap"), ModuleSpec("ls182ap"))))
+    line = two_axes().bus[0].name
+    async with linked_x({line: chain}) as (running, link, updates):
+        await link.go(20.0)
+        await asyncio.sleep(0.3)
+        for place in (0, 1):
+            chain.mute(place, on=True)
+        await running.until("x", lambda state: state.moving is Moving.UNKNOWN)
+        await asyncio.sleep(1.0)
+        target = shown_target(updates)
+
+    assert target.value == pytest.approx(20.0) or target.problem == "where it goes is not known"
 
 
 def shown_target(updates):

@@ -174,7 +174,7 @@ class Number(RecordField, ChannelDouble):  # type: ignore[misc]
     async def publish(self, flags: Any) -> None:  # noqa: ANN401
         """Send the value to those who monitor it, if it has left the deadband or its description is new."""
         alarm = RecordAlarm(self.status, self.severity)
-        if self.deadband and self._sent and not flags & SubscriptionType.DBE_PROPERTY:
+        if self._sent and not flags & SubscriptionType.DBE_PROPERTY:
             before, its_alarm = self._sent
             if alarm == its_alarm and abs(self.value - before) <= self.deadband:
                 self._content.clear()  # of the value before, which a read would return

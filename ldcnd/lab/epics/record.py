@@ -326,8 +326,8 @@ class MotorRecord:
 
     async def show_target(self) -> None:
         """Show where the axis was sent, by any program, or else where it is, and how far it is from there."""
-        if self.state is None or self["UDF"].value:
-            return
+        if self.state is None or self["UDF"].value or self.state.moving is Moving.UNKNOWN:
+            return  # out of sight it goes on to where it was sent
         await self["VAL"].show(self.target(self.state))
         difference = float(self["VAL"].value) - float(self["RBV"].value)
         steps = round(difference / self._step)

@@ -173,6 +173,8 @@ class AxisLink:
         here, problem = self._here, None if self.info.describes(state) else self._other_unit(state.unit)
         if here is None and not problem:
             return
+        if state.moving is Moving.UNKNOWN and not problem:
+            problem = "where it goes is not known"
         target = problem or set_point(state, lambda: here or 0.0, self._sent)
         if target != self._target:
             self._target = target

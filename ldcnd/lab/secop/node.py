@@ -107,7 +107,7 @@ class AxisDrivable(Drivable):  # type: ignore[misc]
 
 
 class WithErrors(Dispatcher):  # type: ignore[misc]
-    """Says of a value how wrong it may be, which frappy leaves out."""
+    """Says of a value how wrong it may be, and answers a read as its last update did, which frappy leaves out."""
 
     def announce_update(self, moduleobj: Any, pobj: Any) -> None:  # noqa: ANN401
         """Send an update to those who listen."""
@@ -117,6 +117,9 @@ class WithErrors(Dispatcher):  # type: ignore[misc]
 
     def _getParameterValue(self, modulename: str, exportedname: str) -> tuple[object, dict[str, object]]:  # noqa: N802
         value, qualifiers = super()._getParameterValue(modulename, exportedname)
+        module = self.secnode.get_module(modulename)
+        if error := module.parameters[module.accessiblename2attr[exportedname]].readerror:
+            raise error
         return value, {**qualifiers, **self._error_of(modulename, exportedname)}
 
     def _error_of(self, module: str, parameter: str) -> dict[str, float]:
