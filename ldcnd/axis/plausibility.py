@@ -230,8 +230,13 @@ class PlausibilityGate:
         if self._agreeing >= (ROUNDS if self._far else 2):
             step = None
             if record is _SURE:
-                # a shaft that happens to come to rest at its 0 was led there
-                zeroed = reading.begun_anew and not known[0].begun_anew and fit >= _Fit.BEYOND
+                # a shaft that happens to come to rest at its 0 was led there, or was sent there between two slow polls
+                zeroed = (
+                    reading.begun_anew
+                    and not known[0].begun_anew
+                    and fit >= _Fit.BEYOND
+                    and (self._far or not self._is_at_target(reading))
+                )
                 step = CounterStep.ZEROED if zeroed else CounterStep.JUMPED if self._far else None
             return self._believe(reading, timing, unconfirmed, step)
         self._unconfirmed = reading, timing
@@ -245,6 +250,12 @@ class PlausibilityGate:
         self._known, self._unconfirmed, self._rounds, self._agreeing = (reading, timing), None, 0, 0
         self._record = _CONTRADICTED
         return Judgement(ReadingVerdict.CONTRADICTS, foreign=foreign)
+
+    def _is_at_target(self, reading: AxisReading) -> bool:
+        return any(
+            each.target_counts is not None and abs(each.target_counts - reading.position_counts) <= NOISE_COUNTS
+            for each in self._expected
+        )
 
     def _contradict(self, reading: AxisReading, timing: Timing, fit: _Fit) -> Judgement:
         """Go on until as many polls in a row make sense as have not; a loop that hunts takes no more of the line."""
