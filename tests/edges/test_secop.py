@@ -1,6 +1,7 @@
 """frappy's own client, unmodified, with a daemon and a SECoP node in processes of their own."""
 
 import asyncio
+import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
@@ -156,6 +157,38 @@ async def test_what_is_read_of_a_silent_axis_is_an_error_and_no_value_of_before(
             await daemon.wait()
             await asyncio.to_thread(follow, there)
             await asyncio.to_thread(there.disconnect)
+
+
+async def test_a_client_that_only_listens_is_told_when_the_node_describes_itself_anew(tmp_path):
+    def listens(port: int) -> socket.socket:
+        listening = socket.create_connection(("127.0.0.1", port), 10)
+        listening.sendall(b"activate\n")
+        while b"active\n" not in listening.recv(1 << 20):
+            pass
+        return listening
+
+    def ends(listening: socket.socket) -> None:
+        listening.settimeout(LONGEST_S)
+        while listening.recv(1 << 20):
+            pass
+
+    config, port = tmp_path / "rig.toml", free_port()
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    text = (ROOT / "config" / "simulated.toml").read_text()
+    config.write_text(text)
+    run = ("run", "--config", str(config), "--listen", endpoint)
+    async with process(*run) as first:
+        await answering(first, endpoint)
+        async with process("secop", "x", "-e", endpoint, "--address", f"127.0.0.1:{port}", "--moves") as node:
+            assert node.stdout
+            await node.stdout.readline()
+            with await asyncio.to_thread(listens, port) as listening:
+                first.terminate()
+                await first.wait()
+                config.write_text(text.replace('unit = "mm"', 'unit = "um"'))
+                async with process(*run) as second:
+                    await answering(second, endpoint)
+                    await asyncio.to_thread(ends, listening)
 
 
 async def test_a_daemon_with_another_unit_is_described_anew_and_not_moved_by_numbers_of_the_former_one(tmp_path):

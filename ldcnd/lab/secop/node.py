@@ -6,9 +6,11 @@ the rig publishes is announced on a thread of its own, as a client that does not
 
 import asyncio
 import logging
+import socket
 import threading
 from collections.abc import Coroutine
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any, TypeVar
 
 from frappy.datatypes import BoolType, FloatRange, StatusType
@@ -203,6 +205,10 @@ class SecNodeServer(Server):  # type: ignore[misc]
             self._tcp.server_close()
             for connection in list(self.dispatcher._connections):  # noqa: SLF001 - frappy ends with its process
                 connection.running = False
+                with suppress(OSError):  # the client may have gone
+                    connection.request.shutdown(
+                        socket.SHUT_RDWR
+                    )  # close alone says nothing while a thread reads from it
                 connection.request.close()
         self._announcing.shutdown(wait=False, cancel_futures=True)
 
