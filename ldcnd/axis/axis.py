@@ -18,7 +18,7 @@ from ldcnd.axis.events import ControlChanged, LoopSeen, PlaceKnown, PlaceUnknown
 from ldcnd.axis.faults import REFERENCE_REFUSED
 from ldcnd.axis.host_tracer import HostTracer, host_channels
 from ldcnd.axis.kept import KeptFiles
-from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.motion import LATENCY_S, AxisMotion, MotionPlan
 from ldcnd.axis.parameters import Parameters
 from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Violations
 from ldcnd.axis.plausibility import PlausibilityGate
@@ -404,9 +404,11 @@ class AxisService:
             permit.ask_to_move()
             self._commands.check(move)
             if self._commands.retargets(move):
+                by_s = self._clock.now_s() + LATENCY_S
                 await self._motion.read()  # the latest reading may be as old as the rates let it be
                 permit.ask_to_move()
-                if self._commands.goes_on(move):
+                if self._commands.goes_on(move) and self._clock.now_s() < by_s:
+                    permit.by_s = by_s
                     self.stops.overtake(permit, permit.verb)
                     return await execute()
             await self.stops.bring_to_rest(StopMode.SMOOTH, by=permit)

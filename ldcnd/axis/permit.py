@@ -7,6 +7,7 @@ packet comes. So a move that waited (for its turn, for the motion ahead of it, f
 step of a homing, for the line) is judged by the state at its start, not by the state at its arrival.
 """
 
+import asyncio
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -24,6 +25,7 @@ from ldcnd.contract.errors import (
     RequestRefused,
     ShuttingDown,
     StopLatched,
+    WrongState,
     step,
 )
 from ldcnd.contract.samples import AxisState
@@ -78,11 +80,14 @@ class Permit:
     Attributes:
         command_id: names the command everywhere.
         verb: what it is.
+        by_s: latest instant, in loop time, to send a packet of its next motion: it goes on from another one, and later
+            it could not turn within the software limits.
     """
 
     def __init__(self, gate: "Gate", command_id: str, verb: Verb, right: Right) -> None:
         self.command_id = command_id
         self.verb = verb
+        self.by_s = math.inf
         self._gate = gate
         self._right = right
         self._epoch = gate.epoch
@@ -155,6 +160,13 @@ class Permit:
         def condition() -> None:
             self._ask(begun=begun)
             require(guards, gate.tracker)
+            if asyncio.get_running_loop().time() > self.by_s:
+                raise WrongState(
+                    f"axis {gate.tracker.name}: the line was too slow for a {self.verb} during the motion under way",
+                    axis=gate.tracker.name,
+                    value=self.verb.value,
+                    remedy="send it again; it begins from rest once the axis stands",
+                )
             for violation in gate.violations(kind, self._counts_per_s / abs(gate.tracker.status.scale.counts_per_unit)):
                 raise violation
 
@@ -194,8 +206,11 @@ class Permit:
         condition = self.to_move()
         if not stays:
             self.begin()
-        with only_while(condition):
-            await self._gate.driver.start()
+        try:
+            with only_while(condition):
+                await self._gate.driver.start()
+        finally:
+            self.by_s = math.inf
 
     async def track(self, position_counts: int) -> None:
         """Go to a position at once; see `Moves.track`."""

@@ -11,13 +11,18 @@ import pytest
 
 from ldcnd.contract.commands import (
     BufferMode,
+    Halt,
     Jog,
     MoveAbsolute,
     MoveRelative,
     MoveVelocity,
+    Power,
+    Reset,
+    SetPosition,
 )
 from ldcnd.contract.errors import LdcndError, LeaseExpired
 from ldcnd.contract.samples import AxisState
+from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.plant import MotorPlant
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, Dialect, DialectRig, dialect_rig
 
@@ -160,3 +165,37 @@ async def test_a_jog_that_is_held_keeps_to_limits_that_a_reload_has_narrowed(dia
             await asyncio.sleep(0.4)
 
     assert 7.9 < rig.position_mm < 8.0 + BEYOND_MM
+
+
+@pytest.mark.parametrize("seed", [216, 275, 285, 0, *(each for each in SOAK if each.values[0] not in (216, 275, 285))])
+async def test_packets_that_come_late_lead_no_motion_out_of_the_limits(seed: int):
+    """What is repeated takes longer than an axis may go on before it must slow down."""
+    dice = random.Random(seed)
+    lost = FaultPlan((LineFault(FaultKind.REQUEST_LOST, 0.25, from_s=5.0),), seed)
+    tried = 0
+    async with dialect_rig(SC, WIDE, faults=lost, line={"margin_ms": 150}, limits=LIMITS) as rig:
+        await rig.power_on()
+        for _ in range(25):
+            if not await rested(rig):
+                continue
+            tried += 1
+            side = -1 if rig.position_mm > 0 else 1
+            for velocity, acceleration in ((40.0 * side, 400.0), (-side * 5.0, dice.choice((30.0, 60.0, 120.0)))):
+                with contextlib.suppress(LdcndError):
+                    await rig.send(MoveVelocity(velocity=velocity, acceleration=acceleration, buffer_mode="aborting"))
+                most = await farthest_mm(rig, dice.uniform(0.1, 1.2))
+                assert most < LIMIT_MM + BEYOND_MM, f"seed {seed}: {most:.2f} mm"
+    assert tried
+
+
+async def rested(rig: DialectRig) -> bool:
+    """Bring the axis to rest and have it know where it is, as far as the line lets it."""
+    with contextlib.suppress(LdcndError, TimeoutError):
+        async with asyncio.timeout(10.0):
+            await rig.send(Halt())
+            await asyncio.sleep(3.0)
+            await rig.send(Reset())
+            await rig.send(Power(on=True))
+            await rig.send(SetPosition(position=round(rig.position_mm, 3)))
+            return (await rig.rig.client.state(AXIS)).referenced and abs(rig.position_mm) < LIMIT_MM
+    return False

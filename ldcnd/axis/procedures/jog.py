@@ -14,7 +14,7 @@ from enum import Enum
 from typing_extensions import override
 
 from ldcnd.axis.events import CommandOver, MotionStarted
-from ldcnd.axis.motion import COUNTER_SHARE, AxisMotion, MotionPlan
+from ldcnd.axis.motion import COUNTER_SHARE, LATENCY_S, AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion
@@ -207,10 +207,13 @@ class HeldJog(Procedure):
         motion, asked = self._motion, self._asked
         if not motion.driver.retargets:
             return False
+        by_s = motion.clock.now_s() + LATENCY_S
         await motion.read()  # the latest reading may be as old as the rates let it be
-        return motion.follows_on(
-            motion.plan_at(asked.velocity, asked.acceleration).motion.acceleration_counts_per_s2, None
-        )
+        rate = motion.plan_at(asked.velocity, asked.acceleration).motion.acceleration_counts_per_s2
+        if not motion.follows_on(rate, None) or motion.clock.now_s() >= by_s:
+            return False
+        self.permit.by_s = by_s
+        return True
 
     @property
     def _asked(self) -> "_Course":
