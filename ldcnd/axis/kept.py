@@ -19,7 +19,9 @@ from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.samples import PastFault
 from ldcnd.drives.driver import StopMode
 from ldcnd.durable import DamagedFile
+from ldcnd.log import get_logger
 
+log = get_logger("kept")
 FORMAT = 1
 NS = 10**9
 DISK_TIME_S = 2.0
@@ -65,7 +67,7 @@ class KeptReference(ReferenceEvidence):
     written: int
     """Time of writing, UTC in ns since 1970."""
     on_disk: int = 0
-    """The same by the clock that stamps files: one that is stamped much later was put there by somebody else."""
+    """The same instant by the clock of files: a later change time shows that another program put it there."""
     origin: float
     """Position 0 on the drive's own counter."""
     mark: int
@@ -213,12 +215,15 @@ class KeptFiles:
 
     @contextmanager
     def _noted(self, path: Path) -> Iterator[None]:
-        """Note why a file cannot be written, until it can."""
+        """Note why a file cannot be written, until it can, and log each reason once."""
         name = str(path.relative_to(self._directory))
         try:
             yield
         except OSError as error:
-            self.troubles[name] = in_words(error)
+            why = in_words(error)
+            if self.troubles.get(name) != why:
+                log.error("not kept on disk", file=name, reason=why)
+            self.troubles[name] = why
             raise
         self.troubles.pop(name, None)
 

@@ -10,7 +10,7 @@ import contextlib
 from collections.abc import Callable, Mapping
 
 from ldcnd.axis.events import LatchRecalled
-from ldcnd.axis.kept import KeptFiles, KeptLatch, in_words
+from ldcnd.axis.kept import KeptFiles, KeptLatch
 from ldcnd.axis.status import AxisStatus
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.samples import AxisState
@@ -42,7 +42,6 @@ class LatchKeeper:
         self._writing = asyncio.Lock()
         self._on_disk: Mapping[str, KeptLatch] | None = {}  # None: not known
         self._others: dict[str, KeptLatch] = {}  # of axes that are not configured now
-        self._trouble = ""
         if files is None:
             return
         for tracker in trackers.values():
@@ -99,13 +98,9 @@ class LatchKeeper:
             self._on_disk = None
             try:
                 await files.keep_latches(now)
-            except OSError as error:
-                trouble = in_words(error)
-                if trouble != self._trouble:
-                    log.error("latches not kept: a restart of the daemon would lose them", reason=trouble)
-                self._trouble = trouble
-                return False
-            self._on_disk, self._trouble = now, ""
+            except OSError:
+                return False  # the files have noted why
+            self._on_disk = now
             return True
 
 

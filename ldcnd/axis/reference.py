@@ -105,7 +105,6 @@ class ReferenceKeeper:
         self._faults_kept = 0
         self.woken = asyncio.Event()
         self._closed = False
-        self._trouble = ""
         tracker.watch(self._watch, "faults")
         if self._drive and files:
             self._drive.about_to_renumber = self.forget
@@ -127,7 +126,6 @@ class ReferenceKeeper:
             await self._files.remove_reference(self._config.name)
         except OSError as error:
             if await self._is_void_without(self._drive):
-                self._complain(f"reference not removed: {in_words(error)}")
                 self._kept = None
                 return
             raise WrongState(
@@ -320,9 +318,7 @@ class ReferenceKeeper:
             await self._files.keep_reference(self._config.name, reference)
         except OSError as error:
             self._on_disk = was_there or isinstance(error, TimeoutError)  # then it may be written later
-            self._complain(f"reference not kept: {in_words(error)}")
             return
-        self._trouble = ""
         if generation == self._generation:
             self._kept = reference
 
@@ -330,19 +326,15 @@ class ReferenceKeeper:
         """The axis has no reference any more, or none that could be proven: nor may the disk say so."""
         if not self._on_disk:
             return
-        try:
+        with contextlib.suppress(WrongState):  # the files have logged why
             await self.forget()
-        except WrongState as error:
-            self._complain(error.message)
 
     async def _keep_faults(self) -> None:
         if self._files is None or self._faults_kept == len(self.faults):
             return
         faults = self.faults = self.faults[-FAULTS_KEPT:]
-        try:
+        with contextlib.suppress(OSError):  # likewise
             await self._files.keep_faults(self._config.name, faults)
-        except OSError as error:
-            self._complain(f"faults not kept: {in_words(error)}")
         self._faults_kept = len(faults)
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
@@ -350,11 +342,6 @@ class ReferenceKeeper:
             self.faults = (*self.faults, entry.past)
             self._faults_kept = -1
             self.woken.set()
-
-    def _complain(self, trouble: str) -> None:
-        if trouble != self._trouble:
-            log.error("not kept on disk", axis=self._config.name, reason=trouble)
-        self._trouble = trouble
 
 
 def _scale_of(config: AxisConfig) -> tuple[float, str, float | None]:

@@ -110,7 +110,8 @@ async def _check_means(client: RigClient, rig: RigConfig, axes: Iterable[str]) -
             remedy="give the configuration of that rig, or its endpoint with --connect",
         )
     there = {info.axis: info for info in await client.axes()}
-    for config in (axis for bus in rig.bus for axis in bus.axis if axis.name in set(axes)):
+    named = set(axes)
+    for config in (axis for bus in rig.bus for axis in bus.axis if axis.name in named):
         info = there.get(config.name)
         means = (config.unit, config.counts_per_unit, config.direction, config.modulo)
         if info is None or means != (info.unit, info.counts_per_unit, info.direction, info.modulo):

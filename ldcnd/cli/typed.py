@@ -210,8 +210,8 @@ force_option = click.option("--force", cls=ForceOption)
 
 
 CONFIGURATION = click.Path(path_type=Path, readable=False)
-"""What configures a program. Its reader says what is wrong with it, as with one that cannot work: click would call a
-file that may not be read a wrong usage, which a service manager is told nothing of."""
+"""Configuration file. Its reader reports an unreadable one as a configuration that cannot work, exit code 78; click
+would report wrong usage, exit code 2, after which a service manager tries again."""
 CONSOLE_ADDRESS = "127.0.0.1:8470"
 OptionT = TypeVar("OptionT", bound=Callable[..., object])
 

@@ -227,7 +227,7 @@ class Axis(AxisVerbs):
     ) -> AsyncIterator[Callable[[float], Coroutine[Any, Any, Trace]]]:
         """Record what happens in the context, which begins once the trace is armed; see `take_trace`.
 
-        Yields what waits for the end of the trace, so many seconds at most, and returns it complete.
+        Yields a function that waits for the end of the trace, with the longest time in seconds, and returns the trace.
         """
         fields = {"channels": channels, "samples": samples, "pre_trigger": pre_trigger, "trigger": trigger}
         every = "fastest" if interval_s is None else interval_s

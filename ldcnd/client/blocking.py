@@ -123,7 +123,7 @@ class BlockingAxis(Facade[asynchronous.Axis]):
     def tracing(
         self, *channels: str, samples: int = 500, interval_s: float | None = None
     ) -> Iterator[Callable[[float], Trace]]:
-        """Record what happens in the context; what it yields waits so many seconds at most, and returns the trace."""
+        """Record what happens in the context; yields a function that waits for the trace, so many seconds at most."""
         arming = self._wrapped.tracing(*channels, samples=samples, interval_s=interval_s)
         with self._loop.inside(arming) as taken:
             yield lambda within_s: self._loop.run(taken(within_s))

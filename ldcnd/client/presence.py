@@ -20,12 +20,12 @@ async def tell_absence(
 ) -> None:
     """Say why no daemon is heard, and None once one is again; until cancelled.
 
-    Zenoh says nothing of a link that it cannot make again, so a second session tries it: only that one is told why.
+    Zenoh reports no reason for a link that it cannot open again; opening a second session gives one.
 
     Args:
         session: over which daemons are heard.
         settings: of that session.
-        say: is told only what is different from before.
+        say: called with the problem when it changes, and with None when a daemon answers again.
         rigs: whose daemons count; those of any rig when empty.
     """
     present: set[tuple[str, str]] = set()

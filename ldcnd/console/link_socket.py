@@ -1,7 +1,6 @@
 """The socket on which a console gives another link to its own user, so that nothing has to be stopped for one.
 
-It lies in the user's runtime folder, where nobody else may look but root: whoever can open it could read the console's
-memory.
+It lies in the user's runtime folder, which only that user and root can open: both can read the console's memory anyway.
 """
 
 import asyncio

@@ -40,7 +40,7 @@ class Rigs:
     Args:
         values: takes what they publish.
         wanted: these only; none means all.
-        lacks: is told what keeps an endpoint from being shown, and None once nothing does.
+        lacks: called with the reason why an endpoint cannot be shown, and with None once it can.
 
     Attributes:
         lease_of: gives the lease under which a page controls an axis of a rig, or None.

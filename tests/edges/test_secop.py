@@ -5,14 +5,15 @@ import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
-from typing import Self
+from pathlib import Path
+from typing import Self, TypeVar
 
 import pytest
 from frappy.client import SecopClient
 from frappy.errors import CommunicationFailedError, ImpossibleError, RangeError
 
 from ldcnd.contract.commands import Power
-from ldcnd.contract.samples import Moving
+from ldcnd.contract.samples import Moving, PositionSample
 from tests.support.process import ROOT, answering, client, daemon, free_port, process
 
 pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(200)]
@@ -159,6 +160,40 @@ async def test_what_is_read_of_a_silent_axis_is_an_error_and_no_value_of_before(
             await asyncio.to_thread(there.disconnect)
 
 
+ClientT = TypeVar("ClientT")
+
+
+async def in_another_unit(
+    folder: Path, begin: Callable[[int], ClientT], follow: Callable[[ClientT], None]
+) -> PositionSample:
+    """Start the daemon again with another unit behind a node that has clients; return where its axis is then.
+
+    Args:
+        folder: for the configuration.
+        begin: connects a client to a port of this machine, in a thread.
+        follow: does what that client does afterwards, likewise.
+    """
+    config, port = folder / "rig.toml", free_port()
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    text = (ROOT / "config" / "simulated.toml").read_text()
+    config.write_text(text)
+    run = ("run", "--config", str(config), "--listen", endpoint)
+    async with process(*run) as first:
+        await answering(first, endpoint)
+        async with process("secop", "x", "-e", endpoint, "--address", f"127.0.0.1:{port}", "--moves") as node:
+            assert node.stdout
+            assert b"SECoP modules {x}" in await node.stdout.readline()
+            there = await asyncio.to_thread(begin, port)
+            first.terminate()
+            await first.wait()
+            config.write_text(text.replace('unit = "mm"', 'unit = "um"'))
+            async with process(*run) as second:
+                await answering(second, endpoint)
+                await asyncio.to_thread(follow, there)
+                async with client(endpoint) as rig:
+                    return await rig.position("x")
+
+
 async def test_a_client_that_only_listens_is_told_when_the_node_describes_itself_anew(tmp_path):
     def listens(port: int) -> socket.socket:
         listening = socket.create_connection(("127.0.0.1", port), 10)
@@ -168,32 +203,17 @@ async def test_a_client_that_only_listens_is_told_when_the_node_describes_itself
         return listening
 
     def ends(listening: socket.socket) -> None:
-        listening.settimeout(LONGEST_S)
-        while listening.recv(1 << 20):
-            pass
+        with listening:
+            listening.settimeout(LONGEST_S)
+            while listening.recv(1 << 20):
+                pass
 
-    config, port = tmp_path / "rig.toml", free_port()
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    text = (ROOT / "config" / "simulated.toml").read_text()
-    config.write_text(text)
-    run = ("run", "--config", str(config), "--listen", endpoint)
-    async with process(*run) as first:
-        await answering(first, endpoint)
-        async with process("secop", "x", "-e", endpoint, "--address", f"127.0.0.1:{port}", "--moves") as node:
-            assert node.stdout
-            await node.stdout.readline()
-            with await asyncio.to_thread(listens, port) as listening:
-                first.terminate()
-                await first.wait()
-                config.write_text(text.replace('unit = "mm"', 'unit = "um"'))
-                async with process(*run) as second:
-                    await answering(second, endpoint)
-                    await asyncio.to_thread(ends, listening)
+    await in_another_unit(tmp_path, listens, ends)
 
 
 async def test_a_daemon_with_another_unit_is_described_anew_and_not_moved_by_numbers_of_the_former_one(tmp_path):
-    def connected(uri: str) -> Client:
-        there = Client(uri, log=None)
+    def connected(port: int) -> Client:
+        there = Client(f"tcp://127.0.0.1:{port}", log=None)
         there.connect(10)
         return there
 
@@ -205,27 +225,9 @@ async def test_a_daemon_with_another_unit_is_described_anew_and_not_moved_by_num
                 there.setParameter("x", "target", 50.0)
             time.sleep(0.2)
         there.until("x", "status", lambda status: status[0] == DISABLED)
+        there.disconnect()
 
-    config, port = tmp_path / "rig.toml", free_port()
-    endpoint = f"tcp/127.0.0.1:{free_port()}"
-    text = (ROOT / "config" / "simulated.toml").read_text()
-    config.write_text(text)
-    run = ("run", "--config", str(config), "--listen", endpoint)
-    async with process(*run) as first:
-        await answering(first, endpoint)
-        async with process("secop", "x", "-e", endpoint, "--address", f"127.0.0.1:{port}", "--moves") as node:
-            assert node.stdout
-            assert b"SECoP modules {x}" in await node.stdout.readline()
-            there = await asyncio.to_thread(connected, f"tcp://127.0.0.1:{port}")
-            first.terminate()
-            await first.wait()
-            config.write_text(text.replace('unit = "mm"', 'unit = "um"'))
-            async with process(*run) as second:
-                await answering(second, endpoint)
-                await asyncio.to_thread(follow, there)
-                async with client(endpoint) as rig:
-                    position = await rig.position("x")
-            await asyncio.to_thread(there.disconnect)
+    position = await in_another_unit(tmp_path, connected, follow)
 
     assert position.unit == "um"
     assert abs(position.value) < 1

@@ -259,7 +259,7 @@ async def test_a_disk_that_fails_delays_no_stop_and_the_answer_says_so(tmp_path,
         state = await rig.client.state("x")
 
     assert (reply.confirmed, reply.kept) == (("x",), ())
-    assert len([line for line in logs if line["event"].startswith("latches not kept")]) == 1
+    assert len([line for line in logs if line["event"] == "not kept on disk" and line["file"] == "latches.json"]) == 1
     assert state.stop_latched
 
 

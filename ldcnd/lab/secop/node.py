@@ -205,10 +205,9 @@ class SecNodeServer(Server):  # type: ignore[misc]
             self._tcp.server_close()
             for connection in list(self.dispatcher._connections):  # noqa: SLF001 - frappy ends with its process
                 connection.running = False
+                # close alone ends nothing while the thread of the connection reads from it
                 with suppress(OSError):  # the client may have gone
-                    connection.request.shutdown(
-                        socket.SHUT_RDWR
-                    )  # close alone says nothing while a thread reads from it
+                    connection.request.shutdown(socket.SHUT_RDWR)
                 connection.request.close()
         self._announcing.shutdown(wait=False, cancel_futures=True)
 
