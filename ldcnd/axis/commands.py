@@ -15,7 +15,7 @@ from ldcnd.axis.events import (
     SpeedChanged,
 )
 from ldcnd.axis.gains import AxisGains
-from ldcnd.axis.motion import AxisMotion, MotionPlan, rest_of_profile_s
+from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import NEVER_S, Procedure
 from ldcnd.axis.procedures.analog import AnalogMove
@@ -29,6 +29,7 @@ from ldcnd.axis.procedures.pwm import PwmRun
 from ldcnd.axis.procedures.track import SetPoint
 from ldcnd.axis.procedures.velocity import VelocityChange
 from ldcnd.axis.status import Completion
+from ldcnd.axis.trapezoid import rest_of_profile_s
 from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,

@@ -22,6 +22,7 @@ from ldcnd.axis.status import ActiveCommand, Completion
 from ldcnd.axis.straight import LineAxis
 from ldcnd.axis.telemetry import AxisTelemetry
 from ldcnd.axis.tracker import AxisTracker
+from ldcnd.axis.trapezoid import braking_way, duration_from_s, profile_duration_s
 from ldcnd.contract.commands import CommandReply, Direction, Verb
 from ldcnd.contract.errors import (
     BusError,
@@ -70,24 +71,6 @@ def both_s(first: MotionPlan, goal: MotionPlan) -> float:
     motion = goal.motion
     last_s = profile_duration_s(way, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
     return (first.duration_s or 0.0) + last_s
-
-
-def profile_duration_s(distance: float, velocity: float, acceleration: float) -> float:
-    """Return how long a trapezoid takes, triangular when it is short; any consistent units, all positive."""
-    if distance * acceleration < velocity * velocity:
-        return 2 * math.sqrt(distance / acceleration)
-    return distance / velocity + velocity / acceleration
-
-
-def braking_way(speed: float, deceleration: float) -> float:
-    """Return how far it is from a speed to rest; any consistent units, the deceleration above 0."""
-    return speed * speed / (2 * deceleration)
-
-
-def rest_of_profile_s(way: float, before: float, after: float, acceleration: float) -> float:
-    """Return how long a trapezoid takes that slews and goes on at another velocity; any consistent units, positive."""
-    change_s = (after - before) / acceleration
-    return way / after + after / (2 * acceleration) + change_s * abs(after - before) / (2 * after)
 
 
 class AxisMotion:
@@ -387,15 +370,9 @@ class AxisMotion:
         motion, reading, target = plan.motion, self.latest(), plan.motion.target_counts
         if target is None:
             return plan
-        way = abs(target - reading.position_counts)
-        before = math.copysign(1.0, target - reading.position_counts) * reading.velocity_counts_per_s
-        speed, rate = motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
-        after_turning = way - math.copysign(braking_way(before, rate), before)
-        if before < 0 or after_turning < 0:
-            return replace(plan, duration_s=abs(before) / rate + profile_duration_s(abs(after_turning), speed, rate))
-        highest = math.sqrt(rate * way + before * before / 2)
-        short = highest < speed
-        there_s = (2 * highest - before) / rate if short else rest_of_profile_s(way, before, speed, rate)
+        way = target - reading.position_counts
+        before = math.copysign(reading.velocity_counts_per_s, reading.velocity_counts_per_s * way)
+        there_s = duration_from_s(abs(way), before, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
         return replace(plan, duration_s=there_s)
 
     def turned_from(self, velocity: float, acceleration: float) -> float:

@@ -8,10 +8,11 @@ from abc import abstractmethod
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import LATENCY_S, AxisMotion, braking_way
+from ldcnd.axis.motion import LATENCY_S, AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import NEVER_S, Procedure
 from ldcnd.axis.tracker import AxisTracker
+from ldcnd.axis.trapezoid import braking_way
 from ldcnd.contract.errors import PositionLimit
 from ldcnd.drives.driver import AxisReading
 
