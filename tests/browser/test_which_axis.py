@@ -80,18 +80,22 @@ async def alpha_runs(house):
 
 
 @asynccontextmanager
-async def without_feed(house):
-    """Start the rig again without one of its axes."""
+async def started_again(house, changed):
+    """Start the rig again with another configuration: `changed` makes it of the text of the one before."""
     config = house.alpha.config
     text = config.read_text(encoding="utf-8")
-    blocks = text.split("[[bus.axis]]")
-    config.write_text("[[bus.axis]]".join(each for each in blocks if 'name = "feed"' not in each), encoding="utf-8")
+    config.write_text(changed(text), encoding="utf-8")
     try:
         await house.alpha.start()
         yield
     finally:
         await house.alpha.end()
         config.write_text(text, encoding="utf-8")
+
+
+def without_feed(text):
+    blocks = text.split("[[bus.axis]]")
+    return "[[bus.axis]]".join(each for each in blocks if 'name = "feed"' not in each)
 
 
 @pytest.mark.parametrize(
@@ -126,7 +130,7 @@ async def test_an_axis_that_goes_is_said_and_not_replaced(house, window, page):
         await go(window, house, f"{page}/alpha/feed")
         await until(window, TEXT, wanted=lambda text: "not known" not in text and re.search("feed|Pn100", text))
 
-    async with without_feed(house):
+    async with started_again(house, without_feed):
         said = "Rig alpha has no axis feed"
         text = await until(window, TEXT, wanted=lambda text: said in text)
         assert await window.evaluate(HASH) == f"#/{page}/alpha/feed"
@@ -187,20 +191,9 @@ async def test_a_trigger_whose_channel_is_not_recorded_any_more_is_still_shown(h
     await window.keys(ESCAPE, ENTER)
 
 
-@asynccontextmanager
-async def alpha_in_cm(house):
-    """Start the rig again with an axis in another unit; it stands where it stood."""
-    config = house.alpha.config
-    text = config.read_text(encoding="utf-8")
-    config.write_text(
-        text.replace('unit = "mm"\ncounts_per_unit = 1000', 'unit = "cm"\ncounts_per_unit = 10000', 1), encoding="utf-8"
-    )
-    try:
-        await house.alpha.start()
-        yield
-    finally:
-        await house.alpha.end()
-        config.write_text(text, encoding="utf-8")
+def x_in_cm(text):
+    """Give an axis another unit; it stands where it stood."""
+    return text.replace('unit = "mm"\ncounts_per_unit = 1000', 'unit = "cm"\ncounts_per_unit = 10000', 1)
 
 
 async def test_what_was_typed_for_one_unit_is_not_there_for_another(house):
@@ -211,7 +204,7 @@ async def test_what_was_typed_for_one_unit_is_not_there_for_another(house):
             await desk.panel("Jog").get_by_label("Speed mm/s").fill("3")
             await expect(desk.panel("Move")).to_contain_text("moves x to 12 mm")
 
-        async with alpha_in_cm(house):
+        async with started_again(house, x_in_cm):
             await expect(desk.page.get_by_text("x in cm, was in mm. What was typed for it is cleared.")).to_be_visible()
             await expect(desk.panel("Move").get_by_label("Position cm")).to_have_value("")
             await expect(desk.panel("Jog").get_by_label("Speed cm/s")).not_to_have_value("3")
@@ -225,7 +218,7 @@ async def test_the_scope_says_values_in_the_unit_that_they_have(house):
             live = desk.panel("Live")
             await expect(live.locator("tr", has_text="alpha · x position")).to_contain_text("mm")
 
-        async with alpha_in_cm(house):
+        async with started_again(house, x_in_cm):
             await expect(live.locator("tr", has_text="alpha · x position")).to_contain_text("cm")
 
         async with alpha_runs(house):
