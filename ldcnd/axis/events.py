@@ -151,9 +151,15 @@ class SpeedChanged:
 
 @dataclass(frozen=True, slots=True)
 class CommandFailing:
-    """The command under way will fail, for a reason, once the axis has come to rest."""
+    """The command under way will fail, for a reason, once the axis has come to rest.
+
+    Attributes:
+        reason: why.
+        interlock: the rule that ends it and what that lacks; empty where none does.
+    """
 
     reason: str
+    interlock: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -140,6 +140,7 @@ class AxisStatus:
             drive has acknowledged it.
         last_end: how the last command ended.
         last_error: why, when it was not done, until the next command is accepted or the axis is reset.
+        interlock: the rule that has ended it and what that lacks, for as long; empty where none has.
         target: where the axis was sent last, or came to rest after anything else, in axis units; None while it is
             neither, and while nothing holds it.
         target_counts: target of the last motion, counts; None when it had no end or was followed by something else.
@@ -179,6 +180,7 @@ class AxisStatus:
     effective_from_s: float = 0.0
     last_end: CommandEnd | None = None
     last_error: str | None = None
+    interlock: str = ""
     target: float | None = None
     target_counts: int | None = None
     approached: bool = False
@@ -274,6 +276,7 @@ class AxisStatus:
             "stop_pending": self.stop_pending,
             "command": self.command,
             "last_error": self.last_error,
+            "interlock": self.interlock,
             "has_reference": self.commanded,
             "reference_lost": self.reference_lost,
             "target": self.target,

@@ -311,6 +311,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         ends_at_s=None,
         effective_from_s=math.inf,
         last_error=last_error,
+        interlock=status.interlock if last_error else "",
         target=None if command.state is AxisState.CONTINUOUS_MOTION else command.target,
         target_counts=None,
         approached=False,
@@ -349,7 +350,7 @@ def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
 
 
 def _note_failure(status: AxisStatus, event: CommandFailing) -> AxisStatus:
-    return _with(status, failure=event.reason)
+    return _with(status, failure=event.reason, interlock=event.interlock or status.interlock)
 
 
 def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:
@@ -435,6 +436,7 @@ def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
         faults=(),
         first_fault=None,
         last_error=None,
+        interlock="",
     )
 
 

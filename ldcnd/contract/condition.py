@@ -4,7 +4,6 @@ Every face shows what this module decides: command line, console, gateways, metr
 sentence of its own; the console's pages get the result from the console's server.
 """
 
-import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum, auto
@@ -228,6 +227,10 @@ class KnownState(Protocol):
         """How the last command ended, other than done."""
 
     @property
+    def interlock(self) -> str:
+        """The interlock that has ended it and what that lacks; empty where none has."""
+
+    @property
     def speed_override(self) -> float:
         """Percent of every velocity."""
 
@@ -294,8 +297,6 @@ TELL_OF_THE_PAST = frozenset({"loop_opened"})
 """Faults that say what has happened and are seen in one reading only; the others say what is so while they stand."""
 _MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
 """Faults whose name says best why the position is lost."""
-_BY_INTERLOCK = re.compile(r"\binterlock \S+: .+")
-"""How the message of `interlock_violated` names the rule and what it lacks."""
 _DRIVEN = frozenset({AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION})
 
 
@@ -457,9 +458,8 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
 def _ended(state: KnownState, faults: Faults | None, *, in_fault: bool) -> tuple[Trouble, ...]:
     """Return how a motion ended that leaves an axis in error stop, or that an interlock has ended."""
     if state.state is not AxisState.ERROR_STOP:
-        by = _BY_INTERLOCK.search(state.last_error or "")
-        text = f"its motion was ended by {by[0]}" if by else ""
-        return (Trouble(TroubleKind.INTERLOCK, _NOTICE, text, "ended by interlock"),) if by else ()
+        text = f"its motion was ended by interlock {state.interlock}"
+        return (Trouble(TroubleKind.INTERLOCK, _NOTICE, text, "ended by interlock"),) if state.interlock else ()
     if in_fault:
         return ()
     first = faults.first if faults else None

@@ -10,7 +10,7 @@ from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import LineCounters
 from ldcnd.contract.plan import PollPriority
-from ldcnd.contract.samples import LatchSample, PastFault, PositionSample, Sample, StateSample, VelocitySample
+from ldcnd.contract.samples import SAMPLE_ITEMS, PastFault, Sample, TelemetryItem
 from ldcnd.contract.units import Dimension
 
 API = 1
@@ -165,6 +165,16 @@ class AxisLimits(Frozen):
     """Highest acceleration, in units a second squared."""
 
 
+def sample_units(unit: str) -> dict[str, str]:
+    """Return the units in which the telemetry items of an axis give their values, by item.
+
+    Args:
+        unit: the axis unit.
+    """
+    in_unit: dict[str, str] = dict.fromkeys((TelemetryItem.POSITION, TelemetryItem.LATCH, TelemetryItem.STATE), unit)
+    return {**in_unit, TelemetryItem.VELOCITY: f"{unit}/s"}
+
+
 class AxisInfo(Frozen):
     """The description of an axis: served on `meta/axes/<axis>`."""
 
@@ -182,6 +192,8 @@ class AxisInfo(Frozen):
     """The identity that the drive reported; null while it has not answered."""
     unit: str
     """Unit of all its values; "count" when no scale is configured."""
+    sample_units: dict[str, str] = Field(default_factory=dict)
+    """The unit in which each telemetry item gives its values; others come from a daemon of before, or of after."""
     counts_per_unit: float | None
     """Encoder counts per unit; null when no scale is configured and the axis works in counts."""
     units: Mapping[Dimension, Mapping[str, str]] = {}
@@ -223,11 +235,6 @@ class AxisInfo(Frozen):
 
     def describes(self, sample: Sample) -> bool:
         """Tell whether the values of a sample are in the units of this description: a restart may bring others."""
-        match sample:
-            case PositionSample() | LatchSample():
-                return sample.unit == self.unit
-            case VelocitySample():
-                return sample.unit == f"{self.unit}/s"
-            case StateSample():
-                return sample.unit in (None, self.unit)
-        return True
+        told = getattr(sample, "unit", None)  # a state of a daemon of before has none
+        item = SAMPLE_ITEMS.get(type(sample))
+        return told is None or item is None or told == sample_units(self.unit).get(item, told)

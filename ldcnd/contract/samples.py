@@ -308,6 +308,8 @@ class StateSample(Sample):
     """The command under way."""
     last_error: str | None = None
     """Why the last command ended other than done, until the next command is accepted."""
+    interlock: str = ""
+    """The interlock that has ended it and what that lacks, for as long; empty where none has."""
     has_reference: bool = True
     """Whether its drive can have a reference; false where `home` and `set_position` are not among its commands."""
     reference_lost: bool = False
@@ -376,6 +378,7 @@ SAMPLE_MODELS: dict[TelemetryItem, type[Sample]] = {
     TelemetryItem.SHADOW: ShadowSample,
 }
 
+SAMPLE_ITEMS: dict[type[Sample], TelemetryItem] = {model: item for item, model in SAMPLE_MODELS.items()}
 _ITEMS = frozenset(item.value for item in TelemetryItem)
 
 

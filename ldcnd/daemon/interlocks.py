@@ -294,7 +294,8 @@ class Interlocks:
         error = rule.violation(f"axis {name}", text)
         reason = f"{error.message}; reaction: {reaction.value}"
         self._events.note(name, INTERLOCK, CommandStatus.ABORTED, reason, code=error.code.value)
-        axis.tracker.take(CommandFailing(error.message))  # whoever waits for the motion is told why it ends
+        # whoever waits for the motion is told why it ends
+        axis.tracker.take(CommandFailing(error.message, f"{rule.config.name}: {text}"))
         group.create_task(axis.stops.bring_to_rest(STOP_MODES[reaction]), name=f"interlock {rule.config.name}")
 
     def _binds(self, rule: BoundRule, axis: AxisService, status: AxisStatus) -> bool:

@@ -14,7 +14,7 @@ from ldcnd.contract.errors import ErrorCode, MalformedRequest
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.contract.health import BusHealth, DaemonHealth
 from ldcnd.contract.keys import RIG_ITSELF, Keys, matches
-from ldcnd.contract.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo
+from ldcnd.contract.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo, sample_units
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.samples import Sample, TelemetryItem
 from ldcnd.daemon.health import HealthWatch
@@ -211,6 +211,7 @@ def axis_info(bus: BusService, axis: AxisService, group: str | None = None) -> A
         model=config.model,
         identity=driver.identity,
         unit=config.unit,
+        sample_units=sample_units(config.unit),
         counts_per_unit=config.counts_per_unit,
         units=config.unit_table,
         g_velocity=config.g_velocity,

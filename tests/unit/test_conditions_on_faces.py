@@ -111,7 +111,7 @@ CASES = (
     Case("speed override 0 %", {"speed_override": 0.0}, "speed override 0 %", Place.KNOWN),
     Case("speed override 30 %", {"speed_override": 30.0}, "speed override 30 %", Place.KNOWN),
     Case("ended by an interlock",
-         {"last_error": "move_velocity: aborted by halt: axis x: interlock door_shut: input door_closed is false"},
+         {"last_error": "move_velocity: aborted by halt", "interlock": "door_shut: input door_closed is false"},
          "ended by interlock", Place.KNOWN),
     Case("error stop", {"state": AxisState.ERROR_STOP, "last_error": "a jam"}, "error stop", Place.KNOWN),
     Case("a fault", {"state": AxisState.ERROR_STOP}, "overheat", Place.KNOWN, (fault("overheat"),),

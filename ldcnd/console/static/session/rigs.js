@@ -23,9 +23,6 @@ const FINAL = new Set(["done", "aborted", "refused", "failed", "unknown"]);
 /** An observer speaks every ten seconds: an hour and a half. */
 const SHADOWS_KEPT = 540;
 
-/** The unit in which a sample of an axis of some unit is. */
-const UNIT_OF = { position: (unit) => unit, latch: (unit) => unit, state: (unit) => unit, velocity: (unit) => `${unit}/s` };
-
 /** One axis: its description and its latest samples. */
 export class Axis {
   samples = {};
@@ -119,10 +116,10 @@ export class Axis {
     if (item === "state" && sample?.state !== this.state?.state) this.refusal = null; // of a state that is over
     if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
     else if (item === "trace") this.trace = sample;
-    else if (UNIT_OF[item]) {
+    else if (kind !== "trace" && kind !== "event") {
       this.#keep(this.#told, item, sample);
       this.#judge(item, sample);
-    } else if (kind !== "trace" && kind !== "event") this.#keep(this.samples, item, sample);
+    }
     if ((item === "state" && sample?.link === "down") || (item === "condition" && sample?.live === false)) this.#outNs = this.rig.nowNs();
     if (item === "position") this.#remember(sample);
     if (item === "state" && sample) this.#noteMotion(sample);
@@ -207,8 +204,8 @@ export class Axis {
 
   /** Keep a sample as far as it is in the units of the description: a restart of the daemon may bring others. */
   #judge(item, sample) {
-    const unit = this.#info?.unit;
-    const fits = !unit || !sample?.unit || sample.unit === UNIT_OF[item](unit);
+    const unit = this.#info?.sample_units[item];
+    const fits = !unit || !sample?.unit || sample.unit === unit;
     const fitting = fits ? sample : item === "state" ? { ...sample, command: sample.command && { ...sample.command, target: null } } : null;
     this.#keep(this.samples, item, fitting);
   }
