@@ -116,6 +116,7 @@ async def test_drive_is_stopped_and_switched_off_when_the_dead_man_is_released()
 
 
 @pytest.mark.parametrize(("address", "counts"), [(9, 100), (1, 1_000_000), (1, 0)])
+@pytest.mark.sweep(2)
 async def test_move_out_of_bounds_is_not_begun(address: int, counts: int):
     chain = await addressed(fresh())
 

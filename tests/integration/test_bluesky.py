@@ -149,6 +149,7 @@ def test_a_reading_after_a_move_was_measured_after_its_end(lab: Laboratory):
     assert all(at < 1.8e9 for at in measured)  # of the rig's clock, not this machine's
 
 
+@pytest.mark.long
 def test_a_detector_in_a_step_scan_is_measured_at_its_point(lab: Laboratory):
     async def ended(status: Status) -> None:
         while not status.done:
@@ -386,6 +387,7 @@ def test_an_adaptive_scan_of_a_signal_ends(lab: Laboratory):
     assert len(lab.documents.data("x_adc")) >= 3
 
 
+@pytest.mark.long
 def test_a_plan_is_suspended_while_a_fault_or_a_value_is_there_and_goes_on_after_it(lab: Laboratory):
     async def trouble():
         await lab.running.until("x", lambda state: state.moving is Moving.YES)
@@ -464,6 +466,7 @@ def test_a_plan_is_suspended_while_another_axis_turns(lab: Laboratory, capsys, k
     assert "Justification for this suspension" in capsys.readouterr().out
 
 
+@pytest.mark.long
 def test_a_plan_is_suspended_while_a_text_is_empty(lab: Laboratory):
     async def short(*, present: bool):
         if present:

@@ -39,6 +39,7 @@ async def test_a_drive_that_loses_power_leaves_a_capture_that_shows_it(tmp_path)
     assert capture.header.config["bus"][0]["name"] == "line0"
 
 
+@pytest.mark.long
 async def test_what_an_earlier_run_has_left_behind_is_not_captured_at_each_start(tmp_path):
     """Captures of an incident would make room for those of every start after it."""
     chain, config = chain_of(), keeping(tmp_path)
@@ -82,6 +83,7 @@ async def test_a_loose_contact_fills_no_disk(tmp_path):
     assert 1 < len(list(tmp_path.iterdir())) <= most
 
 
+@pytest.mark.long
 async def test_nothing_is_written_without_a_place_or_a_cause(tmp_path):
     async with running_rig(config_with("clean_start", tmp_path)) as rig, running_rig() as other:
         await asyncio.sleep(20.0)
@@ -104,6 +106,7 @@ def test_the_capture_of_a_power_loss_plays_back(tmp_path):
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_a_daemon_that_is_aborted_writes_what_was_on_its_lines(tmp_path):
     text = (FOLDER / "clean_start.toml").read_text(encoding="utf-8")
     config = tmp_path / "rig.toml"

@@ -61,6 +61,7 @@ def test_every_command_of_an_axis_is_a_method_of_both_clients():
     assert names <= set(dir(blocking.BlockingAxis))
 
 
+@pytest.mark.long
 def test_the_methods_are_those_that_the_commands_make():
     written = (CLIENT / "verbs.py").read_text()
     blocks = (CLIENT / "blocking.py").read_text()

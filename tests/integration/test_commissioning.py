@@ -77,6 +77,7 @@ async def test_a_motor_that_agrees_with_its_encoder_is_found_within_the_stated_d
 
 
 @pytest.mark.parametrize("direction", ["forward", "reverse"])
+@pytest.mark.sweep(2)
 async def test_a_reversed_motor_is_caught_within_the_stated_distance(direction, tmp_path, monkeypatch):
     text = rig_text(direction=direction).replace("el = 4000", "cl = 121, el = 4000")
     async with commissioning_rig(tmp_path, STANDS, text=text, motor_reversed=True) as rig:

@@ -12,6 +12,7 @@ from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, Dialect, dialect_r
 @pytest.mark.parametrize("dialect", [LS_182AP, V4, SC], ids=lambda dialect: dialect.name)
 @pytest.mark.parametrize("state_hz", [1.0, 2.0, 5.0])
 @pytest.mark.parametrize("on_its_way", [False, True])
+@pytest.mark.sweep(5)
 async def test_a_move_to_the_zero_of_the_counter_is_no_reset(dialect: Dialect, state_hz: float, on_its_way):
     rates = {"position": state_hz, "velocity": 0, "adc": 0, "state": state_hz}
     home = MoveAbsolute(position=0.0, velocity=40.0, buffer_mode=BufferMode.ABORTING)

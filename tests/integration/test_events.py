@@ -2,6 +2,8 @@
 
 import asyncio
 
+import pytest
+
 from ldcnd.client.events import follow_events, latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import MAX_PAYLOAD_BYTES
@@ -69,6 +71,7 @@ async def test_the_last_event_is_found_although_nothing_follows_it():
         rig.broker.subscriptions.append(subscription)
 
 
+@pytest.mark.long
 async def test_what_the_daemon_has_forgotten_is_told_as_lost():
     async with running_rig() as rig, follow_events(rig.client) as events:
         await commands(rig, 1)

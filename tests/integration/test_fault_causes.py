@@ -53,6 +53,7 @@ async def codes_later(rig: DialectRig) -> list[str]:
 
 @logosol
 @latched
+@pytest.mark.sweep(2)
 async def test_a_stop_of_a_tripped_drive_leaves_the_fault_its_name(dialect, condition):
     async with dialect_rig(dialect) as rig:
         await trip(rig, condition)
@@ -114,6 +115,7 @@ async def test_a_second_without_the_cable_leaves_the_fault_its_name(condition):
 
 
 @pytest.mark.parametrize("condition", [*LATCHED, FaultCondition.STALLED], ids=lambda condition: condition.value)
+@pytest.mark.sweep(2)
 async def test_a_tripped_drive_that_is_taken_over_has_a_fault_without_a_cause(condition):
     async with dialect_rig(LS_182AP, gains=GAINS | {"el": 500}) as rig:
         await trip(rig, condition)

@@ -311,6 +311,7 @@ async def test_current_limiting_is_a_warning_that_reset_clears_with_the_loop_clo
 
 
 @named(DIALECTS)
+@pytest.mark.sweep(2)
 async def test_a_counter_that_wraps_is_a_warning(dialect):
     async with near_the_end_of_the_counter(dialect) as rig:
         await rig.send(SetPwm(duty=0.1, duration_s=0.3))  # no profile would go there

@@ -28,6 +28,7 @@ REQUESTS = (
 
 
 @pytest.mark.parametrize("duration_s", [5.0, pytest.param(20.0, marks=pytest.mark.soak)])
+@pytest.mark.long
 async def test_every_query_gets_one_answer_and_every_stop_keeps_its_bound(duration_s):
     dice = random.Random(5)
     answers: Counter[str] = Counter()

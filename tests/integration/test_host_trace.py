@@ -63,6 +63,7 @@ async def test_asked_interval_is_kept_on_a_grid():
     assert all(abs(offset - k * 20e6) < 10e6 for k, offset in enumerate(trace.offsets_ns))
 
 
+@pytest.mark.long
 async def test_other_axes_keep_their_rates_while_one_is_traced_as_fast_as_possible():
     async def gaps_s(rig, axis):
         """The pauses between positions, which are due every 50 ms on y and every 100 ms on z."""
@@ -230,6 +231,7 @@ async def test_every_ldcn_and_nmc_drive_of_the_rig_is_traced_faster_than_it_is_p
     assert all(rate > 100 for rate in rates_hz.values()), rates_hz
 
 
+@pytest.mark.long
 async def test_a_lost_line_ends_the_trace_at_once_and_the_next_one_works():
     config = load_config(SIMULATED)
     line = config.sim[0]

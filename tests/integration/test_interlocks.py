@@ -217,6 +217,7 @@ async def test_a_motion_and_an_output_that_forbid_each_other_never_both_pass(fir
 
 
 @pytest.mark.parametrize("reaction", ["halt", "quick_stop", "power_off"])
+@pytest.mark.sweep(2)
 async def test_a_motion_is_ended_when_a_requirement_is_lost(reaction):
     async with running_machine(machine(DOOR_SHUT | {"reaction": reaction})) as rig:
         await spinning(rig)

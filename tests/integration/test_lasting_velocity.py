@@ -18,6 +18,7 @@ LONG = {"longest_run_s": 3600, "jog_horizon_s": 5}
 SPIN = MoveVelocity(velocity=5.0, duration_s=20.0)
 
 
+@pytest.mark.long
 async def test_a_motion_lasts_as_long_as_it_is_asked_to_and_ends_with_a_ramp():
     async with running_machine(machine(axis=LONG)) as rig:
         await rig.client.command("rotor", Power(on=True))
@@ -32,6 +33,7 @@ async def test_a_motion_lasts_as_long_as_it_is_asked_to_and_ends_with_a_ramp():
         assert (reply.duration_s, reply.position) == (pytest.approx(20.5, rel=1e-3), pytest.approx(101.25, rel=1e-3))
 
 
+@pytest.mark.long
 async def test_the_same_motion_sent_again_lasts_from_then_on():
     async with running_machine(machine(axis=LONG)) as rig:
         await rig.client.command("rotor", Power(on=True))

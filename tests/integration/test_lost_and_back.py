@@ -56,6 +56,7 @@ def rows(virtual: VirtualRig, about: str) -> list[tuple[str, str]]:
     return [(row["what"], row["why"]) for row in found if row["what"] in ("link_lost", "link_back")]
 
 
+@pytest.mark.long
 def test_a_module_without_power_is_named_on_every_screen_and_in_the_log(rig, chain):
     rig.wait(rig.rig.client.ask(SetIo(module="cabinet", high=(LOCK,))))
     assert "module" not in rig.run("fleet").printed
@@ -99,6 +100,7 @@ async def _begun(work):
     return asyncio.create_task(work)
 
 
+@pytest.mark.long
 def test_a_line_that_is_lost_and_comes_back_is_in_the_log_with_what_its_axes_were_told(rig):
     rig.wait(rig.rig.client.command("rotor", Power(on=True)))
     rig.wait(rig.rig.client.command("rotor", MoveVelocity(velocity=0.5)))
@@ -115,6 +117,7 @@ def test_a_line_that_is_lost_and_comes_back_is_in_the_log_with_what_its_axes_wer
     assert "halt, its policy of loss.bus" in why
 
 
+@pytest.mark.long
 def test_a_link_that_flaps_fills_no_log_and_what_it_ends_with_is_said(rig, chain):
     for _ in range(40):
         power(rig, chain.modules[CABINET], on=False, then_s=1.0)
@@ -125,6 +128,7 @@ def test_a_link_that_flaps_fills_no_log_and_what_it_ends_with_is_said(rig, chain
     assert [what for what, _ in rows(rig, "cabinet")][-2:] == ["link_lost", "link_back"]
 
 
+@pytest.mark.long
 def test_of_a_loss_that_is_over_every_face_says_what_why_says(rig, chain):
     rig.wait(rig.rig.client.command("rotor", Power(on=True)))
     rig.wait(rig.rig.client.command("rotor", MoveVelocity(velocity=0.5)))
@@ -138,6 +142,7 @@ def test_of_a_loss_that_is_over_every_face_says_what_why_says(rig, chain):
         assert "check its power" not in said.partition("past fault")[0], command
 
 
+@pytest.mark.long
 def test_all_that_does_not_work_is_counted_and_what_has_one_cause_once(rig, chain):
     for module in chain.modules:
         power(rig, module, on=False, then_s=0.0)

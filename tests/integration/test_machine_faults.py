@@ -208,6 +208,7 @@ async def test_a_hanging_load_is_never_said_to_be_held(kind, tmp_path, monkeypat
     assert "when the loop opened" in text
 
 
+@pytest.mark.long
 async def test_a_load_is_measured_on_the_side_to_which_the_axis_may_go(tmp_path):
     text = (
         rig_text()

@@ -322,6 +322,7 @@ async def test_an_axis_that_is_not_powered_says_how_to_power_it():
 
 
 @pytest.mark.parametrize("rate_hz", [1.0, 20.0])
+@pytest.mark.sweep(2)
 async def test_an_axis_without_limits_may_be_moved_faster_than_its_own_velocity(rate_hz):
     config = load_config(SIMULATED)
     x = config.bus[0].axis[0]

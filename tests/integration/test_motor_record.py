@@ -162,6 +162,7 @@ async def test_puts_are_disabled_and_a_stop_is_not():
 
 @pytest.mark.record("STOP", "`allstop` is one for all records of the gateway")
 @pytest.mark.parametrize("refusal", ["disabled", "paused", "beyond"])
+@pytest.mark.sweep(2)
 async def test_a_motion_that_is_refused_ends_with_an_alarm_until_a_put_is_taken(refusal):
     """A client that waits for DMOV alone looks at the alarm of RBV then, and would say that it has arrived."""
     async with records() as (_, made):

@@ -27,6 +27,7 @@ def stops(rig: DialectRig) -> int:
         (MoveRelative(distance=2.0, buffer_mode="aborting"), 12.0),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_an_sc_goes_on_to_the_new_goal_without_a_halt(then, ends_at):
     async with dialect_rig(SC) as rig:
         await rig.power_on()

@@ -51,9 +51,11 @@ def polls(tmp_path):
     return run
 
 
+@pytest.mark.long
 async def test_a_line_that_is_ordered_by_phase_carries_more_than_one_that_is_ordered_by_deadline(polls):
     assert await polls('order = "phase"') > 1.05 * await polls('order = "deadline"')
 
 
+@pytest.mark.long
 async def test_a_line_is_ordered_by_phase_unless_the_file_says_otherwise(polls):
     assert await polls("") > 1.05 * await polls('order = "deadline"')

@@ -235,6 +235,7 @@ async def test_a_move_that_aborts_a_path_begins_where_its_axis_has_come_to_rest(
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("after_s", [0.31, 0.5, 0.97])
+@pytest.mark.sweep(2)
 async def test_the_stop_of_a_path_does_not_stop_the_move_that_has_aborted_it(name, after_s):
     chain = sc_chain()
     async with two_sc(chain) as rig:
@@ -388,6 +389,7 @@ async def test_drives_without_path_mode_refuse():
     ("via", "end", "direction", "ends_at"),
     [(2.0, 9.0, None, 29.0), (2.0, 1.0, None, 31.0), (2.0, 1.0, Direction.POSITIVE, 41.0), (9.5, 0.5, None, 30.5)],
 )
+@pytest.mark.sweep(2)
 async def test_a_turning_axis_goes_the_short_way_from_corner_to_corner_or_as_it_is_asked(via, end, direction, ends_at):
     chain = sc_chain()
     async with two_sc(chain, turning=10.0) as rig:

@@ -255,6 +255,7 @@ async def test_limits_are_those_of_the_plan_at_the_start():
 
 
 @pytest.mark.promise("one-id-one-motion")
+@pytest.mark.long
 async def test_a_replay_after_thousands_of_halts_is_answered_and_moves_nothing():
     async with running_rig(config(authority="open")) as rig:
         await rig.until("x", lambda state: state.link == "up")

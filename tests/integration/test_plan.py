@@ -148,6 +148,7 @@ async def test_no_stop_of_the_running_daemon_waits_longer_than_planned():
         assert 0.7 * planned.stop_s < latency.longest_s <= planned.stop_s
 
 
+@pytest.mark.long
 async def test_probes_measure_the_wait_of_a_stop_on_a_busy_line_and_the_bound_holds():
     document = config(axes=4, position=60.0, velocity=60.0, adc=5.0, state=5.0).model_dump()
     rig_config = RigConfig.model_validate(with_probes(document, 19.0))
@@ -231,6 +232,7 @@ def test_a_smartstep_line_is_let_pass_unless_it_is_told_to_refuse():
     assert require_plan(smartstep("refuse", velocity=hz, state=hz, position=hz / 10)).holds
 
 
+@pytest.mark.long
 async def test_the_load_on_average_is_what_the_wire_shows():
     document = config(axes=4, position=60.0, velocity=60.0, adc=20.0, state=5.0).model_dump()
     document["bus"][0]["order"] = "deadline"  # drives are waited for half a cycle then

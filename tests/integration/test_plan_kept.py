@@ -100,6 +100,7 @@ async def test_31_axes_use_the_line_as_planned_and_no_poll_is_later_than_planned
     assert seen.longest_s > 0.7 * max(poll.response_s for poll in seen.planned.polls)
 
 
+@pytest.mark.long
 async def test_ordered_by_phase_they_use_less_of_it():
     seen = await kept("phase", 2.0)
 

@@ -158,6 +158,7 @@ axis = [{ name = "feed", address = 1, model = "smartstep" }]
 """
 
 
+@pytest.mark.long
 async def test_a_rig_on_serial_lines_is_rehearsed_without_them_and_leaves_nothing_behind(tmp_path):
     file = tmp_path / "rig.toml"
     file.write_text(REAL)

@@ -21,6 +21,7 @@ def kept(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.sweep(2)
 def test_a_capture_brings_back_every_sample_and_event_bit_for_bit_and_again(name):
     capture, published = kept(name)
 
@@ -31,6 +32,7 @@ def test_a_capture_brings_back_every_sample_and_event_bit_for_bit_and_again(name
 
 
 @pytest.mark.parametrize("name", NAMES)
+@pytest.mark.sweep(2)
 def test_what_is_captured_now_can_be_played_back_from_its_text(name):
     recording = record(name)
 

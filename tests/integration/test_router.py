@@ -153,6 +153,7 @@ async def ended(*words: str) -> tuple[int | None, str]:
     return process.returncode, printed.decode()
 
 
+@pytest.mark.long
 async def test_a_daemon_whose_port_is_busy_says_so_and_ends(endpoint: str) -> None:
     async with router(endpoint):
         code, printed = await ended("run", "--config", str(SIMULATED), "--listen", endpoint)

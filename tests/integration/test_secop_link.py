@@ -89,6 +89,7 @@ async def test_a_latch_is_an_error_that_is_cleared_and_limits_are_refused():
         assert link.status()[0] == StatusCode.IDLE
 
 
+@pytest.mark.long
 async def test_control_is_given_back_when_the_axis_idles_and_never_taken_by_force():
     async with linked_x() as (running, link, _):
         await link.go(1.0)

@@ -189,6 +189,7 @@ async def test_a_viewer_who_commands_is_told_that_he_may_not(rig: SecuredRig) ->
             await RigClient(session, "sim").command("x", Power(on=True))
 
 
+@pytest.mark.long
 async def test_events_tell_whose_certificate_a_command_came_with(rig: SecuredRig) -> None:
     settings = ZenohSettings(connect=(rig.endpoint,), mode="client", config_file=rig.folder / "operator.json5")
 

@@ -29,6 +29,7 @@ class TestSegment(AccessFacts):
 
 
 @pytest.mark.parametrize("login", [{"user": "operator", "password": "guessed"}, {"user": "eve", "password": "x"}, None])
+@pytest.mark.sweep(3)
 async def test_a_wrong_password_is_refused_and_says_so(
     rig: SecuredRig, tmp_path_factory: pytest.TempPathFactory, login: dict[str, str] | None
 ) -> None:

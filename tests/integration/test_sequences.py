@@ -136,6 +136,7 @@ def test_a_stop_halts_what_moves_and_a_pause_does_not(when_s):
     assert reports[-1].event == "stopped"
 
 
+@pytest.mark.long
 def test_it_is_typed_and_taught(monkeypatch, tmp_path):
     config = tmp_path / "rig.toml"
     config.write_text(FILE.read_text(encoding="utf-8"), encoding="utf-8")

@@ -43,6 +43,7 @@ def states(here, mill):
 
 
 @pytest.mark.parametrize("line", ["stop", "stop x", "axis stop x"])
+@pytest.mark.sweep(2)
 def test_a_stop_without_a_rig_stops_every_rig_and_says_which_axes_confirmed(two_rigs, line):
     here, mill = two_rigs
 

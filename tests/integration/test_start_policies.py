@@ -449,6 +449,7 @@ async def turn(chain, address):
 
 
 @pytest.mark.parametrize("placed", [1, 2, 3])
+@pytest.mark.sweep(2)
 async def test_a_line_that_a_killed_daemon_has_addressed_in_part_is_taken_over(placed):
     chain = chain_of(*["ls182ap"] * 4)
     axes = [axis | {"model": "ls-182ap"} for axis in simulated_config().model_dump()["bus"][0]["axis"]]

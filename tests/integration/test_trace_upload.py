@@ -15,6 +15,7 @@ def test_on_an_idle_line_the_longest_strings_take_nearly_all_of_the_time():
 
 
 @pytest.mark.parametrize("string_bytes", [AS_A_RULE_BYTES, 40])
+@pytest.mark.sweep(2)
 def test_on_an_idle_line_nothing_but_the_silence_before_each_command_comes_between_two_strings(string_bytes):
     strings = MEMORIES * READINGS * LONGEST_STRING_BYTES // string_bytes
     took_s = limit_s(string_bytes) / share_of_limit(string_bytes)

@@ -67,6 +67,7 @@ async def at_speed(rig: DialectRig, place_mm: float) -> None:
     ],
     ids=lambda request_: f"{request_.verb.value}",
 )
+@pytest.mark.sweep(7)
 async def test_a_motion_that_could_not_turn_before_the_limit_begins_from_rest(dialect: Dialect, request_):
     async with dialect_rig(dialect, WIDE, limits=LIMITS) as rig:
         await at_speed(rig, 20.0)
@@ -98,6 +99,7 @@ async def test_a_jog_that_could_not_turn_before_the_limit_comes_to_rest_first(di
 
 @dialects
 @pytest.mark.parametrize(("acceleration", "velocity"), [(100.0, -1.0), (100.0, -10.0), (400.0, -5.0), (50.0, 5.0)])
+@pytest.mark.sweep(2)
 async def test_a_motion_that_turns_on_its_way_has_its_velocity_for_as_long_as_was_asked_for(
     dialect: Dialect, acceleration, velocity
 ):
@@ -168,6 +170,7 @@ async def test_a_jog_that_is_held_keeps_to_limits_that_a_reload_has_narrowed(dia
 
 
 @pytest.mark.parametrize("seed", [216, 275, 285, 0, *(each for each in SOAK if each.values[0] not in (216, 275, 285))])
+@pytest.mark.sweep(4)
 async def test_packets_that_come_late_lead_no_motion_out_of_the_limits(seed: int):
     """What is repeated takes longer than an axis may go on before it must slow down."""
     dice = random.Random(seed)

@@ -143,6 +143,7 @@ async def in_trouble():
         return state, await read_state(twin.client.client), str(twin.timeline).splitlines()
 
 
+@pytest.mark.long
 def test_a_twin_begins_with_error_stop_and_alarms_and_nothing_is_commanded_for_it():
     real, twin, events = run(in_trouble())
     assert real.states["x"].state == twin.states["x"].state == "error_stop"

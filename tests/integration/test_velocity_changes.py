@@ -25,6 +25,7 @@ async def speed(rig: DialectRig) -> float:
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_a_jog_gets_faster_slower_and_turns_round_without_a_stop_in_between(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()

@@ -157,6 +157,7 @@ async def command_line(endpoint: str, *arguments: str) -> str:
     return printed.decode()
 
 
+@pytest.mark.long
 async def test_published_samples_count_up_and_bear_the_instant_of_measurement(served):
     with connect(served) as session:
         received = session.declare_subscriber("ldcn/sim/tele/x/position", zenoh.handlers.FifoChannel(100))

@@ -209,6 +209,7 @@ def test_a_latch_outranks_everything_and_only_a_reset_ends_it(history):
             assert all(refused(after, verb) for verb in (Verb.MOVE_ABSOLUTE, Verb.JOG, Verb.POWER))
 
 
+@pytest.mark.sweep(2)
 def test_a_stop_stays_to_be_sent_until_its_drive_confirms_one_as_strong(history):
     for before, event, after in lives(history):
         if before.stop and not isinstance(event, events.StopConfirmed):
@@ -230,6 +231,7 @@ def test_each_command_that_has_begun_ends_once(history):
     assert list(dict.fromkeys(over + under_way)) == list(dict.fromkeys(history.begun))
 
 
+@pytest.mark.sweep(2)
 def test_what_is_not_seen_is_not_said_to_stand(history):
     for _, event, after in lives(history):
         if after.link is not LinkState.UP:
@@ -241,6 +243,7 @@ def test_what_is_not_seen_is_not_said_to_stand(history):
             assert after.command is None or after.state not in MOTION_STATES
 
 
+@pytest.mark.sweep(2)
 def test_a_place_is_known_only_as_long_as_nothing_may_have_changed_the_counter(history):
     for before, event, after in lives(history):
         if isinstance(event, events.DriveLost | events.ReadingsContradicted):
@@ -256,6 +259,7 @@ def test_a_place_is_known_only_as_long_as_nothing_may_have_changed_the_counter(h
             assert isinstance(event, events.PlaceKnown)
 
 
+@pytest.mark.sweep(2)
 def test_an_axis_falls_into_error_stop_without_its_command(history):
     for before, event, after in lives(history):
         if after.state is AxisState.ERROR_STOP and before.state is not AxisState.ERROR_STOP:
@@ -275,6 +279,7 @@ def test_an_axis_in_error_takes_no_command_before_its_reset(history):
             assert all(refused(after, verb) for verb in moving)
 
 
+@pytest.mark.sweep(2)
 def test_only_a_reset_leads_out_of_error_stop(history):
     for before, event, after in lives(history):
         if before.state is AxisState.ERROR_STOP and not isinstance(event, events.CommandBegun):  # none is let through
@@ -291,6 +296,7 @@ def test_a_fault_keeps_its_instant_and_the_first_stays_until_reset(history):
         assert [entry for entry in new_faults(before, after) if entry.code in stood] == []
 
 
+@pytest.mark.sweep(2)
 def test_a_reading_of_before_the_latest_command_ends_nothing(history):
     for before, event, after in lives(history):
         if isinstance(event, events.ReadingTaken) and event.sent_at_s < before.effective_from_s:

@@ -352,6 +352,7 @@ def cut_short(seeds: range) -> list[str]:
 
 
 @pytest.mark.promise("address-only-of-its-place")
+@pytest.mark.long
 def test_a_line_whose_bring_up_was_cut_short_is_taken_over_or_says_what_to_do() -> None:
     assert cut_short(range(15)) == []
 

@@ -81,6 +81,7 @@ def test_the_wheel_has_the_pages_and_no_tests(twice: list[dict[str, Path]]) -> N
     assert set(re.findall(r"(?m)^Provides-Extra: (\S+)", metadata)) >= RUNTIME_EXTRAS
 
 
+@pytest.mark.long
 def test_the_sdist_has_what_building_testing_and_reading_takes(twice: list[dict[str, Path]]) -> None:
     with tarfile.open(twice[0]["sdist"]) as sdist:
         names = {name.partition("/")[2] for name in sdist.getnames()}

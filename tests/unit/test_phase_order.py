@@ -115,6 +115,7 @@ def test_a_host_that_keeps_missing_cycles_keeps_time_in_hand():
     assert 0.00005 < order.guard_s < MOST_GUARD * CYCLE_S
 
 
+@pytest.mark.long
 async def test_a_saturated_line_of_31_drives_carries_an_eighth_more_and_nobody_waits_two_rounds():
     by_deadline = await saturated(31, 1.5, by_phase=False)
     by_phase = await saturated(31, 1.5, by_phase=True)
@@ -135,6 +136,7 @@ async def test_it_still_pays_on_a_host_that_is_late():
     assert by_phase.longest_gap <= 2.0
 
 
+@pytest.mark.long
 async def test_it_does_no_harm_where_nothing_can_be_predicted():
     late_s = (0.000_1, 0.001)
 

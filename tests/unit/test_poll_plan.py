@@ -118,6 +118,7 @@ def test_demand_and_response_times_agree_on_what_fits(seed):
 
 
 @pytest.mark.parametrize("seed", range(12))
+@pytest.mark.sweep(2)
 def test_no_poll_is_ever_later_than_its_bound(seed):
     dice = random.Random(seed)
     tasks = []

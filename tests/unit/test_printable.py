@@ -46,6 +46,7 @@ def test_what_is_harmless_stays_as_it_is(text: str):
 
 
 @pytest.mark.parametrize("escaped", [True, False])
+@pytest.mark.sweep(2)
 def test_each_such_character_is_found_in_a_request_however_it_is_spelled(*, escaped: bool):
     unfit = [chr(code) for code in range(0x110000) if not is_printable(chr(code))]
 

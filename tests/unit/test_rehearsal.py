@@ -35,6 +35,7 @@ def test_where_the_cycles_lie_matters_little(rate_hz: float):
     assert max(lengths_s) < 1.06 * min(lengths_s)
 
 
+@pytest.mark.long
 async def test_a_line_that_polls_all_the_time_is_as_quick_as_one_that_is_simulated_byte_by_byte():
     simulated = await saturated(31, 3.0, by_phase=True)
     drive = PolledDrive(2000.0, replace(COST, overhead_s=0.0))

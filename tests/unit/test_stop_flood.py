@@ -161,6 +161,7 @@ async def test_who_has_stopped_is_entered_once_the_drives_have_confirmed_it():
     flood.dispatcher.stopped.assert_called_once_with(("x",), ("x",), Stop(), None)
 
 
+@pytest.mark.long
 async def test_a_stop_that_cannot_be_recorded_is_sent_all_the_same():
     rig = SlowRig()
     rig.wire_log.add.side_effect = OSError("no room")
