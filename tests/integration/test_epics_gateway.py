@@ -27,7 +27,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.meta import AxisLimits
-from ldcnd.contract.samples import LinkState, Moving
+from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.lab.epics.gateway import gateway
 from ldcnd.testing.memory_session import MemoryBroker
@@ -458,7 +458,26 @@ async def test_a_daemon_that_says_nothing_leaves_no_axis_that_has_arrived():
         await shows(made, "T:x.SEVR", "INVALID")
 
         assert made.variables["T:x.DMOV"].value == 0
-        assert made.variables["T:x.RBV"].severity == AlarmSeverity.INVALID_ALARM
+        of_record = {name: field.severity for name, field in made.variables.items() if name.startswith("T:x.")}
+        assert {name for name, severity in of_record.items() if severity != AlarmSeverity.INVALID_ALARM} == set()
+
+
+@pytest.mark.record("SEVR", "a client may ask any field for it")
+async def test_every_field_of_a_record_carries_its_alarm_from_before_the_first_sample_on():
+    async with records() as (running, made):
+        severities = {"T:x.VAL": [], "T:x.VELO": [], "T:x.DMOV": []}
+        for name, seen in severities.items():
+            field = made.variables[name]
+            field.followers.append(lambda seen=seen, field=field: seen.append(field.severity))
+        await running.client.stop()
+        await shows(made, "T:x.SEVR", "MINOR")
+        while any(AlarmSeverity.MINOR_ALARM not in seen for seen in severities.values()):
+            await asyncio.sleep(0.01)
+        await running.until("x", lambda state: state.stop_latched and state.state is not AxisState.STOPPING)
+        await put(made, "T:x:reset", 1)
+        await shows(made, "T:x.SEVR", "NO_ALARM")
+
+        assert {made.variables[name].severity for name in severities} == {AlarmSeverity.NO_ALARM}
 
 
 @pytest.mark.long

@@ -14,6 +14,7 @@ from caproto import (
     AccessRights,
     AlarmSeverity,
     AlarmStatus,
+    ChannelAlarm,
     ChannelChar,
     ChannelData,
     ChannelDouble,
@@ -74,6 +75,8 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
         action: what a put does; None when it is refused.
         explain: told why a put has no value that the channel can have.
         followers: called after each change, for those who serve the channel by another protocol.
+        of_record: the alarm of the record of which it is a field, which a client may ask any of them for: it has no
+            lower one (dbGet of EPICS base, options DBR_STATUS).
     """
 
     action: Action | None = None
@@ -82,6 +85,7 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
     def __init__(self, **given: Any) -> None:  # noqa: ANN401
         super().__init__(**given)
         self.followers: list[Callable[[], None]] = []
+        self.of_record = self._own = NO_ALARM
 
     def get_field(self, name: str) -> "RecordField":
         """Return the channel for what a client names behind a dot: a variable beside a record has only its value."""
@@ -124,14 +128,26 @@ class RecordField(ChannelData):  # type: ignore[misc] # caproto has no types
             alarm: what it is worth.
             at_s: when it was true, in seconds since 1970; now when missing.
         """
+        self._own = alarm
+        alarm = max(alarm, self.of_record, key=lambda each: each.severity)
         if at_s is None and (value, alarm) == (self.value, RecordAlarm(self.status, self.severity)):
             return
         stamp = {} if at_s is None else {"timestamp": at_s}
         await super().write(value, verify_value=False, status=alarm.status, severity=alarm.severity, **stamp)
 
+    async def take_alarm(self, alarm: RecordAlarm) -> None:
+        """Publish the value again with the alarm that its record has now."""
+        self.of_record = alarm
+        await self.show(self.value, self._own)
+
     def begin(self, value: Value) -> None:
         """Take the first value, before there are clients."""
         self._data["value"] = value
+
+    def begin_in_alarm(self, alarm: RecordAlarm) -> None:
+        """Take the alarm of a record of which nothing is known yet, before there are clients."""
+        self.of_record = alarm
+        self.alarm = ChannelAlarm(status=alarm.status, severity=alarm.severity)
 
     def native(self, value: Any) -> Value:  # noqa: ANN401
         """Return a value as this channel has it."""

@@ -131,6 +131,9 @@ class MotorRecord:
                 self[name].convert = partial(self._typed, dimension)
         for name, value in {**self._described(), **self._speeds(), "UDF": 1}.items():
             self[name].begin(value)
+        self._of_record = tuple({id(field): field for field in record.values()}.values())
+        for field in self._of_record:
+            field.begin_in_alarm(SILENT)
         self._set_metadata()
 
     def _variables_beside(self, target: RecordField) -> dict[str, RecordField]:
@@ -285,9 +288,8 @@ class MotorRecord:
         match sample:
             case PositionSample():
                 await self._define()
-                worst = max(alarm, self._alarm, key=lambda each: each.severity)
-                await self["RBV"].show(sample.value, worst, at_s)
-                await self["RRBV"].show(sample.counts, worst, at_s)
+                await self["RBV"].show(sample.value, alarm, at_s)
+                await self["RRBV"].show(sample.counts, alarm, at_s)
                 self._measured = sample.t
                 await self.show_target()
             case VelocitySample():
@@ -314,10 +316,10 @@ class MotorRecord:
                     )
 
     async def _define(self) -> None:
-        """Take note that a position is known; the alarm of the record is shown with it."""
+        """Take note that a position is known."""
         if self["UDF"].value:
             await self["UDF"].show(0)
-            self._alarm = self.alarm()
+            await self.show_alarm()
             await self.show_motion()
 
     def target(self, state: StateSample) -> float:
@@ -351,11 +353,14 @@ class MotorRecord:
         return SILENT if self.moving is Moving.UNKNOWN or self["UDF"].value else ALARMS[self.condition.alarm]
 
     async def show_alarm(self) -> None:
-        """Show the alarm of the record on its position: no sample may come that would carry it."""
-        before, self._alarm = self._alarm, self.alarm()
-        if self._alarm != before:
-            for field in ("RBV", "RRBV"):
-                await self[field].show(self[field].value, self._alarm)
+        """Show the alarm of the record on each of its fields."""
+        await self._take_alarm(self.alarm())
+
+    async def _take_alarm(self, alarm: RecordAlarm) -> None:
+        if alarm != self._alarm:
+            self._alarm = alarm
+            for field in self._of_record:
+                await field.take_alarm(alarm)
 
     async def _take_inputs(self, sample: InputsSample, alarm: RecordAlarm, at_s: float) -> None:
         """Show inputs, and the switches at both ends of the axis; a drive may not show them for a while."""
@@ -375,10 +380,10 @@ class MotorRecord:
 
     async def grow_old(self) -> None:
         """Show that nothing newer is known of the axis: its drive, its line or its daemon is silent."""
-        self.moving, self._alarm = Moving.UNKNOWN, SILENT
+        self.moving = Moving.UNKNOWN
+        await self._take_alarm(SILENT)
         self.condition = assess(self.state, self._faults, age_s=math.inf)
         await self._show_condition()
-        await self["RBV"].show(self["RBV"].value, SILENT)
         await self.show_motion()
 
     async def _show_condition(self) -> None:
