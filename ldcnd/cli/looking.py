@@ -14,7 +14,7 @@ from ldcnd.cli.names import typed
 from ldcnd.cli.quantities import decimals, sample_text
 from ldcnd.cli.typed import Finite, WholeNumber, axis_of, check_there
 from ldcnd.client.fleet import AxisReport, RigReport, survey
-from ldcnd.client.overview import AxisNow, AxisSeen, modules_now, overview, seen_of
+from ldcnd.client.overview import AxisNow, AxisSeen, modules_now, overview
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
 from ldcnd.contract.commands import Why, WhyReply
@@ -29,6 +29,7 @@ from ldcnd.contract.samples import (
     FaultSample,
     MonitorName,
     MonitorSample,
+    Moving,
     PositionSample,
     Sample,
     StateSample,
@@ -74,7 +75,7 @@ def axes_table(axes: list[AxisNow]) -> list[str]:
             f"{now.info.bus}/{now.info.address}",
             now.condition.position(_digits(now), now.info.unit, now.age_s),
             now.condition.state,
-            f"moving {row(now).moving}",
+            f"moving {_motion(now.seen)}",
             f"link {now.state.link if now.state else 'unknown'}",
             ", ".join(now.condition.notes),
         )
@@ -82,6 +83,14 @@ def axes_table(axes: list[AxisNow]) -> list[str]:
     ]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     return ["  ".join(map(str.ljust, each, widths)).rstrip() for each in cells]
+
+
+def _motion(seen: AxisSeen) -> str:
+    """Return whether an axis moves, and how fast and for how long if it does."""
+    if seen.moving is not Moving.YES:
+        return seen.moving.value
+    rest = "" if seen.rest_s is None else f"for another {seen.rest_s:.1f} s"
+    return " ".join(filter(None, (seen.moving.value, seen.shown_velocity, rest)))
 
 
 def _digits(now: AxisNow) -> str | None:
@@ -93,7 +102,7 @@ def row(now: AxisNow) -> AxisRow:
     state = now.state
     return AxisRow(
         **now.info.model_dump(),
-        **dict(seen_of(state, now.position, now.age_s, now.condition)),
+        **dict(now.seen),
         referenced=state is not None and state.referenced and now.condition.live,
     )
 

@@ -160,7 +160,7 @@ def list_holders(target: Target) -> None:
 
 @lease.command(context_settings={"allow_interspersed_args": False})
 @click.option("--axis", "axes", type=AXIS, multiple=True, help="This axis; may be repeated. All axes when missing.")
-@click.option("--name", default=NAME, show_default=True, help="Who holds it, for people.")
+@click.option("--name", default=NAME, show_default="you", help="Who holds it, for people.")
 @click.option(
     "--seconds",
     "lease_s",

@@ -1,6 +1,7 @@
 """How commands reach axes: checked names, one lease, the reply in units, and a wait whose end halts what was begun."""
 
 import asyncio
+import getpass
 import sys
 from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, nullcontext, suppress
@@ -20,7 +21,7 @@ from ldcnd.cli.quantities import number, outcome, sample_text, values_of
 from ldcnd.cli.typed import Finite, Quantity, WholeNumber, axis_of, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.commands import About, AxisCommand, Command, CommandReply, Halt, PreviewReply, Verb
+from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, PreviewReply, Verb
 from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, step
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.frozen import Frozen, attribute_docstrings
@@ -29,8 +30,18 @@ from ldcnd.contract.samples import PositionSample, Sample, StateSample, Telemetr
 from ldcnd.contract.units import DIMENSIONS
 
 HALT_TIME_S = 3.0
-NAME = "ldcnd"
-"""Under this name the command line is found in events unless a lease says another."""
+
+
+def _name() -> str:
+    try:
+        person = getpass.getuser()
+    except (KeyError, OSError):  # of a process whose user has no account
+        return "ldcnd"
+    return f"{person} (ldcnd)"[:LONGEST_NAME]
+
+
+NAME = _name()
+"""Under this name the command line is found in events unless a lease says another: who was it, is asked later."""
 
 NOTHING: Mapping[str, object] = MappingProxyType({})
 

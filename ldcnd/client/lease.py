@@ -9,7 +9,7 @@ from itertools import count
 from typing import TypeVar
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.commands import AxisCommand, CommandReply
+from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, CommandReply
 from ldcnd.contract.errors import LdcndError, LeaseExpired, LeaseUnknown, OutcomeUnknown, Remedy, SessionError, step
 from ldcnd.contract.leases import Acquire, LeaseReply, Release, Renew
 
@@ -21,8 +21,6 @@ RENEWALS_PER_LEASE = 4
 LEASE_VARIABLE = "LDCND_LEASE"
 """Variable of the environment in which `ldcnd lease hold` gives its lease to the program that it runs."""
 ACQUIRE_AGAIN = Remedy("{}", step("acquire", "acquire it again"))
-LONGEST_NAME = 64
-"""Longest name of a client, characters."""
 
 
 def inherited_lease() -> str | None:

@@ -11,7 +11,17 @@ from ldcnd.contract.condition import Condition, Place, assess, assess_module
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import AxisState, FaultSample, LinkState, Moving, PositionSample, Quality, StateSample
+from ldcnd.contract.samples import (
+    AxisState,
+    FaultSample,
+    LinkState,
+    Moving,
+    PositionSample,
+    Quality,
+    StateSample,
+    VelocitySample,
+)
+from ldcnd.contract.units import Dimension, quantity_text
 from ldcnd.net.session import Publication, SampleKind
 
 
@@ -62,24 +72,14 @@ class AxisSeen(Frozen):
     """Whether the drive answers."""
     moving: Moving
     """Whether it moves; unknown is an answer of its own and never means no."""
+    velocity: float | None
+    """How fast, in axis units a second; null where that is not known."""
+    shown_velocity: str
+    """The same in the unit that is configured for velocities; empty where that is not known."""
+    rest_s: float | None
+    """After how long the motion under way should have run its course, seconds; null where it has no such end."""
     condition: tuple[str, ...]
     """Everything that is to be said of it, in a few words each, the worst first."""
-
-
-def seen_of(
-    state: StateSample | None, position: PositionSample | None, age_s: float | None, condition: Condition
-) -> AxisSeen:
-    """Return how an axis is by its last samples, the age of its position in seconds, and its condition."""
-    return AxisSeen(
-        position=position.value if position else None,
-        quality=position.quality if position else None,
-        age_s=age_s,
-        place=condition.place,
-        state=state.state if state else None,
-        link=state.link if state else None,
-        moving=state.moving if state and condition.live else Moving.UNKNOWN,
-        condition=condition.notes,
-    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +90,9 @@ class AxisNow:
         info: its description.
         state: None before the first.
         position: None before the first.
+        velocity: None before the first.
         age_s: age of the position by the daemon's own clock, seconds; None without one.
+        rest_s: after how long the motion under way should have run its course, seconds; None without such an end.
         health: its last report; None before the first.
         condition: whether its place is known, and all that is to be said of it.
     """
@@ -98,9 +100,66 @@ class AxisNow:
     info: AxisInfo
     state: StateSample | None
     position: PositionSample | None
+    velocity: VelocitySample | None
     age_s: float | None
+    rest_s: float | None
     health: AxisHealth | None
     condition: Condition
+
+    @property
+    def seen(self) -> AxisSeen:
+        """The same in values."""
+        state, position, velocity, is_live = self.state, self.position, self.velocity, self.condition.live
+        return AxisSeen(
+            position=position.value if position else None,
+            quality=position.quality if position else None,
+            age_s=self.age_s,
+            place=self.condition.place,
+            state=state.state if state else None,
+            link=state.link if state else None,
+            moving=state.moving if state and is_live else Moving.UNKNOWN,
+            velocity=velocity.value if velocity and is_live else None,
+            shown_velocity=quantity_text(velocity.value, self.info, Dimension.VELOCITY) if velocity and is_live else "",
+            rest_s=self.rest_s if is_live else None,
+            condition=self.condition.notes,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LastOfAxis:
+    """The last sample of each item of an axis; None before the first."""
+
+    state: StateSample | None
+    fault: FaultSample | None
+    position: PositionSample | None
+    velocity: VelocitySample | None
+
+
+def axis_now(
+    info: AxisInfo, last: LastOfAxis, line: BusHealth | None, age_s: Callable[[int], float], silence: str = ""
+) -> AxisNow:
+    """Return how an axis is.
+
+    Args:
+        info: its description.
+        last: its last samples.
+        line: the last report about its line; None before the first.
+        age_s: tells how old an instant of its daemon is, UTC in ns since 1970.
+        silence: why nothing comes from its daemon; empty while it reports.
+    """
+    health = next((each for each in line.axes if each.axis == info.axis), None) if line else None
+    age = age_s(last.position.t) if last.position else None
+    ends = last.state.command.expected_end if last.state and last.state.command else None
+    return AxisNow(
+        info,
+        last.state,
+        last.position,
+        last.velocity,
+        age,
+        max(0.0, -age_s(ends)) if ends else None,
+        health,
+        assess(last.state, last.fault, health, age_s=age, line_up=line.up if line else None, silence=silence),
+    )
 
 
 async def modules_now(client: RigClient) -> dict[str, tuple[str, Condition]]:
@@ -119,7 +178,7 @@ async def overview(client: RigClient) -> list[AxisNow]:
         SessionError: no daemon answers.
     """
     axes, states, positions = await client.axes(), await client.states(), await client.positions()
-    faults, report = await client.faults(), await last_health(client)
+    velocities, faults, report = await client.velocities(), await client.faults(), await last_health(client)
     lines = {line.bus: line for line in await last_bus_health(client)}
     clock = DaemonClock()
     stamps = [sample.t for samples in (states, positions) for sample in samples.values()]
@@ -127,10 +186,7 @@ async def overview(client: RigClient) -> list[AxisNow]:
         clock.note(t, 0.0)
     found = []
     for info in axes:
-        line, state, position = lines.get(info.bus), states.get(info.axis), positions.get(info.axis)
-        health = next((each for each in line.axes if each.axis == info.axis), None) if line else None
-        age_s = clock.age_s(position.t, 0.0) if position else None
-        fault: FaultSample | None = faults.get(info.axis)
-        condition = assess(state, fault, health, age_s=age_s, line_up=line.up if line else None)
-        found.append(AxisNow(info, state, position, age_s, health, condition))
+        name = info.axis
+        last = LastOfAxis(states.get(name), faults.get(name), positions.get(name), velocities.get(name))
+        found.append(axis_now(info, last, lines.get(info.bus), lambda t: clock.age_s(t, 0.0)))
     return found

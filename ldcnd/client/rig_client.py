@@ -23,6 +23,7 @@ from ldcnd.contract.samples import (
     PositionSample,
     StateSample,
     TelemetryItem,
+    VelocitySample,
     sample_model,
 )
 from ldcnd.contract.samples import Sample as Measurement
@@ -214,6 +215,10 @@ class RigClient:
     async def positions(self) -> dict[str, PositionSample]:
         """Return the last position of every axis that has one."""
         return await self._of_all_axes(TelemetryItem.POSITION, PositionSample)
+
+    async def velocities(self) -> dict[str, VelocitySample]:
+        """Return the last velocity of every axis that has one."""
+        return await self._of_all_axes(TelemetryItem.VELOCITY, VelocitySample)
 
     async def faults(self) -> dict[str, FaultSample]:
         """Return what is wrong with every axis that has published enough to tell."""

@@ -43,7 +43,11 @@ def caget(record: str) -> None:
     assert len(message) > 40
     assert epics.PV(f"{record}:message").get(as_string=True, timeout=LONGEST_S) == message
     assert epics.caget(f"{record}.NAME$", as_string=True) == record == epics.caget(f"{record}.NAME")
+    assert epics.caget(f"{record}.STAT", as_string=True) == "STATE"  # the motion that was put last was refused
+    assert epics.PV(f"{record}.VELO").get_with_metadata(timeout=LONGEST_S)["severity"] == 1
+    assert epics.caput(record, 2.0, wait=True, timeout=LONGEST_S) == 1
     assert epics.caget(f"{record}.STAT", as_string=True) == "NO_ALARM"
+    assert epics.PV(f"{record}.VELO").get_with_metadata(timeout=LONGEST_S)["severity"] == 0
     assert epics.caget(f"{record}_able.VAL") == 0
     assert [epics.caget(f"{record}-Err"), epics.caget(f"{record}-MsgTxt", as_string=True)] == [0, ""]
     assert len(seen) > 3

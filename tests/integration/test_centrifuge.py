@@ -1,6 +1,8 @@
 """The centrifuge of `config/centrifuge.toml` cannot be operated against its rules; each row of them is needed."""
 
 import asyncio
+import getpass
+import json
 import re
 from collections.abc import Callable
 from contextlib import suppress
@@ -403,8 +405,26 @@ def test_the_command_line_shows_who_wrote_outputs(monkeypatch):
         shown = machine.run("log").printed
 
     assert codes == [0, 0, 2]
-    assert "cabinet  set_io           done       by ldcnd" in shown
+    assert f"cabinet  set_io           done       by {getpass.getuser()} (ldcnd)" in shown
     assert "unlock high, door_ajar input" in shown or "unlock high, line 12 input" in shown
+
+
+def test_list_says_how_fast_a_rotor_turns_in_its_unit_and_for_how_long(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        machine.wait(asyncio.sleep(1))
+        for each in ("power on rotor", "home rotor --wait", "move rotor 300 --at-velocity --for 30"):
+            assert machine.run(each).code == 0
+        machine.wait(asyncio.sleep(10))
+        text = machine.run("list").printed
+        seen = json.loads(machine.run("list --json").printed)
+        machine.run("halt rotor --wait")
+        at_rest = json.loads(machine.run("list --json").printed)
+
+    speed, rest = re.search(r"moving yes (\S+) rpm \(.+ g\) for another (\S+) s", text).groups()
+    assert (float(speed), float(rest)) == (pytest.approx(300, abs=16), pytest.approx(seen["rest_s"], abs=1))
+    assert 20 < seen["rest_s"] < 35
+    assert seen["velocity"] == pytest.approx(5, abs=0.3)
+    assert (at_rest["moving"], at_rest["rest_s"], abs(at_rest["velocity"]) < 0.5) == ("no", None, True)
 
 
 def test_an_override_is_shown_by_list_and_why_with_its_rule_its_client_and_its_end(monkeypatch):

@@ -178,7 +178,7 @@ def published(at: Known) -> list[Publication]:
 def axis_now(at: Known) -> AxisNow:
     health = at.line.axes[0]
     condition = assess(at.state, at.faults, health, age_s=at.case.age_s, line_up=at.case.line_up)
-    return AxisNow(INFO, at.state, at.position, at.case.age_s, health, condition)
+    return AxisNow(INFO, at.state, at.position, None, at.case.age_s, None, health, condition)
 
 
 def axis_list(at: Known) -> str:

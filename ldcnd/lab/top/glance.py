@@ -22,17 +22,13 @@ class AxisGlance(Glance, AxisSeen):
     bus: str
     """The line it is on."""
     unit: str
-    """Unit of position and target; velocity is a second of it."""
+    """Unit of position and target."""
     cause: str
     """What several axes have in common that is wrong, such as their line; empty where the trouble is its own."""
     shown_position: str
     """The position in words: in brackets and with its mark where it does not say where the axis is."""
     shown_state: str
     """The state in words."""
-    velocity: float | None
-    """How fast it moves."""
-    shown_velocity: str
-    """The same in the unit that is configured for velocities; empty while it is not known."""
     target: float | None
     """Where its command ends."""
     adc_volts: float | None

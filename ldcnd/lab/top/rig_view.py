@@ -8,7 +8,7 @@ from typing import TypeVar
 
 from ldcnd.client.daemon_clock import DaemonClock
 from ldcnd.client.network import Publication, SampleKind
-from ldcnd.client.overview import seen_of
+from ldcnd.client.overview import LastOfAxis, axis_now
 from ldcnd.contract.codec import decode_received
 from ldcnd.contract.condition import (
     SHARED,
@@ -16,7 +16,6 @@ from ldcnd.contract.condition import (
     Severity,
     Trouble,
     TroubleKind,
-    assess,
     assess_module,
     line_troubles,
 )
@@ -32,7 +31,6 @@ from ldcnd.contract.samples import (
     TelemetryItem,
     VelocitySample,
 )
-from ldcnd.contract.units import Dimension, quantity_text
 from ldcnd.lab.top.glance import AxisGlance, BusGlance, ModuleGlance, RigGlance
 
 ModelT = TypeVar("ModelT", bound=Frozen)
@@ -131,26 +129,26 @@ class RigView:
         return "" if self._description else "waiting for the daemon"
 
     def _axis(self, info: AxisInfo, line: BusHealth | None, now_s: float, silent: str) -> AxisGlance:
-        position = self._latest(self._keys.telemetry(info.axis, TelemetryItem.POSITION), PositionSample)
-        velocity = self._latest(self._keys.telemetry(info.axis, TelemetryItem.VELOCITY), VelocitySample)
-        adc = self._latest(self._keys.telemetry(info.axis, TelemetryItem.ADC), AdcSample)
-        fault = self._latest(self._keys.telemetry(info.axis, TelemetryItem.FAULT), FaultSample)
-        state = self._latest(self._keys.telemetry(info.axis, TelemetryItem.STATE), StateSample)
-        health = next((axis for axis in line.axes if axis.axis == info.axis), None) if line else None
-        age_s = self._clock.age_s(position.t, now_s) if position else None
-        condition = assess(state, fault, health, age_s=age_s, line_up=line.up if line else None, silence=silent)
+        keys, axis = self._keys, info.axis
+        adc = self._latest(keys.telemetry(axis, TelemetryItem.ADC), AdcSample)
+        last = LastOfAxis(
+            self._latest(keys.telemetry(axis, TelemetryItem.STATE), StateSample),
+            self._latest(keys.telemetry(axis, TelemetryItem.FAULT), FaultSample),
+            self._latest(keys.telemetry(axis, TelemetryItem.POSITION), PositionSample),
+            self._latest(keys.telemetry(axis, TelemetryItem.VELOCITY), VelocitySample),
+        )
+        now = axis_now(info, last, line, lambda t: self._clock.age_s(t, now_s), silent)
+        state, position, health, condition = now.state, now.position, now.health, now.condition
         worst = next(iter(condition.troubles), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(
             axis=info.axis,
             bus=info.bus,
             unit=info.unit,
-            **dict(seen_of(state, position, age_s, condition)),
+            **dict(now.seen),
             cause=cause_of(worst, info.bus),
-            shown_position=condition.position(f"{position.value:.3f}" if position else None, info.unit, age_s),
+            shown_position=condition.position(f"{position.value:.3f}" if position else None, info.unit, now.age_s),
             shown_state=condition.summary,
-            velocity=velocity.value if velocity else None,
-            shown_velocity=quantity_text(velocity.value, info, Dimension.VELOCITY) if velocity else "",
             target=state.command.target if state and state.command else None,
             adc_volts=adc.volts if adc else None,
             rate_hz=health.rate_hz if health else None,
