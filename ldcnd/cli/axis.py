@@ -275,7 +275,7 @@ def at(target: Target, axis: str, instant: str | None, ago_s: float | None) -> N
 
 
 home = derived("home", Home, moves=True)
-halt = derived("halt", Halt)
+halt = derived("halt", Halt, rests=True)
 
 
 HOMES = {
@@ -295,7 +295,7 @@ for each in (
     at,
     halt,
     home,
-    derived("quick-stop", QuickStop),
+    derived("quick-stop", QuickStop, rests=True),
     derived("set-position", SetPosition, "position"),
     derived("gains", SetGains),
     derived("probe", Probe, moves=True),

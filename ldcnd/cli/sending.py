@@ -88,11 +88,11 @@ class Sender:
 
         Ctrl-C, SIGTERM and the end of the terminal halt an axis that is waited for, unless it is to be left running.
         """
+        if command.takes_energy_out:
+            self.send_to_all((axis,), command, "done" if wait else "accepted", wait=wait)
+            return
         if wait:
             end_as_interrupted()
-        elif command.takes_energy_out:
-            self.send_to_all((axis,), command, "accepted")
-            return
 
         async def work(client: RigClient) -> tuple[StateSample, str, Sample | None] | None:
             info = await axis_of(client, axis)
@@ -128,8 +128,10 @@ class Sender:
         if state.last_error is not None:
             sys.exit(FAILED)
 
-    def send_to_all(self, axes: Sequence[str], command: Sent, said: str = "done") -> None:
+    def send_to_all(self, axes: Sequence[str], command: Sent, said: str = "done", *, wait: bool = False) -> None:
         """Send one command to several axes, all that take it when none is named; tell how it went with each.
+
+        With `wait` return when it has ended everywhere.
 
         What takes energy out goes to every rig that can be reached unless one is named: it asks no question first.
         """
@@ -143,7 +145,9 @@ class Sender:
                 await axis_of(client, axis)
             wanted = axes or [info.axis for info in known]
             async with asyncio.TaskGroup() as group:
-                tasks = [group.create_task(self._outcome(client, axis, command), name=axis) for axis in wanted]
+                tasks = [
+                    group.create_task(self._outcome(client, axis, command, wait=wait), name=axis) for axis in wanted
+                ]
             return [task.result() for task in tasks]
 
         if not command.takes_energy_out:
@@ -171,11 +175,14 @@ class Sender:
         named = command.model_copy(update={"lease": self.lease, "client": None if self.lease else NAME})
         return await client.command(axis, named)
 
-    async def _outcome(self, client: RigClient, axis: str, command: Sent) -> CommandReply | LdcndError:
+    async def _outcome(self, client: RigClient, axis: str, command: Sent, *, wait: bool) -> CommandReply | LdcndError:
         try:
-            return await self.command(client, axis, command)
+            reply = await self.command(client, axis, command)
+            if wait:
+                await client.wait_for_end(axis, reply.command_id)
         except LdcndError as error:
             return error
+        return reply
 
 
 @asynccontextmanager
@@ -246,7 +253,7 @@ class Derived(click.Command):
     """A command that sends one class: its arguments, its options and its help are the fields and words of the class."""
 
 
-def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False) -> Derived:
+def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False, rests: bool = False) -> Derived:
     """Return a command that sends one class to an axis and tells that the drive has accepted it.
 
     Args:
@@ -254,6 +261,7 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
         command: what it sends.
         arguments: the fields that are given by their place; the others are options.
         moves: it moves the axis, so it can be waited for.
+        rests: it brings the axis to rest, which can be waited for.
     """
 
     @commanding
@@ -268,7 +276,8 @@ def derived(name: str, command: type[Sent], *arguments: str, moves: bool = False
     ) -> None:
         sender.send(axis, of_options(command, **given), given, wait=wait, leave_running=leave_running)
 
-    waiting = [click.Option([name], is_flag=True, help=text) for name, text in WAITING.items()] if moves else []
+    waits = WAITING if moves else {"--wait": "Return when the axis stands."} if rests else {}
+    waiting = [click.Option([name], is_flag=True, help=text) for name, text in waits.items()]
     return _derived(name, command, callback, arguments, [click.Argument(["axis"], type=AXIS)], waiting)
 
 

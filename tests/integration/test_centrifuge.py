@@ -417,13 +417,15 @@ def test_list_says_how_fast_a_rotor_turns_in_its_unit_and_for_how_long(monkeypat
         machine.wait(asyncio.sleep(10))
         text = machine.run("list").printed
         seen = json.loads(machine.run("list --json").printed)
-        machine.run("halt rotor --wait")
+        halted = machine.run("halt rotor --wait")
         at_rest = json.loads(machine.run("list --json").printed)
 
     speed, rest = re.search(r"moving yes (\S+) rpm \(.+ g\) for another (\S+) s", text).groups()
     assert (float(speed), float(rest)) == (pytest.approx(300, abs=16), pytest.approx(seen["rest_s"], abs=1))
     assert 20 < seen["rest_s"] < 35
     assert seen["velocity"] == pytest.approx(5, abs=0.3)
+    assert halted.code == 0
+    assert halted.printed.endswith("rotor: halt done\n")
     assert (at_rest["moving"], at_rest["rest_s"], abs(at_rest["velocity"]) < 0.5) == ("no", None, True)
 
 
