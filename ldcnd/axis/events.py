@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ldcnd.axis.course import Pace
 from ldcnd.axis.scale import AxisScale
-from ldcnd.axis.status import ActiveCommand
+from ldcnd.axis.status import ActiveCommand, Unsure
 from ldcnd.contract.samples import PastFault
 from ldcnd.drives.driver import AxisReading, Fault, StopMode
 
@@ -129,14 +129,14 @@ class MotionStarted:
         target_counts: where it ends, counts; None when it has no end of its own, or when that is not certain.
         approached: it comes from the side that the configuration names.
         pace: of one that another motion goes over into; None for one that begins at rest.
-        unsure: why it is not known whether it has begun; empty when the drive shows it.
+        unsure: why it is not known whether it has begun; None when the drive shows it.
     """
 
     now_s: float
     target_counts: int | None = None
     approached: bool = False
     pace: Pace | None = None
-    unsure: str = ""
+    unsure: Unsure | None = None
 
 
 @dataclass(frozen=True, slots=True)

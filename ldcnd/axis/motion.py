@@ -18,7 +18,7 @@ from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.rest import Settling, window_counts
 from ldcnd.axis.scale import AxisScale
-from ldcnd.axis.status import ActiveCommand, Completion
+from ldcnd.axis.status import ActiveCommand, Completion, Unsure
 from ldcnd.axis.straight import LineAxis
 from ldcnd.axis.telemetry import AxisTelemetry
 from ldcnd.axis.tracker import AxisTracker
@@ -513,7 +513,8 @@ class AxisMotion:
         try:
             await permit.start()
         except OutcomeUnknown as error:
-            self.tracker.take(MotionStarted(self.clock.now_s(), unsure=error.message))  # the next readings tell
+            unsure = Unsure(error.message, from_rest=not in_motion)  # the next readings tell
+            self.tracker.take(MotionStarted(self.clock.now_s(), unsure=unsure))
             raise
         except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent
             if in_motion:

@@ -160,6 +160,15 @@ class Permit:
         def condition() -> None:
             self._ask(begun=begun)
             require(guards, gate.tracker)
+            status = gate.tracker.status
+            if status.unsure and status.is_at(self.command_id):
+                raise WrongState(
+                    f"axis {gate.tracker.name}: nothing of a {self.verb} is started whose start before was not"
+                    f" confirmed: {status.unsure.why}",
+                    axis=gate.tracker.name,
+                    value=self.verb.value,
+                    remedy="look where the axis is, then send another motion",
+                )
             if asyncio.get_running_loop().time() > self.by_s:
                 raise WrongState(
                     f"axis {gate.tracker.name}: the line was too slow for a {self.verb} during the motion under way",

@@ -43,6 +43,19 @@ class Completion(Enum):
 
 
 @dataclass(frozen=True, slots=True)
+class Unsure:
+    """A motion of which it is not known whether it has begun: nothing of its command is started before that is known.
+
+    Attributes:
+        why: in words.
+        from_rest: it was to begin from rest, so that a drive that moves has begun it.
+    """
+
+    why: str
+    from_rest: bool
+
+
+@dataclass(frozen=True, slots=True)
 class ActiveCommand:
     """A motion under way.
 
@@ -125,7 +138,7 @@ class AxisStatus:
         braking: the stop that it has confirmed and that readings are yet to show; None without one.
         driven_open: its motor may have voltage while its loop is open: from a raw duty on until a reading shows a
             closed loop, or rest after a stop.
-        unsure: why it is not known whether the motion has begun; empty when the drive has shown it.
+        unsure: why it is not known whether the motion has begun; None when the drive has shown it.
         off_again: its line is to switch such a motor off again, because its shaft still turns.
         link: whether its drive answers.
         misses: polls in a row without a reply.
@@ -167,7 +180,7 @@ class AxisStatus:
     braking: Braking | None = None
     driven_open: bool = False
     off_again: bool = False
-    unsure: str = ""
+    unsure: Unsure | None = None
     link: LinkState = LinkState.DOWN
     misses: int = 0
     in_vain: int = 0

@@ -120,6 +120,8 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     rest, enabled, command = status.rest.observe(reading, at_s), reading.enabled, status.command
     if rest is not status.rest or enabled is not status.enabled:
         status = replace(status, rest=rest, enabled=enabled)
+    if status.unsure and status.unsure.from_rest and (shows_velocity(reading) or not reading.profile_done):
+        status = _with(status, unsure=None)
     if reading.cut_short and command:
         status = _with(status, failure=reading.cut_short)
     if not enabled and status.target is not None:
@@ -201,7 +203,7 @@ def _take_profile_end(
     if settled is None:
         return _with(status, settle=progress)
     if not settled and status.unsure:
-        return _finished(status, status.unsure, settled=False)
+        return _finished(status, status.unsure.why, settled=False)
     if settled or not settling.faults:
         return _finished(status, settled=settled)
     status = replace(status, own=_own_and(status, NOT_SETTLED))
@@ -316,6 +318,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         target_counts=None,
         approached=False,
         braking=None,
+        unsure=None,
         way=command.way,
         pace=None,
         rest=RestEvidence(rests=False, commanded=status.rest.commanded),
