@@ -1,13 +1,16 @@
 """A sequence at work: its steps one after the other, as a client of the rig that anybody else could be, too."""
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion
 from ldcnd.client.rig import Rig
-from ldcnd.contract.errors import ConfigError, LdcndError, WrongState
+from ldcnd.contract.catalogue import AXIS_COMMANDS
+from ldcnd.contract.commands import Effect, Verb
+from ldcnd.contract.errors import ConfigError, LdcndError, Remedy, WrongState
+from ldcnd.contract.errors import step as remedy_step
 from ldcnd.contract.samples import IoSample, Moving, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
 
@@ -62,6 +65,7 @@ class SequenceRun:
         steps = self._sequence.step
         if not 1 <= first <= len(steps):
             raise ConfigError(f"sequence {self._sequence.name} has no step {first}", value=first, limit=len(steps))
+        await self._check_stand(steps[first - 1 :])
         axes = () if any(step.set for step in steps) else self.used
         who = f"sequence {self._sequence.name}"
         async with AsyncExitStack() as held:
@@ -70,6 +74,26 @@ class SequenceRun:
             self._modules = await self._lines()
             for number in range(first, len(steps) + 1):
                 await self._carry_out(number, steps[number - 1])
+
+    async def _check_stand(self, steps: Sequence[SequenceStep]) -> None:
+        """Refuse to move an axis that another program moves: to give up its control again would halt that motion."""
+        states, brought_to_rest = await self._rig.states(), set[str]()
+        for step in steps:
+            brought_to_rest.update(step.standstill)
+            sent = [*self._positions[step.go].axes] if step.go else []
+            verb = Verb(step.do) if step.do and step.axis else None
+            if verb is Verb.HALT:
+                brought_to_rest.add(str(step.axis))
+            elif verb and AXIS_COMMANDS[verb].effect is Effect.MOTION:
+                sent.append(str(step.axis))
+            for axis in sent:
+                if axis in brought_to_rest or axis not in states or states[axis].moving is not Moving.YES:
+                    continue
+                raise WrongState(
+                    f"axis {axis} is {states[axis].state.words}; sequence {self._sequence.name} has begun nothing",
+                    axis=axis,
+                    remedy=Remedy("{} and wait", remedy_step("halt")),
+                )
 
     @property
     def used(self) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ import tomllib
 import pytest
 
 from ldcnd.config.rig import load_config
+from ldcnd.contract.commands import MoveVelocity
 from ldcnd.contract.errors import ConfigError, InterlockViolated, WrongState
 from ldcnd.contract.sequences import SequenceConfig, SequenceStep
 from ldcnd.lab.sequences import SequenceRun
@@ -134,6 +135,24 @@ def test_a_stop_halts_what_moves_and_a_pause_does_not(when_s):
     reports = machine(program)
 
     assert reports[-1].event == "stopped"
+
+
+def test_what_would_begin_with_a_motion_leaves_a_motion_of_another_as_it_is():
+    async def program(rig, made):
+        await made(SEQUENCES["shut"])[0].run()
+        async with rig.client.control("rotor", client="another") as rotor:
+            await rotor.power(on=True)
+            await (await rotor.home()).done()
+        await rig.client.client.command("rotor", MoveVelocity(velocity=5.0))
+        await asyncio.sleep(8)
+        go = SequenceConfig(name="go", step=(SequenceStep(go=CENTRIFUGE.position[0].name),))
+        for wanted in (go, SEQUENCES["spin"]):
+            with pytest.raises(WrongState, match="has begun nothing"):
+                await made(wanted)[0].run()
+        await asyncio.sleep(3)
+        return speed(rig)
+
+    assert machine(program) == pytest.approx(5.0, abs=0.1)
 
 
 @pytest.mark.long
