@@ -143,10 +143,9 @@ class Permit:
         """Raise when nothing of this command may move the axis now.
 
         Raises:
-            CommandAborted,
-        DriveFault,
-            LdcndError: see `ask`; also a latched or unconfirmed stop, an axis out of reach or in error_stop, and a
-                speed override of 0.
+            StopLatched, CommandAborted, ShuttingDown: see `ask`.
+            RequestRefused, DriveFault: a stop is not confirmed, the axis is out of reach or in error_stop, the speed
+                override is 0, an interlock forbids it, or it is not known whether this command has begun.
         """
         self.to_move()()
 

@@ -247,7 +247,7 @@ class AxisStatus:
 
     @property
     def quality(self) -> Quality:
-        """Quality of a value read just now; never good while it is not known where the axis is."""
+        """Quality of a value read just now: whether it is what the drive counts. `referenced` says whether that is a place."""
         link = self.link
         return Quality.UNCERTAIN if self.position_lost and link is LinkState.UP else QUALITIES[link]
 
