@@ -67,7 +67,7 @@ class KeptReference(ReferenceEvidence):
     written: int
     """Time of writing, UTC in ns since 1970."""
     on_disk: int = 0
-    """The same instant by the clock of files: a later change time shows that another program put it there."""
+    """The same instant by the clock of files: see `_check_left_there`."""
     origin: float
     """Position 0 on the drive's own counter."""
     mark: int
@@ -105,6 +105,8 @@ class LatchFile(Frozen):
 
     format: Literal[1] = 1
     """Format of this file; another one is refused."""
+    on_disk: int | None = None
+    """When it was written, UTC in ns since 1970, see `_check_left_there`; null in a file of an earlier version."""
     axes: dict[str, KeptLatch]
     """By the names of the axes."""
 
@@ -126,15 +128,19 @@ class KeptFiles:
         self._latches = directory / LATCHES
         self._latch_worker = ThreadPoolExecutor(1, "kept latches")
 
-    def latches(self) -> dict[str, KeptLatch]:
-        """Return the latches that are kept, by axis; the caller waits for the disk, since nothing may move before.
+    def latches(self) -> dict[str, KeptLatch] | None:
+        """Return the latches that are kept, by axis; None where there is no file of them, in a directory that is new.
+
+        The caller waits for the disk, since nothing may move before.
 
         Raises:
-            DamagedFile: they cannot be read, or make no sense.
+            DamagedFile: they cannot be read, make no sense, or were put there by another program.
         """
         self._latch_worker.submit(durable.keep_room, self._latches, LATCH_ROOM_BYTES)
         kept = _read(self._latches, LatchFile)()
-        return kept.axes if kept else {}
+        if kept and kept.on_disk is not None:
+            _check_left_there(self._latches, kept.on_disk)
+        return kept.axes if kept else None
 
     async def keep_latches(self, latches: dict[str, KeptLatch]) -> None:
         """Write the latches of all axes; they are on the disk when this returns.
@@ -142,9 +148,13 @@ class KeptFiles:
         Raises:
             OSError: they cannot be written; what was kept before still is.
         """
-        text = LatchFile(axes=latches).model_dump_json(exclude_defaults=True)
+
+        def write() -> None:
+            now = LatchFile(axes=latches, on_disk=time.time_ns())
+            durable.replace(self._latches, now.model_dump_json(exclude_defaults=True))
+
         with self._noted(self._latches):
-            await self._in_thread(lambda: durable.replace(self._latches, text), self._latch_worker)
+            await self._in_thread(write, self._latch_worker)
         self._latch_worker.submit(durable.keep_room, self._latches, LATCH_ROOM_BYTES)
 
     async def reference(self, axis: str) -> KeptReference | None:
@@ -158,9 +168,8 @@ class KeptFiles:
 
         def read() -> KeptReference | None:
             kept = _read(path, KeptReference)()
-            # neither `cp` nor `tar` can set this stamp: it tells a file that was put back from one that was left
-            if kept and path.stat().st_ctime_ns - kept.on_disk > DISK_TIME_S * NS:
-                raise DamagedFile(f"{path}: is a copy that was put there, and may be older than what it replaced")
+            if kept:
+                _check_left_there(path, kept.on_disk)
             return kept and kept.model_copy(update={"on_disk": 0})
 
         return await self._in_thread(read)
@@ -241,6 +250,18 @@ def in_words(error: Exception) -> str:
 
 
 ModelT = TypeVar("ModelT", bound=Frozen)
+
+
+def _check_left_there(path: Path, on_disk: int) -> None:
+    """Refuse a file that another program has put there, such as one of a backup: what came since then is not in it.
+
+    A file says when it was written; neither `cp` nor `tar` can set the time at which its inode has changed last.
+
+    Raises:
+        DamagedFile: it was put there later than it was written.
+    """
+    if path.stat().st_ctime_ns - on_disk > DISK_TIME_S * NS:
+        raise DamagedFile(f"{path}: is a copy that was put there, and may be older than what it replaced")
 
 
 def _read(path: Path, model: type[ModelT]) -> Callable[[], ModelT | None]:

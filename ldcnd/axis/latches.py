@@ -2,7 +2,8 @@
 
 Both are kept from when they come, and a stop is answered once its latch is on the disk, or after `WITHIN_S`. The
 next daemon begins with them, and has what was stopped stopped again: its drive may not have been sent the stop before
-the daemon was killed. Where the file cannot be read, every axis is latched.
+the daemon was killed. Where the file cannot be read, or is one of a
+backup, which may be older than a stop, every axis is latched.
 """
 
 import asyncio
@@ -49,10 +50,11 @@ class LatchKeeper:
         try:
             kept = files.latches()
         except DamagedFile as error:
-            log.error("kept latches cannot be read: every axis is latched, send reset", reason=str(error))
+            log.error("kept latches are not to be trusted: every axis is latched, send reset", reason=str(error))
             kept, self._on_disk = dict.fromkeys(trackers, KeptLatch(stopped=True)), None
         else:
-            self._on_disk = kept
+            self._on_disk = kept  # a directory without a file of them gets one, by which a backup is known later
+            kept = kept or {}
         self._others = {name: latch for name, latch in kept.items() if name not in trackers}
         for name in kept.keys() & trackers.keys():
             latch = kept[name]

@@ -2,6 +2,8 @@
 
 import asyncio
 import os
+import shutil
+import time
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ from structlog.testing import capture_logs
 
 from ldcnd import durable
 from ldcnd.axis import kept as kept_files
+from ldcnd.axis.kept import DISK_TIME_S
 from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, QuickStop, Reset
 from ldcnd.contract.errors import OutcomeUnknown, RequestRefused, WrongState
 from ldcnd.contract.samples import AxisState, LinkState
@@ -205,6 +208,28 @@ async def test_what_was_latched_because_of_a_damaged_file_is_over_once_it_was_re
         latched = [axis for axis in AXES if (await rig.client.state(axis)).stop_latched]
 
     assert latched == ["y", "z", "c"]
+
+
+async def test_a_backup_of_before_a_stop_that_is_put_back_lets_no_axis_move(tmp_path):
+    chain, kept = chain_of(), tmp_path / "state"
+    config = keeping(kept)
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        await settled(rig)
+    await asyncio.to_thread(shutil.copytree, kept, tmp_path / "backup")
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        before = await rig.client.state("x")
+        await rig.client.stop()
+    await asyncio.to_thread(time.sleep, DISK_TIME_S + 0.5)  # the disk has the clock of the machine
+    await asyncio.to_thread(shutil.rmtree, kept)
+    await asyncio.to_thread(shutil.copytree, tmp_path / "backup", kept)
+    async with rig_on(chain, config) as rig:
+        await up(rig)
+        codes = await refused_motion(rig)
+
+    assert not before.stop_latched
+    assert codes == ["stop_latched"] * 3
 
 
 async def test_without_a_place_for_it_the_answer_says_that_the_latch_ends_with_the_daemon(tmp_path):
