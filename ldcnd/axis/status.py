@@ -247,7 +247,7 @@ class AxisStatus:
 
     @property
     def quality(self) -> Quality:
-        """Quality of a value read just now: whether it is what the drive counts; `referenced` tells if that is a place."""
+        """Quality of a value read just now: whether the drive counts it; `referenced` tells whether it is a place."""
         link = self.link
         return Quality.UNCERTAIN if self.position_lost and link is LinkState.UP else QUALITIES[link]
 
