@@ -1,9 +1,10 @@
 """`ldcnd bus`: show the lines of a running daemon."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType
 
 import click
 
@@ -105,12 +106,15 @@ def override_interlock(target: Target, interlock: str, seconds: float, reason: s
 
 
 def _shown(reply: IoReply) -> tuple[IoReply, str]:
-    outputs = "not known" if reply.outputs is None else ", ".join(map(str, reply.outputs)) or "none"
-    return reply, f"{reply.module}: {_levels(reply.levels)}; outputs: {outputs}"
+    names = {line: name for name, line in reply.names.items()}
+    known = None if reply.outputs is None else ", ".join(names.get(line, str(line)) for line in reply.outputs)
+    outputs = "not known" if known is None else known or "none"
+    return reply, f"{reply.module}: {_levels(reply.levels, names)}; outputs: {outputs}"
 
 
-def _levels(levels: tuple[bool, ...]) -> str:
-    return " ".join(f"{line}={'high' if level else 'low'}" for line, level in enumerate(levels, 1))
+def _levels(levels: tuple[bool, ...], names: Mapping[int, str] = MappingProxyType({})) -> str:
+    levelled = enumerate(("high" if level else "low" for level in levels), 1)
+    return " ".join(f"{names.get(line, line)}={level}" for line, level in levelled)
 
 
 def _counted(reply: IoReply, _axis: AxisInfo | None) -> Shown:

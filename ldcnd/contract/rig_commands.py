@@ -245,6 +245,8 @@ class IoReply(Frozen):
     """Levels of the lines, the first is line 1; an output that is shorted shows the level of its pin."""
     outputs: tuple[int, ...] | None
     """Lines that are outputs."""
+    names: dict[str, int] = Field(default_factory=dict)
+    """The lines that have a name in the configuration."""
 
 
 class SetIo(Command[IoReply]):

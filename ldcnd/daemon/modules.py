@@ -233,7 +233,11 @@ class ModuleService:
         if twice := sorted(set(high) & set(low)):
             raise MalformedRequest(f"module {self.name}: line {twice[0]} cannot be high and low", value=twice[0])
         reading = await self._write(levels, frozenset(inputs), (command.pwm1, command.pwm2), condition)
-        return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)
+        return self._replied(reading)
+
+    def _replied(self, reading: IoReading) -> IoReply:
+        names = {name: line for name, line in self._lines.items() if not name.isdigit()}
+        return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs, names=names)
 
     def in_words(self, command: SetIo) -> str:
         """Return what a request sets, by the names of the lines where they have one; empty where it only reads."""
@@ -304,7 +308,7 @@ class ModuleService:
         with only_while(condition):
             await self._driver.set_timer(enabled=enabled, counts_edges=edges, prescale=command.prescale)
         reading = await self._driver.set_outputs({}, frozenset(), (None, None))
-        return IoReply(module=self.name, levels=reading.levels, outputs=reading.outputs)
+        return self._replied(reading)
 
     def _check(self, condition: Condition) -> None:
         """Refuse before anything is noted of outputs: the line asks both again when the turn of a packet has come."""

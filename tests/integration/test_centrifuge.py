@@ -403,8 +403,10 @@ def test_the_command_line_shows_who_wrote_outputs(monkeypatch):
             machine.run(f"bus set-io cabinet {each}").code for each in ("unlock=high 12=input", "door=low", "pin=hig")
         ]
         shown = machine.run("log").printed
+        now = machine.run("bus set-io cabinet").printed
 
     assert codes == [0, 0, 2]
+    assert re.search(r"cabinet: .*\bpin=low .*\bunlock=high\b.*; outputs: (\w+, )*unlock\b", now)
     assert f"cabinet  set_io           done       by {getpass.getuser()} (ldcnd)" in shown
     assert "unlock high, door_ajar input" in shown or "unlock high, line 12 input" in shown
 
