@@ -371,7 +371,8 @@ class BufferMode(StrEnum):
     """Effect of a move on an axis that moves already; PLCopen's buffer modes, and a refusal."""
 
     REFUSE = "refuse"
-    """The move is refused: the sender was not aware of the motion under way."""
+    """The move is refused: the sender was not aware of the motion under way. A motion at a velocity takes another
+    velocity all the same."""
     ABORTING = "aborting"
     """The command under way ends as aborted. The axis is halted first, but for a PIC-SERVO SC on a move or jog: that
     drive goes on to the new goal within the new velocity and acceleration, without a halt."""

@@ -113,7 +113,7 @@ function Move({ axis, kinds }) {
           <${NumberField} key="reach" label="Distance at most" units=${unitsOf(axis.info, "position")} value=${values.reach} onChange=${set("reach")}
             hint="empty: as configured" />`
       }
-      ${previewed && html`<${Choice} label="If it moves already" options=${BUFFERING}
+      ${previewed && html`<${Choice} label="If it moves already" options=${verb === "move_velocity" ? [["refuse", "refuse it, unless it moves at a velocity"], ...BUFFERING.slice(1)] : BUFFERING}
         value=${values.buffer_mode ?? "refuse"} onChange=${set("buffer_mode")} />`}
     </div>
     ${previewed && html`<${Preview} axis=${axis} body=${body} field=${field} onNearest=${set(field)} />`}
