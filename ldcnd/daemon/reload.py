@@ -222,9 +222,14 @@ def _shown(value: object) -> str | None:
     if value is None:
         return None
     if isinstance(value, BaseModel):
-        value = getattr(value, "name", None) or value.model_dump(mode="json", exclude_none=True)
-    text = json.dumps(value, default=str, ensure_ascii=False)
+        value = getattr(value, "name", None) or value
+    text = json.dumps(value, default=_as_written, ensure_ascii=False)
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]} ..."
+
+
+def _as_written(value: object) -> object:
+    """Return a value about as its file has it."""
+    return value.model_dump(mode="json", exclude_defaults=True) if isinstance(value, BaseModel) else str(value)
 
 
 def _by_name(items: object) -> dict[str, BaseModel] | None:

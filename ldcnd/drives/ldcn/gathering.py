@@ -59,7 +59,7 @@ SPLITS = 24
 LOOKED_FURTHER = 4
 """Further waiting addresses at which one search looks for leftovers: stops wait for the end of a bring-up."""
 CONFIRMATIONS = 3
-"""Further replies that must be intact where two modules may share a waiting address."""
+"""Further replies that must be intact before what answers at a waiting address counts as one module there."""
 GOLDEN = 0.618034
 """Instants that are spaced by this share of a servo cycle fall everywhere in it."""
 
@@ -308,7 +308,9 @@ class Gathering:
 
     async def _step(self, stock: Stock, addressing: Callable[[int], None]) -> bool:
         """Do what brings the chain nearer to its addresses; tell whether anything was found that does."""
-        known: dict[int, int] | None = self._by_power(stock) or await self._by_identity(stock)
+        known: dict[int, int] | None = await self._by_power(stock) or await self._by_identity(stock)
+        if known is None:
+            return True
         if not known and stock.complete:
             known = await (self._by_order(stock) if stock.neighbours else self._by_neighbour(stock))
             if known is None:
@@ -323,19 +325,27 @@ class Gathering:
             return True
         return bool(known) or await self._split(stock)
 
-    def _by_power(self, stock: Stock) -> dict[int, int]:
+    async def _by_power(self, stock: Stock) -> dict[int, int]:
         """Return the place of the only waiting module where two neighbours are silent.
 
         The one behind it would be deaf, had the first no power: so it is the first that answers.
         """
         if len(stock.silent) == 2 and stock.neighbours and len(stock.waiting) == 1:  # noqa: PLR2004 - neighbours
             for address, identity in stock.waiting.items():
-                if self._accepts(stock.silent[0], identity):
+                if (
+                    identity
+                    and self._accepts(stock.silent[0], identity)
+                    and await self._speaks_alone(address, identity)
+                ):
                     return {address: stock.silent[0]}
         return {}
 
-    async def _by_identity(self, stock: Stock) -> dict[int, int]:
-        """Return the places of waiting modules, by their addresses, of which only one place expects the identity."""
+    async def _by_identity(self, stock: Stock) -> dict[int, int] | None:
+        """Return the places of waiting modules, by their addresses, of which only one place expects the identity.
+
+        None where one that should be there alone does not go on to say so: its answer may have been a late one of the
+        module at the place, to a question of before. That module has kept all it was set to.
+        """
         known = {}
         for address, identity in stock.waiting.items():
             if identity is None:
@@ -344,12 +354,15 @@ class Gathering:
             holders = [
                 theirs for theirs in stock.waiting.values() if theirs and places and self._accepts(places[0], theirs)
             ]
-            if len(places) == len(holders) == 1 and (stock.complete or await self._speaks_alone(address, identity)):
-                known[address] = places[0]
+            if len(places) == len(holders) == 1:
+                if await self._speaks_alone(address, identity):
+                    known[address] = places[0]
+                elif stock.complete:
+                    return None
         return known
 
     async def _speaks_alone(self, address: int, identity: Identity) -> bool:
-        """Tell whether no other module replies at a waiting address, also if one reply was lost."""
+        """Tell whether one module is at a waiting address, also if one reply was lost or is one to something older."""
         for _ in range(CONFIRMATIONS):
             answer = await self._rate.listen(address)
             if answer is None or answer.identity != identity:
