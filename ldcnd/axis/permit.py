@@ -242,18 +242,22 @@ class Permit:
             return await self._gate.driver.add_points(steps)
 
     async def power_on(self) -> None:
-        """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open."""
+        """Close the loop; see `Moves.power`. It takes several packets: a stop among them leaves it open.
+
+        Nothing moves: a loop that is closed stays as it is. Closed again, it would hold where the shaft is then, with
+        the gains of another kind of motion, and the shaft would turn.
+        """
         condition = self._condition(TO_POWER, InterlockKind.POWER_ON)
         condition()
-        was_on = self._gate.tracker.status.enabled
+        if self._gate.tracker.status.enabled:
+            return
         try:
             self.begin()
             with only_while(condition):
                 await self._gate.driver.power(on=True)
             self.still_wanted()
         except RequestRefused:
-            if not was_on:
-                await self._gate.driver.stop(StopMode.OFF)
+            await self._gate.driver.stop(StopMode.OFF)
             raise
 
     async def set_gains(self, gains: Gains) -> None:

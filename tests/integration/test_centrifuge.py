@@ -411,6 +411,30 @@ def test_the_command_line_shows_who_wrote_outputs(monkeypatch):
     assert "unlock high, door_ajar input" in shown or "unlock high, line 12 input" in shown
 
 
+@pytest.mark.parametrize("end", ["halt", "quick_stop"])
+def test_a_closed_loop_that_is_closed_again_does_not_move_the_rotor(end: str):
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig, rig.client.control("rotor", client="test") as rotor:
+            machine = await made_ready(rig, rotor)
+            await (await rotor.home()).done()
+            await rotor.move_velocity(3.0, acceleration=10.0)
+            await asyncio.sleep(2.0)
+            await (rotor.halt() if end == "halt" else rotor.quick_stop())
+            await asyncio.sleep(3.0)
+            await rotor.reset()
+            for output in ("unlock", "door"):
+                await machine.high(output)
+                await asyncio.sleep(2.0)
+            before, most = rig.truth("rotor").counts, 0.0
+            await rotor.power(on=True)
+            for _ in range(400):
+                await asyncio.sleep(0.002)
+                most = max(most, abs(rig.truth("rotor").counts - before))
+            return most
+
+    assert run(program()) < 1.0
+
+
 def test_list_says_how_fast_a_rotor_turns_in_its_unit_and_for_how_long(monkeypatch):
     with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
         machine.wait(asyncio.sleep(1))
