@@ -32,7 +32,7 @@ from ldcnd.axis.recorder import TraceRecorder
 from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import AxisStatus
-from ldcnd.axis.stopping import AxisStops, takes_energy_out
+from ldcnd.axis.stopping import AxisStops, stop_mode_of
 from ldcnd.axis.telemetry import AxisTelemetry, Note
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.axis.turns import CommandQueue
@@ -248,7 +248,7 @@ class AxisService:
             BusError: the line failed; `OutcomeUnknown` when the drive may have started.
         """
         permit = permit or self.permit(self._next_command_id(), command.verb)
-        if self.stops.possible and (mode := takes_energy_out(command)):
+        if self.stops.possible and (mode := stop_mode_of(command)):
             if isinstance(command, Power):
                 await self._ask_to_open_loop(permit)
             return await self._take_energy_out(permit, command, mode)

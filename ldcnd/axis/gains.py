@@ -6,7 +6,6 @@ from dataclasses import asdict, replace
 from ldcnd.axis import guards
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.status import MOTION_STATES
 from ldcnd.contract.commands import CommandReply, MotionKind, SetGains
 from ldcnd.contract.errors import LeaseRequired, Remedy, ValueOutOfRange, WrongState, step
 from ldcnd.drives.driver import Gains
@@ -38,7 +37,7 @@ class AxisGains:
         Set Gain acts at once: in mid-motion it would change the force on a shaft that lags behind.
         """
         wanted = self._wanted(kind)
-        if wanted is not None and self._motion.tracker.status.state not in MOTION_STATES:
+        if wanted is not None and not self._motion.tracker.status.state.is_motion:
             self._motion.driver.gains = wanted
 
     async def set(self, permit: Permit, request: SetGains) -> CommandReply:

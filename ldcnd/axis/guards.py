@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
 from ldcnd.axis.quiet_drive import QuietDrive
-from ldcnd.axis.status import MOTION_STATES, AxisStatus
+from ldcnd.axis.status import AxisStatus
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
@@ -80,7 +80,7 @@ def check_enabled(axis: AxisTracker) -> None:
 
 def check_stands(axis: AxisTracker) -> None:
     """Refuse while a motion runs: a trapezoid loaded in mid-move is erratic on most drives (PIC-SERVO manual, 4.4)."""
-    if axis.status.state in MOTION_STATES:
+    if axis.status.state.is_motion:
         raise WrongState(
             f"axis {axis.name} is {axis.status.state.words}",
             axis=axis.name,
@@ -278,12 +278,12 @@ BY_VERB: Mapping[Verb, Needs] = {
     Verb.TRACK: Needs((*STILL, check_referenced), TO_MOVE),
     Verb.RESET: Needs((check_reachable, check_stop_confirmed, check_stands, check_not_forced)),
     Verb.SET_POSITION: Needs((check_reachable, check_stands, check_position_kept)),
-    Verb.SET_GAINS: Needs((check_reachable,)),
-    Verb.SET_OUTPUTS: Needs((check_reachable,)),
     Verb.TRACE: Needs(at_packet=(check_reachable,)),
+    Verb.TRACE_ABORT: Needs(),
+    Verb.RESTART_EEPROM_COUNT: Needs(),  # the count is the daemon's own
 }
 """`power` is to close the loop: to open it needs nothing."""
-BY_EFFECT: Mapping[Effect, Needs] = {Effect.MOTION: Needs(STILL, TO_MOVE)}
+BY_EFFECT: Mapping[Effect, Needs] = {Effect.MOTION: Needs(STILL, TO_MOVE), Effect.CHANGE: Needs((check_reachable,))}
 """What a command needs that has no entry of its own; nothing where its effect has none either."""
 
 
@@ -293,13 +293,14 @@ AT_ALL = Needs(ENERGY)
 
 def needs(verb: Verb) -> Needs:
     """Return what a command needs."""
-    return BY_VERB.get(verb) or BY_EFFECT.get(AXIS_COMMANDS[verb].effect, Needs())
+    return BY_VERB[verb] if verb in BY_VERB else BY_EFFECT.get(AXIS_COMMANDS[verb].effect, Needs())
 
 
+_MOTIONS = frozenset(state for state in AxisState if state.is_motion)
 GOES_ON: Mapping[Verb, frozenset[AxisState]] = {
     Verb.MOVE_VELOCITY: frozenset({AxisState.CONTINUOUS_MOTION}),
-    Verb.SET_PWM: MOTION_STATES,
-    Verb.TRACK: MOTION_STATES,
+    Verb.SET_PWM: _MOTIONS,
+    Verb.TRACK: _MOTIONS,
 }
 """Commands that one of their own takes over without a standstill, while the axis is in one of these states."""
 

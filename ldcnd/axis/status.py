@@ -24,9 +24,6 @@ SHORTEST_READING_PAUSE_S = 0.005
 """Shortest time between two readings of an axis that settles."""
 STRENGTH = {StopMode.SMOOTH: 0, StopMode.ABRUPT: 1, StopMode.OFF: 2}
 """Stop modes, weakest first; a pending stop is only replaced by a stronger one."""
-MOTION_STATES = frozenset(
-    {AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION, AxisState.STOPPING}
-)
 QUALITIES = {LinkState.UP: Quality.GOOD, LinkState.DEGRADED: Quality.UNCERTAIN, LinkState.DOWN: Quality.BAD}
 """Quality of a value read just now, by the drive's link."""
 
@@ -241,7 +238,7 @@ class AxisStatus:
         if self.link is not LinkState.UP:
             return Moving.UNKNOWN
         rests = self.rest.rests
-        if rests is False or (self.command and self.state in MOTION_STATES):
+        if rests is False or (self.command and self.state.is_motion):
             return Moving.YES
         return Moving.NO if rests else Moving.UNKNOWN
 

@@ -39,7 +39,7 @@ UNDERSTOOD_NO_MORE = {LossPolicy.QUICK_STOP: StopMode.ABRUPT, LossPolicy.POWER_O
 """How a motion is stopped that is not understood any more, by `loss.bus`; smoothly otherwise."""
 
 
-def takes_energy_out(command: AxisCommand[CommandReply]) -> StopMode | None:
+def stop_mode_of(command: AxisCommand[CommandReply]) -> StopMode | None:
     """Return how a command brings its motor to rest; None for a command that does anything else."""
     match command:
         case Stop() | Halt():

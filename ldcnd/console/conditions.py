@@ -159,6 +159,7 @@ def as_payload(condition: Condition) -> dict[str, object]:
         "mark": condition.mark,
         "state": condition.state,
         "live": condition.live,
+        "moves": condition.moves,
         "alarm": condition.alarm.name.lower(),
         "holder": condition.holder,
         "control": condition.control,

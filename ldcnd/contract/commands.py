@@ -154,7 +154,6 @@ class Command(Frozen, Generic[ReplyT_co]):
         verb: last chunk of its key.
         about: whether it names an axis.
         effect: what it does to the rig.
-        needs_lease: where leases are required, it is refused without one.
         ends: when it is over.
         answer_s: longest wait of a client for its reply, in seconds.
     """
@@ -164,7 +163,6 @@ class Command(Frozen, Generic[ReplyT_co]):
     verb: ClassVar[str]
     about: ClassVar[About]
     effect: ClassVar[Effect] = Effect.CHANGE
-    needs_lease: ClassVar[bool] = False
     ends: ClassVar[Ends] = Ends.WITH_REPLY
     answer_s: ClassVar[float] = ANSWER_S
 
@@ -178,6 +176,11 @@ class Command(Frozen, Generic[ReplyT_co]):
     def takes_energy_out(self) -> bool:
         """Whether it does nothing but bring an axis to rest or switch it off: nothing refuses such a command."""
         return self.effect is Effect.REST
+
+    @classmethod
+    def needs_lease(cls) -> bool:
+        """Tell whether it is refused without a lease where leases are required."""
+        return cls.effect is Effect.MOTION or (cls.effect is Effect.CHANGE and cls.about is About.AXIS)
 
     @classmethod
     def role(cls) -> Role:
@@ -213,7 +216,6 @@ class AxisCommand(Command[ReplyT_co], Generic[ReplyT_co]):
     """
 
     about: ClassVar[About] = About.AXIS
-    needs_lease: ClassVar[bool] = True
     capability: ClassVar[Capability] = Capability.MOTION
     verb: ClassVar[Verb]
 
@@ -473,7 +475,6 @@ class Halt(AxisCommand[CommandReply]):
 
     verb = Verb.HALT
     effect = Effect.REST
-    needs_lease = False
     ends = Ends.BY_READING
 
 
@@ -482,7 +483,6 @@ class Stop(AxisCommand[CommandReply]):
 
     verb = Verb.STOP
     effect = Effect.REST
-    needs_lease = False
 
 
 class QuickStop(AxisCommand[CommandReply]):
@@ -490,7 +490,6 @@ class QuickStop(AxisCommand[CommandReply]):
 
     verb = Verb.QUICK_STOP
     effect = Effect.REST
-    needs_lease = False
 
 
 class HomeMethod(StrEnum):

@@ -125,6 +125,7 @@ class Condition:
         mark: what goes beside the number where it does not, in a few words; empty where it does.
         state: the state in words, for people.
         live: state and velocity are to be believed.
+        moves: a motion is under way, as far as that was seen last.
         alarm: how bad it is.
         troubles: everything that is to be said, the worst first.
         holder: the client in control; None without one, `UNKNOWN_HOLDER` where that is not known.
@@ -139,6 +140,7 @@ class Condition:
     troubles: tuple["Trouble", ...]
     holder: str | None = UNKNOWN_HOLDER
     control: str = ""
+    moves: bool = False
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -377,13 +379,14 @@ def assess(
     gone = _unreachable(state, faults, silence=silence, line_up=line_up is not False)
     pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
     if gone:
-        return replace(_unanswered(last, (*pending, gone), gone.short), holder=holder, control=control)
+        silent = _unanswered(last, (*pending, gone), gone.short)
+        return replace(silent, holder=holder, control=control, moves=state.state.is_motion)
     place, mark = _place(state, faults, is_old=_is_old(state, age_s, health))
     troubles = (*pending, *_found(state, faults, health, place), *_overridden(health), *_slowed(state))
     worst = max((trouble.severity for trouble in troubles), default=_FINE)
     alarm = Alarm.INVALID if place in _AGED else Alarm(worst)
     live = place is not Place.OLD
-    return Condition(place, mark, word if live else last, live, alarm, troubles, holder, control)
+    return Condition(place, mark, word if live else last, live, alarm, troubles, holder, control, state.state.is_motion)
 
 
 def _unanswered(state: str, troubles: tuple[Trouble, ...], mark: str) -> Condition:

@@ -105,11 +105,6 @@ class Keys:
         return f"{self._root}/alive/**"
 
     @property
-    def all_clients(self) -> str:
-        """The tokens of all controlling clients."""
-        return f"{self._root}/client/*"
-
-    @property
     def daemon(self) -> str:
         """The description of the daemon."""
         return f"{self._root}/meta/daemon"

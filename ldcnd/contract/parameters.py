@@ -239,7 +239,6 @@ class ListParameters(ParameterCommand[ParameterList]):
 
     verb = Verb.LIST_PARAMETERS
     effect = Effect.QUESTION
-    needs_lease = False
 
 
 class ReadParameter(ParameterCommand[ParameterReply]):
@@ -247,7 +246,6 @@ class ReadParameter(ParameterCommand[ParameterReply]):
 
     verb = Verb.READ_PARAMETER
     effect = Effect.QUESTION
-    needs_lease = False
 
     parameter: str
     """Its number, such as Pn100, or the manual's name in any case."""
@@ -260,7 +258,6 @@ class ReadAllParameters(ParameterCommand[ParameterDump]):
 
     verb = Verb.READ_ALL_PARAMETERS
     effect = Effect.QUESTION
-    needs_lease = False
 
 
 class PlanParameters(ParameterCommand[ParameterPlan]):
@@ -268,7 +265,6 @@ class PlanParameters(ParameterCommand[ParameterPlan]):
 
     verb = Verb.PLAN_PARAMETERS
     effect = Effect.QUESTION
-    needs_lease = False
 
     values: Mapping[str, Annotated[int, Field(ge=0, le=0xFFFF)]]
     """The wanted words, by number such as Pn100. The unit number in Pn000 is not taken from here."""
@@ -321,7 +317,6 @@ class ReadAlarms(ParameterCommand[AlarmReport]):
 
     verb = Verb.READ_ALARMS
     effect = Effect.QUESTION
-    needs_lease = False
 
 
 class ReadMonitors(ParameterCommand[MonitorReport]):
@@ -329,7 +324,6 @@ class ReadMonitors(ParameterCommand[MonitorReport]):
 
     verb = Verb.READ_MONITORS
     effect = Effect.QUESTION
-    needs_lease = False
 
     monitors: tuple[MonitorName, ...] = Field(default=(), max_length=len(MonitorName))
     """Monitors to read; none stands for all."""

@@ -59,7 +59,6 @@ class MoveTogether(GroupMoves, Command[MoveTogetherReply]):
     verb = "move_together"
     effect = Effect.MOTION
     about = About.RIG
-    needs_lease = True
     ends = Ends.BY_READING
     answer_s = TOGETHER_S
 
@@ -98,7 +97,6 @@ class WalkPath(Command[PathReply]):
     verb = "path"
     effect = Effect.MOTION
     about = About.RIG
-    needs_lease = True
     ends = Ends.BY_READING
     answer_s = TOGETHER_S
 

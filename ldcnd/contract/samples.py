@@ -20,11 +20,17 @@ class AxisState(StrEnum):
     ERROR_STOP = "error_stop"
 
     @property
+    def is_motion(self) -> bool:
+        """Whether a motion is under way."""
+        return self in _MOTIONS
+
+    @property
     def words(self) -> str:
         """The state as every face says it to people."""
         return _STATE_WORDS.get(self, self.value.replace("_", " "))
 
 
+_MOTIONS = frozenset({AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION, AxisState.STOPPING})
 _STATE_WORDS = {
     AxisState.DISCRETE_MOTION: "moving to a target",
     AxisState.CONTINUOUS_MOTION: "moving at a velocity",

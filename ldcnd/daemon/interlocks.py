@@ -14,7 +14,7 @@ from functools import partial
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.events import CommandFailing
 from ldcnd.axis.rest import REST_COUNTS
-from ldcnd.axis.status import MOTION_STATES, AxisStatus
+from ldcnd.axis.status import AxisStatus
 from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
 from ldcnd.contract.commands import kind_of
 from ldcnd.contract.errors import InterlockViolated, LdcndError, ValueOutOfRange
@@ -370,7 +370,7 @@ class Interlocks:
 
 
 def _commanded(status: AxisStatus) -> bool:
-    return status.command is not None and status.state in MOTION_STATES
+    return status.command is not None and status.state.is_motion
 
 
 def _speed(axis: AxisService) -> float:

@@ -256,7 +256,7 @@ def command_list() -> CommandList:
                 key=f"@cmd/{RIG_ITSELF if command.about is About.RIG else '<axis>'}/{command.verb}",
                 summary=command.summary(),
                 effect=command.effect,
-                needs_lease=command.needs_lease,
+                needs_lease=command.needs_lease(),
                 request_schema=schema_name(command),
                 reply_schema=schema_name(command.reply_model()),
             )

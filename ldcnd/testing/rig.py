@@ -316,12 +316,6 @@ class SimulatedRig:
             self._serving.cancel()
         await self._ended()
 
-    async def end_daemon(self) -> None:
-        """Let the daemon end in order, as SIGTERM does: it brings to rest what the configuration says."""
-        self.timeline.note(f"daemon {self._runs} ends")
-        self.daemon.end()
-        await self._ended()
-
     async def _ended(self) -> None:
         if self._serving:
             with contextlib.suppress(asyncio.CancelledError):

@@ -67,7 +67,9 @@ def kept(tmp_path_factory):
     }.items():
         (folder / name).mkdir(exist_ok=True)
         (folder / name / "x.json").write_text(content)
-    return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.json")}
+    found = {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*.json")}
+    del found[Path("latches.json")]  # a damaged one latches every axis, see test_kept_latches.py
+    return found
 
 
 def config(folder: Path):

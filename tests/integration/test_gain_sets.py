@@ -100,6 +100,9 @@ async def test_the_gains_of_the_position_are_back_after_a_fault_and_a_restart(wh
             await asyncio.sleep(1.0)
         await rig.client.command("rotor", Reset())
         await rig.client.command("rotor", Power(on=True))
+        assert held(rig) == (SPIN if what == "stop" else POSITION)  # a closed loop gets no other gains: it would turn
+        await rig.client.command("rotor", MoveRelative(distance=0.1))
+        await rig.until("rotor", lambda state: state.command is None)
         assert held(rig) == POSITION
         await rig.client.command("rotor", MoveVelocity(velocity=2.0))
         assert held(rig) == SPIN

@@ -96,7 +96,7 @@ def test_every_command_inside_lease_hold_is_sent_under_its_lease(rig, monkeypatc
     wanted = {
         str(verb)
         for verb, command in BY_VERB[About.AXIS].items()
-        if issubclass(command, AxisCommand) and command.needs_lease and command.effect is not Effect.QUESTION
+        if issubclass(command, AxisCommand) and command.needs_lease() and command.effect is not Effect.QUESTION
     }
     assert wanted - under_it == NOT_TYPED
 

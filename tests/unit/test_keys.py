@@ -55,7 +55,6 @@ def test_patterns_cover_their_keys_and_no_others() -> None:
     assert matches(KEYS.all_commands, KEYS.command("x", "halt"))
     assert matches(KEYS.all_alive, KEYS.alive("i1"))
     assert matches(KEYS.all_alive, KEYS.alive_axis("i1", "x"))
-    assert matches(KEYS.all_clients, KEYS.client("c1"))
     assert not matches(KEYS.all_telemetry, KEYS.daemon)
     assert not matches(KEYS.all_commands, Keys("bench2").command("x", "halt"))
 

@@ -3,7 +3,6 @@
 import { inPageTerms } from "../parts/remedies.js";
 import { controls } from "./control.js";
 
-const MOVING = new Set(["homing", "discrete_motion", "continuous_motion", "stopping"]);
 /** What buttons send, where that is not what they are called. */
 const VERBS = { enable: "power", disable: "power", parameters: "read_parameter", none: null };
 /** Presses that the daemon would carry out, without a use. */
@@ -60,5 +59,5 @@ function inWords(cause) {
 
 /** Whether a motion is under way. */
 export function moves(axis) {
-  return MOVING.has(axis.state?.state);
+  return Boolean(axis.condition.moves);
 }
