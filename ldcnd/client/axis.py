@@ -7,15 +7,13 @@ from collections import deque
 from collections.abc import AsyncIterator, Callable, Coroutine, Mapping
 from typing import Any, TypeVar
 
-import pydantic
-
 from ldcnd.client.lease import Control
 from ldcnd.client.motion import Jogging, Motion, Position, Sent, State, set_point
 from ldcnd.client.notebook import table
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
 from ldcnd.client.verbs import AxisVerbs
-from ldcnd.contract.codec import decode_received, explained
+from ldcnd.contract.codec import decode_received, valid
 from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
 from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, SessionError, UnknownAxis, WrongState
@@ -382,10 +380,7 @@ async def made(client: RigClient, axis: str, command: type[CommandT], fields: Ma
             fields = {**fields} | {name: read_quantity(text, info, DIMENSIONS[name]) for name, text in texts.items()}
         except NotANumber as error:
             raise MalformedRequest(f"axis {axis}: {error}", axis=axis) from None
-    try:
-        return command.model_validate(fields)
-    except pydantic.ValidationError as error:
-        raise explained(error) from None
+    return valid(command, **fields)
 
 
 REST_S = 5.0

@@ -9,6 +9,7 @@ from itertools import count
 from typing import TypeVar
 
 from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.codec import valid
 from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, CommandReply
 from ldcnd.contract.errors import LdcndError, LeaseExpired, LeaseUnknown, OutcomeUnknown, Remedy, SessionError, step
 from ldcnd.contract.leases import Acquire, LeaseReply, Release, Renew
@@ -151,7 +152,7 @@ async def take_control(client: RigClient, name: str, axes: tuple[str, ...], leas
         lease = await client.ask(Renew(lease=client.lease))
         if set(axes) <= set(lease.axes):
             return Control(client, lease, inherited=True)
-    return Control(client, await client.ask(Acquire(client=name, axes=axes, lease_s=lease_s, force=force)))
+    return Control(client, await client.ask(valid(Acquire, client=name, axes=axes, lease_s=lease_s, force=force)))
 
 
 @contextlib.asynccontextmanager

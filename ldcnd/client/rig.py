@@ -15,6 +15,7 @@ from ldcnd.client.events import follow_events
 from ldcnd.client.lease import Control, inherited_lease, take_control
 from ldcnd.client.motion import Motion
 from ldcnd.client.rig_client import RigClient, find_rig
+from ldcnd.contract.codec import valid
 from ldcnd.contract.commands import StopReply
 from ldcnd.contract.errors import LdcndError, LeaseRequired, SessionError, UnknownAxis
 from ldcnd.contract.events import FINAL, CommandEvent, CommandOutcome, ReadOutcome
@@ -226,7 +227,7 @@ class Rig:
             self._control_of(name)
             moves.append(await made(self._client, name, AxisMove, {"axis": name, "position": position, **limits}))
         stamped = tuple(self._control_of(move.axis).stamped(move, move.axis) for move in moves)
-        reply = await self._client.ask(MoveTogether(moves=stamped, path=path, max_deviation=max_deviation))
+        reply = await self._client.ask(valid(MoveTogether, moves=stamped, path=path, max_deviation=max_deviation))
         return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
 
     async def path(
@@ -254,9 +255,11 @@ class Rig:
         moves = []
         for name, places in corners.items():
             *via, end = places
-            move = AxisPath(axis=name, via=tuple(via), position=end, velocity=velocity, acceleration=acceleration)
+            move = valid(
+                AxisPath, axis=name, via=tuple(via), position=end, velocity=velocity, acceleration=acceleration
+            )
             moves.append(self._control_of(name).stamped(move, name))
-        reply = await self._client.ask(WalkPath(moves=tuple(moves), speed=speed, max_deviation=max_deviation))
+        reply = await self._client.ask(valid(WalkPath, moves=tuple(moves), speed=speed, max_deviation=max_deviation))
         return tuple(self._axis(each.axis).begun(each) for each in reply.replies)
 
     def _control_of(self, name: str) -> Control:
@@ -275,7 +278,7 @@ class Rig:
         Raises:
             LeaseHeld, LeaseRequired: it would be raised, and another program controls one of the axes.
         """
-        return await self._client.ask(SetSpeedOverride(percent=percent, leases=self._leases()))
+        return await self._client.ask(valid(SetSpeedOverride, percent=percent, leases=self._leases()))
 
     async def reload(self, *, dry_run: bool = False, revision: str | None = None) -> ReloadReply:
         """Have the daemon read its configuration again; what needs a restart is named and stays as it is.
@@ -289,7 +292,7 @@ class Rig:
             WrongState: it has another revision.
             LeaseHeld: another client controls an axis whose settings would change.
         """
-        return await self._client.ask(Reload(dry_run=dry_run, revision=revision, leases=self._leases()))
+        return await self._client.ask(valid(Reload, dry_run=dry_run, revision=revision, leases=self._leases()))
 
     async def preview_together(
         self,
@@ -301,10 +304,10 @@ class Rig:
     ) -> PreviewTogetherReply:
         """Preview `move_together`: durations, and how far from a straight line the axes would get."""
         moves = tuple(
-            AxisMove(axis=name, position=position, velocity=velocity, acceleration=acceleration)
+            valid(AxisMove, axis=name, position=position, velocity=velocity, acceleration=acceleration)
             for name, position in targets.items()
         )
-        return await self._client.ask(PreviewTogether(moves=moves, path=path))
+        return await self._client.ask(valid(PreviewTogether, moves=moves, path=path))
 
     # -- what it says ------------------------------------------------------------------------------------------------
 
@@ -369,7 +372,7 @@ class Rig:
         Raises:
             NotSupported: the line is not configured for it.
         """
-        return await self._client.ask(Snapshot(bus=bus))
+        return await self._client.ask(valid(Snapshot, bus=bus))
 
     async def set_io(
         self,
@@ -394,7 +397,8 @@ class Rig:
             lease: one besides those under which this program controls axes here; together they must cover the axes of
                 the module's line, where a motion of them would need one.
         """
-        request = SetIo(
+        request = valid(
+            SetIo,
             module=module,
             high=tuple(high),
             low=tuple(low),
@@ -411,7 +415,7 @@ class Rig:
     ) -> IoReply:
         """Choose what the counter of an I/O module counts: `timer`, `counter` (edges of line 10), or `off`."""
         return await self._client.ask(
-            SetIoTimer(module=module, mode=IoTimer(mode), prescale=prescale, lease=lease, leases=self._leases())
+            valid(SetIoTimer, module=module, mode=mode, prescale=prescale, lease=lease, leases=self._leases())
         )
 
     async def override_interlock(self, interlock: str, seconds: float, reason: str) -> OverrideReply:
@@ -430,7 +434,7 @@ class Rig:
         if not leases:
             raise LeaseRequired("nothing is controlled here", remedy="use Rig.control")
         return await self._client.ask(
-            OverrideInterlock(interlock=interlock, seconds=seconds, reason=reason, lease=leases[0])
+            valid(OverrideInterlock, interlock=interlock, seconds=seconds, reason=reason, lease=leases[0])
         )
 
     async def send_guest_away(self, port: str) -> GuestSentAway:
@@ -440,14 +444,15 @@ class Rig:
             WrongState: no program uses it.
         """
         return await self._client.ask(
-            SendGuestAway(
+            valid(
+                SendGuestAway,
                 port=port,
             )
         )
 
     async def outcome(self, command_id: str) -> CommandOutcome:
         """Return what became of a command."""
-        return await self._client.ask(ReadOutcome(command_id=command_id))
+        return await self._client.ask(valid(ReadOutcome, command_id=command_id))
 
     def events(self, axis: str | None = None, *, history: bool = False) -> Stream[CommandEvent]:
         """Follow what happens to commands, each event once: what the network drops is fetched.

@@ -345,6 +345,18 @@ def _from_msgpack(payload: bytes) -> tuple[object, bytes]:
         ) from None
 
 
+def valid(model: type[ModelT], **fields: object) -> ModelT:
+    """Return a model of what a program has given.
+
+    Raises:
+        MalformedRequest: a value is none that the model takes; names the field.
+    """
+    try:
+        return model.model_validate(fields)
+    except pydantic.ValidationError as error:
+        raise explained(error, model) from None
+
+
 def explained(error: pydantic.ValidationError, model: type[Frozen] = Frozen) -> MalformedRequest:
     """Say in one sentence what is wrong with the first field that is."""
     first = error.errors(include_url=False)[0]
