@@ -15,7 +15,7 @@ from ldcnd.axis import events, faults, guards
 from ldcnd.axis.course import Way
 from ldcnd.axis.rest import Settling
 from ldcnd.axis.scale import AxisScale
-from ldcnd.axis.status import MOTION_STATES, STRENGTH, ActiveCommand, AxisStatus, Completion, new_faults
+from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, Completion, new_faults
 from ldcnd.axis.step import step
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import LdcndError
@@ -240,7 +240,7 @@ def test_what_is_not_seen_is_not_said_to_stand(history):
             assert (after.link, after.at_rest, after.target) == (LinkState.DOWN, False, None)
         if after.moving is Moving.NO:
             assert after.at_rest
-            assert after.command is None or after.state not in MOTION_STATES
+            assert after.command is None or not after.state.is_motion
 
 
 @pytest.mark.sweep(2)
@@ -264,7 +264,7 @@ def test_an_axis_falls_into_error_stop_without_its_command(history):
     for before, event, after in lives(history):
         if after.state is AxisState.ERROR_STOP and before.state is not AxisState.ERROR_STOP:
             assert after.command is None or isinstance(event, events.LatchRecalled)
-        if after.state in MOTION_STATES and before.state not in MOTION_STATES:
+        if after.state.is_motion and not before.state.is_motion:
             # without a command it is a motion that was found in a closed loop
             assert after.command or (after.enabled and after.state is AxisState.DISCRETE_MOTION)
 
