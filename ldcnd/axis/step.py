@@ -313,7 +313,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         ends_at_s=None,
         effective_from_s=math.inf,
         last_error=last_error,
-        interlock=status.interlock if last_error else "",
+        interlock=status.interlock if command.state is AxisState.STOPPING else "",  # that is how it ends the motion
         target=None if command.state is AxisState.CONTINUOUS_MOTION else command.target,
         target_counts=None,
         approached=False,

@@ -461,6 +461,8 @@ async def test_a_machine_that_is_taken_over_with_its_door_open_is_brought_to_res
     async with running_machine(machine(DOOR_SHUT, start="adopt"), chain) as rig:
         await asyncio.sleep(1.0)
         assert rig.speed() == 0
+        state = await rig.client.state("rotor")
+        assert state.interlock == "door_shut: input door_closed is false"
 
 
 @pytest.mark.promise("outputs-by-command")
