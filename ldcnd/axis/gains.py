@@ -21,7 +21,7 @@ class AxisGains:
         config = motion.config
         self._sets = {name: Gains(**each.model_dump()) for name, each in config.gain_sets.items()}
         self._of_kinds = {kind: self._sets[name] for kind, name in config.gains_for.items()}
-        self._of_others = motion.driver.gains if self._of_kinds else None
+        self._of_others = motion.driver.wanted_gains if self._of_kinds else None
 
     def _wanted(self, kind: MotionKind) -> Gains | None:
         """Return the gains for a kind of motion; None where it makes no difference."""
@@ -29,7 +29,7 @@ class AxisGains:
 
     def switches(self, kind: MotionKind) -> bool:
         """Tell whether a kind of motion takes other gains than the drive is to hold now."""
-        return self._wanted(kind) not in (None, self._motion.driver.gains)
+        return self._wanted(kind) not in (None, self._motion.driver.wanted_gains)
 
     def choose(self, kind: MotionKind) -> None:
         """Have the drive hold the gains of a kind of motion, loaded before its first packet, if the axis stands.
@@ -38,7 +38,7 @@ class AxisGains:
         """
         wanted = self._wanted(kind)
         if wanted is not None and not self._motion.tracker.status.state.is_motion:
-            self._motion.driver.gains = wanted
+            self._motion.driver.wanted_gains = wanted
 
     async def set(self, permit: Permit, request: SetGains) -> CommandReply:
         """Load gains: those that the request names, the others as they are; they act at once.
@@ -54,7 +54,7 @@ class AxisGains:
         if request.gain_set is not None:
             guards.check_stands(self._motion.tracker)
             asked = asdict(self._named(request.gain_set)) | asked
-        held = self._motion.driver.gains
+        held = self._motion.driver.wanted_gains
         if held is None and not {"kp", "el"} <= asked.keys():
             raise WrongState(
                 f"axis {self._name} has no gains yet",
@@ -98,7 +98,7 @@ class AxisGains:
         own, self._own = self._own, None
         if own is None:
             return False
-        self._motion.driver.gains = own
+        self._motion.driver.wanted_gains = own
         return True
 
     @property

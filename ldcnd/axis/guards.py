@@ -199,7 +199,7 @@ def check_not_forced(axis: AxisTracker) -> None:
 
 def check_has_gains(drive: QuietDrive) -> None:
     """Refuse to close the loop of a drive that takes gains and has none."""
-    if Verb.SET_GAINS in drive.capabilities and drive.gains is None:
+    if Verb.SET_GAINS in drive.capabilities and drive.wanted_gains is None:
         raise WrongState(
             f"axis {drive.spec.name} has no gains: its loop cannot close",
             axis=drive.spec.name,

@@ -573,7 +573,12 @@ class AxisMotion:
 
     def _ends(self, motion: CountsMotion) -> tuple[Settling | None, Way | None]:
         """Return when a motion has settled, and the way that leads there; None of one without an end of its own."""
-        target, settle, window, gains = motion.target_counts, self.config.settle, self.window_counts, self.driver.gains
+        target, settle, window, gains = (
+            motion.target_counts,
+            self.config.settle,
+            self.window_counts,
+            self.driver.wanted_gains,
+        )
         if target is None:
             return None, None
         settling = Settling(target, window, settle.time_s, settle.timeout_s, faults=settle.unsettled == "fault")

@@ -33,7 +33,7 @@ class QuietDrive(Protocol):
     capabilities: frozenset[Verb]
     adc_full_scale: int | None
     retargets: bool
-    gains: Gains | None
+    wanted_gains: Gains | None
     holds_gains: bool
     home_methods: frozenset[HomeMethod]
     capture_s: float

@@ -344,7 +344,7 @@ class Moves(Readable):
 
     Attributes:
         retargets: it takes a new trapezoid in mid-move and keeps velocity and acceleration within their limits.
-        gains: what is loaded at power-on, and before a motion where the drive is not known to hold it: what was
+        wanted_gains: what is loaded at power-on, and before a motion where the drive is not known to hold it: what was
             acknowledged last, before that the configuration's; None without either. It may be set to others.
         holds_gains: the drive is known to hold them; a drive whose gains are not loaded by the host holds its own.
         home_methods: what can mark the reference position; none for a drive that captures nothing.
@@ -360,7 +360,7 @@ class Moves(Readable):
     """
 
     retargets: bool = False
-    gains: Gains | None = None
+    wanted_gains: Gains | None = None
     holds_gains: bool = True
     home_methods: frozenset[HomeMethod] = frozenset()
     capture_s: float = 0.0

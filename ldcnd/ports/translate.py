@@ -213,7 +213,7 @@ class GuestServo:
         return NOTHING if found is None else Meaning(found, interrupts=True)
 
     def _gains(self, gains: Gains) -> Meaning:
-        held = self.drive.gains
+        held = self.drive.wanted_gains
         if gains == held and self.drive.holds_gains:
             return NOTHING
         if gains.step_multiplier != (held.step_multiplier if held else 1):
@@ -237,7 +237,7 @@ class GuestServo:
 
     def _rates(self, loaded: Trajectory) -> tuple[float, float | None]:
         """Return velocity and acceleration in axis units; the default of the axis for one that was never loaded."""
-        gains, profile = self.drive.gains, self.drive.profile
+        gains, profile = self.drive.wanted_gains, self.drive.profile
         divisor, scale = (gains.sr if gains else 1), abs(self._status().scale.counts_per_unit)
         velocity = velocity_counts_per_s(loaded.velocity or 0, divisor, profile) / scale
         acceleration = acceleration_counts_per_s2(loaded.acceleration or 0, divisor, profile) / scale

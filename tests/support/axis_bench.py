@@ -77,7 +77,7 @@ class FakeDrive(Moves):
 
     def __init__(self) -> None:
         self.spec = AxisSpec("x", 1, "pic-servo-v4", GAINS)
-        self.gains = GAINS
+        self.wanted_gains = GAINS
         self.identity = None
         self.capabilities = frozenset(Verb)
         self.adc_full_scale = 1023
@@ -147,7 +147,7 @@ class FakeDrive(Moves):
     @override
     async def set_gains(self, gains: Gains) -> None:
         await self._take("set_gains", gains)
-        self.gains = gains
+        self.wanted_gains = gains
 
     @override
     async def track(self, position_counts: int) -> None:

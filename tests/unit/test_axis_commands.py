@@ -128,7 +128,7 @@ async def test_power_off_ends_the_motion_and_its_target_is_forgotten():
 async def test_a_drive_without_gains_is_not_switched_on():
     async with axis_bench() as bench:
         await bench.send(Power(on=False))
-        bench.drive.gains = None
+        bench.drive.wanted_gains = None
         with pytest.raises(WrongState, match="no gains"):
             await bench.send(Power(on=True))
         with pytest.raises(WrongState, match="no gains yet"):

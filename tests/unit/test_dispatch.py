@@ -420,7 +420,7 @@ async def _turning(rig: Commanded) -> None:
 
 async def _without_gains(rig: Commanded) -> None:
     await _disabled(rig)
-    rig.x.drive.gains = None
+    rig.x.drive.wanted_gains = None
 
 
 async def _faulted(rig: Commanded) -> None:

@@ -314,7 +314,7 @@ class ServoRegisters(RegisterBook):
     can be read back (LS-182AP manual, "Define Status"; PIC-SERVO manual, 5.2).
 
     Attributes:
-        gains: see `Moves`.
+        wanted_gains: see `Moves`.
         shown_tick: the servo tick in which the drive counts velocity, seconds, the shortest one that is possible, and
             whether that is uncertain.
     """
@@ -322,7 +322,7 @@ class ServoRegisters(RegisterBook):
     shown_tick: tuple[float, bool]
 
     def __init__(self, profile: Profile, gains: Gains | None, now_s: Callable[[], float]) -> None:
-        self.gains = gains
+        self.wanted_gains = gains
         self._profile = profile
         self._cycle_s = profile.servo_cycle_s
         lacking = {
@@ -352,13 +352,13 @@ class ServoRegisters(RegisterBook):
         # Set Gain, Load Trajectory and I/O Control have no counterpart that reads: what the other host wrote is not
         # seen
         self.forget(TAKEN_OVER)
-        if self.gains:
-            self.assume(asdict(self.gains), f"{TAKEN_OVER}; this is what the configuration says")
+        if self.wanted_gains:
+            self.assume(asdict(self.wanted_gains), f"{TAKEN_OVER}; this is what the configuration says")
 
     @property
     def loaded(self) -> bool:
         """Whether the drive is known to hold the gains that it should."""
-        return self.gains is not None and self.holds(asdict(self.gains))
+        return self.wanted_gains is not None and self.holds(asdict(self.wanted_gains))
 
     @property
     def divisor(self) -> int | None:
@@ -369,7 +369,7 @@ class ServoRegisters(RegisterBook):
     @property
     def next_divisor(self) -> int | None:
         """The one in force when the next motion is loaded: until then the gains are; None while it is not known."""
-        return self.gains.sr if self.gains and self._profile.divisor_slows_profile else self.divisor
+        return self.wanted_gains.sr if self.wanted_gains and self._profile.divisor_slows_profile else self.divisor
 
     def _shown_tick(self) -> tuple[float, bool]:
         if not self._profile.divisor_slows_profile:

@@ -247,13 +247,13 @@ class LdcnAxis(Moves):
         return acceleration_counts_per_s2(held, divisor, self.profile)
 
     @property
-    def gains(self) -> Gains | None:
+    def wanted_gains(self) -> Gains | None:
         """See `Moves`."""
-        return self._book.gains
+        return self._book.wanted_gains
 
-    @gains.setter
-    def gains(self, gains: Gains | None) -> None:
-        self._book.gains = gains
+    @wanted_gains.setter
+    def wanted_gains(self, gains: Gains | None) -> None:
+        self._book.wanted_gains = gains
 
     @property
     def holds_gains(self) -> bool:  # type: ignore[override]
@@ -305,8 +305,8 @@ class LdcnAxis(Moves):
         # 5.2)
         if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
             first, offset = (commands.reset_position(self._node),), self.state.counts
-        if self.state.known.closed and self._book.gains and not self._book.loaded:
-            first = (commands.set_gain(self._node, self._book.gains), *first)
+        if self.state.known.closed and self._book.wanted_gains and not self._book.loaded:
+            first = (commands.set_gain(self._node, self._book.wanted_gains), *first)
         trajectory = trajectory_of(_shifted(motion, offset), self._next_divisor(), self.profile)
         return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
 
@@ -320,8 +320,10 @@ class LdcnAxis(Moves):
             await self.stop(StopMode.OFF)
             return
         # it may have been reset unseen, and then "all gain parameters and limit values are set to zero"
-        if self._book.gains and not (self.state.known.closed and self._book.loaded):  # it may have been reset unseen
-            await self.set_gains(self._book.gains)
+        if self._book.wanted_gains and not (
+            self.state.known.closed and self._book.loaded
+        ):  # it may have been reset unseen
+            await self.set_gains(self._book.wanted_gains)
         if self.profile.pic_ae_diagnostics and self.state.known.pic_ae is not False:
             await self._check_without_power_driver()
         # "the Stop Motor command must be issued initially to set amp_en before other motion commands" (PIC-SERVO
@@ -488,9 +490,9 @@ class LdcnAxis(Moves):
             RegisterUnknown: the divisor is not known, and the axis moves or has no gains to be loaded.
         """
         book = self._book
-        if book.gains is not None and not book.loaded:
+        if book.wanted_gains is not None and not book.loaded:
             if await self._stands():
-                await self.set_gains(book.gains)
+                await self.set_gains(book.wanted_gains)
             elif book.divisor is None:
                 raise self._unknown("sr", Remedy("{} and wait: at standstill the gains are loaded again", step("halt")))
         return self._next_divisor() if book.divisor is None else book.divisor
@@ -862,7 +864,7 @@ class LdcnAxis(Moves):
         # a lost reply leaves each register the old or the new value, and the next motion loads them again
         with self._book.writing(asdict(gains)):
             await self._bus.execute(exchange)
-        self._book.gains = gains
+        self._book.wanted_gains = gains
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
         """See `Moves`; PIC-SERVO version 4 only."""
