@@ -235,7 +235,7 @@ class AxisStatus:
     @property
     def moving(self) -> Moving:
         """Whether the axis moves, as far as readings tell; never "no" without readings that prove it."""
-        if self.link is not LinkState.UP:
+        if self.link is not LinkState.UP or (self.unsure and self.unsure.from_rest):
             return Moving.UNKNOWN
         rests = self.rest.rests
         if rests is False or (self.command and self.state.is_motion):

@@ -559,7 +559,15 @@ def _end(
     # what no drive has taken has no effect to wait for: readings count
     effective_from_s = 0.0 if math.isinf(status.effective_from_s) else status.effective_from_s
     target = status.target if how is CommandStatus.DONE else None
-    status = _with(status, failure=None, settle=None, ends_at_s=None, effective_from_s=effective_from_s, target=target)
+    status = _with(
+        status,
+        failure=None,
+        unsure=None,
+        settle=None,
+        ends_at_s=None,
+        effective_from_s=effective_from_s,
+        target=target,
+    )
     if command is None:
         return status
     return replace(

@@ -7,9 +7,9 @@ import pytest
 from ldcnd.contract.commands import Home, HomeMethod, Jog, MoveAbsolute, MoveVelocity
 from ldcnd.contract.errors import OutcomeUnknown
 from ldcnd.contract.rig_commands import SetSpeedOverride
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, Moving
 from ldcnd.drives.ldcn.commands import CommandCode
-from tests.support.dialect_rig import LS_182AP, SC, V4, Dialect, DialectRig, dialect_rig
+from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, Dialect, DialectRig, dialect_rig
 
 APPROACH = {"distance": 2.0, "direction": "positive"}
 STILL_MM = 0.05
@@ -54,11 +54,13 @@ async def test_what_did_not_begin_begins_with_no_other_speed_and_no_later_step(
         with pytest.raises(OutcomeUnknown):
             await rig.send(request_)
         await asyncio.sleep(after_s)
+        told = await rig.rig.client.state(AXIS)
         await rig.rig.client.ask(SetSpeedOverride(percent=50.0))
         await asyncio.sleep(3.0)
         state = await rig.until(lambda state: state.command is None)
 
     assert abs(rig.position_mm) < STILL_MM
+    assert told.moving is (Moving.UNKNOWN if told.command and told.state is not AxisState.STOPPING else Moving.NO)
     assert state.state is AxisState.STANDSTILL
     assert state.last_error
 
