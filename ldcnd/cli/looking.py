@@ -17,7 +17,7 @@ from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.client.overview import AxisNow, AxisSeen, modules_now, overview
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
-from ldcnd.contract.commands import Why, WhyReply
+from ldcnd.contract.commands import Verb, Why, WhyReply
 from ldcnd.contract.condition import SILENT_S, Condition, assess
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.fault_pages import codes, page_text
@@ -230,19 +230,23 @@ def monitors(target: Target, axis: str, names: tuple[str, ...], *, read: bool) -
             target.show(sample, line)
 
 
+OTHER_MOTIONS = {Verb.MOVE_RELATIVE: "by a distance", Verb.MOVE_VELOCITY: "at a velocity"}
+
+
 @click.command()
 @click.argument("axis", type=AXIS)
 @with_target
 def why(target: Target, axis: str) -> None:
     """Tell why AXIS cannot move now, and what would clear that; exits with 1 when something is in the way."""
 
-    async def work(client: RigClient) -> tuple[AxisInfo, WhyReply, bool]:
-        reply = await client.ask(Why(), axis)
-        goes = reply.can_move or (await client.ask(Why(absolute=False), axis)).can_move
-        return await axis_of(client, axis), reply, goes
+    async def work(client: RigClient) -> tuple[AxisInfo, WhyReply]:
+        reply = await client.ask(Why(each_command=True), axis)
+        return await axis_of(client, axis), reply
 
-    info, reply, goes = target.run(work)
-    without = "cannot move to a position now, only by a distance or at a velocity" if goes else "cannot move now"
+    info, reply = target.run(work)
+    taken = {verb for each in reply.commands if not each.causes for verb in each.verbs}
+    others = " or ".join(words for verb, words in OTHER_MOTIONS.items() if verb in taken)
+    without = f"cannot move to a position now, only {others}" if others else "cannot move now"
     lines = [f"{axis}: {'ready to move' if reply.can_move else without}"]
     for cause in reply.causes:
         known = remedy_of(cause)
