@@ -42,6 +42,7 @@ async def moving(line: Plugged, axis: str, position: float, velocity: float) -> 
     ],
     ids=str,
 )
+@pytest.mark.sweep(2)
 async def test_a_line_works_whatever_its_adapter_keeps_back(holding, baud):
     settings = simulated_config(RATES, margin_ms=25, overload="skip", baud=baud)
     async with plugged(holding, settings) as line:

@@ -152,6 +152,7 @@ def test_errors_are_counted_from_the_examination_on():
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_command_prints_findings_as_json_lines():
     running = await asyncio.create_subprocess_exec(
         *LDCND, "doctor", "ldcn", "--config", str(SIMULATED), "--bus", "line0", "--json", stdout=asyncio.subprocess.PIPE

@@ -158,6 +158,7 @@ async def test_a_fresh_line_gets_addresses_when_asked():
         (("ls-182ap", "pic-step"), {"next to the host", "furthest from the host"}, Verdict.FINE),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_a_scan_says_from_which_end_the_chain_is_numbered(names, said, verdict):
     chain = build_chain(ChainSpec(tuple(ModuleSpec(name) for name in names)))
 

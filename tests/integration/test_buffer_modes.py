@@ -196,6 +196,7 @@ async def test_a_target_beyond_the_limits_is_refused_at_once_and_not_when_its_tu
             await move(rig, 1e4, BufferMode.BUFFERED)
 
 
+@pytest.mark.long
 async def test_an_aborting_move_on_an_axis_that_takes_long_to_come_to_rest_is_answered_meanwhile():
     async with running_rig() as rig:
         await moving(rig, 0.0)

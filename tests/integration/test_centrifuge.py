@@ -333,6 +333,7 @@ def test_an_output_that_is_written_the_level_that_it_has_stays_known():
     assert operated(writes)
 
 
+@pytest.mark.long
 def test_of_a_spin_and_an_unlocking_at_one_instant_at_most_one_passes():
     async def race(machine):
         for apart_s in (-0.02, -0.005, -0.001, 0.0, 0.001, 0.003, 0.006, 0.01, 0.02, 0.05, 0.2):

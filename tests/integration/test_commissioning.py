@@ -427,6 +427,7 @@ async def test_the_output_at_rest_tells_friction_and_load(direction, pulls, tmp_
         assert not (await rig.running.client.state(AXIS)).enabled
 
 
+@pytest.mark.long
 async def test_a_load_that_friction_does_not_hold_contradicts_the_person(tmp_path):
     nm = PLANT.torque_nm_per_a * PLANT.supply_v / PLANT.resistance_ohm / 255
     script = {"what falls": "none", "remark": ""}
@@ -689,6 +690,7 @@ async def test_travel_is_jogged_and_typed(tmp_path):
         assert not change.restarts
 
 
+@pytest.mark.long
 async def test_speed_is_raised_until_the_drive_does_not_follow(tmp_path):
     script = {"how far may": "15"}
     async with commissioning_rig(tmp_path, script, supply_v=4.0) as rig:

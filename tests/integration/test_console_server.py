@@ -66,6 +66,7 @@ async def connected(page, rig, *, wanted=True):
                 return seen
 
 
+@pytest.mark.long
 async def test_a_page_that_never_reads_delays_nobody_and_the_console_ends_without_a_complaint(capfd):
     async with bulky_rig() as (endpoint, publish), console("-e", endpoint) as running:
         browser = await running.stranger.enter(running.link)
@@ -136,6 +137,7 @@ async def test_of_two_consoles_on_one_port_the_link_is_that_of_the_address_asked
     assert all(f"{host}:{port}" in told["127.0.0.3"][1] for host in ("127.0.0.1", "127.0.0.2"))
 
 
+@pytest.mark.long
 async def test_the_web_server_refuses_what_the_gate_refuses():
     async with console("-e", f"tcp/127.0.0.1:{free_port()}") as running:
         used = await running.stranger.get(path_of(running.link))
@@ -181,6 +183,7 @@ async def test_the_web_server_refuses_what_the_gate_refuses():
     assert page.close_code == 1008
 
 
+@pytest.mark.long
 async def test_tls_and_a_token_let_in_whoever_has_it_and_cookies_stay_inside_tls(tmp_path):
     now = dt.datetime.now(dt.UTC)
     authority = new_authority("test", now)

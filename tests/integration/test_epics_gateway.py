@@ -316,6 +316,7 @@ async def test_a_move_that_waits_for_the_end_of_a_jog_does_not_begin_after_a_sto
         assert (await running.client.state("x")).moving is Moving.NO
 
 
+@pytest.mark.long
 async def test_a_stop_right_after_a_put_leaves_the_axis_at_rest():
     async with records() as (running, made):
         for turns in range(1, 13):

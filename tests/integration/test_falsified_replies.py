@@ -55,6 +55,7 @@ async def test_of_a_standing_rig_no_false_position_and_no_false_fault_is_publish
 
 
 @pytest.mark.promise("reading-judged")
+@pytest.mark.long
 async def test_relative_moves_go_as_far_as_they_are_told():
     async with running_rig(rig_config(), {"line0": chain(3)}) as rig:
         line = rig.daemon.rig.axes["x"]

@@ -219,6 +219,7 @@ async def test_health_can_be_asked_for_as_json():
 
 
 @pytest.mark.parametrize("frozen_s", [0.9, 4.0])
+@pytest.mark.sweep(2)
 async def test_a_daemon_that_was_frozen_goes_on_and_reports_no_sooner_than_after_half_a_period(frozen_s):
     loop = asyncio.get_running_loop()
     assert isinstance(loop, JumpingLoop)

@@ -268,6 +268,7 @@ async def test_a_motion_is_ended_within_the_bound_when_the_module_falls_silent()
 @pytest.mark.parametrize(
     ("request_", "refused_"), [(UNLOCKED, True), (LOCKED, False), (SetIo(module="cabinet", pwm1=0.5), False)]
 )
+@pytest.mark.sweep(2)
 async def test_to_write_an_output_ends_no_motion_that_requires_it_as_it_stays(request_, refused_):
     async with running_machine(machine(DOOR_SHUT, DOOR_OPENS)) as rig:
         await spinning(rig)

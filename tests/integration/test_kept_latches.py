@@ -175,6 +175,7 @@ async def test_an_axis_in_error_stop_is_in_error_stop_in_the_next_daemon_with_it
 
 
 @pytest.mark.parametrize("content", [b"", b"\0" * 40, b"{", b'{"format": 2, "axes": {}}', b"\xff", "folder"])
+@pytest.mark.sweep(2)
 async def test_a_file_that_cannot_be_read_latches_every_axis_and_says_so_in_one_line(tmp_path, content):
     path = tmp_path / "latches.json"
     path.mkdir() if content == "folder" else path.write_bytes(content)

@@ -61,6 +61,7 @@ async def test_a_move_between_the_switches_ends_at_its_target():
 
 @pytest.mark.promise("limit-switches")
 @dialects
+@pytest.mark.sweep(2)
 async def test_the_drive_stops_at_the_switch_when_the_host_is_dead(dialect):
     async with dialect_rig(dialect, **GUARDED) as rig:
         await rig.power_on()

@@ -55,6 +55,7 @@ def test_rows_are_filtered_and_exported(rig):
 
 
 @pytest.mark.parametrize("since", ["yesterday", "10", "10x", "-5m"])
+@pytest.mark.sweep(2)
 def test_what_is_no_time_is_refused(rig, since):
     refused = rig.run(f"log --since {since}")
     assert refused.code == 2

@@ -78,6 +78,7 @@ async def test_an_orderly_end_is_no_loss_of_a_drive():
     ("policy", "stands"),
     [(LossPolicy.HALT, True), (LossPolicy.QUICK_STOP, True), (LossPolicy.RUN_TO_TARGET, False)],
 )
+@pytest.mark.sweep(2)
 async def test_a_drive_that_still_moves_when_the_line_is_back_does_what_its_policy_says(policy, stands):
     chain = simulated_chain()
     async with running_rig(with_loss(bus=policy), {"line0": chain}) as rig:

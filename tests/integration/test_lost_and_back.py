@@ -83,6 +83,7 @@ def test_a_module_without_power_is_named_on_every_screen_and_in_the_log(rig, cha
     assert "floats" not in rig.run("fleet").printed
 
 
+@pytest.mark.long
 def test_watching_a_module_that_does_not_answer_says_so(rig, chain):
     power(rig, chain.modules[CABINET], on=False, then_s=10.0)
 

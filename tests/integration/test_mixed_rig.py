@@ -211,6 +211,7 @@ async def test_a_cleared_counter_is_the_new_position(tmp_path):
     assert position.counts == 0
 
 
+@pytest.mark.long
 async def test_an_alarm_that_a_drive_enters_in_its_history_is_an_event(tmp_path):
     units = two_drives()
     async with mixed_rig(tmp_path, units) as rig:

@@ -57,6 +57,7 @@ async def test_the_capabilities_tell_what_the_model_can_do(dialect):
 
 @named((LS_173AP, LS_182AP, LS_182AP_22))
 @pytest.mark.parametrize("share", [0.65, 0.35])
+@pytest.mark.sweep(2)
 async def test_an_analog_move_finds_its_direction_and_ends_at_the_value(dialect, share):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
@@ -128,6 +129,7 @@ DEAD_SENSOR = PLANT.model_copy(update={"pot_span_counts": (-(1 << 40), 1 << 40),
         ({}, "not there within 10 s", 50.0),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_an_analog_move_whose_sensor_does_not_follow_ends_at_its_bounds(bounds, failure, way_mm):
     async with dialect_rig(LS_182AP, DEAD_SENSOR, reference="required") as rig:
         await rig.power_on()

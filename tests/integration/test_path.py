@@ -129,6 +129,7 @@ async def test_axes_on_a_path_stay_as_near_to_it_as_was_said_before(speed, corne
 
 
 @pytest.mark.parametrize("leader", NAMES)
+@pytest.mark.sweep(2)
 async def test_a_group_whose_leader_answers_for_it_walks_a_path_too(leader):
     chain = sc_chain()
     async with two_sc(chain, leader=leader) as rig:
@@ -308,6 +309,7 @@ async def test_a_stop_at_any_instant_of_a_path_is_the_last_that_moves():
             await rig.client.ask(path(speed=15.0))  # nothing of the earlier one is left in a drive
 
 
+@pytest.mark.long
 async def test_a_path_that_one_axis_leaves_before_it_starts_leaves_no_points_in_the_other_drive():
     left_at = set()
     for hundredth in range(1, 12):

@@ -130,6 +130,7 @@ async def test_no_poll_of_the_running_daemon_is_later_than_planned(axes):
         assert statistics.exchanges - before == pytest.approx(5.0 * hz * axes, rel=0.01)
 
 
+@pytest.mark.long
 async def test_no_stop_of_the_running_daemon_waits_longer_than_planned():
     rig_config = config(axes=4, position=100.0, velocity=100.0, adc=5.0, state=5.0)
     (planned,) = require_plan(rig_config).buses

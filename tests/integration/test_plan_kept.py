@@ -93,6 +93,7 @@ def check(seen: Kept) -> None:
     assert seen.longest_s <= max(poll.response_s for poll in seen.planned.polls)
 
 
+@pytest.mark.long
 async def test_31_axes_use_the_line_as_planned_and_no_poll_is_later_than_planned():
     seen = await kept("deadline", 2.0)
 

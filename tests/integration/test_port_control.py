@@ -154,6 +154,7 @@ async def test_a_program_that_falls_silent_loses_control_too(tmp_path):
         assert rig.speed() < 0.02
 
 
+@pytest.mark.long
 async def test_a_program_that_only_reads_gives_axes_back_that_rest(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
         await program.begin()

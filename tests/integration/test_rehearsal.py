@@ -278,6 +278,7 @@ def test_a_test_that_never_ends_fails_with_what_happened_and_a_fault_that_never_
     assert "x: jam: to come> never began" in done.stdout
 
 
+@pytest.mark.long
 async def test_a_program_of_asyncio_has_the_clock_of_the_rig(ldcnd_rig):
     began_s, began_at = time.monotonic(), time.time()
     await asyncio.sleep(30)

@@ -39,6 +39,7 @@ def kinds(taken: list[Publication]) -> Counter[str]:
 
 
 @pytest.mark.parametrize("encoding", ["json", "msgpack"])
+@pytest.mark.sweep(2)
 async def test_what_is_published_of_drives_that_move_stop_fail_and_fall_silent(encoding: str):
     events: list[dict[str, object]] = [
         {"at_s": FAULT_AT_S, "module": 2, "begins": "overvoltage"},

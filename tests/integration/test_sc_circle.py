@@ -187,6 +187,7 @@ class CircleHost:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.sweep(2)
 def test_three_axes_draw_a_circle_and_stay_near_it(seed):
     host = CircleHost(seed)
     host.bring_up()

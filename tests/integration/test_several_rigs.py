@@ -82,6 +82,7 @@ def test_a_rig_without_the_axis_is_no_failure_and_an_axis_that_no_rig_has_is_one
 
 
 @pytest.mark.parametrize(("line", "enabled"), [("halt x", True), ("axis halt x", True), ("power off x", False)])
+@pytest.mark.sweep(2)
 def test_halt_and_power_off_ask_for_no_rig_either(two_rigs, line, enabled):
     here, mill = two_rigs
 

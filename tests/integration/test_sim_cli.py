@@ -211,6 +211,7 @@ power = "off"
 """
 
 
+@pytest.mark.long
 def test_a_file_says_what_the_modules_are_and_what_happens_when(tmp_path):
     link, file = tmp_path / "line", tmp_path / "line.toml"
     file.write_text(FILE)
@@ -234,6 +235,7 @@ def test_a_file_says_what_the_modules_are_and_what_happens_when(tmp_path):
             assert host.hears_nobody(3)
 
 
+@pytest.mark.long
 def test_a_fault_plan_spoils_the_line(tmp_path):
     link, plan = tmp_path / "line", tmp_path / "faults.toml"
     plan.write_text('[[fault]]\nkind = "reply_lost"\n')

@@ -35,6 +35,7 @@ async def answered(terminal: int, packet: bytes) -> bytes:
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_drives_of_a_file_answer_behind_a_terminal(tmp_path: Path):
     file, log = tmp_path / "units.toml", tmp_path / "host.capture"
     file.write_text(UNITS)

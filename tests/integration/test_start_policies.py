@@ -327,6 +327,7 @@ async def test_a_line_that_was_lost_is_adopted_whatever_the_policy():
     assert abs(drive(chain, 1).loop.position - 50_000) <= 1
 
 
+@pytest.mark.long
 async def test_stops_during_a_take_over_delay_it_at_most():
     chain = chain_of()
     await leave_x_moving(chain, simulated_config())
@@ -398,6 +399,7 @@ async def referenced_after(chain, **bus):
 
 @pytest.mark.promise("reference-at-reset")
 @pytest.mark.parametrize("baud", [9600, 19_200, 57_600, 115_200])
+@pytest.mark.sweep(2)
 async def test_a_reset_of_drives_that_an_earlier_host_has_used_gives_no_reference(baud):
     chain = chain_of()
     assert all((await referenced_after(chain, baud=baud)).values())

@@ -116,6 +116,7 @@ async def stepper():
     return {value.parameter: (value.active, value.stored) for value in dump.values}
 
 
+@pytest.mark.long
 def test_a_twin_has_the_parameters_of_the_rig_in_both_memories():
     values = run(stepper())
     assert values["Pn102"] == (41, 40)

@@ -131,6 +131,7 @@ async def outcome(send: Callable[[], Awaitable[object]]) -> object:
 
 @pytest.mark.promise("stop-latches")
 @pytest.mark.parametrize("state", TABLE)
+@pytest.mark.sweep(2)
 async def test_each_command_is_taken_or_refused_as_the_table_says(state):
     async with dialect_rig(V4, pwm={"duty": 0.5, "duration_s": 5.0}, tracking={"step": 0.4, "rate": 50.0}) as rig:
         await rig.power_on()

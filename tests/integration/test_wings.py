@@ -111,6 +111,7 @@ async def test_a_daemon_serves_a_real_line_without_a_wing(tree, tmp_path):
 
 
 @pytest.mark.parametrize("tree", ["sim"], indirect=True)
+@pytest.mark.long
 def test_without_the_simulator_a_simulated_line_is_refused_with_one_error(tree):
     _, folder = tree
     done = run(folder, "-m", "ldcnd", "check-config", str(ROOT / "config" / "simulated.toml"))

@@ -222,6 +222,7 @@ def test_a_stop_stays_to_be_sent_until_its_drive_confirms_one_as_strong(history)
         assert codes.count(faults.STOP_UNCONFIRMED.code) == after.stop_pending
 
 
+@pytest.mark.sweep(2)
 def test_each_command_that_has_begun_ends_once(history):
     for _ in lives(history):
         pass
@@ -307,6 +308,7 @@ def test_a_reading_of_before_the_latest_command_ends_nothing(history):
             assert not math.isinf(after.effective_from_s) or before.command is None
 
 
+@pytest.mark.sweep(2)
 def test_a_step_that_changes_nothing_returns_the_same_object(history):
     for _, event, after in lives(history):
         if isinstance(event, events.LookTaken | events.StopConfirmed | events.StopLatch | events.SpeedOverridden):

@@ -78,6 +78,7 @@ async def test_a_poller_without_a_reply_is_asked_again():
 
 
 @pytest.mark.parametrize("bytewise", [False, True])
+@pytest.mark.sweep(2)
 async def test_a_mute_node_is_asked_more_and_more_seldom_and_recovers_at_once(*, bytewise: bool):
     rig = Rig(toy.all_but(1))
     poller = ToyPoller(1, 0.02)
@@ -131,6 +132,7 @@ async def test_half_a_line_that_falls_mute_costs_the_other_half_little_and_is_ba
     assert max(first_s) - min(first_s) < 0.1  # one that answers lets all others be asked
 
 
+@pytest.mark.long
 async def test_one_mute_node_does_not_slow_thirty_healthy_ones():
     rig = Rig(toy.all_but(31))
     period_s = 0.05

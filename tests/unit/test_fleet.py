@@ -139,6 +139,7 @@ def test_a_key_of_no_rig_is_refused(key):
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_the_fleet_is_shown_again_and_again_until_it_is_enough():
     endpoint = free_endpoint()
     async with open_zenoh_session(ZenohSettings(listen=(endpoint,))):

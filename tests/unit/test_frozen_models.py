@@ -108,6 +108,7 @@ def test_a_whole_number_has_no_fraction(value):
         SetGains(kp=value)
 
 
+@pytest.mark.long
 def test_no_field_of_any_model_takes_a_text_or_a_truth_for_a_number():
     """Walk everything that crosses the network or comes from a file, by the annotations of its fields."""
     taken = {
