@@ -165,8 +165,8 @@ def list_guests(target: Target) -> None:
 
 
 def _doing(guest: GuestHealth) -> str:
-    if guest.since is None:
-        return "no program"
+    if guest.problem or guest.since is None:
+        return guest.problem or "no program"
     holds = f"controls {', '.join(guest.axes)}" if guest.axes else "controls nothing"
     since = datetime.fromtimestamp(guest.since / 1e9, UTC).isoformat(timespec="seconds")
     return f"since {since}; {holds}; {guest.packets_hz:.1f} packets/s"

@@ -158,8 +158,14 @@ class GuestView(Protocol):
 class GuestHost(Protocol):
     """What a daemon does for a guest."""
 
-    def show(self, port: str, guest: GuestView | None) -> None:
-        """Show a guest to those who look after the rig, from now on; None once its port has ended."""
+    def show(self, port: str, guest: GuestView | None, problem: str = "") -> None:
+        """Show a guest to those who look after the rig, from now on.
+
+        Args:
+            port: its port.
+            guest: None while that is not served.
+            problem: why it is not served.
+        """
 
     def is_up(self) -> bool:
         """Tell whether every module of the line has its address, so that a guest's reading disturbs nothing."""

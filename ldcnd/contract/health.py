@@ -94,13 +94,15 @@ class GuestHealth(Frozen):
 
     port: str
     """Its configured name, under which the program holds leases."""
-    since: int | None
+    problem: str = ""
+    """Why the port is not served; empty while it is."""
+    since: int | None = None
     """Instant of the program's first byte, UTC in ns since 1970; null without a program."""
-    axes: tuple[str, ...]
+    axes: tuple[str, ...] = ()
     """The axes that it controls."""
-    packets_hz: float = Field(ge=0)
+    packets_hz: float = Field(default=0.0, ge=0)
     """Its packets that wanted a reply, each second, in the last period."""
-    refused: int = Field(ge=0)
+    refused: int = Field(default=0, ge=0)
     """Number of its commands that were answered and not done, since the daemon started; events have the reasons."""
 
 

@@ -168,10 +168,13 @@ class _GuestHost:
     def __init__(self, line: BusService, rig: OwnedRig, dispatcher: Dispatcher) -> None:
         self._line, self._rig, self._dispatcher = line, rig, dispatcher
 
-    def show(self, port: str, guest: GuestView | None) -> None:
+    def show(self, port: str, guest: GuestView | None, problem: str = "") -> None:
         self._line.guests.pop(port, None)
+        self._line.unserved.pop(port, None)
         if guest:
             self._line.guests[port] = guest
+        elif problem:
+            self._line.unserved[port] = problem
 
     def is_up(self) -> bool:
         return self._line.report is not None

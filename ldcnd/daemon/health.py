@@ -179,7 +179,10 @@ class HealthWatch:
             stop_wait=self._stop_wait(service),
             axes=tuple(self._axis(axis, service.asked_hz(axis.config.name), t) for axis in service.axes),
             modules=tuple(self._rig.modules[each].health for each in service.network.io),
-            guests=tuple(self._guest(port, guest, period_s) for port, guest in service.guests.items()),
+            guests=(
+                *(self._guest(port, guest, period_s) for port, guest in service.guests.items()),
+                *(GuestHealth(port=port, problem=why) for port, why in service.unserved.items()),
+            ),
         )
 
     def _guest(self, port: str, guest: GuestView, period_s: float) -> GuestHealth:

@@ -47,7 +47,8 @@ class BusService:
         family: the drive family on it.
         report: how the line came up; None while it is not up.
         problem: why it is not up; empty while it is.
-        guests: of its ports, by their names; of one that cannot be opened there is none.
+        guests: of its ports that are served, by their names.
+        unserved: why the others are not.
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class BusService:
         self.problem = "not opened yet"
         self._link_events = LinkEvents(note, "the line", "bus_down")
         self.guests: dict[str, GuestView] = {}
+        self.unserved: dict[str, str] = {}
         self._pollers: dict[str, Poller[Any]] = {}
         self._stop_probe_hz = stop_probe_hz
         self._was_up = False

@@ -47,10 +47,12 @@ async def serve(port: PortConfig, bus: Bus, drives: Sequence[Drive], ios: Sequen
                 said = reason
                 log.error("the port cannot be served and is tried again", guest=port.name, reason=reason)
                 host.refuse(RIG_ITSELF, f"the port {port.name} is not served and is tried again: {reason}", port.name)
+            host.show(port.name, None, f"not served, tried again: {reason}")
             await asyncio.sleep(TRIED_AGAIN_S)
         except Exception:
             log.exception("port ended", guest=port.name, bus=port.bus)
             host.refuse(RIG_ITSELF, f"the port {port.name} has ended by a fault of its own", port.name)
+            host.show(port.name, None, "has ended by a fault of its own, see the daemon's log")
             return
 
 

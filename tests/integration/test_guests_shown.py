@@ -195,3 +195,13 @@ def test_a_rig_without_ports_says_so(monkeypatch):
     with virtual_rig(monkeypatch) as rig:
         assert "no port is served" in rig.run("bus guests").errors
         assert rig.run("bus guests --json").printed == ""
+
+
+async def test_a_port_that_cannot_be_opened_is_shown_with_the_reason(tmp_path):
+    (tmp_path / "old").write_text("a file that somebody has put there")
+    async with running_machine(with_port(tmp_path / "old"), chain_of_machine()) as rig:
+        found = await shown(rig)
+
+    assert found.port == "old"
+    assert found.problem.startswith("not served, tried again: ")
+    assert (tmp_path / "old").read_text() == "a file that somebody has put there"

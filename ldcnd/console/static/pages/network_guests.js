@@ -10,7 +10,7 @@ export function Guests({ rig, bus }) {
   if (!guests.length) return null;
   const rows = guests.map(
     (guest) => html`<tr key=${guest.port}><th scope="row">${guest.port}</th>
-    <td>${guest.since === null ? "no program" : dateAndClock(guest.since)}</td>
+    <td>${guest.problem || (guest.since === null ? "no program" : dateAndClock(guest.since))}</td>
     <td>${guest.axes.join(", ") || "nothing"}</td>
     <td class="number">${number(guest.packets_hz, 1)}</td><td class="number">${guest.refused}</td>
     <td>${
