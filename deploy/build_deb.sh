@@ -108,7 +108,7 @@ main_package() {
     unit "$here/units/beside@.service" console "Console in browsers" "$root"
     unit "$here/units/beside@.service" metrics "Metrics for Prometheus" "$root"
     unit "$here/units/beside@.service" record "Recording" "$root"
-    sed -i 's,^ExecStart=.* record,& --out /var/lib/ldcnd-record/%i/%%Y%%m%%d-%%H%%M%%S.mcap,; s,^RuntimeDirectory=.*,StateDirectory=ldcnd-record/%i\nStateDirectoryMode=0750,; /^RuntimeDirectoryMode/d' \
+    sed -i 's,^ExecStart=.* record,& --out /var/lib/ldcnd-record/%i/%%Y%%m%%d-%%H%%M%%S.mcap,; s,^RuntimeDirectory=.*,StateDirectory=ldcnd-record/%i\nStateDirectoryMode=0750,; /^RuntimeDirectory[MP]/d' \
         "$units/ldcnd-record@.service"
     install -Dm644 "$here/units/ldcnd.env" "$root/etc/ldcnd/ldcnd.env"
     install -Dm644 "$here/udev/71-ldcnd.rules" "$root/usr/lib/udev/rules.d/71-ldcnd.rules"

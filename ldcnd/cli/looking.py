@@ -86,11 +86,15 @@ def axes_table(axes: list[AxisNow]) -> list[str]:
 
 
 def _motion(seen: AxisSeen) -> str:
-    """Return whether an axis moves, and how fast and for how long if it does."""
+    """Return whether an axis moves, and how fast and for how long if it does.
+
+    Drives count velocity in whole counts a servo tick: a slow motion reads 0 at times, which says nothing.
+    """
     if seen.moving is not Moving.YES:
         return seen.moving.value
+    speed = f"about {seen.shown_velocity}" if seen.velocity else ""
     rest = "" if seen.rest_s is None else f"for another {seen.rest_s:.1f} s"
-    return " ".join(filter(None, (seen.moving.value, seen.shown_velocity, rest)))
+    return " ".join(filter(None, (seen.moving.value, speed, rest)))
 
 
 def _digits(now: AxisNow) -> str | None:

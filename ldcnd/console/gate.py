@@ -3,7 +3,7 @@
 Only `/static/` is served without a visitor's cookie. What changes anything needs the cookie, a header that only the
 console's own pages can set, and the console's own origin; a WebSocket needs cookie and origin, because browsers let any
 page open one. What only brings axes to rest needs no cookie: a page that was let in keeps its header, whatever becomes
-of the cookies of its browser, and may have axes under way.
+of the cookies of its browser and of the console's process, and may have axes under way.
 
 Browsers keep one set of cookies for all ports of a host, so the names of these have the port that the browser sees.
 """

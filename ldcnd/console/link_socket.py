@@ -1,11 +1,12 @@
-"""The socket on which a console gives another link to its own user, so that nothing has to be stopped for one.
+"""What the consoles of a user share: the socket on which one gives another link, and the key that signs their pages.
 
-It lies in the user's runtime folder, which only that user and root can open: both can read the console's memory anyway.
+Both lie in the user's runtime folder, which only that user and root can open; both could read the memory of a console.
 """
 
 import asyncio
 import json
 import os
+import secrets
 import socket
 import tempfile
 from collections.abc import AsyncIterator, Callable
@@ -22,6 +23,8 @@ RUNTIME_FOLDERS = ("RUNTIME_DIRECTORY", "XDG_RUNTIME_DIR")
 SERVICES = Path("/run/ldcnd-console")
 """Where the services of the package have theirs, each in a folder of its own (deploy/units/beside@.service)."""
 PRIVATE = 0o700
+PAGE_KEY = "ldcnd-console.key"
+KEY_BYTES = 32
 EVERY_ADDRESS = ("0.0.0.0", "::")  # noqa: S104 - a console there listens on the address that is asked for
 _PREFIX, _SUFFIX = "ldcnd-console-", ".sock"
 _ANY = f"{_PREFIX}*-*{_SUFFIX}"
@@ -50,6 +53,21 @@ def _folder() -> Path:
     if folder.stat().st_uid != os.getuid():
         raise ConfigError(f"{folder} belongs to another user: no links of a console are given there")
     return folder
+
+
+def page_key() -> bytes | None:
+    """Return the key that the consoles of this user sign with, one after the other; None where it cannot be kept."""
+    try:
+        path = _folder() / PAGE_KEY
+        with (
+            suppress(FileExistsError),
+            os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as new,
+        ):
+            new.write(secrets.token_bytes(KEY_BYTES))
+        key = path.read_bytes()
+    except (OSError, ConfigError):
+        return None
+    return key if len(key) == KEY_BYTES else None
 
 
 def _folders() -> list[Path]:

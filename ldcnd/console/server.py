@@ -26,7 +26,7 @@ from ldcnd.console.control import control_routes
 from ldcnd.console.feed import Feed
 from ldcnd.console.gate import RequestGate
 from ldcnd.console.latest_values import LatestValues
-from ldcnd.console.link_socket import GivenLink, giving_links
+from ldcnd.console.link_socket import GivenLink, giving_links, page_key
 from ldcnd.console.pages import Pages
 from ldcnd.console.reading import STATIC, reading_routes
 from ldcnd.console.replies import LinkReply
@@ -98,7 +98,7 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
     values = LatestValues()
     beside = Beside()
     rigs = Rigs(values, settings.rigs, beside.lacks)
-    visitors = Visitors(loop.time, settings.token)
+    visitors = Visitors(loop.time, settings.token, page_key())
     listening = _listen(settings.address)
     host, port = listening.getsockname()[:2]
 

@@ -1,5 +1,6 @@
 """Who may use the console: links that let a browser in, and the browsers that were let in."""
 
+import hashlib
 import hmac
 import secrets
 from collections.abc import Callable
@@ -32,7 +33,7 @@ class Visitor:
     @property
     def client(self) -> str:
         """The name under which its commands go."""
-        return f"console-{self.number}"
+        return f"console-{self.number}" if self.number else "console, a page of before"
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,16 +43,20 @@ class _Link:
 
 
 class Visitors:
-    """Keeps links and visitors in memory: those of a process that ends are worth nothing any more.
+    """Keeps links and visitors in memory: of those of a process that has ended only the pages may bring to rest.
 
     Args:
         now_s: a clock.
         standing_token: lets in every browser that has it, any number of times; None is the rule on one's own machine.
+        page_key: signs what pages send, so that one of an earlier process with this key is known.
     """
 
-    def __init__(self, now_s: Callable[[], float], standing_token: str | None = None) -> None:
+    def __init__(
+        self, now_s: Callable[[], float], standing_token: str | None = None, page_key: bytes | None = None
+    ) -> None:
         self._now_s = now_s
         self._standing_token = standing_token
+        self._page_key = page_key or secrets.token_bytes(TOKEN_BYTES)
         self._links: list[_Link] = []
         self._visitors: list[Visitor] = []
         self._count = 0
@@ -81,7 +86,7 @@ class Visitors:
         if known:
             return known
         self._count += 1
-        visitor = Visitor(self._count, secrets.token_urlsafe(TOKEN_BYTES), secrets.token_urlsafe(TOKEN_BYTES), now_s)
+        visitor = Visitor(self._count, secrets.token_urlsafe(TOKEN_BYTES), self._signed(secrets.token_hex(8)), now_s)
         self._visitors = [*self._visitors, visitor]
         if len(self._visitors) > MOST_VISITORS:
             self._visitors.remove(min(self._visitors, key=lambda each: each.seen_at_s))
@@ -92,8 +97,13 @@ class Visitors:
         return self._seen([each for each in self._present() if _same(each.token, token)])
 
     def of_page(self, csrf: str) -> Visitor | None:
-        """Return the visitor whose page sends this, and record the time."""
-        return self._seen([each for each in self._present() if is_csrf_of(each, csrf)])
+        """Return the visitor whose page sends this, and record the time; without a number one who is not in any more.
+
+        A page stays open over a restart of the console, and may have axes in sight that move.
+        """
+        known = self._seen([each for each in self._present() if is_csrf_of(each, csrf)])
+        was_in = _same(self._signed(csrf.partition(".")[0]), csrf)
+        return known or (Visitor(0, "", csrf, self._now_s()) if was_in else None)
 
     def see(self, visitor: Visitor) -> None:
         """Note that a visitor has a page open."""
@@ -109,6 +119,10 @@ class Visitors:
             return None
         self.see(known[0])
         return known[0]
+
+    def _signed(self, number: str) -> str:
+        mac = hmac.new(self._page_key, number.encode(errors="replace"), hashlib.sha256)
+        return f"{number}.{mac.hexdigest()}"
 
     def _standing_token_is(self, token: str) -> bool:
         return self._standing_token is not None and _same(self._standing_token, token)

@@ -127,6 +127,30 @@ async def test_a_stop_that_gets_lost_is_told_at_once(house):
         assert not (await house.sim.rig.state("x")).stop_latched
 
 
+COVERED = """(selector) => [...document.querySelectorAll(selector)].filter((button) => {
+  const { left, top, width, height } = button.getBoundingClientRect();
+  return !button.contains(document.elementFromPoint(left + width / 2, top + height / 2));
+}).map((button) => button.textContent)"""
+"""Returns what is written on the buttons that a pointer does not reach."""
+
+
+@pytest.mark.parametrize("width", [1920, 1366, 1000, 600, 390])
+async def test_what_is_told_of_a_stop_lies_over_nothing_that_ends_a_motion(house, width):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.page.set_viewport_size({"width": width, "height": 800})
+        await desk.open("axis/sim/x")
+        await desk.page.route("**/api/stop", lambda route: route.abort())
+        await desk.page.get_by_role("button", name="Stop all axes").click()
+        report = desk.page.get_by_text("The stop did not get through")
+        await expect(report).to_be_in_viewport(ratio=1)
+
+        covered = await desk.page.evaluate(COVERED, "button.stop, .endings button")
+        assert covered == []
+        await desk.page.get_by_role("button", name="Dismiss").click()
+        await expect(report).to_be_hidden()
+
+
 async def test_a_fault_is_shown_with_its_remedy_and_the_remedy_helps(house):
     await house.sim.quiet("z")
     async with house.desk() as desk:

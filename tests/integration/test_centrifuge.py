@@ -448,7 +448,7 @@ def test_list_says_how_fast_a_rotor_turns_in_its_unit_and_for_how_long(monkeypat
         halted = machine.run("halt rotor --wait")
         at_rest = json.loads(machine.run("list --json").printed)
 
-    speed, rest = re.search(r"moving yes (\S+) rpm \(.+ g\) for another (\S+) s", text).groups()
+    speed, rest = re.search(r"moving yes about (\S+) rpm \(.+ g\) for another (\S+) s", text).groups()
     assert (float(speed), float(rest)) == (pytest.approx(300, abs=16), pytest.approx(seen["rest_s"], abs=1))
     assert 20 < seen["rest_s"] < 35
     assert "rotor: cannot move to a position now, only at a velocity" in why

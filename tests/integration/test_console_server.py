@@ -87,6 +87,26 @@ async def test_a_page_that_never_reads_delays_nobody_and_the_console_ends_withou
     assert not capfd.readouterr().err
 
 
+async def test_a_page_that_is_open_over_a_restart_of_the_console_stops_and_does_nothing_else(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    listen = ("--listen", f"127.0.0.1:{free_port()}")
+    async with bulky_rig() as (endpoint, _):
+        async with console("-e", endpoint, *listen) as before:
+            page_of_before = await before.stranger.enter(before.link)
+            before.process.kill()
+            await before.process.wait()
+        async with console("-e", endpoint, *listen) as after:
+            anew = await after.stranger.enter(after.link)
+            async with feed(anew) as page:
+                await connected(page, "sim")
+            stopped = await page_of_before.post("/api/stop")
+            others = [await page_of_before.post("/api/rigs/sim/axes/x/reset"), await page_of_before.get("/api/rigs")]
+            forged = await page_of_before.forging(x_ldcnd_csrf="0011223344556677." + "0" * 64).post("/api/stop")
+
+    assert stopped.document["rigs"]["sim"]["confirmed"] == ["x"]
+    assert [each.status for each in (*others, forged)] == [401] * 3
+
+
 @pytest.mark.long
 async def test_another_link_is_given_without_stopping_anything():
     async with console("-e", f"tcp/127.0.0.1:{free_port()}") as running:
