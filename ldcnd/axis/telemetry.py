@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import Any
 
+from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, AxisStatus
 from ldcnd.contract.commands import ReportShadow
 from ldcnd.contract.events import CommandStatus
@@ -18,6 +19,7 @@ Inputs = tuple[bool | None, bool | None, bool | None, bool | None, bool | None]
 """Reverse limit, forward limit, index, stop input, amplifier enable."""
 INPUTS_NS = 1_000_000_000
 """Inputs are published when one changes, and when so long has passed."""
+_POSITION = frozenset({TelemetryItem.POSITION})
 FaultKey = tuple[tuple[FaultEntry, ...], FaultEntry | None]
 
 
@@ -54,6 +56,7 @@ class AxisTelemetry:
         self._fields: dict[str, Any] = {}
         self._published: dict[str, Any] = {}
         self._published_faults: FaultKey | None = None
+        self._read: tuple[AxisScale, AxisReading, int, int] | None = None  # what the last position was made of
         self._last_inputs: Inputs | None = None
         self._inputs_at_ns = 0
 
@@ -73,6 +76,7 @@ class AxisTelemetry:
         fields = self._fields if status is self._of else self._fields_of(status)
         quality = fields["quality"]
         if TelemetryItem.POSITION in asked:
+            self._read = scale, reading, t, t_error_ns
             counts, lag, turns = reading.position_counts, reading.following_error_counts, None
             value = (counts - scale.origin_counts) / scale.counts_per_unit
             if scale.modulo is not None:
@@ -148,6 +152,10 @@ class AxisTelemetry:
         if status is self._latest and not due:
             return
         self._latest = status
+        if self._read and self._read[0] is not status.scale:
+            # no face may show the old number as a place that is known, which this state would make of it
+            _, reading, read_at, error_ns = self._read
+            self.publish(status, reading, _POSITION, read_at, error_ns)
         fields = self._fields if status is self._of else self._fields_of(status)
         if due or fields != self._published:
             self._published, command = fields, status.command

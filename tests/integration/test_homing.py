@@ -5,9 +5,9 @@ import contextlib
 
 import pytest
 
-from ldcnd.contract.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs
+from ldcnd.contract.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs, SetPosition
 from ldcnd.contract.errors import BusError, MalformedRequest, NotSupported, PositionLimit, VelocityLimit
-from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.contract.samples import AxisState, PositionSample, StateSample, TelemetryItem
 from ldcnd.drives.ldcn.controls import HomingControl
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from tests.support.dialect_rig import (
@@ -48,6 +48,28 @@ async def offset(rig: DialectRig) -> float:
     """Return how much more the daemon says than the shaft's true position, once the axis has settled."""
     await asyncio.sleep(1.0)  # virtual
     return await published_position(rig) - rig.position_mm
+
+
+@named([LS_182AP, SC])
+@pytest.mark.parametrize("command", [Home(method=HomeMethod.REVERSE_LIMIT, velocity=-5.0), SetPosition(position=50.0)])
+async def test_no_position_of_before_is_the_last_one_once_the_place_is_known(dialect, command):
+    async with dialect_rig(dialect, rates={"position": 0.5, "state": 20.0}) as rig:
+        await rig.power_on()
+        last, known = None, []
+        async with rig.rig.client.samples(AXIS) as samples:
+            await rig.send(command)
+            async with asyncio.timeout(120):
+                while len(known) < 3:
+                    _, sample = await anext(samples)
+                    if isinstance(sample, PositionSample):
+                        last = sample
+                    elif isinstance(sample, StateSample) and sample.referenced and last:
+                        known.append(last)
+        await asyncio.sleep(3.0)
+        now = await rig.rig.client.position(AXIS)
+
+    origins = {round(each.counts / 1000.0 - each.value, 3) for each in (*known, now)}
+    assert len(origins) == 1
 
 
 @named(LIMITS)
