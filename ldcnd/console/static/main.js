@@ -10,7 +10,7 @@ import { RigPage } from "./pages/rig.js";
 import { ScopePage } from "./pages/scope.js";
 import { TracePage } from "./pages/trace.js";
 import { TuningPage } from "./pages/tuning.js";
-import { number } from "./parts/format.js";
+import { number, sentence } from "./parts/format.js";
 import { problems } from "./parts/problems.js";
 import { Mark } from "./parts/state.js";
 import { AxisStrip, PlaceAndTarget } from "./parts/strip.js";
@@ -84,7 +84,7 @@ function Notices() {
   return html`<div class="notices" role="alert">
     ${loginIsGone() && html`<p class="notice mark" data-level="bad">The login of this page is gone: its cookies were cleared or
       replaced. Halt and stop work on. For all else load the page again, or open it with a new link of ldcnd console.</p>`}
-    ${failure && html`<p class="notice mark" data-level="bad">${failure.message} ${failure.remedy ?? ""}</p>`}
+    ${failure && html`<p class="notice mark" data-level="bad">${sentence(failure.message)} ${sentence(failure.remedy ?? "")}</p>`}
     ${[...rigs.values()].filter((rig) => rig.worth).map((rig) => html`<p class="notice mark" key=${rig.name} data-level="bad"
       >${rig.name}: no new values. ${rig.worth.why}</p>`)}
     ${lost.size > 0 && html`<p class="notice mark" data-level="bad">${lostInWords().join(" ")}

@@ -53,3 +53,8 @@ export function dateAndClock(ns) {
 export function words(name) {
   return String(name ?? "–").replaceAll("_", " ");
 }
+
+/** A message with the point that ends a sentence: those of the daemon have none. */
+export function sentence(text) {
+  return !text || /[.!?]$/.test(text) ? text : `${text}.`;
+}

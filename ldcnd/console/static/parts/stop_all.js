@@ -6,7 +6,7 @@ import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { rigs } from "../session/rigs.js";
 import { Action, useAtOnce } from "./controls.js";
-import { clock } from "./format.js";
+import { clock, sentence } from "./format.js";
 
 const KEY = "Escape";
 const PATIENCE_MS = 6_000;
@@ -27,7 +27,7 @@ export function StopAll() {
       const { rigs: replies } = await askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
       setReport({ at, lines: Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)) });
     } catch (error) {
-      setReport({ at, lines: [{ text: `The stop did not get through: ${error.message} Use the emergency stop.`, level: "bad" }] });
+      setReport({ at, lines: [{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad" }] });
     }
   }
 
