@@ -117,7 +117,7 @@ export class Axis {
     if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
     else if (item === "trace") this.trace = sample;
     else if (kind !== "trace" && kind !== "event") {
-      this.#keep(this.#told, item, sample);
+      this.#keep(this.#told, item, sample?.unit ? sample : null); // what has a unit is judged anew by each description
       this.#judge(item, sample);
     }
     if ((item === "state" && sample?.link === "down") || (item === "condition" && sample?.live === false)) this.#outNs = this.rig.nowNs();
