@@ -2,8 +2,8 @@
 
 Both are kept from when they come, and a stop is answered once its latch is on the disk, or after `WITHIN_S`. The
 next daemon begins with them, and has what was stopped stopped again: its drive may not have been sent the stop before
-the daemon was killed. Where the file cannot be read, or is one of a
-backup, which may be older than a stop, every axis is latched.
+the daemon was killed. Where the file cannot be read, or is one of a backup, which may be older than a stop, every axis
+is latched.
 """
 
 import asyncio

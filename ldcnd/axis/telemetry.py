@@ -19,7 +19,6 @@ Inputs = tuple[bool | None, bool | None, bool | None, bool | None, bool | None]
 """Reverse limit, forward limit, index, stop input, amplifier enable."""
 INPUTS_NS = 1_000_000_000
 """Inputs are published when one changes, and when so long has passed."""
-_POSITION = frozenset({TelemetryItem.POSITION})
 FaultKey = tuple[tuple[FaultEntry, ...], FaultEntry | None]
 
 
@@ -56,7 +55,7 @@ class AxisTelemetry:
         self._fields: dict[str, Any] = {}
         self._published: dict[str, Any] = {}
         self._published_faults: FaultKey | None = None
-        self._read: tuple[AxisScale, AxisReading, int, int] | None = None  # what the last position was made of
+        self._placed: tuple[AxisScale, AxisReading, int, int] | None = None  # what the last position was made of
         self._last_inputs: Inputs | None = None
         self._inputs_at_ns = 0
 
@@ -76,24 +75,7 @@ class AxisTelemetry:
         fields = self._fields if status is self._of else self._fields_of(status)
         quality = fields["quality"]
         if TelemetryItem.POSITION in asked:
-            self._read = scale, reading, t, t_error_ns
-            counts, lag, turns = reading.position_counts, reading.following_error_counts, None
-            value = (counts - scale.origin_counts) / scale.counts_per_unit
-            if scale.modulo is not None:
-                value, turns = scale.within_turn(value)
-            self._position.publish(
-                {
-                    "t": t,
-                    "t_error_ns": t_error_ns,
-                    "seq": 0,
-                    "quality": quality,
-                    "value": value,
-                    "unit": scale.unit,
-                    "turns": turns,
-                    "counts": counts,
-                    "following_error": None if lag is None else lag / scale.counts_per_unit,
-                }
-            )
+            self._publish_position(scale, reading, quality, t, t_error_ns)
         if TelemetryItem.VELOCITY in asked:
             velocity = reading.velocity_counts_per_s
             scaled = Quality.UNCERTAIN if reading.velocity_uncertain and quality is Quality.GOOD else quality
@@ -147,16 +129,38 @@ class AxisTelemetry:
                 )
         self.publish_state(status, t, t_error_ns, due=TelemetryItem.STATE in asked)
 
+    def _publish_position(
+        self, scale: AxisScale, reading: AxisReading, quality: Quality, t: int, t_error_ns: int
+    ) -> None:
+        self._placed = scale, reading, t, t_error_ns
+        counts, lag, turns = reading.position_counts, reading.following_error_counts, None
+        value = (counts - scale.origin_counts) / scale.counts_per_unit
+        if scale.modulo is not None:
+            value, turns = scale.within_turn(value)
+        self._position.publish(
+            {
+                "t": t,
+                "t_error_ns": t_error_ns,
+                "seq": 0,
+                "quality": quality,
+                "value": value,
+                "unit": scale.unit,
+                "turns": turns,
+                "counts": counts,
+                "following_error": None if lag is None else lag / scale.counts_per_unit,
+            }
+        )
+
     def publish_state(self, status: AxisStatus, t: int, t_error_ns: int = 0, *, due: bool = False) -> None:
         """Publish the state and the faults if they changed, or if they are due anyway."""
         if status is self._latest and not due:
             return
         self._latest = status
-        if self._read and self._read[0] is not status.scale:
-            # no face may show the old number as a place that is known, which this state would make of it
-            _, reading, read_at, error_ns = self._read
-            self.publish(status, reading, _POSITION, read_at, error_ns)
         fields = self._fields if status is self._of else self._fields_of(status)
+        if self._placed and self._placed[0] is not status.scale:
+            # no face may show the old number as a place that is known, which this state would make of it
+            _, reading, read_at, error_ns = self._placed
+            self._publish_position(status.scale, reading, fields["quality"], read_at, error_ns)
         if due or fields != self._published:
             self._published, command = fields, status.command
             self._state.publish(

@@ -294,7 +294,7 @@ class Interlocks:
         error = rule.violation(f"axis {name}", text)
         reason = f"{error.message}; reaction: {reaction.value}"
         self._events.note(name, INTERLOCK, CommandStatus.ABORTED, reason, code=error.code.value)
-        # whoever waits for the motion is told why it ends
+        # the end of the command gives this as its reason
         axis.tracker.take(CommandFailing(error.message, f"{rule.config.name}: {text}"))
         group.create_task(axis.stops.bring_to_rest(STOP_MODES[reaction]), name=f"interlock {rule.config.name}")
 

@@ -446,6 +446,7 @@ def test_list_says_how_fast_a_rotor_turns_in_its_unit_and_for_how_long(monkeypat
         seen = json.loads(machine.run("list --json").printed)
         why = machine.run("why rotor").printed
         halted = machine.run("halt rotor --wait")
+        stands = machine.run("halt rotor --wait")
         at_rest = json.loads(machine.run("list --json").printed)
 
     speed, rest = re.search(r"moving yes about (\S+) rpm \(.+ g\) for another (\S+) s", text).groups()
@@ -455,6 +456,7 @@ def test_list_says_how_fast_a_rotor_turns_in_its_unit_and_for_how_long(monkeypat
     assert seen["velocity"] == pytest.approx(5, abs=0.3)
     assert halted.code == 0
     assert halted.printed.endswith("rotor: halt done\n")
+    assert stands.code == 0
     assert (at_rest["moving"], at_rest["rest_s"], abs(at_rest["velocity"]) < 0.5) == ("no", None, True)
 
 

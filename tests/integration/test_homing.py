@@ -7,7 +7,7 @@ import pytest
 
 from ldcnd.contract.commands import Halt, Home, HomeMethod, HomeStop, MoveAbsolute, SetOutputs, SetPosition
 from ldcnd.contract.errors import BusError, MalformedRequest, NotSupported, PositionLimit, VelocityLimit
-from ldcnd.contract.samples import AxisState, PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.samples import AxisState, InputsSample, PositionSample, StateSample, TelemetryItem
 from ldcnd.drives.ldcn.controls import HomingControl
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from tests.support.dialect_rig import (
@@ -55,7 +55,7 @@ async def offset(rig: DialectRig) -> float:
 async def test_no_position_of_before_is_the_last_one_once_the_place_is_known(dialect, command):
     async with dialect_rig(dialect, rates={"position": 0.5, "state": 20.0}) as rig:
         await rig.power_on()
-        last, known = None, []
+        last, known, inputs_at = None, [], []
         async with rig.rig.client.samples(AXIS) as samples:
             await rig.send(command)
             async with asyncio.timeout(120):
@@ -63,6 +63,8 @@ async def test_no_position_of_before_is_the_last_one_once_the_place_is_known(dia
                     _, sample = await anext(samples)
                     if isinstance(sample, PositionSample):
                         last = sample
+                    elif isinstance(sample, InputsSample):
+                        inputs_at.append(sample.t)
                     elif isinstance(sample, StateSample) and sample.referenced and last:
                         known.append(last)
         await asyncio.sleep(3.0)
@@ -70,6 +72,7 @@ async def test_no_position_of_before_is_the_last_one_once_the_place_is_known(dia
 
     origins = {round(each.counts / 1000.0 - each.value, 3) for each in (*known, now)}
     assert len(origins) == 1
+    assert inputs_at == sorted(inputs_at)
 
 
 @named(LIMITS)
