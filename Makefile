@@ -23,7 +23,7 @@ test: .venv/ready
 	$(MAKE) --no-print-directory -j 2 check tests
 
 tests: .venv/ready
-	$(PY) -m pytest -n 4 --dist worksteal
+	$(PY) -m pytest -n 3 --dist worksteal
 
 # what takes long, and whole programs as people run them: browsers, systemd, packages, pages to the letter; half an hour
 test-system: .venv/ready

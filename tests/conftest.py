@@ -1,6 +1,7 @@
 """Which clock a test runs on, and what no test may leave behind."""
 
 import asyncio
+import gc
 import re
 import signal
 import sys
@@ -97,6 +98,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             rows[function] += 1
         if is_async_test(item) and no_task_is_left.__name__ not in item.fixturenames:
             item.fixturenames.insert(0, no_task_is_left.__name__)
+
+
+def pytest_collection_finish() -> None:
+    """Leave what was collected out of each garbage collection: thousands of tests are looked through otherwise."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture

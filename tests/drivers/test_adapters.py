@@ -122,6 +122,7 @@ async def test_a_move_goes_on_where_its_policy_says_so_and_no_stop_was_asked_for
 
 
 @pytest.mark.parametrize("instant_s", [0.0, 0.004, 0.03])
+@pytest.mark.sweep(2)
 async def test_a_stop_that_is_cut_off_by_the_plug_is_carried_out_when_it_is_back(instant_s):
     async with plugged(settings=slow_config(loss={"bus": "run_to_target"})) as line:
         await moving(line, "x", 95.0, 5.0)
@@ -138,6 +139,7 @@ async def test_a_stop_that_is_cut_off_by_the_plug_is_carried_out_when_it_is_back
         assert (await line.rig.client.state("x")).stop_latched
 
 
+@pytest.mark.long
 async def test_a_homing_that_is_cut_off_leaves_the_axis_at_rest_without_a_reference():
     async with plugged() as line:
         await powered(line, "y")

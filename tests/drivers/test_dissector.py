@@ -123,6 +123,7 @@ def test_requests_and_replies_are_paired_and_damage_is_shown(tmp_path: Path):
 
 @needs_tshark
 @pytest.mark.real_time
+@pytest.mark.long
 def test_smartstep_packets_have_their_fields(tmp_path: Path):
     records = asyncio.run(smartstep_records(tmp_path))
 

@@ -102,6 +102,7 @@ async def test_port_that_fails_right_after_it_was_opened_is_free_again(terminal,
 
 
 @pytest.mark.parametrize("steps", range(0, 400, 10))
+@pytest.mark.sweep(2)
 async def test_port_whose_opening_is_cancelled_at_any_step_is_free_again(terminal, steps):
     opening = asyncio.create_task(open_serial_port(SerialSettings(terminal, 19_200)))
     for _ in range(steps):

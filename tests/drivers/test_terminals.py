@@ -94,6 +94,7 @@ async def bench(folder: Path, policy: str) -> AsyncIterator[Bench]:
             thread.join(5)
 
 
+@pytest.mark.long
 async def test_a_stop_while_the_adapter_is_unplugged_is_carried_out_under_its_new_name(tmp_path: Path):
     async with bench(tmp_path, "run_to_target") as on:
         await on.moving("x", 1.5)
@@ -115,6 +116,7 @@ async def test_a_stop_while_the_adapter_is_unplugged_is_carried_out_under_its_ne
         assert on.adapter.link.readlink() != first or first.exists()
 
 
+@pytest.mark.long
 async def test_slow_motion_is_halted_when_the_adapter_is_back(tmp_path: Path):
     async with bench(tmp_path, "halt") as on:
         await on.moving("x", 1.5)

@@ -34,6 +34,7 @@ async def watched(rig, command):
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_every_goal_is_reached_from_below(dialect):
     async with dialect_rig(dialect, approach=FROM_BELOW) as rig:
         await rig.power_on()
@@ -91,6 +92,7 @@ async def test_two_motions_are_one_command_with_one_target(dialect):
 @pytest.mark.promise("approach-keeps-limits")
 @pytest.mark.parametrize("ending", [Halt(), Stop()], ids=["halt", "stop"])
 @pytest.mark.parametrize("after_s", [0.1, 0.55, 0.75])
+@pytest.mark.sweep(2)
 async def test_a_halt_or_a_stop_in_either_motion_ends_the_move(ending, after_s):
     async with dialect_rig(LS_182AP, approach=FROM_BELOW) as rig:
         await rig.power_on()

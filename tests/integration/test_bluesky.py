@@ -195,6 +195,7 @@ def test_a_relative_grid_ends_where_it_began(lab: Laboratory):
 
 
 @pytest.mark.parametrize("ending", ["stop", "latch", "another program"])
+@pytest.mark.sweep(2)
 def test_where_an_axis_was_sent_is_forgotten_once_something_else_has_stopped_or_moved_it(lab: Laboratory, ending: str):
     async def end_it(x):
         # in one go: the clock of the rig runs on between two calls of this thread, and the motion may be over by then

@@ -2,6 +2,8 @@
 
 import asyncio
 
+import pytest
+
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.samples import LinkState
 from ldcnd.testing import run, simulated_rig
@@ -32,6 +34,7 @@ async def found_lost(mover: str) -> dict[str, float]:
         return down_s
 
 
+@pytest.mark.long
 def test_an_axis_that_moves_is_found_lost_as_soon_as_the_others():
     for mover in "xz":
         down_s = run(found_lost(mover))

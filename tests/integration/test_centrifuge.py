@@ -304,6 +304,7 @@ def test_a_wire_that_is_cut_in_a_spin_brings_the_rotor_to_rest_behind_the_locked
 
 
 @pytest.mark.parametrize("part", ["lock", "door", "pin"])
+@pytest.mark.sweep(2)
 def test_an_output_that_is_high_refuses_a_spin_though_its_part_has_jammed(part):
     output = {"lock": "unlock", "door": "door", "pin": "pin"}[part]
 

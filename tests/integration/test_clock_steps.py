@@ -29,6 +29,7 @@ def leased():
 
 
 @pytest.mark.parametrize("step_s", STEPS)
+@pytest.mark.sweep(2)
 async def test_a_lease_that_is_renewed_outlives_a_step_of_the_clock(step_s: float):
     clock = Clock()
     async with running_rig(leased(), clock_off_s=lambda: clock.off_s) as rig:

@@ -43,6 +43,7 @@ def sent(rig):
     return found
 
 
+@pytest.mark.long
 def test_nothing_that_moves_is_sent_before_the_confirmation(rig, config):
     before = len(sent(rig))
     listed = rig.run(f"commission x --config {config} --list")

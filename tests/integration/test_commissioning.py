@@ -60,6 +60,7 @@ def proposed(record):
     return {each.name: each.value for each in record.result.proposals}
 
 
+@pytest.mark.long
 async def test_a_motor_that_agrees_with_its_encoder_is_found_within_the_stated_distance(tmp_path):
     async with commissioning_rig(tmp_path, STANDS) as rig:
         checklist = await rig.checklist()
@@ -154,6 +155,7 @@ async def test_a_motor_with_friction_is_driven_with_little_more_than_that(tmp_pa
         assert figures(kept)["output limit"] * 1.53 / 255 < 2.2 * 0.05
 
 
+@pytest.mark.long
 async def test_no_more_output_is_tried_once_the_axis_moved_without_counts(tmp_path):
     async with commissioning_rig(tmp_path, encoder_disconnected=True, friction_nm=0.02) as rig:
         rig.person.script["did the axis move"] = lambda: "y" if abs(rig.drive.shaft.position_counts) > 4 else "n"
@@ -659,6 +661,7 @@ async def test_swapped_switches_are_found(tmp_path):
         assert "swapped" in kept.result.text
 
 
+@pytest.mark.long
 async def test_a_reference_is_searched_several_times(tmp_path):
     async with commissioning_rig(tmp_path, {"how many": "4"}) as rig:
         kept = await (await rig.checklist()).run("home")
@@ -907,6 +910,7 @@ async def test_settings_that_are_there_are_not_asked_for(tmp_path):
         assert checklist.next_open(after="load") == "motor"
 
 
+@pytest.mark.long
 async def test_an_axis_in_counts_has_no_scale_to_find(tmp_path):
     text = rig_text().replace('unit = "mm"\ncounts_per_unit = 1000 # as ordered\n', "")
     axis, rates, rest = text.partition("rates")

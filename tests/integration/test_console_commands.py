@@ -194,6 +194,7 @@ def test_what_looks_like_html_in_a_page_stays_text():
         ("power", {"on": "off"}),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_what_takes_energy_out_is_sent_whatever_else_is_wrong_with_it_or_its_page(console, verb, body):
     async with open_page(console.app, console.browser) as page:
         await page.take("sim", "x")

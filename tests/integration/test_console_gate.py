@@ -98,6 +98,7 @@ async def test_the_token_of_another_visitor_does_not_help(console):
 @pytest.mark.parametrize(
     "host", ["", "evil.example", "evil.example:8470", "127.0.0.1.evil.example:8470", "[::2]:8470", "127.0.0.1:8470:1"]
 )
+@pytest.mark.sweep(2)
 async def test_a_name_that_is_not_the_console_s_is_refused(console, host):
     """An evil page whose name is made to mean this machine comes with its own name."""
     read = await console.browser.forging(host=host).get("/api/rigs")

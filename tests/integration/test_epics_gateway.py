@@ -207,6 +207,7 @@ async def test_a_target_beyond_the_limit_is_refused_and_moves_nothing():
 
 
 @pytest.mark.parametrize(("asked", "said"), [(math.nan, "nan"), (math.inf, "inf"), ("10 furlong", "furlong")])
+@pytest.mark.sweep(2)
 async def test_what_is_no_target_is_refused_in_words_and_moves_nothing(asked, said):
     async with records() as (running, made):
         with pytest.raises(ValueError, match=said):
@@ -427,6 +428,7 @@ async def test_no_tweak_is_lost_however_quick_they_are(step: float, count: int, 
         assert (await running.client.position("x")).value == pytest.approx(step * count, abs=0.02)
 
 
+@pytest.mark.long
 async def test_a_tweak_beyond_the_limit_leaves_the_target_of_those_before_it():
     async with records() as (running, made):
         await put(made, "T:x", 99.0)
@@ -625,6 +627,7 @@ async def test_a_daemon_with_another_unit_is_not_moved_by_numbers_of_the_former_
             assert (await client.position("x")).value == pytest.approx(stands + 2, abs=0.02)
 
 
+@pytest.mark.long
 async def test_no_value_of_a_daemon_with_another_unit_is_shown_in_the_unit_of_the_former_one():
     broker = MemoryBroker()
     seen: list[tuple[str, float, str, AlarmSeverity]] = []

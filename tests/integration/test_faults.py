@@ -116,6 +116,7 @@ async def test_what_switches_the_power_driver_off_is_named_and_recovered_from(di
         (FaultCondition.OVERHEAT, FaultCode.OVERHEAT),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_what_is_wrong_with_the_power_driver_off_is_named(dialect, condition, code):
     async with dialect_rig(dialect) as rig:
         await rig.until(lambda state: state.state is AxisState.DISABLED)
@@ -249,6 +250,7 @@ async def test_a_counter_that_wrapped_means_nothing_before_a_new_reference(diale
 
 
 @named((V4, LS_182AP))
+@pytest.mark.sweep(2)
 async def test_a_counter_that_wrapped_can_be_homed_with_the_warning_standing(dialect):
     far_index = PLANT.model_copy(
         update={"index_width_counts": 40, "index_at_counts": 8000, "index_spacing_counts": 100_000}
@@ -269,6 +271,7 @@ async def test_a_counter_that_wrapped_can_be_homed_with_the_warning_standing(dia
 
 
 @named((V1, V4, SC))
+@pytest.mark.sweep(2)
 async def test_motor_power_lost_is_named_and_nothing_lurches_when_it_returns(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
@@ -291,6 +294,7 @@ async def test_motor_power_lost_is_named_and_nothing_lurches_when_it_returns(dia
 
 
 @named((V1, V4, SC))
+@pytest.mark.sweep(2)
 async def test_current_limiting_is_a_warning_that_reset_clears_with_the_loop_closed(dialect):
     hard_stop = PLANT.model_copy(update={"forward_limit_counts": 1000, "stop_margin_counts": 100})
     async with dialect_rig(dialect, hard_stop, gains=GAINS | {"cl": 101, "el": 16_000}) as rig:

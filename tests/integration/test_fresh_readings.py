@@ -2,6 +2,8 @@
 
 import asyncio
 
+import pytest
+
 from ldcnd.drives.ldcn.packet import AuxFlag, CommandCode, Packet
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.smartstep.cable import smartstep_chain
@@ -23,6 +25,7 @@ def exchanges_of_guest(rig) -> int:
     return sum(each.event is WireEvent.SENT and each.guest == "old" for each in records)
 
 
+@pytest.mark.long
 async def test_a_fresh_reading_of_others_is_the_answer_and_an_old_one_is_none(tmp_path):
     replies = {}
     for fresh_ms in (0.0, 100.0):
@@ -40,6 +43,7 @@ async def test_a_fresh_reading_of_others_is_the_answer_and_an_old_one_is_none(tm
     assert replies[0.0] == replies[100.0]
 
 
+@pytest.mark.long
 async def test_a_fresh_reading_is_that_of_the_moving_drive(tmp_path):
     async with guest(tmp_path, fresh_ms=20.0, rates=OFTEN) as (rig, program):
         await program.begin()
@@ -56,6 +60,7 @@ async def test_a_fresh_reading_is_that_of_the_moving_drive(tmp_path):
         assert places == sorted(set(places))
 
 
+@pytest.mark.long
 async def test_no_reading_from_before_a_command_of_the_guest_answers_it(tmp_path):
     async with guest(tmp_path, "control", fresh_ms=1000.0, rates=OFTEN) as (rig, program):
         await program.begin()
@@ -68,6 +73,7 @@ async def test_no_reading_from_before_a_command_of_the_guest_answers_it(tmp_path
                 assert rig.daemon.rig.axes["rotor"].tracker.status.enabled is on
 
 
+@pytest.mark.long
 async def test_words_of_a_smartstep_that_are_polled_are_answered_fresh(tmp_path):
     loop = asyncio.get_running_loop()
     took = {}

@@ -154,6 +154,7 @@ async def test_the_motor_stops_and_holds_at_home(dialect, stop):
 
 
 @named((V1, V3, LS_182AP, LS_182AP_22))
+@pytest.mark.sweep(2)
 async def test_the_loop_can_be_opened_at_home(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
@@ -265,6 +266,7 @@ async def test_a_wider_index_pulse_may_be_searched_for_faster():
 
 
 @named((V1, V4, LS_182AP))
+@pytest.mark.sweep(2)
 async def test_a_switch_is_found_fast_and_taken_over_slowly(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()

@@ -26,6 +26,7 @@ def rising(level, channel="velocity"):
     return TraceTrigger(channel=channel, kind=TriggerKind.RISING, level=level)
 
 
+@pytest.mark.long
 async def test_fastest_trace_follows_a_move_with_a_true_time_for_every_sample():
     async with running_rig() as rig:
         await ready(rig)
@@ -122,6 +123,7 @@ async def test_trace_tells_when_a_trigger_counts():
     assert filled_s == pytest.approx(50 * 0.02, abs=0.1)
 
 
+@pytest.mark.long
 async def test_trigger_that_does_not_come_ends_the_trace_in_its_time_and_frees_the_line():
     async with running_rig() as rig:
         await ready(rig)

@@ -149,6 +149,7 @@ async def test_a_drive_that_was_out_of_reach_is_identified_before_it_takes_a_com
 
 
 @pytest.mark.promise("moving-shaft-not-caught")
+@pytest.mark.long
 async def test_a_loop_is_not_closed_while_the_shaft_coasts():
     """A heavy rotor: the drive would hold it at once, at whatever speed."""
     async with dialect_rig(V4, COASTING, velocity=40, acceleration=400) as rig:

@@ -23,6 +23,7 @@ async def inputs(rig: DialectRig, wanted: Callable[[InputsSample], bool] = lambd
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_a_limit_switch_shows_in_the_poll_that_carries_it(dialect):
     async with dialect_rig(dialect, rates={"position": 100, "state": 1}) as rig:
         await rig.power_on()

@@ -236,6 +236,7 @@ async def test_a_motion_is_ended_when_a_requirement_is_lost(reaction):
         assert ended.endswith(": axis rotor: interlock door_shut: input door_closed is false"), ended
 
 
+@pytest.mark.long
 async def test_a_motion_goes_on_where_the_rule_has_no_reaction():
     async with running_machine(machine(DOOR_SHUT | {"reaction": "none"})) as rig:
         await spinning(rig)

@@ -117,6 +117,7 @@ async def test_what_another_program_does_to_a_drive_is_found_at_the_next_polls(a
 
 @pytest.mark.promise("contradiction-stops")
 @pytest.mark.parametrize(("axis", "position", "at"), [("x", 80.0, 30_000), ("z", 45.0, 40_000)])
+@pytest.mark.sweep(2)
 async def test_a_counter_that_another_program_sets_in_mid_motion_costs_the_reference_and_halts_the_axis(
     axis, position, at
 ):

@@ -266,6 +266,7 @@ async def test_a_stop_on_a_full_disk_outlasts_a_killed_daemon(tmp_path):
     assert latched == [["stop_latched"] * 3] * 2
 
 
+@pytest.mark.long
 async def test_a_disk_that_fails_delays_no_stop_and_the_answer_says_so(tmp_path, monkeypatch):
     def fails(path: Path, text: str) -> None:
         raise OSError(28, os.strerror(28))

@@ -116,6 +116,7 @@ async def test_a_reference_outlives_the_daemon_and_moves_go_where_they_are_told(
     assert said == [""]
 
 
+@pytest.mark.long
 async def test_a_reference_outlives_many_restarts(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     async with restarted(chain, config):
@@ -145,6 +146,7 @@ async def test_a_homed_axis_has_its_mark_from_its_homing(tmp_path):
     assert (state.referenced, after.value) == (True, pytest.approx(before.value, abs=0.001))
 
 
+@pytest.mark.long
 async def test_a_daemon_killed_in_mid_move_is_followed_by_one_that_knows_where_it_is(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -165,6 +167,7 @@ async def test_a_daemon_killed_in_mid_move_is_followed_by_one_that_knows_where_i
     assert there.value == pytest.approx(90.0, abs=0.01)
 
 
+@pytest.mark.long
 async def test_turns_of_a_rotary_axis_outlive_the_daemon(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     (bus,) = config.bus
@@ -491,6 +494,7 @@ async def test_a_reference_that_cannot_be_removed_from_the_disk_is_made_void_in_
 
 
 @pytest.mark.promise("kept-reference")
+@pytest.mark.long
 async def test_where_neither_disk_nor_drive_can_forget_a_reference_there_is_no_other(tmp_path, monkeypatch):
     def read_only(path: Path, *_text: str) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
@@ -510,6 +514,7 @@ async def test_where_neither_disk_nor_drive_can_forget_a_reference_there_is_no_o
         assert (await position_of(rig)).value == pytest.approx(41.0, abs=0.01)
 
 
+@pytest.mark.long
 async def test_a_disk_that_does_not_answer_holds_up_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(asyncio.get_running_loop().__class__, "run_in_executor", _never)
     chain = chain_of()

@@ -182,6 +182,7 @@ async def test_a_stop_that_was_confirmed_and_not_carried_out_is_sent_again(motio
 @pytest.mark.promise("told-twice")
 @pytest.mark.parametrize("command", ["_load", "_arm_homing"])
 @pytest.mark.parametrize("dialect", [V4, LS_182AP, SC], ids=lambda each: each.name)
+@pytest.mark.sweep(2)
 async def test_a_late_reply_does_not_stand_for_that_to_what_a_motion_needs(dialect, command, monkeypatch):
     """The drive answers and takes nothing, once: the motion goes where it was sent, and ends on its mark."""
     deaf, taking = [True], getattr(SimulatedDrive, command)

@@ -36,6 +36,7 @@ async def test_each_of_200_clients_that_stop_the_rig_at_once_has_one_confirmed_a
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_200_unanswered_stops_are_all_held_and_each_is_answered_once():
     endpoint = free_endpoint()
     held: list[Query] = []

@@ -51,6 +51,7 @@ async def test_a_move_ends_within_one_count(axis, resolution):
         assert await settled(rig, axis) == pytest.approx(-7.3, abs=resolution * 1.01)
 
 
+@pytest.mark.long
 async def test_a_move_takes_as_long_as_its_reply_says():
     async with running_rig() as rig:
         await powered(rig, "x")

@@ -262,6 +262,7 @@ async def test_a_jog_that_was_changed_on_its_way_ends_without_a_host_on_sc_alone
 
 @pytest.mark.promise("jog-ends-in-drive")
 @pytest.mark.parametrize(("dialect", "bound_s"), [(SC, 1.0), (V4, HORIZON_S), (LS_182AP, HORIZON_S)], **names)
+@pytest.mark.sweep(2)
 async def test_a_jog_that_is_held_ends_at_its_goal_in_the_drive_when_the_daemon_is_killed(dialect, bound_s):
     async with powered(dialect, {"jog_reach_s": HORIZON_S}) as rig:
         jog = await rig.client.command("x", Jog(velocity=4.0, hold_s=0.4))

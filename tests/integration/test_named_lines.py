@@ -121,6 +121,7 @@ async def test_an_output_has_its_level_after_the_loss_of_its_client_and_keeps_it
         assert driven(rig) == LOW
 
 
+@pytest.mark.long
 async def test_an_output_has_its_level_after_a_loss_of_the_line_and_at_the_end_of_the_daemon():
     chain = chain_of_machine()
     async with running_machine(machine(module=with_lock(loss={"bus": "high", "daemon": "low"})), chain) as rig:

@@ -33,6 +33,7 @@ def rows(virtual) -> dict[str, dict[str, object]]:
     return {row["axis"]: row for row in map(json.loads, printed.splitlines())}
 
 
+@pytest.mark.long
 def test_a_daemon_that_ended_in_mid_move_leaves_an_axis_that_says_it_is_not_homed(monkeypatch):
     chain = four_drives()
     with virtual_rig(monkeypatch, chains={"line0": chain}) as first:

@@ -328,6 +328,7 @@ async def test_a_path_that_one_axis_leaves_before_it_starts_leaves_no_points_in_
     assert len(left_at) > 5
 
 
+@pytest.mark.long
 async def test_an_axis_that_walks_more_slowly_is_not_ended_by_one_that_has_arrived(monkeypatch):
     monkeypatch.setitem(AXIS, "settle", {"window": 1.0, "time_s": 0.0})
     monkeypatch.setitem(AXIS, "rates", {"position": 50, "state": 50})
@@ -409,6 +410,7 @@ async def test_a_turning_axis_goes_the_short_way_from_corner_to_corner_or_as_it_
 
 
 @pytest.mark.parametrize("allowed_s", [0.05, 0.12, 0.2, 0.3, 2.0])
+@pytest.mark.sweep(2)
 async def test_a_path_begins_in_time_or_not_at_all_however_long_its_drives_are_fed(allowed_s):
     chain = sc_chain()
     async with two_sc(chain, baud=19_200) as rig:

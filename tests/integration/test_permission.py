@@ -189,6 +189,7 @@ async def test_a_stop_between_the_halt_and_the_start_of_an_aborting_move_wins():
 
 
 @pytest.mark.promise("permission-at-motion")
+@pytest.mark.long
 async def test_a_homing_whose_lease_was_lost_begins_no_further_leg():
     """The axis stands on its switch: the first leg moves off it; the search would be the second one."""
     rig_config = config()

@@ -60,6 +60,7 @@ async def events(rig, axis="rotor"):
     return [each for each in (await rig.client.ask(ReadEvents(axis=axis, count=100))).events if each.client == "old"]
 
 
+@pytest.mark.long
 async def test_a_program_enables_moves_and_finds_its_counts(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
         await program.begin()
@@ -143,6 +144,7 @@ async def test_a_program_that_goes_loses_control_and_what_it_moved_halts(tmp_pat
         assert all(each.client is None for each in (await rig.client.ask(ListHolders())).holders)
 
 
+@pytest.mark.long
 async def test_a_program_that_falls_silent_loses_control_too(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
         await program.begin()
@@ -191,6 +193,7 @@ async def test_a_hard_reset_of_the_program_switches_off_what_it_controls_and_not
         assert rig.daemon.rig.axes["table"].tracker.status.enabled
 
 
+@pytest.mark.long
 async def test_after_a_hard_reset_the_program_finds_its_counter_at_zero(tmp_path):
     """Programs take it for their zero: with an older one they would move elsewhere, and back."""
     async with guest(tmp_path, "control") as (rig, program):
@@ -224,6 +227,7 @@ async def test_limits_hold_for_the_program_and_its_move_is_not_done(tmp_path):
         assert shaft(rig) == pytest.approx(1500, abs=20)  # its profile is over, the shaft follows
 
 
+@pytest.mark.long
 async def test_a_zero_that_the_program_sets_is_its_own_counter_and_the_position_of_everybody(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
         await program.begin()
@@ -401,6 +405,7 @@ async def test_a_move_that_waits_for_rest_does_not_begin_once_its_program_has_en
     ],
     ids=["loaded", "half a packet"],
 )
+@pytest.mark.sweep(2)
 async def test_what_a_program_has_loaded_is_not_begun_by_the_next_one(tmp_path, begun, rest):
     async with guest(tmp_path, "control") as (rig, program):
         await program.begin()
@@ -437,6 +442,7 @@ async def test_hard_reset_reaches_modules_that_the_program_has_put_into_another_
                 await asyncio.sleep(0.02)
 
 
+@pytest.mark.long
 async def test_a_program_that_begins_anew_after_a_fault_moves_the_axis_as_on_the_bare_line(tmp_path):
     """Hard Reset, Stop Motor, Clear Sticky Bits, and a move: as after a jam, when its program is started again."""
     async with guest(tmp_path, "control") as (rig, program):

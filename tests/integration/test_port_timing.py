@@ -2,6 +2,8 @@
 
 import asyncio
 
+import pytest
+
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.guest_program import Program, guest
@@ -34,6 +36,7 @@ async def bare_s() -> float:
     return loop.time() - asked_s
 
 
+@pytest.mark.long
 async def test_a_reply_comes_one_exchange_of_others_later_than_on_the_bare_line(tmp_path):
     """1.7 ms later in the median and 3.3 ms at most, when a line at 115,200 bits/s polls two axes."""
     async with guest(tmp_path) as (_, program):

@@ -155,6 +155,7 @@ async def test_all_but_the_last_chunk_of_a_killed_recorder_is_recovered(tmp_path
     assert "configuration.json" in attached(whole)
 
 
+@pytest.mark.long
 async def test_a_recording_that_was_cut_tells_where_and_is_recovered_up_to_there(tmp_path):
     path, cut, whole = tmp_path / "run.mcap", tmp_path / "cut.mcap.part", tmp_path / "whole.mcap"
     await record_a_move(path, 10.0)
@@ -172,6 +173,7 @@ async def test_a_recording_that_was_cut_tells_where_and_is_recovered_up_to_there
     assert facts(whole)["damage 1"] == str(damage)
 
 
+@pytest.mark.long
 async def test_a_chunk_that_was_damaged_costs_no_other_chunk(tmp_path):
     path, damaged, whole = tmp_path / "run.mcap", tmp_path / "damaged.mcap", tmp_path / "whole.mcap"
     await record_a_move(path, 10.0)
@@ -223,6 +225,7 @@ async def test_a_recording_whose_next_file_exists_ends_with_one_error_and_is_who
     assert sorted(tmp_path.iterdir()) == [taken, path]
 
 
+@pytest.mark.long
 async def test_a_full_disk_ends_the_recording_and_what_was_written_is_recovered(tmp_path):
     path, whole = tmp_path / "run.mcap", tmp_path / "whole.mcap"
     before = resource.getrlimit(resource.RLIMIT_FSIZE)

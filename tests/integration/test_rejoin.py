@@ -225,6 +225,7 @@ async def test_a_stop_works_while_a_drive_is_dark():
     assert drive(chain, 1).loop.servo_on
 
 
+@pytest.mark.long
 async def test_stops_of_a_dark_axis_do_not_disturb_the_search_for_it():
     chain = chain_of()
     async with rig_on(chain, simulated_config()) as rig:
@@ -277,6 +278,7 @@ async def test_a_foreign_module_in_place_of_the_old_one_gets_no_address():
     assert chain.modules[3].address in WAITING_ADDRESSES
 
 
+@pytest.mark.long
 async def test_members_of_a_group_with_a_leader_come_back_to_their_group():
     chain = chain_of()
     config = simulated_config(UNSEEN_MOTIONS_END, group=[{"name": "pair", "axes": ["y", "z"], "leader": "z"}])

@@ -84,6 +84,7 @@ async def test_a_client_reads_the_positions_of_the_daemon_alone():
     assert heard == ["another program publishes on the keys of rig sim; such values are left out, 1 so far"]
 
 
+@pytest.mark.long
 async def test_neither_events_nor_health_come_from_another_program():
     reports = []
     async with running_rig() as running, running.broker.session() as other:
@@ -175,6 +176,7 @@ def test_axis_watch_shows_the_positions_of_the_daemon_and_that_there_is_another_
     assert watched.errors.count("another program publishes on the keys of rig sim") == 1
 
 
+@pytest.mark.long
 async def test_values_of_a_daemon_that_came_back_with_another_unit_are_in_a_file_that_describes_it(tmp_path):
     document = load_config(SIMULATED).model_dump(mode="json", exclude_unset=True)
     document["bus"][0]["axis"][0] |= {"unit": "um", "counts_per_unit": 2}

@@ -59,6 +59,7 @@ async def near_the_end(dialect, side: int = 1, **axis: object) -> AsyncIterator[
         (2.0, -3.0, WAYS.SHORTEST_WAY, 7.0),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_an_axis_turns_the_shortest_way_or_as_it_is_told(start, target, direction, ends_at):
     async with dialect_rig(V4, ENDLESS, **ROTARY) as rig:
         await rig.power_on()

@@ -116,6 +116,7 @@ async def test_a_router_that_comes_late_is_found(endpoint: str) -> None:
     assert sample.unit == "mm"
 
 
+@pytest.mark.long
 async def test_a_router_killed_under_load_makes_no_move_happen_twice_and_telemetry_resumes(endpoint: str) -> None:
     async with daemon_behind(endpoint), asyncio.TaskGroup() as group:
         async with router(endpoint) as first, connected(endpoint) as session:

@@ -2,6 +2,8 @@
 
 import asyncio
 
+import pytest
+
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import Power
 from ldcnd.contract.samples import AxisState
@@ -16,6 +18,7 @@ def with_event(**event) -> RigConfig:
     return RigConfig.model_validate(document)
 
 
+@pytest.mark.long
 async def test_an_overvoltage_at_its_time_is_a_fault_of_its_axis_only():
     async with running_rig(with_event(module=2, begins="overvoltage")) as rig:
         loop = asyncio.get_running_loop()
@@ -30,6 +33,7 @@ async def test_an_overvoltage_at_its_time_is_a_fault_of_its_axis_only():
         assert (await rig.client.state("x")).state is AxisState.STANDSTILL
 
 
+@pytest.mark.long
 async def test_a_module_without_supply_loses_its_link():
     async with running_rig(with_event(module=4, power="off")) as rig:
         await rig.until("c", lambda state: state.link == "up")

@@ -140,6 +140,7 @@ async def test_command_pulses_are_geared_to_motor_speed_as_configured(gear, rpm)
     assert (trace.header.drive.gear_numerator, trace.header.drive.gear_denominator) == (4, 1)
 
 
+@pytest.mark.long
 async def test_raw_words_are_kept_as_the_drive_has_them():
     async with trace_rig() as under_test:
         trace = await accelerating_trace(under_test, 0.5, trace_request())

@@ -41,6 +41,7 @@ async def speed(rig):
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_motions_that_begin_have_their_share_of_the_velocity_and_say_so(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()

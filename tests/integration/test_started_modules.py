@@ -24,6 +24,7 @@ def started() -> list[str]:
 
 
 @pytest.mark.parametrize("file", started())
+@pytest.mark.sweep(2)
 def test_a_module_that_can_be_started_says_what_it_is_for(file, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", [file, "--help"])
 

@@ -68,6 +68,7 @@ async def turns_to_the_first_packet(rig: RunningRig, payloads: list[str]) -> tup
 
 
 @pytest.mark.promise("readers-delay-no-stop")
+@pytest.mark.long
 async def test_a_stop_reaches_the_line_behind_256_reads_in_as_many_turns_as_without_and_a_step_of_reading_in_each(
     monkeypatch: pytest.MonkeyPatch,
 ):

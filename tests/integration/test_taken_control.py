@@ -37,6 +37,7 @@ async def test_whoever_takes_control_moves_at_once_and_the_other_program_is_told
 
 @pytest.mark.parametrize("for_s", [0.1, 0.5])
 @pytest.mark.parametrize("commands", [True, False])
+@pytest.mark.sweep(2)
 async def test_a_daemon_that_was_restarted_ends_control_in_the_documented_way(ldcnd_rig, for_s, commands):
     """Its next daemon has never heard of the lease."""
 

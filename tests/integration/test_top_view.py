@@ -3,6 +3,8 @@
 import asyncio
 from contextlib import asynccontextmanager
 
+import pytest
+
 from ldcnd.client.overview import overview
 from ldcnd.contract.commands import Halt, MoveAbsolute, Power
 from ldcnd.contract.condition import Severity
@@ -105,6 +107,7 @@ async def never():
     raise TransportLost("no such port")
 
 
+@pytest.mark.long
 async def test_who_begins_to_look_later_sees_the_same_age():
     chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
     async with running_rig(chains={"line0": chain}) as rig:

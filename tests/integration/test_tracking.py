@@ -99,6 +99,7 @@ async def test_set_points_faster_than_the_rate_are_refused():
         await rig.send(Track(position=0.2))
 
 
+@pytest.mark.long
 async def test_the_mean_rate_is_kept_although_single_set_points_may_come_early():
     async with dialect_rig(V4, tracking=TRACKING | {"rate": 10.0}) as rig:
         await rig.power_on()

@@ -83,6 +83,7 @@ async def test_a_motion_that_could_not_turn_before_the_limit_begins_from_rest(di
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_a_jog_that_could_not_turn_before_the_limit_comes_to_rest_first(dialect: Dialect):
     async with dialect_rig(dialect, WIDE, limits=LIMITS) as rig:
         await rig.power_on()

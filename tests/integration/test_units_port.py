@@ -75,6 +75,7 @@ async def test_reads_are_answered_with_the_same_bytes_as_on_the_bare_line(tmp_pa
             assert await program.send_bytes(frame(head)) == await bare(frame(head)), head
 
 
+@pytest.mark.long
 async def test_what_drives_are_silent_about_gets_no_answer_and_the_next_frame_does(tmp_path):
     async with units_guest(tmp_path, "read") as (rig, program, _feed):
         for rubbish in RUBBISH:
@@ -261,6 +262,7 @@ async def test_a_program_that_asks_as_fast_as_it_can_leaves_polls_their_rate(tmp
 @pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # of pyserial's client
 @pytest.mark.real_time
 @pytest.mark.parametrize("scheme", ["socket", "rfc2217"])
+@pytest.mark.sweep(2)
 async def test_a_program_comes_in_by_the_network(tmp_path, scheme):
     port = free_port()
     tcp = {"name": "old", "bus": "steps", "listen": f"127.0.0.1:{port}", "rfc2217": scheme == "rfc2217"}

@@ -47,6 +47,7 @@ async def test_a_long_log_comes_in_pages_without_gap_or_repetition():
         assert fetched.lines == tuple(map(str, bus.wire_log.records()))[: len(fetched.lines)]
 
 
+@pytest.mark.long
 async def test_a_page_that_was_overwritten_starts_at_the_oldest_record_left():
     rigs = load_config(SIMULATED)
     (bus,) = rigs.bus

@@ -50,6 +50,7 @@ def served() -> Iterator[str]:
         runner.run(running.__aexit__(None, None, None))
 
 
+@pytest.mark.long
 async def test_last_values_and_descriptions_are_readable_by_anyone(served):
     with connect(served) as session:
         telemetry = get(session, "ldcn/sim/tele/**")

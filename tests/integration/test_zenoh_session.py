@@ -308,6 +308,7 @@ async def test_the_interpreter_exits_when_the_program_fails_inside_a_session(end
         assert await daemon.wait() == 7
 
 
+@pytest.mark.long
 async def test_the_interpreter_exits_although_a_client_is_stuck(endpoint: str) -> None:
     async with program(DAEMON, endpoint, "stuck") as daemon, program(CLIENT, endpoint) as client:
         await said(daemon)
@@ -350,6 +351,7 @@ async def test_what_a_link_shows_of_its_login_is_kept_until_it_goes(endpoint: st
         await until(forgotten)
 
 
+@pytest.mark.long
 async def test_queries_in_order_do_not_overtake_each_other(pair: Pair):
     """Commands are numbered: one that is overtaken is refused."""
     came: list[bytes] = []

@@ -2,6 +2,7 @@
 
 import itertools
 
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -59,6 +60,7 @@ def test_any_bytes_are_survived(noise):
 
 @settings(max_examples=60, deadline=None)
 @given(requests=st.lists(packets, max_size=12))
+@pytest.mark.long
 def test_any_commands_with_any_data_are_answered_with_right_checksums(requests):
     received = play(chain_of_all(), requests)
 

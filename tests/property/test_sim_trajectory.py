@@ -154,6 +154,7 @@ JOG = [("jog", 600, 200)]
         max_size=12,
     ),
 )
+@pytest.mark.long
 def test_cycles_that_pass_at_once_are_those_that_pass_one_by_one(model, program):
     plant = MotorPlant(reverse_limit_counts=-9000, forward_limit_counts=9000, stop_margin_counts=900)
     quick, slow = (SimulatedAxis(model, plant=plant) for _ in range(2))

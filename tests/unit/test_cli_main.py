@@ -51,6 +51,7 @@ def test_errors_quote_what_a_stranger_sent_without_passing_it_on(monkeypatch, ca
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES))
+@pytest.mark.sweep(2)
 def test_the_example_of_each_command_can_be_typed_and_stands_in_its_help(path):
     words = path.split()
 

@@ -85,6 +85,7 @@ def printed_by(program: str, folder: Path) -> list[str]:
     ).stdout.split()
 
 
+@pytest.mark.long
 def test_the_client_loads_nothing_of_the_daemon(tmp_path: Path) -> None:
     loaded = printed_by(f"import sys, {', '.join(MODULES)}; print(*sys.modules, sep='\\n')", tmp_path)
 

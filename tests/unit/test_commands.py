@@ -90,6 +90,7 @@ def test_a_payload_of_before_means_what_it_always_did(verb: str):
     assert decode(BY_VERB[verb], vector["json"].encode(), Encoding.JSON) == command
 
 
+@pytest.mark.long
 def test_schema_names_are_the_titles_of_the_schemas():
     for name, text in all_schemas().items():
         assert name == schema_name(type(json.loads(text)["title"], (Frozen,), {}))

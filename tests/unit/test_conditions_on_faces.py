@@ -343,6 +343,7 @@ CALM = ("moved by another", "controlled by another", "not controlled", "moved by
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.sweep(2)
 def test_alarm_systems_get_no_ok_of_an_axis_whose_place_is_not_known(case):
     at = known(case)
     condition = axis_now(at).condition

@@ -73,6 +73,7 @@ def test_no_wildcard_reaches_a_command_or_a_stop(wide: str) -> None:
 
 
 @given(chunks, chunks)
+@pytest.mark.long
 def test_keys_and_their_parsers_are_inverse(axis: str, word: str) -> None:
     assert KEYS.parse_command(KEYS.command(axis, word)) == CommandAddress(axis, word)
     assert KEYS.parse_telemetry(KEYS.telemetry(axis, word)) == TelemetryAddress(axis, word)

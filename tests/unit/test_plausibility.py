@@ -77,6 +77,7 @@ def test_the_first_reading_is_believed_but_nothing_has_jumped_away_from_it():
 
 
 @given(st.integers(-(2**31), 2**31 - 1))
+@pytest.mark.long
 def test_any_other_position_of_a_standing_axis_is_asked_again(counts: int):
     axis = Axis()
 

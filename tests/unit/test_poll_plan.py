@@ -133,6 +133,7 @@ def test_no_poll_is_ever_later_than_its_bound(seed):
 
 
 @pytest.mark.parametrize("seed", range(8))
+@pytest.mark.sweep(2)
 def test_no_poll_is_later_than_its_bound_whoever_chooses_among_equals(seed):
     dice = random.Random(seed)
     tasks = []

@@ -126,6 +126,7 @@ def test_who_was_unscheduled_is_not_polled_however_late(order):
     priorities=st.lists(st.sampled_from(Priority), min_size=2, max_size=31),
     seed=st.integers(0, 1000),
 )
+@pytest.mark.long
 def test_nobody_starves_and_within_a_priority_nobody_waits_for_two_mean_gaps(order, priorities, seed):
     """Everybody is late again at once, which is the worst that can be asked of a line."""
     dice = random.Random(seed)

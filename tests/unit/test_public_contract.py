@@ -100,6 +100,7 @@ def test_only_what_stands_above_the_kept_version_announces():
         changes_of(changelog, "0.3.0")
 
 
+@pytest.mark.long
 def test_every_schema_command_and_name_is_in_the_list():
     now = "\n".join(facts())
 

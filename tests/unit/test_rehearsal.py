@@ -29,6 +29,7 @@ def test_the_more_drives_there_are_to_choose_from_the_less_they_are_waited_for(r
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 1000.0])
+@pytest.mark.sweep(2)
 def test_where_the_cycles_lie_matters_little(rate_hz: float):
     lengths_s = [COST.wire_s + wait_s(31, rate_hz, seed) for seed in range(4)]
 

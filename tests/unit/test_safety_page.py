@@ -4,6 +4,8 @@ import ast
 import re
 from collections.abc import Iterator
 
+import pytest
+
 from tests.support.process import ROOT
 
 PAGE = ROOT / "docs" / "explanation" / "safety.md"
@@ -20,6 +22,7 @@ def marked() -> Iterator[str]:
                     yield promise
 
 
+@pytest.mark.long
 def test_every_promise_has_a_test_and_every_marked_test_a_promise():
     promised = PROMISE.findall(PAGE.read_text(encoding="utf-8"))
 

@@ -252,6 +252,7 @@ def five_percent(seed: int) -> FaultPlan:
 
 
 @pytest.mark.parametrize("times", [200, pytest.param(2000, marks=pytest.mark.soak)])
+@pytest.mark.long
 async def test_writes_and_reads_on_a_bad_line_keep_ledger_and_values_true(tmp_path, times):
     dice = random.Random(182)
     drive = simulated(1)

@@ -194,6 +194,7 @@ async def test_interval_is_judged_by_the_unit_of_this_drive():
 
 
 @pytest.mark.parametrize("seed", range(8))
+@pytest.mark.sweep(2)
 async def test_a_bad_line_gives_the_true_trace_or_an_error_and_executes_in_a_fresh_mode_only(seed):
     drive = simulated(1)
     drive.drive.set_run(0.0, on=True)

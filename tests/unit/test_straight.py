@@ -57,6 +57,7 @@ def test_without_common_ramps_the_deviation_is_that_of_the_ramps():
     st.floats(1_000, 1_000_000),
     st.sampled_from([1, 2, 3]),
 )
+@pytest.mark.long
 def test_limits_are_kept_and_the_longest_way_is_hardly_left(ways, velocity, acceleration, divisor):
     axes = {str(at): axis(way, velocity, acceleration, divisor) for at, way in enumerate(ways)}
     line = straight_line(axes)

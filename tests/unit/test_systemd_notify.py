@@ -153,6 +153,7 @@ async def test_ready_comes_first_and_stopping_last(manager: Manager):
     assert messages[-1] == "STOPPING=1\nSTATUS=stopping: axes come to rest"
 
 
+@pytest.mark.long
 async def test_watchdog_is_fed_well_within_its_time(manager: Manager):
     async with service_of(manager) as (_, daemon, _client):
         await daemon.wait_up()

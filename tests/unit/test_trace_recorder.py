@@ -104,6 +104,7 @@ async def until(publisher, phase):
             await asyncio.sleep(0.01)
 
 
+@pytest.mark.long
 async def test_the_longest_trace_of_the_longest_numbers_fits_into_payloads():
     tracer = FakeTracer(MOST_CHANNELS)
     async with recording(tracer) as (recorder, publisher):
