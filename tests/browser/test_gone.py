@@ -65,6 +65,10 @@ MODULE = """() => [...document.querySelectorAll("section")]
   .filter((each) => each.querySelector("h2, h3")?.textContent === "Module cabinet")
   .filter((each) => each.parentElement.closest("section")?.textContent.startsWith("alpha"))
   .map((each) => each.textContent).join()"""
+ON_THE_RIG = (
+    "() => document.querySelector('[aria-label=\"Rig alpha\"] [aria-label=\"Module cabinet\"] dd')?.innerText ?? ''"
+)
+"""What the rig page says of its door."""
 ATTENTION = """() => document.querySelector(".attention, main").textContent"""
 EVENTS = """() => [...document.querySelectorAll("tr")].map((each) => each.textContent)
   .filter((each) => each.includes("cabinet")).join()"""
@@ -149,7 +153,11 @@ async def test_a_module_without_power_is_named_and_shows_no_value_and_its_loss_a
         await until(window, MODULE, wanted=lambda found: "1 low" not in found and "1 high" not in found)
         await window.evaluate("() => { location.hash = '#/rig'; }")
         await until(window, ATTENTION, wanted=lambda found: "alpha · cabinet" in found)
+        await until(window, ON_THE_RIG, wanted=lambda found: "unknown" in found)
         await until(window, ATTENTION, wanted=lambda found: "alpha · cabinet" not in found)
+        await until(
+            window, ON_THE_RIG, wanted=lambda found: "unknown" not in found and ("on" in found or "off" in found)
+        )
         await window.evaluate("() => { location.hash = '#/events'; }")
         await until(window, EVENTS, wanted=lambda found: "link lost" in found and "link back" in found)
     finally:

@@ -3,6 +3,7 @@
 import { html, useState } from "../html.js";
 import { Action, Choice, Facts, Panel, Table } from "../parts/controls.js";
 import { number } from "../parts/format.js";
+import { levelsOf, readingOf } from "../parts/module_reading.js";
 import { NumberField, unread } from "../parts/number_field.js";
 import { ofRig } from "../session/control.js";
 
@@ -17,11 +18,6 @@ const TIMER = [
   ["timer", "time, at 5 MHz"],
   ["counter", "edges of line 10"],
 ];
-
-/** A module is read at least twice a second. */
-const OLD_S = 2;
-
-const levelsOf = (levels) => levels.map((level, index) => `${index + 1} ${level ? "high" : "low"}`).join(", ");
 
 export function Snapshot({ rig, bus }) {
   const [taken, setTaken] = useState(null);
@@ -46,17 +42,6 @@ export function Snapshot({ rig, bus }) {
 export function Modules({ rig, bus }) {
   const named = bus.info.modules.filter((module) => module.name);
   return named.map((module) => html`<${Module} key=${module.name} rig=${rig} name=${module.name} />`);
-}
-
-/** Return what the latest reading of a module shows: its named lines in their order, and all lines; unknown when it is old. */
-function readingOf(rig, module) {
-  const seen = rig.axis(module);
-  const { io } = seen.samples;
-  const known = !rig.worth && seen.ageS("io") < OLD_S && io?.quality !== "bad";
-  const named = Object.entries(io?.named ?? {}).map(([line, on]) => [line, known && on !== null ? (on ? "on" : "off") : "unknown"]);
-  const lines = known ? levelsOf(io.levels) : "unknown";
-  const outputs = known && io.outputs ? io.outputs.join(", ") || "none" : "unknown";
-  return { named, all: [["lines", lines], ["outputs", outputs]] };
 }
 
 function Module({ rig, name }) {

@@ -13,6 +13,7 @@ import { calms, isUseless, obstacle, useless } from "../session/obstacles.js";
 import { axesOf, changed, endpoints, useRigs } from "../session/rigs.js";
 import { AxesOf, refused, ShortAction } from "./rig_axes.js";
 import { GroupMoves } from "./rig_groups.js";
+import { ModulesOf } from "./rig_modules.js";
 import { SpeedOverride } from "./rig_speed.js";
 
 /** So many axes are found without a filter. */
@@ -117,6 +118,7 @@ function RigSection({ rig }) {
       const bus = view.by === "group" ? null : rig.buses.get(part);
       return (mine.length > 0 || !filtered) && html`<${AxesOf} key=${`${view.by} ${part}`} rig=${rig} name=${part} bus=${bus} axes=${mine} found=${Boolean(filtered)} />`;
     })}
+    ${!filtered && [...rig.buses.values()].map((bus) => html`<${ModulesOf} key=${bus.name} rig=${rig} bus=${bus} />`)}
     ${filtered && !axes.length && html`<p class="quiet">No axis of this rig is like that.</p>`}
     <${GroupMoves} rig=${rig} />
   </section>`;
