@@ -203,6 +203,8 @@ LATE_S = 1.0
 CLOCK_TOLERANCE = 0.9
 """A drive's baud clock may be 3 % fast and a time stamp a little early: bytes count as too early below this share."""
 PROBE_ROUNDS = 3
+GONE_PAUSE_S = 0.25
+"""Shortest time between two probes of a node that has been gone for long, in seconds."""
 LONGEST_QUARANTINE = 20
 """Longest wait for silence, in multiples of `quiet_s`; a line that is never silent is flushed after that."""
 READS = PacketEffect.READS  # looked up slowly in its class
@@ -264,7 +266,7 @@ class Line(Receiver):
         self._kept = (b"", 0.0)  # the reply that is lingered over, and when it came
         self._distrusted = False  # the reply on the wire may be to something older
         self._in_step = True  # nothing makes it uncertain to which request a reply belongs
-        self._probes_left, self._quarantined_s = 0, 0.0
+        self._probes_left, self._probed_s, self._quarantined_s = 0, -NEVER_S, 0.0
         self.undelivered: deque[tuple[Transaction, bytes, Timing]] = deque()
         self._coalesce_s, self._deliver_by_s = settings.coalesce_s, NEVER_S
         transport.attach(self)
@@ -728,11 +730,13 @@ class Line(Receiver):
             return
         mute = self._schedule.mute
         exchange = self._resync.probe(mute.failing())
-        # where nobody has answered for long, one that could is asked once: the search for the lost must go on
+        # where nobody has answered for long, one that could is asked once, and not after each loss: the search for the
+        # lost, and stops that wait, take their time from the same silence
         gone = exchange is None or mute.misses.get(exchange.node, 0) > PROBE_ROUNDS
         self._probes_left = 0 if gone else self._probes_left - 1
         self._in_step = self._probes_left == 0  # silence and flush have to do where no node proves it
-        if exchange:
+        if exchange and not (gone and now_s < self._probed_s + GONE_PAUSE_S):
+            self._probed_s = now_s
             self._send(Transaction(exchange, Lane.STOP, now_s), now_s, "probe")
         else:
             self._next()
