@@ -32,6 +32,8 @@ MISSED_S = 0.2
 """The same while its drive misses polls: of one that has lost power in motion the last place is soon not its own."""
 OLD_PERIODS = 4
 """Periods of a position's rate that may pass besides: a poll may be lost or late."""
+MISSED_PERIODS = 2
+"""The same while its drive misses polls: one is known to be lost."""
 SILENT_S = 3.0
 """Time without anything from a daemon after which nothing that it said counts as known, seconds; each axis gives a sign
 of life every second. The same in each face."""
@@ -413,8 +415,9 @@ def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line
 
 def _is_old(state: KnownState, age_s: float | None, health: AxisHealth | None) -> bool:
     rate_hz = (health.rate_wanted_hz if health else 0.0) or 1.0
-    longest_s = MISSED_S if state.link is LinkState.DEGRADED else OLD_S
-    return age_s is not None and age_s > longest_s + OLD_PERIODS / rate_hz
+    missed = state.link is LinkState.DEGRADED
+    longest_s = MISSED_S + MISSED_PERIODS / rate_hz if missed else OLD_S + OLD_PERIODS / rate_hz
+    return age_s is not None and age_s > longest_s
 
 
 def _place(state: KnownState, faults: Faults | None, *, is_old: bool) -> tuple[Place, str]:

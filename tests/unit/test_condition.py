@@ -2,7 +2,7 @@
 
 import pytest
 
-from ldcnd.contract.condition import Severity, Trouble, assess, line_troubles
+from ldcnd.contract.condition import Place, Severity, Trouble, assess, line_troubles
 from ldcnd.contract.health import AxisHealth, ItemHealth
 from ldcnd.contract.samples import AxisState, FaultEntry, FaultSample, LinkState, Moving, Quality, StateSample
 
@@ -149,6 +149,14 @@ def test_polls_that_are_missed_explain_a_low_rate():
     found = troubles_of(state(link=LinkState.DEGRADED), faults(), health(1.0))
 
     assert said(found) == notice("the drive missed its latest polls")
+
+
+@pytest.mark.parametrize(("age_s", "is_old"), [(0.29, False), (0.31, True)])
+def test_the_place_of_a_drive_that_misses_polls_is_old_after_two_more(age_s, is_old):
+    """It may have lost its power in motion: where it was seen last is soon not where it is."""
+    found = assess(state(link=LinkState.DEGRADED), faults(), health(20.0), age_s=age_s)
+
+    assert (found.place is Place.OLD, found.live) == (is_old, not is_old)
 
 
 def test_an_axis_that_does_not_answer_may_move_and_is_not_said_to_be_in_error_stop():
