@@ -93,7 +93,9 @@ async def test_the_button_stops_every_axis_of_every_rig(house):
 
         stops = desk.page.locator(".stops")
         await expect(stops.filter(has_text="sim: stopped and latched: x, y, z, c.")).to_be_visible()
-        await expect(stops.filter(has_text="mixed: stopped and latched: x. NOT stopped: feed, spool")).to_be_visible()
+        await expect(
+            stops.filter(has_text="mixed: stopped and latched: x. No stop reaches feed, spool")
+        ).to_be_visible()
         await expect(desk.page.locator(".stop-report")).to_have_attribute("data-shown", "no")
         state = await house.sim.until("y", lambda state: state.moving == "no")
         assert state.stop_latched

@@ -207,7 +207,7 @@ async def test_a_stop_names_what_it_does_not_reach_on_every_page(house):
             stops = desk.page.locator(".stops", has_text="mixed: ")
             for place in ("axis/mixed/x", "events"):
                 await desk.open(place)
-                await expect(stops).to_contain_text("NOT stopped: feed, spool; feed may move: emergency stop.")
+                await expect(stops).to_contain_text("No stop reaches feed, spool; feed may move: emergency stop.")
                 await expect(stops).not_to_contain_text("Nothing moves before Reset")
     finally:
         await house.mixed.quiet("x")

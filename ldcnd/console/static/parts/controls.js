@@ -1,6 +1,7 @@
 /** Controls: a button says in visible text why it cannot act now; a choice and a tick have labels. */
 
 import { html, useEffect, useId, useLayoutEffect, useRef, useState } from "../html.js";
+import { sentence } from "./format.js";
 import { inPageTerms } from "./remedies.js";
 import { faultPage } from "./state.js";
 import { cameUnderHand } from "./under_hand.js";
@@ -116,7 +117,7 @@ export function RefusalText({ refusal }) {
   return html`<span class="refusal" role="alert">
     ${
       refusal &&
-      html`<b>${refusal.message}</b> ${refusal.remedy && html`<span>${inPageTerms(refusal)}.</span>`}
+      html`<b>${refusal.message}</b> ${refusal.remedy && html`<span>${sentence(inPageTerms(refusal))}</span>`}
       ${refusal.code && html` <a href=${faultPage(refusal.code)}>${refusal.code}</a>`}`
     }
   </span>`;

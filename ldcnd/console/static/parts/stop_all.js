@@ -90,7 +90,8 @@ function StopsOf({ rig }) {
   const [moving, stopped] = [true, false].map((is) => latched.filter(({ state }) => (state.moving === "yes") === is));
   if (!axes.length) return null;
   // what no stop reaches goes on beside those that are latched
-  const free = [...rig.axes.values()].filter((axis) => axis.info && !axis.can("stop"));
+  const all = [...rig.axes.values()].filter((axis) => axis.info);
+  const free = all.filter((axis) => !axis.can("stop"));
   const going = free.filter((axis) => !axis.condition.live || axis.state?.moving !== "no");
   const of = rigs.size > 1 ? `${rig.name}: ` : "";
   const ready = latched.filter((axis) => obstacle(axis, "reset") === null);
@@ -98,8 +99,8 @@ function StopsOf({ rig }) {
   return html`<p class="notice mark stops" data-level=${pending.length || going.length ? "bad" : "warn"}>
     ${pending.length > 0 && html`<span>${of}stop NOT confirmed by ${named(pending)}: use the machine’s emergency stop.</span> `}
     ${moving.length > 0 && html`<span>${of}stop latched, moving still: ${named(moving)}.</span> `}
-    ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}.${free.length ? "" : " Nothing moves before Reset."}</span> `}
-    ${free.length > 0 && html`<span>NOT stopped: ${named(free)}${going.length ? `; ${named(going)} may move: emergency stop` : ""}.</span> `}
+    ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}.${axes.length < all.length ? "" : " Nothing moves before Reset."}</span> `}
+    ${free.length > 0 && html`<span>No stop reaches ${named(free)}${going.length ? `; ${named(going)} may move: emergency stop` : ""}.</span> `}
     ${ready.length > 0 && html`<${Action} act=${reset}>Reset stopped axes<//>`}
   </p>`;
 }

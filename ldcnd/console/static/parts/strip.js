@@ -1,10 +1,10 @@
 /** An axis in one line that never leaves the screen: where it is and goes, its state, and what ends its motion. */
 
-import { html } from "../html.js";
+import { html, useState } from "../html.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { Action } from "./controls.js";
-import { decimalsOf, number } from "./format.js";
+import { clock, decimalsOf, number } from "./format.js";
 import { Homed, Place, StateWord, TroubleWords } from "./state.js";
 import { stopAxis } from "./stop_all.js";
 
@@ -15,18 +15,29 @@ export function PlaceAndTarget({ axis }) {
   return html`<span class="number"><${Place} axis=${axis} decimals=${decimals} />${target != null && html` <span class="quiet">→ ${number(target, decimals)}</span>`}</span>`;
 }
 
-/** The strip of the page of an axis. Anyone may end a motion, with or without control. */
+/** The strip of the page of an axis. Anyone may end a motion, with or without control.
+ *
+ * What came of that is in the state of the axis, but for a page to which nothing comes any more: that shows the answer.
+ */
 export function AxisStrip({ axis }) {
   const toHalt = obstacle(axis, "halt");
+  const [answered, setAnswered] = useState(null);
+  const tell = (what) => (reply) => setAnswered(`${what} at ${clock(Date.now() * 1e6)}: ${came(reply)}.`);
   return html`<div class="strip of-axis">
     <span class="where"><b>${axis.name}</b> <${PlaceAndTarget} axis=${axis} /></span>
     <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /><${TroubleWords} axis=${axis} /></span>
     ${axis.can("stop") && html`<span class="endings" role="group" aria-label=${`End a motion of ${axis.name}`}>
-      <${Action} calms act=${() => command(axis, "halt")} obstacle=${toHalt} reason="halt-way"
+      <${Action} calms act=${() => command(axis, "halt")} onDone=${tell("Halt")} obstacle=${toHalt} reason="halt-way"
         title=${toHalt ?? "Decelerate and hold; no latch"}>Halt<//><span class="unseen" id="halt-way">${toHalt ?? ""}</span>
-      <${Action} calms act=${() => stopAxis(axis)} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
-      <${Action} calms act=${() => command(axis, "quick_stop")} kind="warn"
+      <${Action} calms act=${() => stopAxis(axis)} onDone=${tell("Stop")} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
+      <${Action} calms act=${() => command(axis, "quick_stop")} onDone=${tell("Quick stop")} kind="warn"
         title="Hold at once, without a ramp, and latch until reset">Quick stop<//>
     </span>`}
+    ${answered && axis.rig.worth && html`<span role="status">${answered}</span>`}
   </div>`;
+}
+
+function came({ confirmed }) {
+  if (!confirmed) return "the daemon has it";
+  return confirmed.length ? `confirmed by ${confirmed.join(", ")}` : "confirmed by no drive";
 }
