@@ -68,7 +68,7 @@ WAITING_FRAMES = 4
 """Maximum number of frames that wait for a page that does not read; then its oldest streams are dropped."""
 STREAMED_SAMPLES = 4096
 """Maximum number of streamed samples in a frame; the oldest are dropped."""
-SIGN_OF_LIFE_S = 1.0
+SIGN_OF_LIFE_S = 0.5
 """Maximum time between two frames, even with nothing in them, seconds."""
 
 

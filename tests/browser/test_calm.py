@@ -1,12 +1,13 @@
 """Every condition of an axis on the rig page and on the axis page, as a person reads them."""
 
+import asyncio
 import re
 from contextlib import suppress
 
 import pytest
 
 from ldcnd.console.conditions import as_payload
-from ldcnd.contract.commands import Reset
+from ldcnd.contract.commands import Halt, MoveRelative, Power, Reset
 from ldcnd.contract.condition import Place
 from tests.unit.test_conditions_on_faces import CASES, Case, axis_now, known
 
@@ -196,3 +197,34 @@ async def test_a_jog_that_a_stop_ends_is_an_ordinary_end(house):
         await playwright.expect(desk.page.locator(".refusal:not(:empty)")).to_have_count(0)
     await house.sim.quiet("x", "y", "z", "c")
     await house.mixed.quiet("x")
+
+
+SAID = (
+    "() => ['.summary', '.strip .moving', 'main'].map((each) => document.querySelector(each)?.textContent).join(' | ')"
+)
+
+
+async def test_a_page_that_loads_while_an_axis_moves_says_at_no_instant_that_nothing_moves(house):
+    await house.sim.quiet("x")
+    await house.sim.rig.command("x", Power(on=True))
+    await house.sim.rig.command("x", MoveRelative(distance=-100.0, velocity=2.0))
+    try:
+        async with house.desk() as desk:
+            await desk.page.route("**/api/rigs", lambda route: later(route, 2.0))  # as over a slow network
+            await desk.page.goto("about:blank")
+            await desk.open("rig")
+            said = []
+            async with asyncio.timeout(30):
+                while not said or not re.search(r"\bx −", said[-1]):
+                    said.append(await desk.page.evaluate(SAID))
+                    await asyncio.sleep(0.05)
+            assert not [each for each in said[:-1] if re.search("Nothing moves|Nothing needs attention|No rig", each)]
+            assert any("Waiting for values" in each for each in said)
+    finally:
+        await house.sim.rig.command("x", Halt())
+
+
+async def later(route, pause_s: float) -> None:
+    """Let a request of the page go on after a while."""
+    await asyncio.sleep(pause_s)
+    await route.continue_()

@@ -19,7 +19,7 @@ import { StopAll, Stops } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
 import { loginIsGone } from "./session/api.js";
 import { feed } from "./session/feed.js";
-import { axesOf, axisNamed, changed, commissions, failure, rigs, useRigs, watch } from "./session/rigs.js";
+import { axesOf, axisNamed, changed, commissions, failure, isWhole, rigs, useRigs, watch } from "./session/rigs.js";
 
 const PAGES = [
   ["rig", "Rig", RigPage],
@@ -45,6 +45,12 @@ function Navigation({ at }) {
   </nav>`;
 }
 
+/** Return what is said where nothing is wrong or moves, as far as this page knows. */
+function calm(text) {
+  if (!isWhole()) return "Waiting for values";
+  return rigs.size ? text : "No rig is known";
+}
+
 /** One line on how things are: heard by screen readers when it changes. */
 function Summary() {
   const wrong = problems(rigs.values());
@@ -53,7 +59,7 @@ function Summary() {
   return html`<p class="summary" role="status">
     ${feed.live ? "" : html`<${Mark} level="bad">No data from the console process<//> `}
     <${Mark} level=${worst}>
-      ${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : "Nothing needs attention"}<//>
+      ${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : calm("Nothing needs attention")}<//>
     ${[...rigs.values()].filter((rig) => !rig.worth && slowed(rig)).map((rig) => html`<${Mark} level="warn"
       >${rigs.size > 1 ? `${rig.name}: ` : ""}speed override ${number(overrideOf(rig), 0)} %${overrideOf(rig) === 0 ? ": nothing moves" : ""}<//> `)}
     ${mine.length > 0 && html` <span class="mine">You control ${mine.map((axis) => axis.name).join(", ")}</span>`}
@@ -73,7 +79,7 @@ function Strip({ at }) {
   return html`<div class="strip">
     <span class="moving">${moving.length
       ? moving.slice(0, MOST_MOVING).map((each) => html`<a href=${`#/axis/${each.rig.name}/${each.name}`}>${each.name}</a> <${PlaceAndTarget} axis=${each} /> `)
-      : !unsure.length && html`<span class="quiet">Nothing moves</span>`}${moving.length > MOST_MOVING && ` and ${moving.length - MOST_MOVING} more move`}${
+      : !unsure.length && html`<span class="quiet">${calm("Nothing moves")}</span>`}${moving.length > MOST_MOVING && ` and ${moving.length - MOST_MOVING} more move`}${
       unsure.length > 0 && html` <span class="mark" data-level="bad">not known whether ${unsure.slice(0, MOST_MOVING).join(", ")}${
         unsure.length > MOST_MOVING && ` and ${unsure.length - MOST_MOVING} more`} move</span>`}</span>
     ${worst && html`<span class="worst mark" data-level=${worst.level}>${worst.places[0].where}${worst.places.length > 1 ? ` and ${worst.places.length - 1} more` : ""}: ${worst.text}</span>`}

@@ -10,7 +10,7 @@ import { Mark } from "../parts/state.js";
 import { ask } from "../session/api.js";
 import { command, controls, release, take } from "../session/control.js";
 import { calms, isUseless, obstacle, useless } from "../session/obstacles.js";
-import { axesOf, changed, endpoints, useRigs } from "../session/rigs.js";
+import { axesOf, changed, endpoints, isWhole, useRigs } from "../session/rigs.js";
 import { AxesOf, refused, ShortAction } from "./rig_axes.js";
 import { GroupMoves } from "./rig_groups.js";
 import { ModulesOf } from "./rig_modules.js";
@@ -69,6 +69,7 @@ function Invitation() {
 }
 
 function NoRig() {
+  if (!isWhole()) return null;
   return html`<section class="panel"><h2>No rig yet</h2>
     <p>No daemon has been heard. Start one, <code>ldcnd run --config config/simulated.toml</code>, or name its endpoint
       to <code>ldcnd console -e</code>. This page shows it as soon as it is there.</p>

@@ -5,8 +5,8 @@ import { decode } from "../vendor/msgpack/decode.mjs";
 const RATE_HZ = 10;
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 4_000;
-/** A frame comes at least once a second: so much silence means that the console process, or the way to it, is gone. */
-const SILENCE_MS = 3_500;
+/** A frame comes at least twice a second: so much silence means that the console process, or the way to it, is gone. */
+const SILENCE_MS = 2_000;
 
 /** A feed hands entries on as they come; who listens decides what is kept. */
 export class Feed {

@@ -383,6 +383,13 @@ export let commissions = false;
 /** Why the descriptions could not be read; null while they can. */
 export let failure = null;
 
+let described = false;
+
+/** Whether this page knows all that there is to know: before that it has nothing to say of what moves or is wrong. */
+export function isWhole() {
+  return feed.live && described && [...rigs.values()].every((rig) => rig.worth || rig.daemon);
+}
+
 const watchers = new Set();
 let drawnAtMs = 0;
 let due = 0;
@@ -431,6 +438,7 @@ export const describe = unlessUnderWay(async () => {
     for (const each of told) rigNamed(each.name).describe(each);
     commissions = may ?? false;
     failure = null;
+    described = true;
   } catch (error) {
     failure = error;
   }
