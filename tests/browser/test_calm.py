@@ -215,7 +215,7 @@ async def test_a_page_that_loads_while_an_axis_moves_says_at_no_instant_that_not
             await desk.open("rig")
             said = []
             async with asyncio.timeout(30):
-                while not said or not re.search(r"\bx −", said[-1]):
+                while not said or not re.search(r"\bx \W\d", said[-1]):
                     said.append(await desk.page.evaluate(SAID))
                     await asyncio.sleep(0.05)
             assert not [each for each in said[:-1] if re.search("Nothing moves|Nothing needs attention|No rig", each)]
