@@ -461,6 +461,20 @@ def test_list_says_how_fast_a_rotor_turns_in_its_unit_and_for_how_long(monkeypat
     assert (at_rest["moving"], at_rest["rest_s"], abs(at_rest["velocity"]) < 0.5) == ("no", None, True)
 
 
+def test_a_halt_that_is_waited_for_returns_when_a_rotor_that_nothing_drives_stands(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        machine.wait(asyncio.sleep(1))
+        for each in ("power on rotor", "home rotor --wait", "move rotor 600 --at-velocity --for 300"):
+            assert machine.run(each).code == 0
+        machine.wait(asyncio.sleep(10))
+        assert machine.run("power off rotor").code == 0
+        halted = machine.run("halt rotor --wait")
+        at_rest = json.loads(machine.run("list --json").printed)
+
+    assert halted.printed.endswith("rotor: halt done\n")
+    assert (at_rest["moving"], abs(at_rest["velocity"]) < 0.5) == ("no", True)
+
+
 def test_an_override_is_shown_by_list_and_why_with_its_rule_its_client_and_its_end(monkeypatch):
     with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
         machine.wait(asyncio.sleep(1))
