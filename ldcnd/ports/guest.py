@@ -116,7 +116,7 @@ class Guest(Presence):
     ) -> None:
         super().__init__(port, host, group)
         self._bus = bus
-        self._share = LineShare(UNPAUSED_S)
+        self._share = LineShare(UNPAUSED_S, lambda: bus.guests_s.get(port.name, 0.0))
         self._fresh = FreshReplies(bus, port.fresh_ms)
         self._timer: asyncio.TimerHandle | None = None
         self._axes = tuple(drive.spec.name for drive in drives)
