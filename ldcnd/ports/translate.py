@@ -118,15 +118,34 @@ class GuestServo:
     def __init__(self, drive: LdcnAxis, status: Callable[[], StatusView], client: str) -> None:
         self.drive, self._status, self._client = drive, status, client
         self.zero = 0
+        self._has_home = True  # its home register is 0 from a Hard Reset until its next search is over
+        self.homing = ""
         self.restart()
+
+    def hard_reset(self) -> None:
+        """Begin at 0 as after a Hard Reset: "position ... set to zero" (PIC-SERVO manual, 4.1); programs count on it."""
+        self.restart()
+        self.set_zero(self.drive.state.counts, 0)
+        self._has_home = False
 
     def restart(self) -> None:
         """Forget what the guest has loaded, as its drive does with a reset; the next program finds its counter."""
         self._registers = Trajectory()
         self._holds = False  # the guest's drive has its servo on, whatever its amplifier does
         self.armed = _NO_HOMING
-        self.homing = self.running = ""
+        self._home_is_over()
+        self.running = ""
         self.slews_at_s = 0.0
+
+    def home(self, wire_counts: int) -> int:
+        """Return the guest's home register for that of the drive."""
+        if self.homing and not self._status().is_at(self.homing):
+            self._home_is_over()
+        return self.counter(wire_counts) if self._has_home else 0
+
+    def _home_is_over(self) -> None:
+        self._has_home = self._has_home or bool(self.homing)
+        self.homing = ""
 
     def counter(self, wire_counts: int) -> int:
         """Return the guest's counter for that of the drive; 32 bits, signed."""
@@ -139,7 +158,8 @@ class GuestServo:
 
     def begun(self, command: AxisCommand[CommandReply], command_id: str, now_s: float) -> None:
         """Take note that a command of the guest is under way."""
-        self.homing = self.running = ""
+        self._home_is_over()
+        self.running = ""
         if isinstance(command, Home):
             self.homing, self.armed = command_id, _NO_HOMING
         if isinstance(command, Home | MoveVelocity) and self._registers.mode is ProfileMode.VELOCITY:
