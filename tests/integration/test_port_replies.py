@@ -25,6 +25,9 @@ CLEARED = "power on clears the position error first"
 OFF = "the motor is off, which the drive calls a position error; on the wire this packet leaves its loop closed"
 
 
+NOTHING = StatusItem(0)
+
+
 @dataclass(frozen=True)
 class Row:
     """A packet of the program.
@@ -41,7 +44,7 @@ class Row:
     then_s: float = 0.2
     differs: str = ""
     differs_on: str = ""
-    items: StatusItem = StatusItem(0)
+    items: StatusItem = NOTHING
 
 
 PACE_S = 0.35
