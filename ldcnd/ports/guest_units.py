@@ -54,8 +54,8 @@ from ldcnd.ports.share import LineShare
 
 log = get_logger("ports")
 
-UNPAUSED_S = 5.0
-"""Time of the line that a guest which has paused may use without a pause, seconds: both memories of a trace."""
+UNPAUSED_S = 7.0
+"""Time of the line that a guest which has paused may use without a pause, seconds: more than a trace takes."""
 PARITY_BIT = 0x80
 _BYTES_OF_COUNT = {CountUnit.BYTES: 1.0, CountUnit.WORDS: 2.0, CountUnit.CHARS: 0.5}
 

@@ -5,8 +5,8 @@ import math
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-LINE_SHARE = 0.25
-"""A guest that asks without a pause has so much of the line; others keep three quarters."""
+LINE_SHARE = 0.2
+"""A guest that asks without a pause has so much of the line; others keep at least 0.7 of their polls."""
 
 
 class LineShare:

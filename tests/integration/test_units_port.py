@@ -305,7 +305,7 @@ async def test_a_program_that_asks_as_fast_as_it_can_leaves_polls_their_rate(tmp
             while loop.time() < until_s:
                 replies += bool(await program.send("W1011000000"))
             assert replies > 100
-            # the line is full of polls alone: a guest has a quarter of it, after 5 s of it that it has for nothing
+            # the line is full of polls alone: a guest has a fifth of it, after 7 s of it that it has for nothing
             assert polls() - before >= (0.7 if pays else 0.55) * alone
 
 
