@@ -78,6 +78,11 @@ class TraceRecorder:
         """The channels that can be recorded."""
         return self._tracer.channels
 
+    @property
+    def is_busy(self) -> bool:
+        """Whether a trace is under way, its upload included."""
+        return self._current is not None
+
     async def carry_out(self, command_id: str, command: AxisCommand[CommandReply]) -> CommandReply:
         """Arm or abort a trace; called by the axis in turn with its other commands.
 

@@ -534,8 +534,9 @@ def _abort(status: AxisStatus, by: Verb) -> AxisStatus:
     """Return the status of a command that another one ends, with the reason where something is wrong, too."""
     if by is Verb.HALT and status.command and status.command.verb is Verb.JOG and not status.failure:
         return _end(status, CommandStatus.DONE)  # MC_Jog: a jog has no other end than to be let go
+    when = " while it settled: its profile was over" if status.settle else ""
     why = f": {status.failure}" if status.failure else ""
-    return _end(status, CommandStatus.ABORTED, f"aborted by {by}{why}")
+    return _end(status, CommandStatus.ABORTED, f"aborted by {by}{when}{why}")
 
 
 def _finished(status: AxisStatus, error: str | None = None, *, settled: bool | None = None) -> AxisStatus:

@@ -221,7 +221,7 @@ def convert(file: Path, form: str | None, out: Path | None, *, as_json: bool) ->
     models: dict[int, str] = {}
     if capture.header.config:
         (line,) = config_of(capture.header).bus
-        models = {axis.address: axis.model for axis in line.axis}
+        models = {each.address: each.model for each in (*line.axis, *getattr(line, "module", ()))}
     _render(capture, FAMILIES[capture.header.family].describe(models), form, out, as_json=as_json)
 
 
@@ -260,6 +260,7 @@ async def _fetch(client: RigClient, bus: str, seconds: float) -> tuple[WireLogRe
         first_record=log.first_record,
     )
     models = {axis.address: axis.model for axis in await client.axes() if axis.bus == bus}
+    models |= {module.address: module.model for module in line.modules if module.model}
     return log, header, FAMILIES[log.family].describe(models)
 
 

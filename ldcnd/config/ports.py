@@ -183,6 +183,15 @@ class GuestHost(Protocol):
             LdcndError: as any client would get it.
         """
 
+    def is_traced(self, axis: str) -> bool:
+        """Tell whether a client's trace of an axis is under way, its upload included."""
+
+    def require_control(self, axis: str, lease: str) -> None:
+        """Refuse what a guest sends by itself once it has lost control of the axis; raises LdcndError."""
+
+    def tell(self, about: str, what: str, client: str) -> None:
+        """Enter among the events what a guest has begun by itself."""
+
     def refuse(self, about: str, what: str, client: str) -> None:
         """Enter what was refused to a guest, and why, among the events."""
 

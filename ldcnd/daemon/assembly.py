@@ -188,6 +188,15 @@ class _GuestHost:
     async def carry_out(self, about: str, command: Command[Frozen]) -> Frozen:
         return await self._dispatcher.answer(about, command)
 
+    def is_traced(self, axis: str) -> bool:
+        return self._rig.axes[axis].traces.is_busy
+
+    def require_control(self, axis: str, lease: str) -> None:
+        self._dispatcher.require_control(axis, lease)
+
+    def tell(self, about: str, what: str, client: str) -> None:
+        self._dispatcher.events.note(about, "guest", CommandStatus.DONE, what, client=client)
+
     def refuse(self, about: str, what: str, client: str) -> None:
         self._dispatcher.events.note(about, "guest", CommandStatus.REFUSED, what, client=client)
 

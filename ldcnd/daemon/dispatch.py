@@ -528,6 +528,15 @@ class Dispatcher:
         self._refuse_rival(axis)
         self.authority.admit(axis, lease, None, self._clock.now_s())
 
+    def require_control(self, axis: str, lease: str | None) -> None:
+        """Refuse what was admitted under a lease that has ended since.
+
+        Raises:
+            RequestRefused: it has, or another daemon has the rig.
+        """
+        self._refuse_rival(axis)
+        self.authority.check_held(axis, lease, self._clock.now_s())
+
     def _right(self, axis: str, command: AxisCommand[CommandReply], accepted: asyncio.Event) -> Right:
         """Return what must still hold of the sender when a motion of its command begins.
 
@@ -539,8 +548,7 @@ class Dispatcher:
         arrived_s = self._clock.now_s()
 
         def holds() -> None:
-            self._refuse_rival(axis)
-            self.authority.check_held(axis, command.lease, self._clock.now_s())
+            self.require_control(axis, command.lease)
 
         def in_time() -> None:
             if command.not_after is not None:

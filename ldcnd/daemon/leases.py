@@ -324,10 +324,11 @@ class LeaseWatch:
         lease = self._authority.release(token, self._clock.now_s())
         self._show(lease.axes)
         log.info("control released", client=lease.client, axes=sorted(lease.axes), leave_running=leave_running)
-        moving = [name for name in lease.axes if self._rig.axes[name].tracker.status.moving is not Moving.NO]
+        states = {name: self._rig.axes[name].tracker.status for name in lease.axes}
+        moving = [name for name, each in states.items() if each.commanded and each.moving is not Moving.NO]
         if not leave_running:
             for name in moving:
-                seen = self._rig.axes[name].tracker.status.moving is Moving.YES
+                seen = states[name].moving is Moving.YES
                 why = "released while it moved" if seen else "released before it was seen to rest"
                 self._lost(lease, (name,), why, None)
         self._take_gains_back(lease.axes)
@@ -355,8 +356,10 @@ class LeaseWatch:
                     module.enter(Situation.CLIENT)
         for name in axes:
             axis = self._rig.axes[name]
-            self._note(name, lease, CommandStatus.ABORTED, f"{cause}; policy: {axis.config.loss.client.value}", code)
-            if self.group is not None:
+            commanded = axis.tracker.status.commanded
+            policy = f"; policy: {axis.config.loss.client.value}" if commanded else ""
+            self._note(name, lease, CommandStatus.ABORTED, f"{cause}{policy}", code)
+            if self.group is not None and commanded:
                 self.group.create_task(
                     apply_policy(axis, axis.config.loss.client, f"loss of control: {cause}"), name=f"client loss {name}"
                 )

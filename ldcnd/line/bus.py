@@ -2,6 +2,7 @@
 
 import asyncio
 from contextvars import ContextVar
+from functools import partial
 from typing import Any, TypeVar
 
 from typing_extensions import override
@@ -189,6 +190,7 @@ class Bus:
     Attributes:
         proofs: who is known to be at which address; what changes anything is sent to no other.
         listeners: hear each intact reply; see `Listener`.
+        guests_s: how long the exchanges that a guest has caused have taken the line, seconds, by the name of the guest.
     """
 
     def __init__(self, settings: BusSettings, opener: Opener, resync: Resync | None = None) -> None:
@@ -198,6 +200,7 @@ class Bus:
         self._resync = resync or Resync()
         self.proofs = Proofs()
         self.listeners: list[Listener] = []
+        self.guests_s: dict[str, float] = {}
         self._opener = opener
         self._loop = asyncio.get_running_loop()
         self._schedule: Schedule[Transaction] = Schedule(settings.cycle, self.proofs)
@@ -414,8 +417,16 @@ class Bus:
         if self._line is None:
             raise self._down()
         self._schedule.push(job, lane)
+        if job.guest:
+            job.future.add_done_callback(partial(self._taken, job))
         self._line.kick()
         return job
+
+    def _taken(self, job: Job, _done: "asyncio.Future[Any]") -> None:
+        """Count what an exchange of a guest has taken; one without a reply has cost others all that it took."""
+        now_s = self._loop.time()
+        took_s = job.timing.received_at_s - job.timing.sent_at_s if job.timing else now_s - job.wanted_at_s
+        self.guests_s[job.guest] = self.guests_s.get(job.guest, 0.0) + took_s
 
     def _down(self) -> BusDown:
         return BusDown(

@@ -116,7 +116,7 @@ class Guest(Presence):
     ) -> None:
         super().__init__(port, host, group)
         self._bus = bus
-        self._share = LineShare(UNPAUSED_S)
+        self._share = LineShare(UNPAUSED_S, lambda: bus.guests_s.get(port.name, 0.0))
         self._fresh = FreshReplies(bus, port.fresh_ms)
         self._timer: asyncio.TimerHandle | None = None
         self._axes = tuple(drive.spec.name for drive in drives)
@@ -276,9 +276,7 @@ class Guest(Presence):
         if module.outputs:
             module.outputs.restart()
         if module.servo:
-            module.servo.restart()
-            # programs take it for their zero: "position ... set to zero" at power-up (PIC-SERVO manual, 4.1)
-            module.servo.set_zero(module.servo.drive.state.counts, 0)
+            module.servo.hard_reset()
             if self._control and module.name in self._control.axes:
                 self._relieve(module, Power(on=False, client=self._name))
             if self._control and self._visit and self._host.status(module.name).state is AxisState.ERROR_STOP:
@@ -406,9 +404,9 @@ def _as_guest(module: _Reached, items: StatusItem, status: bytes, now_s: float) 
         return status
     told, flags = bytearray(status), servo.flags(StatusFlag(status[0]), now_s)
     told[0] = int(flags & ~StatusFlag.MOVE_DONE if module.about_to_move() else flags)
-    for item in (StatusItem.POSITION, StatusItem.HOME):
+    for item, shown in ((StatusItem.POSITION, servo.counter), (StatusItem.HOME, servo.home)):
         if items & item:
             at = 1 + item_bytes(module.profile, items & (int(item) - 1))
-            counter = servo.counter(POSITION.decode(bytes(told[at : at + POSITION.width])))
+            counter = shown(POSITION.decode(bytes(told[at : at + POSITION.width])))
             told[at : at + POSITION.width] = counter.to_bytes(POSITION.width, "little", signed=True)
     return bytes(told)

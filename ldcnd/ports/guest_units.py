@@ -7,6 +7,7 @@ comes in one piece once it is known to be intact, at the same time as its last c
 import asyncio
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 from pydantic import ValidationError
@@ -14,11 +15,19 @@ from typing_extensions import override
 
 from ldcnd.config.ports import GuestHost, PortConfig
 from ldcnd.contract.codec import explained
-from ldcnd.contract.commands import AxisCommand, CommandReply
 from ldcnd.contract.errors import AxisUnreachable, BusError, DataRefused, LdcndError, ValueOutOfRange
 from ldcnd.drives.driver import Drive
-from ldcnd.drives.smartstep.commands import Refusal, reference, string_reference
+from ldcnd.drives.smartstep.addresses import OperatingMode, Register, TraceRegister
+from ldcnd.drives.smartstep.commands import (
+    Refusal,
+    execute,
+    reference,
+    set_operating_mode,
+    string_reference,
+    write_trace_register,
+)
 from ldcnd.drives.smartstep.drive import SmartStepAxis
+from ldcnd.drives.smartstep.modes import leave
 from ldcnd.drives.smartstep.network import BAUD
 from ldcnd.drives.smartstep.packet import (
     END,
@@ -35,6 +44,7 @@ from ldcnd.drives.smartstep.packet import (
 from ldcnd.drives.smartstep.profiles import CountUnit, SmartStepProfile
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange
+from ldcnd.line.proof import only_while
 from ldcnd.log import get_logger
 from ldcnd.ports.control import Visit
 from ldcnd.ports.fresh import FreshReplies
@@ -44,8 +54,8 @@ from ldcnd.ports.share import LineShare
 
 log = get_logger("ports")
 
-UNPAUSED_S = 5.0
-"""Time of the line that a guest which has paused may use without a pause, seconds: both memories of a trace."""
+UNPAUSED_S = 7.0
+"""Time of the line that a guest which has paused may use without a pause, seconds: more than a trace takes."""
 PARITY_BIT = 0x80
 _BYTES_OF_COUNT = {CountUnit.BYTES: 1.0, CountUnit.WORDS: 2.0, CountUnit.CHARS: 0.5}
 
@@ -67,8 +77,12 @@ class UnitsGuest(Presence):
     ) -> None:
         super().__init__(port, host, group)
         self._fresh = FreshReplies(bus, port.fresh_ms)
-        self._units = {drive.spec.address: GuestUnit(drive) for drive in drives if isinstance(drive, SmartStepAxis)}
-        self._share = LineShare(UNPAUSED_S)
+        self._units = {
+            drive.spec.address: GuestUnit(drive, partial(host.is_traced, drive.spec.name))
+            for drive in drives
+            if isinstance(drive, SmartStepAxis)
+        }
+        self._share = LineShare(UNPAUSED_S, lambda: bus.guests_s.get(port.name, 0.0))
         self._line = bytearray()
         self._latest: _Asked | None = None
         self._came = asyncio.Event()
@@ -98,9 +112,10 @@ class UnitsGuest(Presence):
     @override
     async def gone(self) -> None:
         self._latest = None
-        for unit in self._units.values():
-            unit.restart()
         await super().gone()
+        for unit in self._units.values():
+            if unit.leaves():
+                await leave(unit.drive.words)
 
     def _take(self, frame: bytes) -> None:
         """Take what may be a frame; drives are silent about what is none, and about those of other units."""
@@ -129,9 +144,8 @@ class UnitsGuest(Presence):
                         self.receive(add_parity(reply) if _has_parity(asked.frame) else reply)
 
     def _fresh_reply(self, command: CommandPacket) -> bytes | None:
-        """Return what the drive has just replied to the same frame; None where the guest has changed that."""
-        kept = self._units[command.unit].kept(command.address) is not None
-        if kept or command.function is Function.SETTING or not self._host.is_up():
+        """Return what the drive has just replied to the same frame; None where it may be another one now."""
+        if command.function is Function.SETTING or not self._host.is_up():
             return None
         request = command.encode()
         return next((reply for frame, reply in self._fresh.of(command.unit) if frame == request), None)
@@ -142,7 +156,7 @@ class UnitsGuest(Presence):
         try:
             if command.function is Function.SETTING:
                 try:
-                    return _answered(command, await self._set(unit, asked))
+                    return await self._set(unit, asked)
                 finally:
                     self._fresh.changed(command.unit)
             return await self._read(unit, command)
@@ -153,7 +167,7 @@ class UnitsGuest(Presence):
     async def _read(self, unit: GuestUnit, command: CommandPacket) -> bytes | None:
         name, what = unit.drive.spec.name, f"reading {command.address:04X}H"
         try:
-            reply: bytes = await unit.drive.words.ask(_reading(command, unit.drive.profile))
+            return await unit.drive.words.ask(_reading(command, unit.drive.profile))
         except ValueOutOfRange as error:  # what a drive does with an odd address or count is not known
             self._refuse(name, what, error.message)
             return _answered(command, ResponseStatus.BYTE_COUNT_ERROR)
@@ -162,37 +176,41 @@ class UnitsGuest(Presence):
         except LdcndError as error:
             self._refuse(name, what, error.message)
             return None
-        word = unit.kept(command.address) if command.function is Function.REFERENCE else None
-        if word is None or not decode_reply(reply).status.normal:
-            return reply
-        return ReplyPacket(command.unit, ResponseStatus.REFERENCE, command.address, word).encode()
 
-    async def _set(self, unit: GuestUnit, asked: _Asked) -> ResponseStatus:
-        """Carry out a setting; return what the drive says to it, or to one that it does not do."""
+    async def _set(self, unit: GuestUnit, asked: _Asked) -> bytes:
+        """Carry out a setting; return what the drive says to it, or would say to one that it does not get."""
         axis, command, control = unit.drive.spec.name, asked.command, self._control
         what = f"setting {command.address:04X}H to {command.data:04X}H"
-
-        async def do(wanted: AxisCommand[CommandReply]) -> None:
-            if control is None:
-                raise AssertionError("a guest without control sets nothing")
-            lease = await control.over((axis,), asked.visit)
-            await self._host.carry_out(axis, wanted.model_copy(update={"lease": lease}))
-
         if control is None:
             self._refuse(axis, what, f"the port {self._name} has access = read")
-            return ResponseStatus.SETTING_ADDRESS_ERROR
+            return _answered(command, ResponseStatus.SETTING_ADDRESS_ERROR)
         try:
-            await unit.set(command.address, command.data, do)
+            wanted = unit.command_for(command.address, command.data)
+            lease = await control.over((axis,), asked.visit)
+            if wanted is None:
+                return await self._send(unit, command, lease)
+            await self._host.carry_out(axis, wanted.model_copy(update={"lease": lease}))
         except (BusError, AxisUnreachable):
             raise
         except LdcndError as error:
             self._refuse(axis, what, error.message)
             refused = isinstance(error, DataRefused)
-            return ResponseStatus.SETTING_DATA_ERROR if refused else ResponseStatus.SETTING_ADDRESS_ERROR
+            return _answered(
+                command, ResponseStatus.SETTING_DATA_ERROR if refused else ResponseStatus.SETTING_ADDRESS_ERROR
+            )
         except ValidationError as error:  # a frame holds values that no command has
             self._refuse(axis, what, explained(error).message)
-            return ResponseStatus.SETTING_DATA_ERROR
-        return ResponseStatus.SETTING
+            return _answered(command, ResponseStatus.SETTING_DATA_ERROR)
+        return _answered(command, ResponseStatus.SETTING)
+
+    async def _send(self, unit: GuestUnit, command: CommandPacket, lease: str) -> bytes:
+        """Send a setting as it is, as long as the guest has control; return the drive's reply."""
+        axis = unit.drive.spec.name
+        with only_while(partial(self._host.require_control, axis, lease)):
+            reply = await unit.drive.words.ask(_setting(command), once=True)
+        if decode_reply(reply).status.normal and (begun := unit.sends(command.address, command.data)):
+            self._host.tell(axis, begun, self._name)
+        return reply
 
 
 def _has_parity(frame: bytes) -> bool:
@@ -202,6 +220,22 @@ def _has_parity(frame: bytes) -> bool:
 
 def _answered(command: CommandPacket, status: ResponseStatus) -> bytes:
     return ReplyPacket(command.unit, status, command.address, command.data).encode()
+
+
+def _setting(command: CommandPacket) -> Exchange[bytes | Refusal]:
+    """Return the exchange of a setting that goes to the drive as it is, as is its reply.
+
+    The guest itself repeats one whose reply is lost, or does not: the line sends it once, and so need not wait whether
+    an older reply came.
+    """
+    exchange: Exchange[Any] = (
+        set_operating_mode(command.unit, OperatingMode(command.data))
+        if command.address == Register.OPERATING_MODE
+        else execute(command.unit)
+        if command.address == Register.OPERATION
+        else write_trace_register(command.unit, TraceRegister(command.address), command.data)
+    )
+    return replace(exchange, decode=bytes, repeatable=True)
 
 
 def _reading(command: CommandPacket, profile: SmartStepProfile) -> Exchange[bytes | Refusal]:

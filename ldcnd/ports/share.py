@@ -2,11 +2,11 @@
 
 import asyncio
 import math
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 
-LINE_SHARE = 0.25
-"""A guest that asks without a pause has so much of the line; others keep three quarters."""
+LINE_SHARE = 0.2
+"""A guest that asks without a pause has so much of the line; others keep at least 0.7 of their polls."""
 
 
 class LineShare:
@@ -14,10 +14,11 @@ class LineShare:
 
     Args:
         unpaused_s: time of the line that a guest which has paused may use without a pause, seconds.
+        used_s: returns how much of the line's time its exchanges have taken, seconds; see `Bus.guests_s`.
     """
 
-    def __init__(self, unpaused_s: float) -> None:
-        self._unpaused_s = unpaused_s
+    def __init__(self, unpaused_s: float, used_s: Callable[[], float]) -> None:
+        self._unpaused_s, self._used_s = unpaused_s, used_s
         self._loop = asyncio.get_running_loop()
         self._line, self._free_at_s = asyncio.Lock(), -math.inf
 
@@ -26,10 +27,9 @@ class LineShare:
         """Wait for the guest's turn; the context is what it does with the line."""
         async with self._line:
             await asyncio.sleep(max(0.0, self._free_at_s - self._loop.time()))
-            began_s = self._loop.time()
+            before_s = self._used_s()
             try:
                 yield
             finally:
-                now_s = self._loop.time()
-                earned_s = max(self._free_at_s, now_s - self._unpaused_s / LINE_SHARE)
-                self._free_at_s = earned_s + (now_s - began_s) / LINE_SHARE
+                earned_s = max(self._free_at_s, self._loop.time() - self._unpaused_s / LINE_SHARE)
+                self._free_at_s = earned_s + (self._used_s() - before_s) / LINE_SHARE

@@ -117,20 +117,42 @@ class GuestServo:
 
     def __init__(self, drive: LdcnAxis, status: Callable[[], StatusView], client: str) -> None:
         self.drive, self._status, self._client = drive, status, client
-        self.zero = 0
+        self.zero = self._home_zero = 0  # a home position keeps its number when the counter gets another zero
+        self._has_home = True  # its home register is 0 from a Hard Reset until its next search is over
+        self.homing = ""
         self.restart()
+
+    def hard_reset(self) -> None:
+        """Begin at 0, as after a Hard Reset: "position ... set to zero" (PIC-SERVO manual, 4.1)."""
+        self.restart()
+        self.set_zero(self.drive.state.counts, 0)
+        self._has_home = False
 
     def restart(self) -> None:
         """Forget what the guest has loaded, as its drive does with a reset; the next program finds its counter."""
         self._registers = Trajectory()
         self._holds = False  # the guest's drive has its servo on, whatever its amplifier does
         self.armed = _NO_HOMING
-        self.homing = self.running = ""
+        self._home_is_over()
+        self.running = ""
         self.slews_at_s = 0.0
+
+    def home(self, wire_counts: int) -> int:
+        """Return the guest's home register for that of the drive."""
+        if self.homing and not self._status().is_at(self.homing):
+            self._home_is_over()
+        return self._shown(wire_counts, self._home_zero) if self._has_home else 0
+
+    def _home_is_over(self) -> None:
+        self._has_home = self._has_home or bool(self.homing)
+        self.homing = ""
 
     def counter(self, wire_counts: int) -> int:
         """Return the guest's counter for that of the drive; 32 bits, signed."""
-        counts = wire_counts + self.drive.state.offset_counts - self.zero
+        return self._shown(wire_counts, self.zero)
+
+    def _shown(self, wire_counts: int, zero: int) -> int:
+        counts = wire_counts + self.drive.state.offset_counts - zero
         return (counts + (1 << 31)) % (1 << 32) - (1 << 31)
 
     def set_zero(self, counts: float, value: int) -> None:
@@ -139,9 +161,10 @@ class GuestServo:
 
     def begun(self, command: AxisCommand[CommandReply], command_id: str, now_s: float) -> None:
         """Take note that a command of the guest is under way."""
-        self.homing = self.running = ""
+        self._home_is_over()
+        self.running = ""
         if isinstance(command, Home):
-            self.homing, self.armed = command_id, _NO_HOMING
+            self.homing, self.armed, self._home_zero = command_id, _NO_HOMING, self.zero
         if isinstance(command, Home | MoveVelocity) and self._registers.mode is ProfileMode.VELOCITY:
             self.running = command_id
             self.slews_at_s = now_s + abs(command.velocity or 0.0) / (command.acceleration or math.inf)

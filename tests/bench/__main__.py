@@ -19,6 +19,7 @@ from tests.bench import (
     console,
     counts,
     interlock_cost,
+    ports,
     round_trip,
     saturated_command,
     scaling,
@@ -64,6 +65,7 @@ PARTS = (
     "client",
     "counts",
     "interlocks",
+    "ports",
 )
 
 
@@ -129,6 +131,7 @@ def _parts(folder: Path, rounds: int, virtual_s: float, before: Path | None) -> 
         client_sample.rows,
         partial(counts.rows, ROOT, before),
         interlock_cost.rows,
+        partial(ports.rows, virtual_s),
     )
     return dict(zip(PARTS, found, strict=True))
 

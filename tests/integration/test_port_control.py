@@ -9,7 +9,7 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.samples import AxisState
-from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, encode_packet
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, StatusItem, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
 from tests.support.guest_program import guest, open_port
@@ -207,6 +207,58 @@ async def test_after_a_hard_reset_the_program_finds_its_counter_at_zero(tmp_path
         await program.send(load(GO_NOW, counts=1000))
         await finished(program)
         assert shaft(rig) == pytest.approx(3000, abs=20)
+
+
+def home(reply):
+    return int.from_bytes(bytes.fromhex(reply)[1:5], "little", signed=True)
+
+
+async def test_after_a_hard_reset_the_programs_home_register_is_zero_until_its_next_search(tmp_path):
+    read = Packet(1, READ, bytes((StatusItem.HOME,)))
+
+    async def searches(program):
+        await program.send(ENABLE)
+        await program.send(Packet(1, CommandCode.SET_HOMING_MODE, b"\x28"))
+        await program.send(load(RUN_NOW, speed=0.5))
+        await asyncio.sleep(6)
+
+    async with guest(tmp_path, "control") as (_, program):
+        await program.begin()
+        await searches(program)
+        found = home(await program.send(read))
+        assert found
+        await program.begin()
+        assert home(await program.send(read)) == 0
+        await searches(program)
+        assert home(await program.send(read)) not in {0, found}
+
+
+async def test_a_latched_stop_keeps_a_program_from_giving_the_axis_another_position(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=2000))
+        await finished(program)
+        await asyncio.sleep(1.0)
+        await rig.client.ask(Stop(), "rotor")
+        before = rig.daemon.rig.axes["rotor"].tracker.status.scale
+        await program.send(Packet(1, CommandCode.RESET_POSITION))
+        await asyncio.sleep(0.5)
+        assert rig.daemon.rig.axes["rotor"].tracker.status.scale == before
+        assert position(await program.send(Packet(1, READ, POSITION))) == pytest.approx(2000, abs=20)
+        assert any("latched" in (each.reason or "") for each in await events(rig))
+
+
+async def test_a_move_that_follows_one_that_has_still_to_settle_is_not_said_to_have_cut_it_short(tmp_path):
+    async with guest(tmp_path, "control", reference="at_reset") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(Packet(1, CommandCode.RESET_POSITION))
+        for counts in (1000, 2000):
+            await program.send(load(GO_NOW, counts=counts))
+            await finished(program)
+        aborted = [each.reason for each in await events(rig) if each.status == "aborted"]
+        assert all("its profile was over" in each for each in aborted), aborted
 
 
 async def test_limits_hold_for_the_program_and_its_move_is_not_done(tmp_path):

@@ -85,10 +85,12 @@ def drive_by_rfc2217(port: int) -> tuple[list[bytes], float]:
 
 @pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # of pyserial's client
 @pytest.mark.real_time
-async def test_a_program_that_speaks_rfc_2217_sets_its_rate_by_it():
+@pytest.mark.parametrize("access", ["read", "control"])
+async def test_a_program_that_speaks_rfc_2217_sets_its_rate_by_it(access):
     port = free_port()
-    async with running_machine(with_tcp_port(port, rfc2217=True)):
+    async with running_machine(with_tcp_port(port, rfc2217=True, access=access)) as rig:
         replies, rate = await asyncio.to_thread(drive_by_rfc2217, port)
+        assert rig.daemon.rig.axes["rotor"].tracker.status.referenced is (access == "control")
 
     assert rate == 115_200
     assert all(replies[1:])

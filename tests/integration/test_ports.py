@@ -133,7 +133,7 @@ async def test_a_guest_that_reads_as_fast_as_it_can_leaves_polls_their_rate(tmp_
             replies += bool(await program.send(Packet(1, NO_OPERATION)))
 
         assert replies > 20
-        assert len(sent) - replies >= 0.85 * alone
+        assert len(sent) - replies >= 0.78 * alone
 
 
 @pytest.mark.long

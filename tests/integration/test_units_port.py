@@ -7,12 +7,12 @@ import pytest
 import serial
 
 from ldcnd.client.overview import last_bus_health
-from ldcnd.client.traces import arm_trace, fetch_trace, trace_header, wait_for_trace
-from ldcnd.contract.errors import LeaseHeld
+from ldcnd.client.traces import arm_trace, trace_header, wait_for_trace
+from ldcnd.contract.errors import BusyTracing, LeaseHeld
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.parameters import ReadParameter, WriteParameter
-from ldcnd.contract.traces import TakeTrace, TracePhase
+from ldcnd.contract.traces import AbortTrace, TakeTrace, TracePhase
 from ldcnd.drives.smartstep.parameters import PN100, PN304
 from ldcnd.line.exchange import Lane
 from ldcnd.line.flight_recorder import WireEvent
@@ -59,7 +59,7 @@ def sent_of_guest(rig) -> list[bytes]:
 async def refusals(rig, axis="feed") -> list[str]:
     """Return why what the guest asked for was not done."""
     events = (await rig.client.ask(ReadEvents(axis=axis))).events
-    return [each.reason for each in events if each.client == "old" and each.verb == "guest"]
+    return [each.reason for each in events if (each.client, each.verb, each.status) == ("old", "guest", "refused")]
 
 
 async def bare(head: bytes) -> str:
@@ -135,9 +135,6 @@ async def test_parameters_are_written_under_a_lease_and_each_eeprom_write_is_cou
         ("W1100000200", "9", "would be unit 2"),
         ("W1120002002", "5", "not one of the manual's"),
         ("W1120010002", "5", "executes nothing"),
-        ("W1150020001", "5", "shorter than 2"),
-        ("W1150040001", "5", "own trigger"),
-        ("W1150007777", "5", "no trace object"),
         ("W1180000001", "9", "does not set 8000H"),
         ("W1151000001", "9", "does not set 5100H"),
         ("W1230000003", "6", "even number"),
@@ -161,72 +158,124 @@ async def test_who_has_no_control_sets_nothing(tmp_path):
         assert "someone" in (await refusals(rig))[-1]
 
 
-async def test_a_counter_is_cleared_by_mode_and_execute(tmp_path):
+TRACE = ("W1150008101", "W1150010000", "W1150020002", "W1150030000", "W1150040000", "W1150050000")
+EXECUTE = ("W1120002000", "W1120010001")
+
+
+async def test_settings_of_a_trace_are_answered_with_the_same_bytes_as_on_the_bare_line(tmp_path):
+    async with units_guest(tmp_path) as (_, program, _feed):
+        for head in (*TRACE, "W1150020001", "W1150040001", "W1150007777", *EXECUTE):
+            assert await program.send_bytes(frame(head)) == await bare(frame(head)), head
+
+
+@pytest.mark.parametrize(("mode", "moving"), [("2003", True), ("2003", False), ("2004", False)])
+@pytest.mark.sweep(1)
+async def test_a_counter_is_cleared_by_mode_and_execute_as_on_the_bare_line(tmp_path, mode, moving):
     async with units_guest(tmp_path) as (rig, program, feed):
         loop = asyncio.get_running_loop()
         feed.drive.set_pulse_rate(1000.0, loop.time())
-        await asyncio.sleep(1)
-        assert await program.send("W1120002003") == "W1120002003"
-        assert await program.send("W1020000000") == "W1020002003"
-        assert await program.send("W1120010001") == "W1920010001"
-        assert "command pulses come in" in (await refusals(rig))[-1]
-        feed.drive.set_pulse_rate(0.0, loop.time())
-        await asyncio.sleep(0.1)
-
+        await asyncio.sleep(5)
+        if not moving:
+            feed.drive.set_pulse_rate(0.0, loop.time())
+            await asyncio.sleep(0.5)
+        assert await program.send(f"W112000{mode}") == f"W112000{mode}"
+        assert await program.send("W1020000000") == f"W102000{mode}"
         assert await program.send("W1120010001") == "W1120010001"
-
-        assert await program.send("W1020000000") == "W1020000000"
-        assert feed.drive.command_counter == 0
-
-
-@pytest.mark.long
-async def test_a_trace_of_the_program_is_one_of_the_axis_and_its_memory_is_read_by_both(tmp_path):
-    async with units_guest(tmp_path) as (rig, program, _feed):
-        for head in ("W1150008101", "W1150010000", "W1150020014", "W1150030000", "W1150040000"):
-            assert await program.send(head) == head
-        assert await program.send("W1050000000") == "W1050008101"
-        assert await program.send("W1120002000") == "W1120002000"
-        assert await program.send("W1111000051") == "W1911000051"  # a drive in Data Trace Mode takes no other setting
-        assert await program.send("W1120010001") == "W1120010001"
-        assert await program.send("W1020000000") == "W1020002000"
-        async with asyncio.timeout(30):
+        async with asyncio.timeout(5):
             while await program.send("W1020000000") != "W1020000000":
-                await asyncio.sleep(0.2)
-        header = await trace_header(rig.client, "feed")
-        assert [each.name for each in header.channels] == ["speed_feedback", "inp", "torque_reference", "run"]
-        read = await program.send("W1230000008")
-        await wait_for_trace(rig.client, "feed", header.trace_id, 120)
-        trace = await fetch_trace(rig.client, "feed", header.trace_id)
-        assert trace.header.phase is TracePhase.COMPLETE
-        assert read[13:] == "".join(f"{word:04X}" for word in trace.raw[0][:4])
+                await asyncio.sleep(0.05)
+        cleared = feed.drive.command_counter if mode == "2003" else feed.drive.feedback_counter
+        assert cleared < 3000
+        events = (await rig.client.ask(ReadEvents(axis="feed"))).events
+        assert any(mode in (each.reason or "") and each.client == "old" for each in events)
+        await asyncio.sleep(2.5)
+        if not moving:
+            async with rig.client.samples("feed", "position") as samples:
+                _, sample = await anext(samples)
+            assert abs(sample.counts - feed.drive.feedback_counter) < 10
 
 
-@pytest.mark.long
+async def reads_its_trace(program: UnitsProgram, pause_s: float) -> tuple[float, float]:
+    """Set up a trace, execute it and read its memory; return the longest waits for a setting and for a string."""
+    loop, settings, strings = asyncio.get_running_loop(), [], []
+    for head in (*TRACE, *EXECUTE):
+        asked_s = loop.time()
+        assert await program.send(head, 1.0) == head
+        settings.append(loop.time() - asked_s)
+    async with asyncio.timeout(10):
+        while await program.send("W1020000000", 1.0) != "W1020000000":
+            await asyncio.sleep(0.05)
+    for address in range(0x3000, 0x3000 + 1000, 100):
+        asked_s = loop.time()
+        assert len(await program.send(f"W12{address:04X}0064", 1.0)) > 200
+        strings.append(loop.time() - asked_s)
+        await asyncio.sleep(pause_s)
+    return max(settings), max(strings)
+
+
+@pytest.mark.parametrize("pause_s", [0.0, 0.3])
+@pytest.mark.sweep(1)
+async def test_a_program_traces_again_and_again_as_on_the_bare_line(tmp_path, pause_s):
+    async with units_guest(tmp_path) as (rig, program, _feed):
+        loop = asyncio.get_running_loop()
+        for _ in range(4):
+            again_s = loop.time() + 10
+            setting_s, string_s = await reads_its_trace(program, pause_s)
+            print(f"setting {setting_s:.3f} s, string {string_s:.3f} s")
+            assert setting_s < 0.2
+            assert string_s < 0.5
+            await asyncio.sleep(again_s - loop.time())
+        assert await refusals(rig) == []
+
+
 async def test_a_program_leaves_its_own_trace_and_not_that_of_others(tmp_path):
     async with units_guest(tmp_path) as (rig, program, feed):
         other = await arm_trace(rig.client, "feed", TakeTrace(channels=("speed_feedback",), interval_s=0.05))
-        for head in ("W1120000000", "W1120002000", "W1120002003", "W1120010001", "W1111000051", "W1150008101"):
+        for head in ("W1120000000", *EXECUTE, "W1120002003", "W1111000051", "W1150008101"):
             assert await program.send(head) == f"W19{head[3:]}", head
         assert feed.drive.mode == 0x2000
         await wait_for_trace(rig.client, "feed", other.trace_id, 120)
         assert (await trace_header(rig.client, "feed")).phase is TracePhase.COMPLETE
 
-        for head in ("W1150020200", "W1120002000", "W1120010001"):
+        for head in ("W1150020200", *EXECUTE):
             assert await program.send(head) == head
         assert feed.drive.mode == 0x2000
+        assert await program.send("W1111000051") == "W1911000051"  # a drive in Data Trace Mode takes no other setting
         assert await program.send("W1120000000") == "W1120000000"
         assert feed.drive.mode == 0
-        assert (await trace_header(rig.client, "feed")).phase is TracePhase.ABORTED
 
 
-async def test_what_a_program_has_entered_and_not_executed_is_forgotten_when_it_goes(tmp_path):
-    async with units_guest(tmp_path) as (_, first, _feed):
+async def test_others_trace_once_the_trace_of_a_program_is_over_or_ended(tmp_path):
+    async with units_guest(tmp_path) as (rig, program, feed):
+        for head in ("W1150020200", *EXECUTE):
+            assert await program.send(head) == head
+        program.port.close()
+        await asyncio.sleep(0.5)
+        assert feed.drive.mode == 0x2000
+        request = TakeTrace(channels=("speed_feedback",), interval_s=0.01)
+        with pytest.raises(BusyTracing):
+            await arm_trace(rig.client, "feed", request)
+        await rig.client.command("feed", AbortTrace())
+        assert feed.drive.mode == 0
+        await arm_trace(rig.client, "feed", request)
+
+
+async def test_what_a_program_sends_by_itself_is_not_sent_once_control_was_taken_from_it(tmp_path):
+    async with units_guest(tmp_path) as (rig, program, feed):
+        assert await program.send("W1150020200") == "W1150020200"
+        await rig.client.ask(Acquire(client="ada", axes=("feed",), lease_s=60, force=True))
+        for head in EXECUTE:
+            assert await program.send(head) == f"W19{head[3:]}"
+        assert feed.drive.mode == 0
+
+
+async def test_a_mode_that_a_program_has_entered_and_not_executed_is_left_when_it_goes(tmp_path):
+    async with units_guest(tmp_path) as (_, first, feed):
         await first.send("W1120002003")
+        assert feed.drive.mode == 0x2003
         first.port.close()
-        await asyncio.sleep(0.1)
-        second = UnitsProgram(str(tmp_path / "port"))
-        assert await second.send("W1020000000") == "W1020000000"
-        second.port.close()
+        await asyncio.sleep(0.5)
+        assert feed.drive.mode == 0
 
 
 async def test_a_frame_that_is_repeated_before_its_reply_is_carried_out_once(tmp_path):
@@ -251,12 +300,14 @@ async def test_a_program_that_asks_as_fast_as_it_can_leaves_polls_their_rate(tmp
 
         before = polls()
         await asyncio.sleep(30)
-        alone, before = polls() - before, polls()
-        replies, until_s = 0, loop.time() + 30
-        while loop.time() < until_s:
-            replies += bool(await program.send("W1011000000"))
-        assert replies > 100
-        assert polls() - before >= 0.7 * alone  # the line is full of polls alone: a guest has a quarter of it
+        alone = polls() - before
+        for pays in (False, True):
+            replies, before, until_s = 0, polls(), loop.time() + 30
+            while loop.time() < until_s:
+                replies += bool(await program.send("W1011000000"))
+            assert replies > 100
+            # the line is full of polls alone: a guest has a fifth of it, after 7 s of it that it has for nothing
+            assert polls() - before >= (0.7 if pays else 0.55) * alone
 
 
 @pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # of pyserial's client

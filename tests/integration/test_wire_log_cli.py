@@ -42,6 +42,17 @@ async def test_a_line_is_dumped_as_a_capture_in_words_as_json_and_for_wireshark(
     assert "line0" in refusal.errors
 
 
+async def test_replies_of_a_module_that_is_no_axis_are_read_by_what_stands_there(tmp_path):
+    async with daemon(ROOT / "config" / "centrifuge.toml") as endpoint:
+        commands = [f"ldcnd bus wire-log line0 --seconds 3 --format words -e {endpoint}"]
+        commands.append(f"ldcnd bus wire-log line0 --seconds 3 --out one.capture -e {endpoint}")
+        *ran, converted = await run_all(tmp_path, *commands, "ldcnd bus convert one.capture --format words")
+    for each in (ran[0], converted):
+        assert each.code == 0, each
+        assert "levels" in each.printed
+        assert "Logosol" not in each.printed
+
+
 async def test_what_the_page_does_with_a_capture_can_be_done(tmp_path):
     shutil.copy(FOLDER / "power_loss.capture", tmp_path / "fault.capture")
 

@@ -12,6 +12,8 @@ from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from tests.support.machine_rig import Machine, machine, running_machine
 
 SET_ADDRESS = CommandCode.SET_ADDRESS
+LOOK_S = 0.0002
+"""How often a program looks for more of a reply, seconds."""
 
 
 def with_port(link: Path, access: str = "read", *, fresh_ms: float = 0.0, **axis: object) -> RigConfig:
@@ -58,7 +60,7 @@ class Program:
         reply, loop = b"", asyncio.get_running_loop()
         until_s = loop.time() + within_s
         while loop.time() < until_s:
-            await asyncio.sleep(0.0002)
+            await asyncio.sleep(LOOK_S)
             try:
                 reply += os.read(self._descriptor, 100)
             except BlockingIOError:

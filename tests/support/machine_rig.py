@@ -119,7 +119,7 @@ async def running_machine(config: RigConfig, chain: Chain | None = None) -> Asyn
     async with running_rig(config, {"line": chain}) as rig:
         for axis in rig.daemon.rig.axes:
             await rig.until(axis, lambda state: state.link is LinkState.UP)
-        found = Machine(rig.daemon, rig.client, rig.session, rig.broker)
+        found = Machine(rig.daemon, rig.client, rig.session, rig.broker, lives=rig.lives)
         object.__setattr__(found, "chain", chain)
         async with asyncio.timeout(5.0):
             rotor, cabinet = rig.daemon.rig.axes["rotor"].tracker, rig.daemon.rig.modules["cabinet"]

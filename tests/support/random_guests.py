@@ -1,8 +1,8 @@
-"""A random program on a port beside a random client, cable cuts and programs that are killed; the shafts judge.
+"""A random program on a port beside a random client, cable cuts, killed programs and daemons; the shafts judge.
 
 What must hold whatever they do: nothing moves an axis that is latched, or that somebody else controls; no module is
 reset, readdressed or set to another rate by the program; a stop brings every shaft to rest within its bound; what the
-daemon says of a register is what the simulated drive holds.
+daemon says of gains, positions, outputs, the timer and the rate is what the simulated modules hold.
 """
 
 import asyncio
@@ -16,13 +16,14 @@ from pathlib import Path
 from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, Reset, Stop
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.leases import Acquire, ListHolders, Release, Renew
-from ldcnd.contract.samples import LinkState
+from ldcnd.contract.samples import LinkState, PositionSample, TelemetryItem
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
+from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from tests.support.guest_program import Program, open_port
-from tests.support.machine_rig import COUNTS, GAINS, Machine
+from tests.support.machine_rig import CLOSED, COUNTS, GAINS, LOCK, OPEN, Machine
 
 AXES = ("rotor", "table")
 STOP_BOUND_S = 3.0
@@ -106,8 +107,9 @@ class World:
                 self._person,
                 self._stops,
                 self._takes,
+                self._daemon,
             ),
-            (40, 8, 4, 6, 3, 15, 6, 8),
+            (40, 8, 4, 6, 3, 15, 6, 8, 2),
         )[0]
         self.history.append(act.__name__)
         if self._lease:
@@ -124,10 +126,29 @@ class World:
         if self._program:
             await self._closes()
         await self._compare_registers()
+        await self._compare_places()
+        await self._compare_outputs()
+
+    async def _opens(self) -> None:
+        if self._program is not None:
+            return
+        async with asyncio.timeout(10):
+            while not self._link.exists():  # a daemon has just begun
+                await asyncio.sleep(0.05)
+        self._program = open_port(self._link)
+
+    async def _daemon(self) -> None:
+        """End the daemon, or kill it, beside the program; the next one finds the drives as they are."""
+        await self.rig.begin_anew(self._chance.choice((0.0, 0.3, 3.0)), killed=self._chance.random() < 0.5)
+        if self._program:
+            self._program.close()  # its terminal has gone, as an adapter that was unplugged
+        self._program = self._lease = None
+        self._stand.clear()  # its latches end with it, without a folder for them
+        self._moved.update(AXES)  # what a killed one has left moving
 
     async def _packets(self) -> None:
-        if self._program is None:
-            self._program = open_port(self._link)
+        await self._opens()
+        assert self._program
         for _ in range(self._chance.randrange(1, 5)):
             with suppress(BlockingIOError):
                 self._program.send_bytes(_any_packet(self._chance))
@@ -135,8 +156,8 @@ class World:
 
     async def _begins(self) -> None:
         """Set the line up as every program does, and move."""
-        if self._program is None:
-            self._program = open_port(self._link)
+        await self._opens()
+        assert self._program
         self._program.set_rate(termios.B19200)
         await self._program.send(Packet(0xFF, CommandCode.HARD_RESET), 0.05)
         for address in (1, 2, 3):
@@ -250,3 +271,30 @@ class World:
             for register in info.registers:
                 if register.value is not None and register.name in holds:
                     assert holds[register.name] == register.value, f"{info.axis}: {register.name}"
+
+    async def _compare_places(self) -> None:
+        """Compare positions, whose origin programs and persons have set, with where the shafts are."""
+        for place, name in enumerate(AXES, 1):
+            axis = self.rig.daemon.rig.axes[name]
+            async with self.rig.client.samples(name, TelemetryItem.POSITION) as samples:
+                _, sample = await anext(samples)
+            assert isinstance(sample, PositionSample)
+            assert isinstance(axis.driver, LdcnAxis)
+            drive = self._drives()[place - 1]
+            drive.catch_up(self._loop.time())
+            counts = drive.loop.position + axis.driver.state.offset_counts
+            assert abs(sample.counts - counts) < CREEPS * COUNTS, f"{name}: counts"
+            assert abs(sample.value - axis.tracker.status.scale.position(counts)) < CREEPS, f"{name}: position"
+            if axis.tracker.status.referenced and self.rig.lives:
+                truth = self.rig.lives.truth(name).position
+                assert abs(sample.value - truth) < CREEPS, f"{name} is said to be at {sample.value}, and is at {truth}"
+            assert abs(self.rig.daemon.rig.buses[0].bus.baud / drive.baud - 1) < 0.03, f"{name}: rate"
+
+    async def _compare_outputs(self) -> None:
+        await asyncio.sleep(0.2)
+        io, cabinet = self.rig.io, self.rig.daemon.rig.modules["cabinet"]
+        for name, line in (("lock", LOCK), ("door_closed", CLOSED), ("door_open", OPEN)):
+            held = bool(io.levels & 1 << line - 1)
+            assert cabinet.values[name] in {None, held}, f"{name}: {cabinet.values[name]}, and is {held}"
+        driven = bool(io.outputs & 1 << LOCK - 1)
+        assert driven is (cabinet.values["lock"] is not None), f"lock: {cabinet.values['lock']}, driven: {driven}"

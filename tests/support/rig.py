@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
@@ -34,6 +34,19 @@ class RunningRig:
     client: RigClient
     session: MemorySession
     broker: MemoryBroker
+    lives: SimulatedRig | None = field(default=None, kw_only=True)
+    """Where its daemon can be ended, and another one started."""
+
+    async def begin_anew(self, after_s: float, *, killed: bool) -> None:
+        """End the daemon, or kill it, and start another one on the same lines some time later."""
+        assert self.lives
+        if killed:
+            await self.lives.kill_daemon()
+        else:
+            await self.lives.close()
+        await asyncio.sleep(after_s)
+        await self.lives.start_daemon()
+        object.__setattr__(self, "daemon", self.lives.daemon)
 
     async def until(self, axis: str, wanted: Callable[[StateSample], bool], within_s: float = 60.0) -> StateSample:
         """Wait for a state of an axis."""
@@ -93,7 +106,7 @@ async def running_rig(
     async with broker.session() as session:
         try:
             await rig.start_daemon()
-            yield RunningRig(rig.daemon, RigClient(session, config.rig), session, broker)
+            yield RunningRig(rig.daemon, RigClient(session, config.rig), session, broker, lives=rig)
         finally:
             await rig.close()
 

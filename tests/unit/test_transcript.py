@@ -47,6 +47,14 @@ def test_the_layout_of_a_reply_follows_the_node_s_dialect_and_its_defined_items(
     assert transcript.describe(received(defined)) == "status 00, adc 77"
 
 
+def test_a_reply_of_a_node_that_nothing_is_known_of_is_no_reply_of_a_particular_drive():
+    transcript = LdcnTranscript({})
+
+    transcript.describe(sent(encode_packet(Packet(3, CommandCode.READ_STATUS, b"\x3f"))))
+
+    assert transcript.describe(received(bytes(13))) == "13 bytes of node 3, of which nothing says what it is"
+
+
 def test_a_pic_io_is_not_read_as_a_servo():
     transcript = LdcnTranscript({2: PIC_IO})
 

@@ -13,6 +13,7 @@ from ldcnd.drives.ldcn.packet import (
     StatusItem,
     StatusPacket,
     decode_status,
+    status_bytes,
 )
 from ldcnd.drives.ldcn.pic_io import IoItem, IoStatus, decode_io_status
 from ldcnd.drives.ldcn.profiles import LS_182AP, DeviceKind, Profile, identify
@@ -23,7 +24,8 @@ from ldcnd.line.flight_recorder import Parts, WireEvent, WireRecord
 class LdcnTranscript:
     """Reads the records of one LDCN line, oldest first.
 
-    A node that tells its identity is read by its dialect from then on. Until then it is read as LS-182AP.
+    A node that tells its identity is read by its dialect from then on. Until then requests are read as those to an
+    LS-182AP, and so are replies as far as their length allows.
 
     Args:
         profiles: the dialects by node address, as far as they are known.
@@ -78,6 +80,9 @@ class LdcnTranscript:
         address, profile, items = self._asked
         if profile.kind is DeviceKind.IO:
             return _io_words(decode_io_status(IoItem(items), data))
+        known = address in self._learned or address in self._profiles
+        if not known and len(data) != status_bytes(profile, items):
+            return f"{len(data)} bytes of node {address}, of which nothing says what it is"
         status = decode_status(profile, items, data)
         if status.device_id is not None and status.version is not None:
             told = identify(status.device_id, status.version)

@@ -157,7 +157,7 @@ class SmartStepAxis(PollsItself):
             spec.profile,
             spec.eeprom,
             others,
-            self._cleared,
+            self.counter_cleared,
             self._audit.wrote,
             self._audit.may_have_written,
         )
@@ -235,7 +235,8 @@ class SmartStepAxis(PollsItself):
     def _hears_itself(self) -> None:
         self.words.self_hearing = True
 
-    def _cleared(self) -> None:
+    def counter_cleared(self) -> None:
+        """A counter was cleared."""
         if self._poller:
             self._poller.forget_position()
 

@@ -82,8 +82,10 @@ class Words:
         self._proof = bus.proofs.expect(unit, f"axis {axis}", axis)
         self._type: int | None = None
 
-    async def ask(self, exchange: Exchange[ValueT | Refusal], lane: Lane = Lane.COMMAND) -> ValueT:
-        """Run one exchange, in the response time of the profile.
+    async def ask(
+        self, exchange: Exchange[ValueT | Refusal], lane: Lane = Lane.COMMAND, *, once: bool = False
+    ) -> ValueT:
+        """Run one exchange, in the response time of the profile; with `once` it is never sent again.
 
         Raises:
             WrongState: the drive receives its own replies.
@@ -99,7 +101,7 @@ class Words:
             )
         if exchange.effect is PacketEffect.CHANGES:
             await self.identify()
-        answer = await self._bus.execute(commands.with_response_time(exchange, self._profile), lane)
+        answer = await self._bus.execute(commands.with_response_time(exchange, self._profile), lane, once=once)
         if isinstance(answer, Refusal):
             mode = await self._mode_of(answer)
             raise drive_error(self.axis, answer, mode)
