@@ -175,8 +175,17 @@ class RigClient:
 
     async def at(self, t: int | str, axis: str = "*") -> dict[str, AxisInstant]:
         """Return where an axis, or each of them, was at an instant; see `Rig.at`."""
-        answers = await self._values(self.keys.at(axis), {"_time": str(t)})
-        return {answer.key.split("/")[-2]: self._decoded(answer, AxisInstant) for answer in answers}
+        return {name: instants[0] for name, instants in (await self._past(str(t), axis)).items()}
+
+    async def between(self, t: int | str, until: int | str, axis: str = "*") -> dict[str, list[AxisInstant]]:
+        """Return where an axis, or each of them, was from an instant to another one; see `Rig.between`."""
+        return await self._past(f"[{t}..{until}]", axis)
+
+    async def _past(self, time: str, axis: str) -> dict[str, list[AxisInstant]]:
+        found: dict[str, list[AxisInstant]] = {}
+        for answer in await self._values(self.keys.at(axis), {"_time": time}):
+            found.setdefault(answer.key.split("/")[-2], []).append(self._decoded(answer, AxisInstant))
+        return found
 
     async def axes(self) -> list[AxisInfo]:
         """Return all axes, in the order of their addresses."""
