@@ -143,7 +143,7 @@ class Axis(AxisVerbs):
         Raises:
             MalformedRequest: it is no range, or one with more than 1000 readings.
         """
-        return (await self._client.between(t, until, self.name))[self.name]
+        return (await self._client.past(f"[{t}..{until}]", self.name))[self.name]
 
     def positions(self) -> Positions:
         """Iterate over the positions that come from now on; several readers do not disturb each other."""

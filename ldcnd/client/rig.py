@@ -376,7 +376,7 @@ class Rig:
         Raises:
             MalformedRequest: it is no range, or one with more than 1000 readings of an axis.
         """
-        return await self._client.between(t, until)
+        return await self._client.past(f"[{t}..{until}]")
 
     async def snapshot(self, bus: str) -> SnapshotReply:
         """Return the positions of all axes of a line at one instant, and how sure that instant is.
