@@ -5,15 +5,17 @@ from collections.abc import Iterator
 from typing import Final
 
 from ldcnd.axis.scale import AxisScale
+from ldcnd.axis.status import AxisStatus
 from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.instants import Coordinates, Reading, count_until, instant_of, instants_of, longest_gap_ns, packed
-from ldcnd.contract.samples import Quality
 from ldcnd.drives.driver import AxisReading
 
 HISTORY_S: Final = 600.0
 """Time for which readings are kept at the rate of the polls, seconds."""
 MOST_READINGS: Final = 60_000
 """Readings that are kept of an axis at most, 38 bytes each: 2.3 MB, 600 s of 100 polls a second."""
+
+LONGEST_ERROR_NS: Final = 0xFFFF_FFFF
 
 _RECORD = struct.Struct("<qIqddH")
 """As `Reading` has it."""
@@ -34,21 +36,23 @@ class ReadingRing:
         self._ring = bytearray(self._most * _RECORD.size)
         self._count = 0
         self._last_ns = 0
-        self._rest: tuple[object, ...] = ()
+        self._status: AxisStatus | None = None
+        self._levels: tuple[bool | None, ...] = ()
+        self._origin = 0.0
         self._packed = 0
 
-    def take(self, reading: AxisReading, quality: Quality, origin_counts: float, t: int, t_error_ns: int) -> None:
+    def take(self, reading: AxisReading, status: AxisStatus, t: int, t_error_ns: int) -> None:
         """Keep a reading; in every poll, so what seldom changes is compared and not computed."""
-        rest = (
-            quality,
+        levels = (
             reading.reverse_limit,
             reading.forward_limit,
             reading.index,
             reading.stop_input,
             reading.amplifier_enable,
         )
-        if rest != self._rest:
-            self._rest, self._packed = rest, packed(rest[1:], quality)
+        if status is not self._status or levels != self._levels:
+            self._status, self._levels = status, levels
+            self._origin, self._packed = status.scale.origin_counts, packed(levels, status.quality)
         if t <= self._last_ns:
             self._count = 0  # the clock was set back: which instants these were is not known
         self._last_ns = t
@@ -56,10 +60,10 @@ class ReadingRing:
             self._ring,
             self._count % self._most * _RECORD.size,
             t,
-            min(t_error_ns, 0xFFFF_FFFF),
+            t_error_ns if t_error_ns < LONGEST_ERROR_NS else LONGEST_ERROR_NS,  # noqa: FURB136 - no call in a poll
             reading.position_counts,
             reading.velocity_resolution_counts_per_s,
-            origin_counts,
+            self._origin,
             self._packed,
         )
         self._count += 1

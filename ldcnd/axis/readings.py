@@ -294,8 +294,7 @@ class AxisReadings:
             asked |= END_ITEMS
         self._telemetry.publish(tracker.status, reading, asked, t, t_error_ns)
         if TelemetryItem.POSITION in asked:  # of the others some drives have a position of before
-            status = tracker.status
-            self.history.take(reading, status.quality, status.scale.origin_counts, t, t_error_ns)
+            self.history.take(reading, tracker.status, t, t_error_ns)
         if before.command:
             self._report_end()
             self._ask_in_time(timing.sent_at_s)

@@ -138,7 +138,7 @@ class Axis(AxisVerbs):
         return (await self._client.at(t, self.name))[self.name]
 
     async def between(self, t: int, until: int) -> list[AxisInstant]:
-        """Return where it was from an instant to another one; see `Rig.between`.
+        """Return where it was in a range; see `Rig.between`.
 
         Raises:
             MalformedRequest: it is no range, or one with more than 1000 readings.

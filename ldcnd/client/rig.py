@@ -367,7 +367,7 @@ class Rig:
         return await self._client.at(t)
 
     async def between(self, t: int, until: int) -> dict[str, list[AxisInstant]]:
-        """Return where every axis was at the first instant of a range, at each reading in it, and at the last instant.
+        """Return where every axis was at both ends of a range and at each reading in it.
 
         Args:
             t: UTC in ns since 1970, as in samples.

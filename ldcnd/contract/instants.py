@@ -8,6 +8,7 @@ no less than one, and that a loop overshoots a little.
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 from itertools import pairwise
 from typing import Final, NamedTuple, Protocol
 
@@ -69,6 +70,7 @@ class Coordinates(NamedTuple):
     """Negative where forward is backward in counts."""
 
 
+@lru_cache(maxsize=256)
 def packed(levels: tuple[bool | None, ...], quality: Quality) -> int:
     """Return inputs, in the order of `InputLevels`, and quality as one number of 10 bits."""
     number = QUALITIES.index(quality)
