@@ -147,14 +147,15 @@ class AxisReadings:
         self._on_ended = on_ended
         self._note = note
         self._digested: AxisReading | None = None
-        self.history = ReadingRing(motion.config.rates.position)
+        self.history = _ring(motion.config)
         self._over: tuple[CommandEnd, Arrival] | None = None
         motion.tracker.watch(self._watch, "last_end")
 
     def reconfigure(self, config: AxisConfig) -> None:
-        """Take the rates of another configuration."""
-        if config.rates.position != self.history.rate_hz:
-            self.history = ReadingRing(config.rates.position)
+        """Take rates and scale of another configuration."""
+        ring = _ring(config)
+        if ring.made_for != self.history.made_for:
+            self.history = ring
 
     @property
     def seen(self) -> bool:
@@ -293,7 +294,7 @@ class AxisReadings:
             asked |= END_ITEMS
         self._telemetry.publish(tracker.status, reading, asked, t, t_error_ns)
         if TelemetryItem.POSITION in asked:  # of the others some drives have a position of before
-            self.history.take(reading, tracker.status.scale.origin_counts, t, t_error_ns)
+            self.history.take(reading, tracker.status, t, t_error_ns)
         if before.command:
             self._report_end()
             self._ask_in_time(timing.sent_at_s)
@@ -374,3 +375,7 @@ class AxisReadings:
         read_at_s = min(self._tracker.status.next_reading_s(at_s), at_s + self._commands.watch_s)
         if self.ask_at and not math.isinf(read_at_s):
             self.ask_at(read_at_s)
+
+
+def _ring(config: AxisConfig) -> ReadingRing:
+    return ReadingRing(config.rates.position, config.signed_counts_per_unit)

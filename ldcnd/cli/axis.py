@@ -12,7 +12,7 @@ from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.names import whose
 from ldcnd.cli.nearest import naming_nearest
 from ldcnd.cli.output import end_as_interrupted, keys, repetitions, show_lines
-from ldcnd.cli.quantities import decimals, number, seconds
+from ldcnd.cli.quantities import number, seconds
 from ldcnd.cli.sending import (
     NAME,
     WAITING,
@@ -50,10 +50,8 @@ from ldcnd.contract.commands import (
     Track,
 )
 from ldcnd.contract.errors import ConfigError, LeaseExpired
-from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import AlarmReport, ClearCounter, CounterReply, ReadAlarms
-from ldcnd.contract.samples import Quality
 from ldcnd.contract.units import Dimension, quantity_text, shown_quantity
 
 WAIT, LEAVE = (click.option(name, is_flag=True, help=text) for name, text in WAITING.items())
@@ -247,38 +245,12 @@ def _cleared(reply: CounterReply, _info: AxisInfo | None) -> Shown:
     yield reply, [f"{reply.axis}: the {reply.counter} counter is cleared and reads {reply.value}{remarks}"]
 
 
-@click.command()
-@click.argument("axis", type=AXIS)
-@click.argument("instant", required=False)
-@click.option("--ago", "ago_s", type=Finite(0, 600), help="In place of INSTANT: so many seconds ago.")
-@with_target
-def at(target: Target, axis: str, instant: str | None, ago_s: float | None) -> None:
-    """Show where AXIS was at INSTANT of the last 600 s, with bounds: RFC 3339, or UTC in ns since 1970."""
-    if (instant is None) == (ago_s is None):
-        raise click.UsageError("say INSTANT or --ago, one of them")
-
-    async def work(client: RigClient) -> tuple[AxisInstant, AxisInfo]:
-        info = await axis_of(client, axis)
-        return (await client.at(instant or f"now(-{ago_s}s)", axis))[axis], info
-
-    found, info = target.run(work)
-    if found.position is None or found.velocity is None:
-        target.show(found, f"{axis}: not known: {found.reason}")
-        return
-    place, speed, digits = found.position, found.velocity, decimals(info)
-    target.show(
-        found,
-        f"{axis}: {place.value:.{digits}f} {found.unit}, from {place.lower:.{digits}f} to {place.upper:.{digits}f}",
-        f"  at {speed.value:.4g} {found.unit}/s, from {speed.lower:.4g} to {speed.upper:.4g}",
-        *([f"  its data are {found.quality.value}"] if found.quality is not Quality.GOOD else []),
-    )
-
-
 home = derived("home", Home, moves=True)
 halt = derived("halt", Halt, rests=True)
 
 
 HOMES = {
+    "at": "ldcnd.cli.past:at",
     "monitors": "ldcnd.cli.looking:monitors",
     "reset": "ldcnd.cli.rig:reset",
     "stop": "ldcnd.cli.rig:stop",
@@ -292,7 +264,6 @@ def command() -> None:
 
 
 for each in (
-    at,
     halt,
     home,
     derived("quick-stop", QuickStop, rests=True),

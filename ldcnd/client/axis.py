@@ -137,6 +137,14 @@ class Axis(AxisVerbs):
         """
         return (await self._client.at(t, self.name))[self.name]
 
+    async def between(self, t: int, until: int) -> list[AxisInstant]:
+        """Return where it was in a range; see `Rig.between`.
+
+        Raises:
+            MalformedRequest: it is no range, or one with more than 1000 readings.
+        """
+        return (await self._client.past(f"[{t}..{until}]", self.name))[self.name]
+
     def positions(self) -> Positions:
         """Iterate over the positions that come from now on; several readers do not disturb each other."""
         reader = Positions(self)

@@ -118,6 +118,7 @@ class BlockingAxis(Facade[asynchronous.Axis]):
     stop = _waiting(asynchronous.Axis.stop)
     take_trace = _waiting(asynchronous.Axis.take_trace)
     at = _waiting(asynchronous.Axis.at)
+    between = _waiting(asynchronous.Axis.between)
 
     @contextmanager
     def tracing(
@@ -179,6 +180,7 @@ class BlockingRig(Facade[rig.Rig]):
 
     stop = _waiting(rig.Rig.stop)
     at = _waiting(rig.Rig.at)
+    between = _waiting(rig.Rig.between)
     daemon = _waiting(rig.Rig.daemon)
     describe = _waiting(rig.Rig.describe)
     buses = _waiting(rig.Rig.buses)

@@ -366,6 +366,18 @@ class Rig:
         """
         return await self._client.at(t)
 
+    async def between(self, t: int, until: int) -> dict[str, list[AxisInstant]]:
+        """Return where every axis was at both ends of a range and at each reading in it.
+
+        Args:
+            t: UTC in ns since 1970, as in samples.
+            until: likewise.
+
+        Raises:
+            MalformedRequest: it is no range, or one with more than 1000 readings of an axis.
+        """
+        return await self._client.past(f"[{t}..{until}]")
+
     async def snapshot(self, bus: str) -> SnapshotReply:
         """Return the positions of all axes of a line at one instant, and how sure that instant is.
 

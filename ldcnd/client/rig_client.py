@@ -173,10 +173,16 @@ class RigClient:
         self._origin.found(source)
         return daemon
 
-    async def at(self, t: int | str, axis: str = "*") -> dict[str, AxisInstant]:
+    async def at(self, t: int, axis: str = "*") -> dict[str, AxisInstant]:
         """Return where an axis, or each of them, was at an instant; see `Rig.at`."""
-        answers = await self._values(self.keys.at(axis), {"_time": str(t)})
-        return {answer.key.split("/")[-2]: self._decoded(answer, AxisInstant) for answer in answers}
+        return {name: instants[0] for name, instants in (await self.past(str(t), axis)).items()}
+
+    async def past(self, time: str, axis: str = "*") -> dict[str, list[AxisInstant]]:
+        """Return where an axis, or each of them, was at an instant or in a range, as `_time` of a selector says it."""
+        found: dict[str, list[AxisInstant]] = {}
+        for answer in await self._values(self.keys.at(axis), {"_time": time}):
+            found.setdefault(answer.key.split("/")[-2], []).append(self._decoded(answer, AxisInstant))
+        return found
 
     async def axes(self) -> list[AxisInfo]:
         """Return all axes, in the order of their addresses."""

@@ -1,7 +1,6 @@
 """The rig's description of itself and its last values: answers to `get` on `meta/**` and `tele/**`."""
 
-from collections.abc import Callable, Iterator, Mapping
-from datetime import datetime
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache, partial
 from typing import Literal, TypeAlias
 
@@ -13,6 +12,7 @@ from ldcnd.contract.commands import About, Verb
 from ldcnd.contract.errors import ErrorCode, MalformedRequest
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.contract.health import BusHealth, DaemonHealth
+from ldcnd.contract.history import AxisInstant, refuse_more_than, time_of
 from ldcnd.contract.keys import RIG_ITSELF, Keys, matches
 from ldcnd.contract.meta import AxisInfo, BusInfo, CommandInfo, CommandList, DaemonInfo, sample_units
 from ldcnd.contract.plan import RigBudget
@@ -97,14 +97,13 @@ class Describing:
         self._schemas = {keys.schema(name): text for name, text in shipped_schemas().items()}
 
     def on_telemetry(self, query: Query) -> Iterator[None]:
-        """Answer with the last value of every key that the query covers, or where axes were at an instant."""
+        """Answer with the last value of every key that the query covers, or where axes were."""
         if query.key.endswith("/at"):
             try:
-                t = _instant(query.parameters.get("_time", ""), self._clock.now_ns())
+                return _in_steps(query, self._past(query))
             except MalformedRequest as error:
                 query.refuse(error)
                 return iter(())
-            return _in_steps(query, self._at(query, t))
         return _in_steps(query, self._newest(query, self._publisher.last))
 
     def on_meta(self, query: Query) -> Iterator[None]:
@@ -139,13 +138,25 @@ class Describing:
             self._latest[key, encoding] = published, payload, name
             yield Answer(key, payload, name, published.t), SAMPLE_WORK
 
-    def _at(self, query: Query, t: int) -> Iterator[_Part]:
-        """Yield where every axis that the query covers was at an instant."""
-        for key in _covered(query.key, tuple(self._histories)):
-            axis = self._histories[key]
-            status = axis.tracker.status
-            payload, name = encode(axis.readings.history.at(t, status.scale, status.quality), _wanted_encoding(query))
-            yield Answer(key, payload, name, t), DESCRIPTION_WORK
+    def _past(self, query: Query) -> Iterator[_Part]:
+        """Return where every axis that the query covers was, at an instant or in a range.
+
+        Raises:
+            MalformedRequest: it names neither, or a range with more readings than an answer may have.
+        """
+        t, until = time_of(query.parameters.get("_time", ""), self._clock.now_ns())
+        axes = {key: self._histories[key] for key in _covered(query.key, tuple(self._histories))}
+        for axis in axes.values():
+            refuse_more_than(axis.config.name, axis.readings.history.count(t, until))
+        return self._instants(axes, t, until, _wanted_encoding(query))
+
+    def _instants(self, axes: Mapping[str, AxisService], t: int, until: int, encoding: Encoding) -> Iterator[_Part]:
+        for key, axis in axes.items():
+            history, scale = axis.readings.history, axis.tracker.status.scale
+            found: Iterable[AxisInstant] = [history.at(t, scale)] if t == until else history.between(t, until, scale)
+            for instant in found:
+                payload, name = encode(instant, encoding)
+                yield Answer(key, payload, name, instant.t), DESCRIPTION_WORK
 
     def _bus_source(self, bus: BusService) -> object:
         """Return what the description of a line is made of; its counters never stand still."""
@@ -265,26 +276,6 @@ def command_list() -> CommandList:
         errors=tuple(code.value for code in ErrorCode),
         encodings=tuple(encoding.value for encoding in Encoding),
     )
-
-
-def _instant(text: str, now_ns: int) -> int:
-    """Return the instant that a selector's `_time` names, UTC in ns since 1970.
-
-    Raises:
-        MalformedRequest: it names none.
-    """
-    try:
-        if text.startswith("now(") and text.endswith("s)"):
-            return now_ns + round(float(text[4:-2]) * 1e9)
-        if text.isdecimal():
-            return int(text)
-        moment = datetime.fromisoformat(text)
-        seconds = round(moment.replace(microsecond=0).timestamp())
-    except (ValueError, OverflowError):
-        raise MalformedRequest(
-            f"_time={text!r} is no instant", value=text, remedy="_time=now(-2s), RFC 3339, or ns since 1970, UTC"
-        ) from None
-    return seconds * 1_000_000_000 + moment.microsecond * 1000
 
 
 def _wanted_encoding(query: Query) -> Encoding:

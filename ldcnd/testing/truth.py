@@ -69,7 +69,8 @@ class Machine:
     @property
     def module(self) -> Module:
         """The module of the line."""
-        return self.chain.modules[self.place - 1]
+        modules = self.chain.modules
+        return modules[0 if isinstance(modules[0], SimulatedSmartSteps) else self.place - 1]  # they are one cable
 
     @property
     def servo(self) -> SimulatedDrive:
@@ -131,7 +132,8 @@ class Machine:
     def _of_smartstep(self, drive: SimulatedSmartStep, now_s: float) -> Truth:
         drive.advance(now_s)
         motor, scale = drive.motor, self.config.signed_counts_per_unit
-        position = drive.feedback_counter / scale
+        counter = drive.feedback_counter
+        position = (counter - 2**32 if counter >= 2**31 else counter) / scale  # it is below 0 where it ran backward
         return Truth(
             position=position,
             counts=motor.position,

@@ -5,10 +5,12 @@ import csv
 import json
 
 import pytest
+from click.testing import CliRunner
 
 import ldcnd
+from ldcnd.cli.main import cli
 from ldcnd.contract.commands import MoveAbsolute, Power
-from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.errors import ConfigError, UnknownAxis
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState
 from ldcnd.lab.recording.tables import export_tables
@@ -89,3 +91,36 @@ async def test_tables_are_never_overwritten(tmp_path):
 
     with pytest.raises(ConfigError, match="exists already"):
         export_tables(path, folder)
+
+
+async def test_a_recording_answers_where_an_axis_was_as_its_daemon_did(tmp_path):
+    path = tmp_path / "run.mcap"
+    async with recorded_rig(path) as recorded:
+        rig = recorded.rig
+        await rig.until("x", lambda state: state.state is AxisState.DISABLED)
+        await rig.client.command("x", Power(on=True))
+        await asyncio.sleep(1.0)
+        began = EPOCH_NS + round(asyncio.get_running_loop().time() * 1e9)
+        reply = await rig.client.command("x", MoveAbsolute(position=5.0))
+        await rig.client.wait_for_end("x", reply.command_id)
+        await asyncio.sleep(3.0)
+        instants = range(began - 10**8, began + 2 * 10**9, 37_000_000)
+        asked = [(await rig.client.at(t, "x"))["x"] for t in instants]
+        ranged = (await rig.client.past(f"[{began}..{began + 10**9}]", "x"))["x"]
+
+    told = ldcnd.recording(path)
+
+    for t, by_daemon in zip(instants, asked, strict=True):
+        found = told.at("x", t)
+        for one, other in ((found.position, by_daemon.position), (found.velocity, by_daemon.velocity)):
+            assert one.value == pytest.approx(other.value, abs=1e-9)
+            assert (one.lower, one.upper) == pytest.approx((other.lower, other.upper), abs=1e-9)
+        assert (found.t, found.quality, found.inputs) == (by_daemon.t, by_daemon.quality, by_daemon.inputs)
+    assert [each.t for each in told.between("x", began, began + 10**9)] == [each.t for each in ranged]
+    assert told.at("x", began - 10**12).reason
+    with pytest.raises(UnknownAxis):
+        told.at("nobody", began)
+    args = ["axis", "at", "x", str(began), "--recording", str(path)]
+    shown = CliRunner().invoke(cli, [*args, "--to", str(began + 10**9), "--json"])
+    assert [json.loads(line)["t"] for line in shown.stdout.splitlines()] == [each.t for each in ranged]
+    assert CliRunner().invoke(cli, args).stdout.startswith(f"x: {told.at('x', began).position.value:.3f} mm, from ")

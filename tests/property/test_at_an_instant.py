@@ -5,18 +5,31 @@ import json
 import math
 import random
 import statistics
+from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
+from ldcnd.axis.status import AxisStatus
+from ldcnd.client.axis import Axis
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import LdcndError, MalformedRequest
+from ldcnd.contract.samples import LinkState, Moving
+from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.testing import run, simulated_rig
 from ldcnd.testing.rig import BEGINS_NS, SimulatedRig
 
 AXES = ("x", "y", "z", "c")
+UNITS = ("feed", "spool")
 LOOKS = 8
-"""Instants in a row of one axis, in about the time between two polls; the widest bound is compared with the largest
-error of these, of at least a count: a shaft that stands has none."""
+"""Instants in a row of one axis."""
+KNOWN_AFTER_S = 4.0
+"""By then two polls have followed an instant, also of a SmartStep."""
+FAST_HZ = 20
+SLOW_RATIO = 2.6
+"""Where ramps begin and end between two polls, see `judge`."""
+KINDS = {"move_absolute": "move", "move_relative": "move", "move_velocity": "jog", "home": "home", "halt": "stop"}
 
 
 async def _move(axis, rng: random.Random) -> None:
@@ -58,77 +71,143 @@ async def _live(axis, rng: random.Random) -> None:
                 await asyncio.sleep(0.5)
 
 
+async def _turn(rig: SimulatedRig, unit: str, rng: random.Random) -> None:
+    """Let the pulses that a SmartStep follows, which come from elsewhere, change their rate every now and then."""
+    while True:
+        rate = rng.choice((0.0, 0.0, 1.0)) * rng.uniform(-20_000, 20_000)
+        rig.machine(unit).unit.drive.set_pulse_rate(rate, asyncio.get_running_loop().time())
+        await asyncio.sleep(rng.uniform(0.3, 6))
+
+
 async def _look(rig: SimulatedRig, axis: str) -> tuple[int, float, float]:
-    """Return the servo cycle in which the shaft was seen, its place and its speed."""
-    drive, now_s = rig.machine(axis).servo, asyncio.get_running_loop().time()
-    since_s, cycle_s = (
-        now_s - drive.settings.phase_s,
-        drive.profile.servo_cycle_s * (1 + drive.settings.drift_ppm * 1e-6),
-    )
-    ago_s = since_s - math.floor(since_s / cycle_s + 1e-6) * cycle_s
+    """Return when the shaft was where it is seen, in which servo cycle that is, its place and its speed."""
+    now_s, ago_s = asyncio.get_running_loop().time(), 0.0
+    if axis not in UNITS:
+        drive = rig.machine(axis).servo
+        since_s, cycle_s = (
+            now_s - drive.settings.phase_s,
+            drive.profile.servo_cycle_s * (1 + drive.settings.drift_ppm * 1e-6),
+        )
+        ago_s = since_s - math.floor(since_s / cycle_s + 1e-6) * cycle_s
     truth = rig.truth(axis)
     return BEGINS_NS + round((rig.now_s - ago_s) * 1e9), truth.position, truth.velocity
 
 
-def judge(count: int, seed: int, share: float) -> None:
-    """Ask for instants of axes that move, stop, home and stand, and compare with their shafts."""
+class Judged(NamedTuple):
+    """An instant that was asked for; lengths in counts."""
 
-    async def program() -> list[tuple[bool, bool, float, float]]:
-        rng, judged, unknown = random.Random(seed), [], 0
-        async with simulated_rig(Path("config/simulated.toml"), seed=seed) as rig:
-            async with rig.client.control(*AXES, client="day") as axes:
-                lives = [asyncio.create_task(_live(axis, random.Random(seed * 10 + i))) for i, axis in enumerate(axes)]
-                await asyncio.sleep(2)
-                seen: list[tuple[str, int, float, float]] = []
-                while len(judged) < count:
-                    name = rng.choice(AXES)
-                    for _ in range(LOOKS):
-                        seen.append((name, *(await _look(rig, name))))
-                        await asyncio.sleep(rng.uniform(0.001, 0.02))
-                    while seen and seen[0][1] < BEGINS_NS + (rig.now_s - 0.5) * 1e9:
-                        name, t, place, speed = seen.pop(0)
-                        axis = rig.daemon.rig.axes[name]
-                        status = axis.tracker.status
-                        found = axis.readings.history.at(t, status.scale, status.quality)
-                        if not (found.position and found.velocity):
-                            unknown += 1
-                            continue
-                        at, speeds = found.position, found.velocity
-                        count_width = 1 / abs(status.scale.counts_per_unit)
-                        judged.append(
-                            (
-                                at.lower <= place <= at.upper,
-                                speeds.lower <= speed <= speeds.upper,
-                                (at.upper - at.lower) / 2 / count_width,
-                                max(abs(at.value - place) / count_width, 1.0),
-                            )
-                        )
-                for life in lives:
-                    life.cancel()
-                await asyncio.gather(*lives, return_exceptions=True)
-        assert unknown <= len(judged) / 100
-        return judged
+    kind: str
+    inside: bool
+    speed_inside: bool
+    half: float
+    error: float
 
-    judged = run(program())
-    inside, speeds_inside = (statistics.fmean(each[i] for each in judged) for i in (0, 1))
-    polls = [list(zip(*judged[i : i + LOOKS], strict=True)) for i in range(0, len(judged), LOOKS)]
-    ratio = statistics.median(max(half) / max(error) for _, _, half, error in polls)
-    widest = statistics.median(half for _, _, half, _ in judged)
-    print(f"seed {seed}: {len(judged)} instants, {inside:.4%} inside, velocities {speeds_inside:.4%},"
-          f" half width over error {ratio:.2f}, median half width {widest:.2f} counts")  # fmt: skip
-    assert inside >= share
-    assert speeds_inside >= share
-    assert ratio <= 3.0
+
+def _kind(axis: str, status: AxisStatus) -> str:
+    if axis in UNITS:
+        return "follow"
+    verb = status.command.verb.value if status.command else ""
+    return KINDS.get(verb, "stand") if status.moving is not Moving.NO or verb else "stand"
+
+
+def _judge(rig: SimulatedRig, seen: tuple[str, str, int, float, float]) -> Judged | None:
+    name, kind, t, place, speed = seen
+    axis = rig.daemon.rig.axes[name]
+    found, per_unit = (
+        axis.readings.history.at(t, axis.tracker.status.scale),
+        abs(axis.tracker.status.scale.counts_per_unit),
+    )
+    at, speeds = found.position, found.velocity
+    if at is None or speeds is None:
+        return None
+    inside, speed_inside = at.lower <= place <= at.upper, speeds.lower <= speed <= speeds.upper
+    return Judged(kind, inside, speed_inside, (at.upper - at.lower) / 2 * per_unit, abs(at.value - place) * per_unit)
+
+
+async def _day(config: RigConfig, count: int, seed: int) -> list[Judged | None]:
+    """Ask for instants of axes that move, jog, stop, home and stand, and compare with their shafts."""
+    rng, judged = random.Random(seed), []
+    async with simulated_rig(config, seed=seed) as rig:
+        every = tuple(rig.daemon.rig.axes)
+        async with rig.client.control(*(name for name in every if name not in UNITS), client="day") as held:
+            axes = (held,) if isinstance(held, Axis) else held
+            lives = [asyncio.create_task(_live(axis, random.Random(seed * 10 + i))) for i, axis in enumerate(axes)]
+            units = [name for name in every if name in UNITS]
+            lives += [asyncio.create_task(_turn(rig, name, random.Random(f"{seed} {name}"))) for name in units]
+            await asyncio.sleep(2)
+            seen: list[tuple[str, str, int, float, float]] = []
+            while len(judged) < count:
+                name = rng.choice(every)
+                for _ in range(LOOKS):
+                    kind = _kind(name, rig.daemon.rig.axes[name].tracker.status)
+                    seen.append((name, kind, *(await _look(rig, name))))
+                    await asyncio.sleep(rng.uniform(0.001, 0.02))
+                known = BEGINS_NS + (rig.now_s - KNOWN_AFTER_S) * 1e9
+                while seen and seen[0][2] < known:
+                    judged.append(_judge(rig, seen.pop(0)))
+            for life in lives:
+                life.cancel()
+            await asyncio.gather(*lives, return_exceptions=True)
+            for axis in axes:
+                await axis.stop()
+    return judged
+
+
+def _ratio(judged: Sequence[Judged], least: float) -> float:
+    return statistics.median(each.half / max(each.error, least) for each in judged)
+
+
+def judge(name: str, hz: float, count: int, seed: int, share: float, most_ratio: float = 2.0) -> None:
+    """Judge a rig that polls so often, and say how its bounds were.
+
+    Their ratio is half the width between the bounds over the error of the value, |value - truth|, in the median of all
+    instants. An error of less than a count counts as one, for a counter tells no less; the ratio to fractions of a
+    count, which no bound can promise, is printed beside it.
+    """
+    config = load_config(Path("config") / f"{name}.toml")
+    asked = run(_day(with_rate(config, hz), count, seed))
+    judged = [each for each in asked if each]
+    kinds = {kind: [each for each in judged if each.kind == kind] for kind in sorted({each.kind for each in judged})}
+    for kind, some in {**kinds, "all": judged}.items():
+        inside, speeds = statistics.fmean(e.inside for e in some), statistics.fmean(e.speed_inside for e in some)
+        print(
+            f"{name} at {hz:g} Hz, seed {seed}, {kind}: {len(some)} instants, {inside:.3%} inside, velocities"
+            f" {speeds:.3%}; half width {statistics.median(e.half for e in some):.2f} counts, error"
+            f" {statistics.median(e.error for e in some):.2f}; ratio {_ratio(some, 1.0):.2f}, of fractions of a count"
+            f" {_ratio(some, 1e-3):.2f}"
+        )
+    assert len(judged) >= 0.97 * len(asked)
+    assert statistics.fmean(each.inside for each in judged) >= share
+    assert statistics.fmean(each.speed_inside for each in judged) >= share - 0.002
+    assert _ratio(judged, 1.0) <= most_ratio
+
+
+def with_rate(config: RigConfig, hz: float) -> RigConfig:
+    """Return a rig whose axes are read so often; a SmartStep answers a twentieth as often, with its monitors."""
+
+    def axis(each: AxisConfig) -> AxisConfig:
+        rate = hz / 20 if each.name in UNITS else hz
+        return each.model_copy(update={"rates": each.rates.model_copy(update={"position": rate})})
+
+    buses = [bus.model_copy(update={"axis": tuple(axis(each) for each in bus.axis)}) for bus in config.bus]
+    return config.model_copy(update={"bus": tuple(buses)})
+
+
+@pytest.mark.parametrize("rig", ["simulated", "mixed"])
+def test_a_shaft_was_within_the_bounds_of_an_instant(rig: str):
+    judge(rig, 20, 200, 3, 0.99)
 
 
 @pytest.mark.long
-def test_the_shaft_was_within_the_bounds_of_an_instant():
-    judge(4000, 3, 0.997)
+@pytest.mark.parametrize("hz", [5, 20, 100])
+def test_the_shaft_was_within_the_bounds_of_4000_instants(hz: float):
+    judge("simulated", hz, 4000, 3, 0.997, 2.0 if hz >= FAST_HZ else SLOW_RATIO)
 
 
 @pytest.mark.soak
-def test_the_shaft_was_within_the_bounds_of_100000_instants():
-    judge(100_000, 4, 0.999)
+@pytest.mark.parametrize(("rig", "hz"), [*(("simulated", hz) for hz in (5, 10, 20, 50, 100)), ("mixed", 20)])
+def test_the_shaft_was_within_the_bounds_of_100000_instants(rig: str, hz: float):
+    judge(rig, hz, 17_000, 4, 0.999, 2.0 if hz >= FAST_HZ else SLOW_RATIO)
 
 
 def test_a_query_of_an_instant_answers_with_bounds_and_refuses_what_is_none():
@@ -167,5 +246,44 @@ def test_a_program_asks_where_axes_were_and_what_is_not_known_is_not_guessed():
                 assert (silent.quality, silent.position) == ("bad", None)
                 with pytest.raises(MalformedRequest):
                     await x.at("yesterday")
+
+    run(program())
+
+
+def test_a_query_of_a_range_answers_its_ends_and_every_reading_and_refuses_too_many():
+    async def program() -> None:
+        async with simulated_rig(Path("config/simulated.toml"), seed=1) as rig, rig.network.session() as session:
+            await asyncio.sleep(60)
+            now = BEGINS_NS + round(rig.now_s * 1e9)
+            t, until = now - 3 * 10**9, now - 10**9
+            told = await session.query("ldcn/sim/tele/x/at", parameters={"_time": f"[{t}..{until}]"})
+            found = [json.loads(each.payload) for each in told]
+            instants = [each["t"] for each in found]
+            assert (instants[0], instants[-1]) == (t, until)
+            assert instants == sorted(set(instants))
+            assert 36 <= len(found) <= 46  # 2 s of 20 polls a second, and what was read besides
+            assert all(each["position"]["lower"] <= 0.0 <= each["position"]["upper"] for each in found)
+            assert [each.t for each in (await rig.client.between(t, until))["x"]] == instants
+            (many,) = await session.query("ldcn/sim/tele/*/at", parameters={"_time": "[now(-59s)..now(-1s)]"})
+            assert many.is_error
+            assert "1000" in json.loads(many.payload)["message"]
+            for none in ("[now(-1s)..now(-2s)]", "[now(-2s)..]", "[]", "now(-2s)..now(-1s)"):
+                (refused,) = await session.query("ldcn/sim/tele/x/at", parameters={"_time": none})
+                assert refused.is_error, none
+
+    run(program())
+
+
+def test_an_instant_has_the_quality_of_then():
+    async def program() -> None:
+        async with simulated_rig(Path("config/simulated.toml"), seed=1) as rig:
+            async with rig.client.control("x", client="day") as x:
+                await asyncio.sleep(2)
+                t = BEGINS_NS + round((rig.now_s - 1) * 1e9)
+                assert (await x.at(t)).quality == "good"
+                rig.faults.mute("x")
+                status = rig.daemon.rig.axes["x"].tracker
+                await rig.until(lambda: status.status.link is LinkState.DEGRADED)
+                assert (await x.at(t)).quality == "good"  # though the drive does not answer by now
 
     run(program())

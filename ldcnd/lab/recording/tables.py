@@ -11,6 +11,8 @@ from pathlib import Path
 from mcap.records import Channel, Message
 
 from ldcnd.contract.errors import ConfigError
+from ldcnd.contract.history import AxisInstant
+from ldcnd.lab.recording.instants import RecordedReadings, recorded_readings
 from ldcnd.lab.recording.reading import Damage, Recording
 
 T_NS = "t_ns"
@@ -51,6 +53,7 @@ class RecordedTables:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._recording = Recording(path)
+        self._readings: dict[str, RecordedReadings] = {}
 
     @property
     def damages(self) -> tuple[Damage, ...]:
@@ -90,6 +93,29 @@ class RecordedTables:
         rows = [_row(message, cells) for name, message, cells in _rows(self._recording) if name == found[0]]
         names = dict.fromkeys(name for row in rows for name in row)
         return {name: [row.get(name) for row in rows] for name in names}
+
+    def at(self, axis: str, t: int) -> AxisInstant:
+        """Return where an axis was at an instant, UTC in ns since 1970, with the bounds that a daemon gives.
+
+        Raises:
+            ConfigError: the file is no recording, or has no description of the axis.
+            UnknownAxis: it has no such axis.
+        """
+        return self._of(axis).at(t)
+
+    def between(self, axis: str, t: int, until: int) -> list[AxisInstant]:
+        """Return the same of the first instant of a range, of each reading in it, and of its last instant.
+
+        Raises:
+            ConfigError: the file is no recording, or has no description of the axis.
+            UnknownAxis: it has no such axis.
+        """
+        return list(self._of(axis).between(t, until))
+
+    def _of(self, axis: str) -> RecordedReadings:
+        if axis not in self._readings:
+            self._readings[axis] = recorded_readings(self._recording, axis)
+        return self._readings[axis]
 
 
 def recording(path: Path | str) -> RecordedTables:

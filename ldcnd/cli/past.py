@@ -1,0 +1,70 @@
+"""`ldcnd axis at`: where an axis was, by the daemon or by a recording."""
+
+import time
+from datetime import UTC, datetime
+from pathlib import Path
+
+import click
+
+from ldcnd.cli.connection import AXIS, Target, with_target
+from ldcnd.cli.quantities import decimals
+from ldcnd.cli.record import RECORDING, a_failure, tell_damages
+from ldcnd.cli.typed import Finite, axis_of
+from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.history import AxisInstant, time_of
+from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.samples import Quality
+from ldcnd.parts import require
+
+
+@click.command()
+@click.argument("axis", type=AXIS)
+@click.argument("instant", required=False)
+@click.option("--to", "until", help="From INSTANT to this one: both, and every reading between them.")
+@click.option("--ago", "ago_s", type=Finite(0, 600), help="In place of INSTANT: so many seconds ago.")
+@click.option("--recording", type=RECORDING, help="Ask this MCAP file instead of a daemon.")
+@with_target
+def at(
+    target: Target, axis: str, instant: str | None, until: str | None, ago_s: float | None, recording: Path | None
+) -> None:
+    """Show where AXIS was at INSTANT of the last 600 s, with bounds: RFC 3339, or UTC in ns since 1970."""
+    if (instant is None) == (ago_s is None):
+        raise click.UsageError("say INSTANT or --ago, one of them")
+    said = instant or f"now(-{ago_s}s)"
+    said = said if until is None else f"[{said}..{until}]"
+
+    async def work(client: RigClient) -> tuple[list[AxisInstant], AxisInfo]:
+        info = await axis_of(client, axis)
+        return (await client.past(said, axis))[axis], info
+
+    found, info = target.run(work) if recording is None else _recorded(recording, axis, said)
+    for each in found:
+        _show(target, axis, each, info, named=until is not None)
+
+
+def _recorded(path: Path, axis: str, said: str) -> tuple[list[AxisInstant], AxisInfo]:
+    require("mcap")
+    from ldcnd.lab.recording.instants import recorded_readings  # noqa: PLC0415 - needs an optional package
+    from ldcnd.lab.recording.reading import Recording  # noqa: PLC0415
+
+    file = Recording(path)
+    t, until = time_of(said, time.time_ns())
+    with a_failure():
+        recorded = recorded_readings(file, axis)
+    tell_damages(path, file.damages)
+    return [recorded.at(t)] if t == until else list(recorded.between(t, until)), recorded.info
+
+
+def _show(target: Target, axis: str, found: AxisInstant, info: AxisInfo, *, named: bool) -> None:
+    when = f" {datetime.fromtimestamp(found.t / 1e9, UTC).isoformat(timespec='milliseconds')}" if named else ""
+    if found.position is None or found.velocity is None:
+        target.show(found, f"{axis}{when}: not known: {found.reason}")
+        return
+    place, speed, digits = found.position, found.velocity, decimals(info)
+    target.show(
+        found,
+        f"{axis}{when}: {place.value:.{digits}f} {found.unit},"
+        f" from {place.lower:.{digits}f} to {place.upper:.{digits}f}",
+        f"  at {speed.value:.4g} {found.unit}/s, from {speed.lower:.4g} to {speed.upper:.4g}",
+        *([f"  its data are {found.quality.value}"] if found.quality is not Quality.GOOD else []),
+    )
