@@ -413,7 +413,10 @@ class ReloadReply(Frozen):
 
 
 class Reload(Command[ReloadReply]):
-    """Read the configuration file again, and take what needs no restart; a motion under way keeps its values."""
+    """Read the configuration file again, and take what needs no restart; a motion under way keeps its values.
+
+    What such a motion has still to begin, as the last leg of an approach, is held to the new ones.
+    """
 
     verb = "reload"
     about = About.RIG
