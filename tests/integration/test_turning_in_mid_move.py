@@ -98,6 +98,24 @@ async def test_a_jog_that_could_not_turn_before_the_limit_comes_to_rest_first(di
 
 
 @dialects
+async def test_a_jog_that_comes_to_rest_before_it_turns_gets_no_goal_meanwhile(dialect: Dialect):
+    """Its drive would take the goal at once, and slow down at the acceleration that is too low for that."""
+    async with dialect_rig(dialect, WIDE, limits=LIMITS) as rig:
+        await rig.power_on()
+        jog = Jog(velocity=20.0, acceleration=60.0, hold_s=0.2)
+        held = {"renews": (await rig.send(jog)).command_id}
+        while rig.position_mm < 17.5:
+            await rig.send(jog.model_copy(update=held))
+            await asyncio.sleep(0.005)
+        back, most = Jog(velocity=-1.0, acceleration=4.0, hold_s=0.2).model_copy(update=held), 0.0
+        for _ in range(40):
+            await rig.send(back)
+            most = max(most, await farthest_mm(rig, 0.1))
+
+    assert most < LIMIT_MM + BEYOND_MM
+
+
+@dialects
 @pytest.mark.parametrize(("acceleration", "velocity"), [(100.0, -1.0), (100.0, -10.0), (400.0, -5.0), (50.0, 5.0)])
 @pytest.mark.sweep(2)
 async def test_a_motion_that_turns_on_its_way_has_its_velocity_for_as_long_as_was_asked_for(

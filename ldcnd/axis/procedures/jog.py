@@ -256,7 +256,8 @@ class HeldJog(Procedure):
         await motion.driver.stop(StopMode.SMOOTH)
         motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         motion.tracker.take(MotionStarted(motion.clock.now_s()))
-        self._phase = _Phase.SLOWS
+        # no next goal before it stands: at another acceleration the limit ahead may be too near
+        self._phase, self._extend_at_s = _Phase.SLOWS, math.inf
 
     async def _stop(self, reason: str) -> bool:
         self._hold.over = True  # nobody renews it while the packets of the stop are under way
