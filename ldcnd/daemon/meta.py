@@ -1,5 +1,6 @@
 """The rig's description of itself and its last values: answers to `get` on `meta/**` and `tele/**`."""
 
+import contextlib
 from collections.abc import Callable, Iterator, Mapping
 from datetime import datetime
 from functools import lru_cache, partial
@@ -9,7 +10,7 @@ from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.contract.catalogue import COMMANDS, shipped_schemas
 from ldcnd.contract.codec import Encoding, encode
-from ldcnd.contract.commands import About, Verb
+from ldcnd.contract.commands import LATEST_NS, About, Verb
 from ldcnd.contract.errors import ErrorCode, MalformedRequest
 from ldcnd.contract.frozen import Frozen, schema_name
 from ldcnd.contract.health import BusHealth, DaemonHealth
@@ -273,18 +274,20 @@ def _instant(text: str, now_ns: int) -> int:
     Raises:
         MalformedRequest: it names none.
     """
-    try:
+    t = -1
+    with contextlib.suppress(ValueError, OverflowError):
         if text.startswith("now(") and text.endswith("s)"):
-            return now_ns + round(float(text[4:-2]) * 1e9)
-        if text.isdecimal():
-            return int(text)
-        moment = datetime.fromisoformat(text)
-        seconds = round(moment.replace(microsecond=0).timestamp())
-    except (ValueError, OverflowError):
+            t = now_ns + round(float(text[4:-2]) * 1e9)
+        elif text.isdecimal():
+            t = int(text)
+        else:
+            moment = datetime.fromisoformat(text)
+            t = round(moment.replace(microsecond=0).timestamp()) * 1_000_000_000 + moment.microsecond * 1000
+    if not 0 <= t <= LATEST_NS:
         raise MalformedRequest(
             f"_time={text!r} is no instant", value=text, remedy="_time=now(-2s), RFC 3339, or ns since 1970, UTC"
-        ) from None
-    return seconds * 1_000_000_000 + moment.microsecond * 1000
+        )
+    return t
 
 
 def _wanted_encoding(query: Query) -> Encoding:
