@@ -5,6 +5,8 @@ import contextlib
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any
 
+from typing_extensions import override
+
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.latches import LatchKeeper
@@ -78,7 +80,7 @@ class Daemon:
         self._run = Run(instance, clock.now_ns(), clock)
         self._serving = asyncio.Event()
         self._ending = asyncio.Event()
-        self._failure: Exception | None = None
+        self._failure: BaseException | None = None  # the first; a panic inside Zenoh is no Exception
         self.captures = _capture_watch(self, self._run)
         self._declarations: list[Declaration] = []
         self._health = HealthWatch(rig, self._keys, publisher, clock, self._load)
@@ -146,7 +148,7 @@ class Daemon:
         Start: stops first, so that no line is open that cannot be stopped; then lines, questions, and commands. Stop:
         commands are refused, what moves comes to rest, tokens go, lines close.
         """
-        async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
+        async with contextlib.AsyncExitStack() as declared, GuardedGroup(self._guarded) as group:
             declared.callback(self._dispatcher.events.flush)  # last of all
             leases = self._dispatcher.leases
             leases.group = group
@@ -157,23 +159,21 @@ class Daemon:
             try:
                 await self._declare_stops(declared, requests)
                 serving += [
-                    group.create_task(self._guarded(bus.run()), name=f"line {bus.bus.settings.name}")
-                    for bus in self.rig.buses
+                    group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses
                 ]
                 await self._declare(declared, requests)
-                serving.append(group.create_task(self._guarded(self._watch_axes()), name="liveliness"))
-                serving.append(group.create_task(self._guarded(self._latches.run()), name="latches"))
-                serving.append(group.create_task(self._guarded(leases.run()), name="leases"))
-                serving.append(group.create_task(self._guarded(self._dispatcher.interlocks.run()), name="interlocks"))
+                serving.append(group.create_task(self._watch_axes(), name="liveliness"))
+                serving.append(group.create_task(self._latches.run(), name="latches"))
+                serving.append(group.create_task(leases.run(), name="leases"))
+                serving.append(group.create_task(self._dispatcher.interlocks.run(), name="interlocks"))
                 serving += [
-                    group.create_task(self._guarded(module.run()), name=f"module {name}")
-                    for name, module in self.rig.modules.items()
+                    group.create_task(module.run(), name=f"module {name}") for name, module in self.rig.modules.items()
                 ]
-                serving.append(group.create_task(self._guarded(self._health.run()), name="health"))
+                serving.append(group.create_task(self._health.run(), name="health"))
                 if self._heartbeat:
-                    serving.append(group.create_task(self._guarded(self._heartbeat.run()), name="heartbeat"))
+                    serving.append(group.create_task(self._heartbeat.run(), name="heartbeat"))
                 if self.captures:
-                    serving.append(group.create_task(self._guarded(self.captures.run()), name="captures"))
+                    serving.append(group.create_task(self.captures.run(), name="captures"))
                 serving += [group.create_task(_served(guest), name="guest") for guest in self._guests]
                 self._serving.set()
                 log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._run.instance)
@@ -200,9 +200,11 @@ class Daemon:
         """Do part of the daemon's work; if it fails, end in order, so that axes come to rest, and fail only then."""
         try:
             await work
-        except Exception as error:  # noqa: BLE001 - whatever is wrong in here, axes must not go on unwatched
+        except (asyncio.CancelledError, GeneratorExit, KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # noqa: BLE001 - whatever is wrong in here, axes must not go on unwatched
             log.error("internal error, the daemon ends", reason=repr(error))
-            self._failure = error
+            self._failure = self._failure or error
             self._ending.set()
 
     async def _declare_stops(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
@@ -250,7 +252,7 @@ class Daemon:
         try:
             async with asyncio.timeout(STOP_TIME_S), asyncio.TaskGroup() as group:
                 for name, axis in self.rig.axes.items():
-                    group.create_task(self._bring_to_rest(axis), name=f"rest {name}")
+                    group.create_task(self._guarded(self._bring_to_rest(axis)), name=f"rest {name}")
         except TimeoutError:
             log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
         for name, axis in self.rig.axes.items():
@@ -329,6 +331,25 @@ class Daemon:
             axes=tuple(self.rig.axes),
             buses=tuple(bus.bus.settings.name for bus in self.rig.buses),
         )
+
+
+class GuardedGroup(asyncio.TaskGroup):
+    """Tasks of which one that fails does not cancel the others."""
+
+    def __init__(self, guarded: Callable[[Coroutine[Any, Any, Any]], Coroutine[Any, Any, None]]) -> None:
+        """Begin without tasks.
+
+        Args:
+            guarded: does the work of a task; sees to what it raises.
+        """
+        super().__init__()
+        self._guarded = guarded
+
+    @override
+    def create_task(  # type: ignore[override] # its stub names what differs between versions of Python
+        self, coro: Coroutine[Any, Any, Any], **kwargs: Any
+    ) -> "asyncio.Task[Any]":
+        return super().create_task(self._guarded(coro), **kwargs)
 
 
 async def _served(guest: Callable[[], Awaitable[None]]) -> None:
