@@ -83,7 +83,6 @@ class AxisMotion:
         tracker: of its state.
         telemetry: publishes it.
         clock: of the daemon.
-        read: reads the drive's state at once.
         reference: keeps its reference.
     """
 
@@ -115,7 +114,8 @@ class AxisMotion:
         self.tracker = tracker
         self.telemetry = telemetry
         self.clock = clock
-        self.read = read
+        self._read = read
+        self._looked: tuple[AxisReading, float] | None = None  # the last reading out of turn, and when it was asked for
         self._loop = asyncio.get_running_loop()
 
     def reconfigure(self, config: AxisConfig) -> None:
@@ -146,8 +146,21 @@ class AxisMotion:
         """Its coordinates."""
         return self.tracker.status.scale
 
+    async def read(self) -> AxisReading:
+        """Read the drive's state at once; `latest` is that reading until a poll brings a newer one.
+
+        Raises:
+            BusError: as `ReadingOutOfTurn`.
+        """
+        asked_at_s = self.clock.now_s()
+        reading = await self._read()
+        self._looked = reading, asked_at_s
+        return reading
+
     def latest(self) -> AxisReading:
-        """Return the latest reading; see `AxisTracker.latest`."""
+        """Return the latest reading, of a poll or out of turn; see `AxisTracker.latest`."""
+        if self._looked and self._looked[1] > self.tracker.read_at_s:
+            return self._looked[0]
         return self.tracker.latest()
 
     @property
