@@ -126,7 +126,7 @@ class ModuleService:
         self._clock = clock
         self._topic = publisher.item(driver.name, TelemetryItem.IO)
         self._misses = 0
-        self._situation: Situation | None = None
+        self._situations: dict[Situation, None] = {}  # whose levels are yet to be written, the oldest first
         self._due = asyncio.Event()
         self._seen = False
         self._writes = asyncio.Lock()
@@ -329,12 +329,14 @@ class ModuleService:
         elif self._seen:
             self.enter(Situation.BUS)
         self._driver.restarted, self._seen = False, True
+        self._due.set()  # also for what has happened while nothing could be written
         self._link_events.back()
 
     def enter(self, situation: Situation) -> None:
-        """Have the outputs written that have a level in a situation."""
+        """Have the outputs written that have a level in a situation, once the module is within reach."""
         if any(situation.level_of(output) is not None for output in self._outputs.values()):
-            self._situation = situation
+            self._situations.pop(situation, None)
+            self._situations[situation] = None  # behind the others: what has happened last has the last word
             self._due.set()
 
     async def run(self) -> None:
@@ -342,16 +344,18 @@ class ModuleService:
         while True:
             await self._due.wait()
             self._due.clear()
-            situation, self._situation = self._situation, None
-            if situation and not await self.apply(situation):
-                await asyncio.sleep(APPLIED_AGAIN_S)
-                if not self._due.is_set():
-                    self.enter(situation)
+            while self._situations and self._reading is not None:
+                situation = next(iter(self._situations))
+                del self._situations[situation]  # before it is written: it may come again meanwhile
+                if not await self.apply(situation):
+                    if situation not in self._situations:
+                        self._situations = {situation: None} | self._situations
+                    await asyncio.sleep(APPLIED_AGAIN_S)
 
     async def apply(self, situation: Situation) -> bool:
         """Write the outputs that have a level in a situation; one that may not be written stays as it is.
 
-        Returns False when packets were lost.
+        Returns False when packets were lost, or the module is out of reach.
         """
         complete = True
         for name, output in self._outputs.items():
@@ -362,7 +366,7 @@ class ModuleService:
             try:
                 await self._write({output.line: level}, frozenset(), (None, None), lambda: None)
             except LdcndError as error:
-                complete = complete and not isinstance(error, BusError)
+                complete = complete and self._driver.proof.holds and not isinstance(error, BusError)
                 log.warning("output not set", module=self.name, output=name, reason=error.message)
                 self._note(
                     situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value
