@@ -50,6 +50,7 @@ class Workers:
         """Have a job done that must not raise. Any thread, never blocks."""
         ended: Future[None] | None = None
         with self._lock:
+            # in the lock, so that `stop` puts its marks behind every job that was taken
             self._jobs.put(job)
             if self._free:
                 self._free -= 1
@@ -84,6 +85,7 @@ class Workers:
         try:
             async with asyncio.timeout(timeout_s):
                 return await asyncio.wrap_future(future)
+        # also of a caller that was cancelled: what comes into being meanwhile would be nobody's
         except (TimeoutError, asyncio.CancelledError):
             future.add_done_callback(partial(self._undo, undo))
             raise
@@ -94,6 +96,7 @@ class Workers:
             if not self._stopping:
                 self._stopping = True
                 for _ in self._ended:
+                    # one for each thread: who has taken its own takes nothing more
                     self._jobs.put(None)
         try:
             async with asyncio.timeout(timeout_s):

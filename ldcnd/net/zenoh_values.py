@@ -18,6 +18,7 @@ class ZenohQos(TypedDict):
     express: bool
 
 
+# with BLOCK the node "will wait for queue to progress" (zenoh, `CongestionControl`), and the bus loop with it
 _DROP = zenoh.CongestionControl.DROP
 TRAVEL: Mapping[Qos, ZenohQos] = {
     Qos.TELEMETRY: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA, "express": False},
