@@ -96,6 +96,7 @@ def build_daemon(
         events.note(axis, verb, status, reason, code=code)
 
     kept = KeptFiles(config.state_dir) if config.state_dir else None
+    # a reset clears what proves a reference, so it is worth keeping only where drives are taken over
     taken_over = frozenset(axis.name for bus in config.bus if bus.takes_over for axis in bus.axis)
 
     def make_axis(axis: AxisConfig, bus: Bus, driver: Drive) -> AxisService:

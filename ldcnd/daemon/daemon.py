@@ -155,6 +155,7 @@ class Daemon:
             requests = Requests(self.rig, self._keys, group, self._dispatcher)
             for each in self.rig.axes.values():
                 self._watch_link(each, group)
+            # what is cancelled at the end; commands under way are not among it, they end when their lines close
             serving: list[asyncio.Task[None]] = []
             try:
                 await self._declare_stops(declared, requests)
@@ -182,7 +183,9 @@ class Daemon:
                 for axis in self.rig.axes.values():
                     axis.close()  # first: what waits now would begin behind the stop that its policy sends
                 await self._come_to_rest()
+                # behind the axes: an interlock may forbid a level while something moves
                 await self._leave_outputs()
+                # behind them, too: a reference is kept of an axis that stands
                 await self._keep_references()
                 await self._latches.settled()
                 if self._failure:
@@ -214,6 +217,7 @@ class Daemon:
             await stops.declare(self._session, self._keys)
         for declaration in stops.hand_over(requests.on_stop):
             self._declarations.append(declaration)
+            # closed behind the lines: until then stops are taken, or refused once `finish` was called
             declared.push_async_callback(declaration.close)
 
     async def _declare(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
@@ -242,6 +246,7 @@ class Daemon:
     def _on_daemon(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's signature
         """Note which other daemons serve this rig: two of them would move every axis twice."""
         address = self._keys.parse_alive(key)
+        # the watch shows this daemon's own token as well, and those of axes
         if address.axis is not None or address.instance == self._run.instance:
             return
         log.error("another daemon serves this rig", rig=self.rig.name, instance=address.instance, alive=alive)
@@ -265,6 +270,7 @@ class Daemon:
         while axis.tracker.status.stop_pending or axis.tracker.status.is_braking:
             await axis.send_pending_stop()
             await asyncio.sleep(STOP_AGAIN_S)
+        # behind the stop, since it opens the loop of an axis that holds lent gains
         await axis.take_gains_back()
 
     async def _leave_outputs(self) -> None:

@@ -141,8 +141,10 @@ class Ledger:
         Raises:
             TooManyRequests: it has an id of its own, and there is no room to remember that.
         """
+        # first: what cannot be remembered is refused before anything of it exists
         self._remember(entry)
         self._entries[entry.command_id] = entry
+        # by its login where it has one: any client may call itself by the name of another
         sender = RESTING if entry.command.takes_energy_out else entry.login or entry.client or ""
         entries = self._of_senders.setdefault(sender, OrderedDict())
         self._of_senders.move_to_end(sender)
@@ -210,6 +212,7 @@ class Ledger:
         if command.lease is not None and command.sequence is not None:
             return
         now_s = self._now_s()
+        # all live equally long, so the first to be entered is the first to expire
         while self._until_s and next(iter(self._until_s.values())) <= now_s:
             del self._until_s[next(iter(self._until_s))]
         if len(self._until_s) >= LARGEST_MEMORY:
@@ -252,6 +255,7 @@ def status_of(error: LdcndError) -> CommandStatus:
 
 
 def _fingerprint(command_id: str) -> int:
+    # 64 bits: that any two of `LARGEST_MEMORY` ids are alike has a chance of 2e-9
     return int.from_bytes(hashlib.blake2b(command_id.encode(), digest_size=8).digest(), "big")
 
 
@@ -321,6 +325,7 @@ class EventLog:
         """Take a change of the ledger; what is refused at once was never accepted."""
         if entry.status is CommandStatus.REFUSED and self._news and _is_acceptance(self._news[-1].entry, entry):
             self._news.pop()
+            # nobody has seen its number: who asks for events has them published first
             self._end -= 1
             self._sequence[entry.axis] -= 1
         seq = self._sequence.get(entry.axis, 0)
@@ -371,6 +376,7 @@ class EventLog:
         code: str | None = None,
     ) -> None:
         """Enter what concerns an axis and is in no ledger: control that was lost or refused, a stop confirmed late."""
+        # first, since what waits to be published has lower numbers
         self.flush()
         seq = self._sequence.get(axis, 0)
         self._sequence[axis] = seq + 1

@@ -282,6 +282,7 @@ def _instant(text: str, now_ns: int) -> int:
             t = int(text)
         else:
             moment = datetime.fromisoformat(text)
+            # apart from the microseconds: a float holds no nanoseconds of an instant of today
             t = round(moment.replace(microsecond=0).timestamp()) * 1_000_000_000 + moment.microsecond * 1000
     if not 0 <= t <= LATEST_NS:
         raise MalformedRequest(

@@ -162,13 +162,16 @@ class ModuleService:
             self.changed()
 
     def _observed(self, reading: IoReading, timing: Timing) -> None:
+        # from its address, but perhaps from another module
         if not self._driver.proof.holds:
             self._lost()
             return
         if self._reading is None or self._driver.restarted:
             self._returned()
+        # a reply to a request from before the write tells the level of before
         for name in [name for name, until_s in self._unread_until_s.items() if timing.sent_at_s >= until_s]:
             del self._unread_until_s[name], self.before[name]
+        # when it was asked for, since the level may have changed directly behind that
         self._misses, self._reading, self.read_at_s = 0, reading, timing.sent_at_s
         values = {
             name: each.take(reading.levels[each.line - 1], timing.true_from_s) for name, each in self._inputs.items()
@@ -196,6 +199,7 @@ class ModuleService:
             self._differs[name] = 0
             return False
         self._differs[name] = min(before + 1, DIFFERS_AFTER)
+        # said once, by the reading that completes the row
         if before != DIFFERS_AFTER - 1:
             return before == DIFFERS_AFTER
         reason = f"output {name} was set {_word(written)} and its pin shows {_word(not written)}: check what it drives"
@@ -211,6 +215,7 @@ class ModuleService:
 
     def _gone(self) -> None:
         """It is out of reach: nothing is known of its lines."""
+        # one that has never answered was not lost
         if self._seen:
             self._link_events.lost()
         self._reading, self.read_at_s = None, -math.inf
@@ -283,6 +288,7 @@ class ModuleService:
             except LdcndError:
                 self._take(values)
                 raise
+            # without an end while it is written: any reply may be to a request from before
             self._unread_until_s |= dict.fromkeys(changes, math.inf)
             self.before = {name: (values[name], self.read_at_s) for name in changes} | self.before
             try:
@@ -295,6 +301,7 @@ class ModuleService:
                         self._set[name] = level
                 return reading
             finally:
+                # also after an error: which of the packets have arrived is not known
                 self._unread_until_s |= dict.fromkeys(changes, asyncio.get_running_loop().time())
 
     async def set_timer(self, command: SetIoTimer, condition: Condition) -> IoReply:
@@ -307,6 +314,7 @@ class ModuleService:
         enabled, edges = command.mode is not IoTimer.OFF, command.mode is IoTimer.COUNTER
         with only_while(condition):
             await self._driver.set_timer(enabled=enabled, counts_edges=edges, prescale=command.prescale)
+        # sets nothing: only its last packet is sent, which reads
         reading = await self._driver.set_outputs({}, frozenset(), (None, None))
         return self._replied(reading)
 
