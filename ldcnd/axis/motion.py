@@ -370,12 +370,14 @@ class AxisMotion:
         limit = self.limit_ahead(reading.velocity_counts_per_s / scale.counts_per_unit)
         ends = [] if target_counts is None else [target_counts]
         ways = [end - reading.position_counts if forward else reading.position_counts - end for end in ends]
+        # it can stop at its target, which is within the limits
         if any(way >= braking for way in ways):
             return True
         if limit is not None:
             room = scale.counts(limit) - reading.position_counts
             if braking > (room if forward else -room):
                 return False
+        # a target ahead that is too near for that would be overshot
         return not any(way > 0 for way in ways)
 
     def in_mid_move(self, plan: MotionPlan) -> MotionPlan:
@@ -603,6 +605,7 @@ class AxisMotion:
         self,
         command_id: str,
         verb: Verb,
+        # PLCopen has DiscreteMotion for an axis that MC_Halt slows down; here whatever comes to rest is stopping
         state: AxisState = AxisState.STOPPING,
         completion: Completion = Completion.REST,
     ) -> None:

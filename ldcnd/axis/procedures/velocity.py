@@ -44,6 +44,7 @@ class VelocityChange(EndlessMotion):
         await self.permit.load(plan.motion)
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
         last_s = run_s + motion.ramp_s(request.duration_s, plan)
+        # before the start: if that is not confirmed the motion is ended all the same
         self._until_s = motion.clock.now_s() + min(last_s, COUNTER_SHARE * room_s)
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         _, at_limit = motion.end_ahead(motion.here, plan.velocity * last_s)
