@@ -12,6 +12,10 @@ from concurrent.futures import Future
 from functools import partial
 from typing import TypeVar
 
+from ldcnd.log import get_logger
+
+log = get_logger("workers")
+
 ResultT = TypeVar("ResultT")
 
 Job = Callable[[], None]
@@ -118,7 +122,10 @@ class Workers:
     def _work(self, ended: Future[None]) -> None:
         try:
             while job := self._jobs.get():
-                job()
+                try:
+                    job()
+                except BaseException:  # a panic in Zenoh is no Exception; those who wait are not to blame for it
+                    log.exception("bug on a worker thread", thread=self._name)
                 # what the job holds must not live until the next one comes
                 del job
                 with self._lock:
