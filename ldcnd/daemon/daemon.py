@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from typing import Any
 
 from typing_extensions import override
@@ -13,6 +13,7 @@ from ldcnd.axis.latches import LatchKeeper
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
+from ldcnd.contract.errors import SessionError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import API, DaemonInfo
@@ -30,7 +31,7 @@ from ldcnd.daemon.modules import Situation
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.rig_commands import AnswerReload
 from ldcnd.line.capture import Capture
-from ldcnd.log import get_logger
+from ldcnd.log import LogLimit, get_logger
 from ldcnd.net.hand_over import Load
 from ldcnd.net.publisher import Publisher
 from ldcnd.net.session import Declaration, Session
@@ -87,6 +88,7 @@ class Daemon:
         plan = plan_rig(config)
         self._health.stop_bounds_s = _stop_bounds_s(plan)
         self._health.overrides = self._dispatcher.interlocks.overrides
+        self._tokens_logged = LogLimit(now_s=clock.now_s)
         self._heartbeat = heartbeat
         if heartbeat:
             self._health.heartbeat = lambda: heartbeat.health
@@ -316,15 +318,25 @@ class Daemon:
                 for name, axis in self.rig.axes.items():
                     alive = axis.tracker.status.link is not LinkState.DOWN
                     if alive and name not in tokens:
-                        tokens[name] = await self._session.declare_token(
-                            self._keys.alive_axis(self._run.instance, name)
-                        )
+                        with self._unless_congested(name):
+                            tokens[name] = await self._session.declare_token(
+                                self._keys.alive_axis(self._run.instance, name)
+                            )
                     elif not alive and name in tokens:
                         await tokens.pop(name).close()
                 await asyncio.sleep(TOKEN_PERIOD_S)
         finally:
             for token in tokens.values():
                 await token.close()
+
+    @contextlib.contextmanager
+    def _unless_congested(self, axis: str) -> Iterator[None]:
+        """Go on without a token that the network does not take, and try again: nothing moves by it, or stops for it."""
+        try:
+            yield
+        except SessionError as error:
+            if (fields := self._tokens_logged.admit()) is not None:
+                log.warning("axis not shown as alive", axis=axis, reason=error.message, **fields)
 
     def _info(self) -> DaemonInfo:
         return DaemonInfo(

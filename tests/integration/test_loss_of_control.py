@@ -9,7 +9,7 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
-from ldcnd.contract.errors import LeaseExpired, LeaseHeld, LeaseRequired
+from ldcnd.contract.errors import LeaseExpired, LeaseHeld, LeaseRequired, SessionError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.leases import Acquire, LeaseReply
 from ldcnd.contract.rig_commands import Rehearsal, Rehearse
@@ -240,3 +240,25 @@ async def test_an_internal_error_while_one_axis_is_brought_to_rest_leaves_no_oth
     await asyncio.sleep(1.0)
 
     assert drive(chain, 2).loop.trajectory.at_rest
+
+
+async def test_a_network_that_takes_no_token_for_a_while_stops_no_axis(monkeypatch):
+    """The daemon ended for it, and brought everything to rest."""
+    async with running_rig(load_config(SIMULATED)) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveVelocity(velocity=5.0))
+        bus, session = rig.daemon.rig.lines["line0"].bus, type(rig.session)
+
+        async def takes_none(_session: object, key: str) -> None:
+            raise SessionError(f"{key}: cannot declare within 5 s: a peer takes nothing")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(session, "declare_token", takes_none)
+            bus.drop("a cable that comes loose")
+            await rig.until("x", lambda state: state.link == "down")
+            await rig.until("x", lambda state: state.link == "up")
+            await asyncio.sleep(1.0)
+            await rig.client.command("y", Power(on=True))
+        await asyncio.sleep(1.0)
+        assert (await rig.client.state("y")).enabled
