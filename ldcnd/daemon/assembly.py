@@ -90,7 +90,7 @@ def build_daemon(
     clock = Clock(now_ns)
     publisher = Publisher(session, Keys(config.rig), ENCODINGS[config.telemetry.encoding])
     events = EventLog(publisher, clock, instance)
-    ledger = Ledger(events.changed, clock.now_s)
+    ledger = Ledger(events.changed, clock.now_s, events.is_reserved)
 
     def note(axis: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
         events.note(axis, verb, status, reason, code=code)

@@ -433,11 +433,11 @@ class Dispatcher:
         client, right, accepted = command.client, UNCONDITIONAL, asyncio.Event()
         if command.takes_energy_out:
             # a stop whose id was used is no repetition: it is sent, under another one
-            if self._ledger.is_taken(command_id):
+            if self._ledger.is_taken(command.command_id):
                 command_id = self.events.next_command_id()
             client = client or self._holder_by(axis_name, command)
         else:
-            if entry := self._ledger.repeated(command_id, axis_name, command):
+            if entry := self._ledger.repeated(command.command_id, axis_name, command):
                 return await self._answer_again(entry)
             # behind the ledger: a repetition has an old sequence, and is answered all the same
             client = self._admit(axis_name, command) or client
@@ -446,7 +446,7 @@ class Dispatcher:
         if hold:
             right = right.also(lambda: hold.check(self._clock.now_s()))
         permit = axis.permit(command_id, command.verb, right)
-        self._ledger.open(LedgerEntry(command_id, axis_name, command, client, login))
+        self._enter(LedgerEntry(command_id, axis_name, command, client, login))
         over = self._under_way[command_id] = asyncio.Event()
         try:
             if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
@@ -470,6 +470,19 @@ class Dispatcher:
             # a jog that was refused must not be renewed into life
             if hold and not hold.begun:
                 hold.over = True
+
+    def _enter(self, entry: LedgerEntry) -> None:
+        """Enter a command that begins.
+
+        Raises:
+            TooManyRequests: as `Ledger.open`.
+        """
+        try:
+            self._ledger.open(entry)
+        except Exception:
+            if not entry.command.takes_energy_out:
+                raise
+            log.exception("command not entered", axis=entry.axis, verb=entry.verb)  # it is carried out all the same
 
     async def _start(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
         reply = await axis.execute(command, permit)

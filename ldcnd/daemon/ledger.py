@@ -79,33 +79,48 @@ class LedgerEntry:
 class Ledger:
     """The commands of one rig, latest last."""
 
-    def __init__(self, changed: Callable[[LedgerEntry, LdcndError | None], None], now_s: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        changed: Callable[[LedgerEntry, LdcndError | None], None],
+        now_s: Callable[[], float],
+        is_reserved: Callable[[str], bool] = lambda _: False,
+    ) -> None:
         """Begin empty.
 
         Args:
             changed: called with every entry and every change of status, and the error that goes with it.
             now_s: returns the time, in seconds.
+            is_reserved: tells whether an id is for commands that come without one.
         """
         self._entries: dict[str, LedgerEntry] = {}
         self._of_senders: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
         self._until_s: dict[int, float] = {}  # by fingerprint, in the order of expiry
         self._changed = changed
         self._now_s = now_s
+        self._is_reserved = is_reserved
 
-    def is_taken(self, command_id: str) -> bool:
-        """Tell whether an id names another command already, or has."""
-        return command_id in self._entries or self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s()
+    def is_taken(self, command_id: str | None) -> bool:
+        """Tell whether the id that a sender chose, if it did, names another command already, or has, or may."""
+        return command_id is not None and (
+            command_id in self._entries or self._is_remembered(command_id) or self._is_reserved(command_id)
+        )
 
-    def repeated(self, command_id: str, axis: str, command: AxisCommand[CommandReply]) -> LedgerEntry | None:
-        """Return the entry that this id has already, or None when it is new.
+    def _is_remembered(self, command_id: str) -> bool:
+        return self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s()
+
+    def repeated(self, command_id: str | None, axis: str, command: AxisCommand[CommandReply]) -> LedgerEntry | None:
+        """Return the entry that the id which a sender chose has already; None when it is new, or the sender chose none.
 
         Raises:
-            CommandIdReused: the id belongs to another command, or to one whose answer was evicted.
+            CommandIdReused: the id belongs to another command, to one whose answer was evicted, or to the daemon.
         """
+        if command_id is None:
+            return None
         entry = self._entries.get(command_id)
-        if entry is None and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():
+        if entry is None and (self._is_remembered(command_id) or self._is_reserved(command_id)):
+            own = "is one of those that the daemon gives" if self._is_reserved(command_id) else "was taken before"
             raise CommandIdReused(
-                f"command id {command_id!r} was taken before, its answer is not kept; it is not carried out again",
+                f"command id {command_id!r} {own}, its answer is not kept; it is not carried out again",
                 axis=axis,
                 value=command_id,
                 remedy=Remedy("{}; give every command an id of its own", step("events", "look at the events")),
@@ -320,6 +335,10 @@ class EventLog:
     def next_command_id(self) -> str:
         """Return an id for a command that came without one."""
         return f"{self._run}-{next(self._serial)}"
+
+    def is_reserved(self, command_id: str) -> bool:
+        """Tell whether an id is one that `next_command_id` has returned, or may return."""
+        return command_id.startswith(f"{self._run}-")
 
     def changed(self, entry: LedgerEntry, error: LdcndError | None) -> None:
         """Take a change of the ledger; what is refused at once was never accepted."""
