@@ -203,6 +203,7 @@ class AxisService:
     def connected(self, *, placed: bool) -> None:
         """The line came up; `placed` when 0 is where the drive was powered on, and that is the reference."""
         self.stops.line_up = True
+        # what was recalled counts once: when the line comes up again it proves nothing
         origin_counts, self._recalled = 0.0 if placed else self._recalled, None
         if origin_counts is None:
             self.tracker.take(PlaceUnknown())
@@ -398,6 +399,7 @@ class AxisService:
             CommandAborted: a halt, or a later aborting move, came first.
             LdcndError: as the move itself, and as `Permit.ask_to_move`: also what has changed while it waited.
         """
+        # behind others that wait it follows the last of these
         ahead = self._last_in_turn if self._successors.locked() else self._active_id
         patience_s = math.inf
         if move.buffer_mode is BufferMode.ABORTING and self.tracker.status.command:
@@ -406,6 +408,7 @@ class AxisService:
             if self._commands.retargets(move):
                 by_s = self._clock.now_s() + LATENCY_S
                 await self._motion.read()  # the latest reading may be as old as the rates let it be
+                # again, because the reading has taken its time
                 permit.ask_to_move()
                 if self._commands.goes_on(move) and self._clock.now_s() < by_s:
                     permit.by_s = by_s
@@ -426,11 +429,13 @@ class AxisService:
         async with self._successors:  # those who wait are served in the order in which they came
             deadline_s = self._clock.now_s() + patience_s
             while self.tracker.status.command:
+                # no await between this look and the wait, so that no change is missed
                 self._queue.changed.clear()
                 try:
                     async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
                         await self._queue.changed.wait()
                 except TimeoutError:
+                    # said once: from here on its sender waits for no reply
                     deadline_s = math.inf
                     waits(self._active_id or permit.command_id)
                 permit.ask()

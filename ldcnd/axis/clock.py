@@ -22,6 +22,7 @@ class Clock:
 
     def wall_ns(self, at_s: float) -> int:
         """Return the wall time of an instant of the loop's clock."""
+        # by the distance from now: the wall clock may be set at any time, the loop's goes on evenly
         return self.now_ns() - round((self.now_s() - at_s) * 1e9)
 
     def stamp(self, timing: Timing) -> tuple[int, int]:

@@ -140,10 +140,12 @@ class AxisCommands:
         hold, procedure = self.holds.get(command_id), self.procedure
         if hold is None:
             raise no_such_jog(self._config.name, command_id)
+        # a halt, a limit or a fault has ended it meanwhile
         if hold.begun and not (isinstance(procedure, HeldJog) and procedure.is_of(hold)):
             hold.over = True
         now_s = self._motion.clock.now_s()
         hold.check(now_s)
+        # before the hold is renewed: with a velocity that is refused it must run out
         plan = self._motion.plan_at(request.velocity, request.acceleration)
         hold.renew(request, now_s)
         if isinstance(procedure, HeldJog) and procedure.wants_step:
@@ -206,6 +208,7 @@ class AxisCommands:
             self._drop_procedure()
             return
         self._blind = self._tracker.status.link is not LinkState.UP
+        # before it is tried: if its packets are lost, that is when it is tried again
         self._retry_s = self._motion.clock.now_s() + (BLIND_RETRY_S if self._blind else STEP_RETRY_S)
         try:
             goes_on = await self._take_step(procedure)
@@ -225,6 +228,7 @@ class AxisCommands:
                 self._tracker.status.command is not None
                 and self._tracker.status.command.completion is Completion.PROCEDURE
             )
+        # before `RequestRefused`, which they are, too: whoever has overtaken the step sees to the drive
         except (StopLatched, CommandAborted):
             raise
         except (RequestRefused, DriveFault) as error:
@@ -331,6 +335,7 @@ class AxisCommands:
         else:
             plan = self._PLANNED[type(request)](self, request)
             if isinstance(request, MoveAbsolute | MoveRelative):
+                # its first motion may be the one away from the goal
                 plan = self._motion.before_approach(plan, request.velocity, request.acceleration) or plan
         return self._motion.follows_on(plan.motion.acceleration_counts_per_s2, plan.motion.target_counts)
 
@@ -382,6 +387,7 @@ class AxisCommands:
 
     async def _jog(self, permit: Permit, request: Jog) -> CommandReply:
         now_s = self._motion.clock.now_s()
+        # `begin_hold` has made one on arrival, unless the jog comes from inside the daemon
         hold = self.holds.get(permit.command_id) or self.holds.begin(permit.command_id, request, now_s)
         return await self._undertake(HeldJog(self._motion, permit, hold))
 
@@ -439,6 +445,7 @@ class AxisCommands:
         changed = self._motion.quantise(
             replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / before)
         )
+        # with the goal of before: what is lost on the way changes the speed or nothing
         await permit.load(changed)
         if tracker.status.command is not command:
             return False  # it has ended meanwhile: what was loaded is not started
@@ -458,6 +465,7 @@ class AxisCommands:
         motion = self._motion
         permit.check_state()
         here = await motion.read()  # one reading alone may be wrong
+        # before the axis gets another origin: a crash between the two must not leave the old one
         await motion.reference.forget()
         permit.still_wanted()
         guards.check_position_kept(self._tracker)

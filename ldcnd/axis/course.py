@@ -60,6 +60,7 @@ class Braking:
             driven_open: the motor may have voltage with its loop open, which no flag shows: a stop that holds closes
                 the loop, and of one that switches off only a shaft at rest shows that it was heard.
         """
+        # it was asked for before the drive had the stop
         if at_s < self.acknowledged_at_s:
             return self
         if driven_open and not reading.enabled:
@@ -83,6 +84,7 @@ class Braking:
 
     def _observe_open(self, position: int, at_s: float) -> "Braking | bool":
         if abs(position - self.still_counts) > REST_COUNTS or math.isinf(self.still_since_s):
+            # still turning: after `AGAIN_S` of that it is False, and the stop is sent again
             return at_s - self.acknowledged_at_s < AGAIN_S and replace(self, still_counts=position, still_since_s=at_s)
         return True if at_s - self.still_since_s >= REST_S else self
 

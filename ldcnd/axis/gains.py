@@ -69,6 +69,7 @@ class AxisGains:
         if not request.lent:
             await permit.set_gains(changed)
             self._own = None
+            # what is set counts for all motions that have no gains of their own
             self._of_others = self._of_others and replace(self._of_others, **asked)
             return self._motion.reply(permit)
         if request.lease is None:

@@ -270,6 +270,7 @@ class HostTracer(Tracer):
             raw_columns=tuple(f"{each.channel.name} of the drive" for each in chosen),
             phase=_first_phase(request.trigger, pre_trigger),
         )
+        # armed from here on: what fires the trigger before anybody waits for it is kept
         self._bus.add_poller(capture)
         limit_s = GRACE_S + SLACK * request.samples * max(interval_s, shortest_s)
         return ArmedCapture(axis, self._bus, capture, granted, request.timeout_s, limit_s)

@@ -155,6 +155,7 @@ class KeptFiles:
 
         with self._noted(self._latches):
             await self._in_thread(write, self._latch_worker)
+        # for the next one: this one has become the file, with the room that was kept
         self._latch_worker.submit(durable.keep_room, self._latches, LATCH_ROOM_BYTES)
 
     async def reference(self, axis: str) -> KeptReference | None:
@@ -239,6 +240,7 @@ class KeptFiles:
     async def _in_thread(self, work: Callable[[], ResultT], worker: ThreadPoolExecutor | None = None) -> ResultT:
         future = asyncio.get_running_loop().run_in_executor(worker or self._worker, work)
         async with asyncio.timeout(DISK_TIME_S):  # TimeoutError is an OSError
+            # a thread cannot be cancelled: the write goes on, and what comes later is written behind it
             return await asyncio.shield(future)
 
 

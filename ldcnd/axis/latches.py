@@ -91,6 +91,7 @@ class LatchKeeper:
     async def _keep(self, files: KeptFiles) -> bool:
         """Write the latches unless they are on the disk as they are; tell whether they are."""
         async with self._writing:  # those who wait find that it was done for all
+            # before the look: what changes while the disk is written is written next
             self._changed.clear()
             now = self._others | {
                 name: latch for name, each in self._trackers.items() if (latch := _latch_of(each.status))

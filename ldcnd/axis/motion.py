@@ -83,7 +83,6 @@ class AxisMotion:
         tracker: of its state.
         telemetry: publishes it.
         clock: of the daemon.
-        read: reads the drive's state at once.
         reference: keeps its reference.
     """
 
@@ -115,7 +114,8 @@ class AxisMotion:
         self.tracker = tracker
         self.telemetry = telemetry
         self.clock = clock
-        self.read = read
+        self._read = read
+        self._looked: tuple[AxisReading, float] | None = None  # the last reading out of turn, and when it was asked for
         self._loop = asyncio.get_running_loop()
 
     def reconfigure(self, config: AxisConfig) -> None:
@@ -146,8 +146,21 @@ class AxisMotion:
         """Its coordinates."""
         return self.tracker.status.scale
 
+    async def read(self) -> AxisReading:
+        """Read the drive's state at once; `latest` is that reading until a poll brings a newer one.
+
+        Raises:
+            BusError: as `ReadingOutOfTurn`.
+        """
+        asked_at_s = self.clock.now_s()
+        reading = await self._read()
+        self._looked = reading, asked_at_s
+        return reading
+
     def latest(self) -> AxisReading:
-        """Return the latest reading; see `AxisTracker.latest`."""
+        """Return the latest reading, of a poll or out of turn; see `AxisTracker.latest`."""
+        if self._looked and self._looked[1] > self.tracker.read_at_s:
+            return self._looked[0]
         return self.tracker.latest()
 
     @property
@@ -357,12 +370,14 @@ class AxisMotion:
         limit = self.limit_ahead(reading.velocity_counts_per_s / scale.counts_per_unit)
         ends = [] if target_counts is None else [target_counts]
         ways = [end - reading.position_counts if forward else reading.position_counts - end for end in ends]
+        # it can stop at its target, which is within the limits
         if any(way >= braking for way in ways):
             return True
         if limit is not None:
             room = scale.counts(limit) - reading.position_counts
             if braking > (room if forward else -room):
                 return False
+        # a target ahead that is too near for that would be overshot
         return not any(way > 0 for way in ways)
 
     def in_mid_move(self, plan: MotionPlan) -> MotionPlan:
@@ -590,6 +605,7 @@ class AxisMotion:
         self,
         command_id: str,
         verb: Verb,
+        # PLCopen has DiscreteMotion for an axis that MC_Halt slows down; here whatever comes to rest is stopping
         state: AxisState = AxisState.STOPPING,
         completion: Completion = Completion.REST,
     ) -> None:

@@ -190,6 +190,7 @@ class Permit:
         Raises:
             InterlockViolated: names the rule.
         """
+        # a motor without voltage holds nothing that could fall
         if self._gate.tracker.status.energised:
             for violation in self._gate.violations(InterlockKind.POWER_OFF, 0.0):
                 raise violation
@@ -200,6 +201,7 @@ class Permit:
         """Prepare a motion; see `Moves.load`. Part of it may start the drive's profile generator."""
         self._about_to(motion)
         self.ask_to_move()
+        # before its packets: part of a load may turn the shaft, and readings of that must be believed
         self._gate.expect(motion)
         self._gate.counts_per_s = self._counts_per_s
         with only_while(self.to_move()):
@@ -212,12 +214,14 @@ class Permit:
             stays: what was loaded ends where the axis stands, so the motion of the command has yet to begin.
         """
         condition = self.to_move()
+        # behind the condition, which so still asks for the first packet whether it comes in time
         if not stays:
             self.begin()
         try:
             with only_while(condition):
                 await self._gate.driver.start()
         finally:
+            # of this motion alone; the next one begins from what it finds
             self.by_s = math.inf
 
     async def track(self, position_counts: int) -> None:
@@ -225,6 +229,7 @@ class Permit:
         drive = self._gate.driver
         if Verb.TRACK not in drive.capabilities:
             raise cannot(drive.spec, "track")
+        # the drive follows without a profile: to judge readings it may be there at once
         motion = CountsMotion(position_counts, math.inf, math.inf)
         self._about_to(motion)
         condition = self.to_move()
@@ -236,6 +241,7 @@ class Permit:
 
     async def add_points(self, steps: Sequence[int]) -> PathStatus:
         """Fill the drive's buffer of path points; see `Moves.add_points`. A motion begins only with `start_path`."""
+        # how fast points are is not known here: rules for fast motions bind them
         self._counts_per_s = self._gate.counts_per_s = math.inf
         self.ask_to_move()
         with only_while(self.to_move()):
@@ -363,6 +369,7 @@ async def start_path(network: Network, names: frozenset[str], permits: Sequence[
     Raises:
         LdcndError: as `Permit.ask_to_move` of any member, and as `Network.start_path`.
     """
+    # made before any of them has begun: each still asks whether its command comes in time
     conditions = [permit.to_move() for permit in permits]
 
     def ask_all() -> None:

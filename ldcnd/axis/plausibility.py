@@ -186,6 +186,7 @@ class PlausibilityGate:
             standing: the axis was at rest, and nothing was commanded since.
         """
         known = self._known
+        # what was commanded is over, and explains no way from here
         if standing:
             self._expected = ()
         if known is None:
@@ -208,6 +209,7 @@ class PlausibilityGate:
         else:
             self._known, self._record = (reading, timing), _SURE
             if self._expected:
+                # those before the latest have been replaced by it
                 self._expected = self._expected[-1:]
             return _BELIEVED
         return self._weigh(known, reading, timing, fit)

@@ -71,6 +71,7 @@ class AxisPoller(Poller[AxisReading]):
     def ask_at(self, at_s: float) -> None:
         """Have the drive read at this instant as well; replaces an earlier request that was not met yet."""
         self._extra_s = at_s
+        # a poll that is to be repeated goes first, and plans behind it
         if self._again is None and min(self._grid_s, at_s) != self.due_at_s:
             self._plan()
             self._reschedule(self)
@@ -93,6 +94,7 @@ class AxisPoller(Poller[AxisReading]):
             return exchange
         if self._extra_s <= now_s:
             self._extra_s = NEVER_S
+            # otherwise the poll is due as well, and reads all that was asked for
             if now_s < self._grid_s:
                 self._plan()
                 return self._driver.reading(EXTRA_ITEMS)
@@ -125,6 +127,7 @@ class AxisPoller(Poller[AxisReading]):
             return
         if again:
             self._again = self._driver.reading(reply.asked)
+            # at once: until it agrees with another one a reading is held back
             self.due_at_s = timing.received_at_s
             self.deadline_at_s = timing.received_at_s + AGAIN_S
         else:

@@ -158,6 +158,7 @@ def _turning_speeds(legs: Sequence[_Leg], accelerations: Sequence[float], period
         allowed = [TURN_SHARE * a * period_s / turn for turn, a in zip(turns, accelerations, strict=True) if turn > 0]
         speeds.append(min([before.most_velocity, after.most_velocity, *allowed]))
     speeds.append(0.0)
+    # forwards, then backwards: no corner is faster than the legs before and behind it let it be
     for at, leg in enumerate(legs):
         speeds[at + 1] = min(speeds[at + 1], math.sqrt(speeds[at] ** 2 + 2 * leg.acceleration * leg.length))
     for at in range(len(legs) - 1, -1, -1):
@@ -178,6 +179,7 @@ class _Ramp:
 
     @classmethod
     def of(cls, leg: _Leg, v0: float, v1: float) -> "_Ramp":
+        # where speeding up from v0 meets slowing down to v1
         reachable = math.sqrt((v0 * v0 + v1 * v1) / 2 + leg.acceleration * leg.length)
         return cls(v0, v1, max(v0, v1, min(leg.most_velocity, reachable)), leg.acceleration, leg.length)
 
@@ -224,6 +226,7 @@ def _sampled(
             begun_s += ramps[at].duration_s
             at += 1
         point = legs[-1].end if t >= total_s else legs[at].at(min(ramps[at].way(t - begun_s), legs[at].length))
+        # the drive goes straight from point to point, past each corner between them
         cut = max([cut, *(_from_chord(corner, last, point) for corner in passed)])
         points.append(point)
         last = point

@@ -211,6 +211,7 @@ class AxisReadings:
 
     def miss(self, error: BusError) -> None:
         """Take note that a poll brought nothing, or nothing that can be used."""
+        # a damaged reply of who was not identified is no sign of life of this drive
         if not (self._proof.holds and isinstance(error, PacketRejected | BadReply)):
             self._count_miss()
             return
@@ -276,9 +277,11 @@ class AxisReadings:
         if reading.altered != altered or not reading.profile_done:  # a call less for each poll of what stands
             self._audit(reading, timing, altered)
         t, t_error_ns = self._clock.stamp(timing)
+        # until it is taken: a command that ends in between has ended with it
         self._digested = reading
         status = tracker.observe(reading, timing, t)
         self._digested = None
+        # the first reading of all is no return: there was nothing to lose
         if before.link is LinkState.DOWN and earlier is not None and self.returned:
             self.returned()
         if status.reference_lost and not before.reference_lost:
@@ -290,6 +293,7 @@ class AxisReadings:
                 self._queue.wake()
         if self._stops.inherited:
             self._stops.watch_inherited(reading, timing.sent_at_s)
+        # whoever waits for the end reads the position next: it must be that of the end
         if self._over:
             asked |= END_ITEMS
         self._telemetry.publish(tracker.status, reading, asked, t, t_error_ns)

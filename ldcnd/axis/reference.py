@@ -142,6 +142,7 @@ class ReferenceKeeper:
             before = await drive.evidence()
             if abs(before.mark) < LEAST_MARK:
                 return True  # no reference has such a mark
+            # a new mark would be the old one: it is the place where the axis stands
             if before.counter == before.mark:
                 return False
             await drive.leave_mark()
@@ -178,6 +179,7 @@ class ReferenceKeeper:
         self._proof = ReferenceEvidence(
             address=self._config.address, identity=identity, baud=baud, scale=_scale_of(self._config)
         )
+        # until it is known that there is none: one that cannot be read is there, too
         self._on_disk = True
         try:
             kept = await self._files.reference(self._config.name)
@@ -221,6 +223,7 @@ class ReferenceKeeper:
                 await self._keep_motion()
             else:
                 await self._woken_within(REST_S)
+                # something has changed again: it does not rest for long enough yet
                 if self.woken.is_set():
                     continue
                 await self._keep()
@@ -285,6 +288,7 @@ class ReferenceKeeper:
         except LdcndError as error:
             log.debug("reference not kept", axis=self._config.name, reason=error.message)
             return
+        # it may have been moved, or have lost its place, while the drive was read
         if not self._stands_referenced() or shown.position_lost:
             return
         if abs(shown.mark) < LEAST_MARK:
@@ -293,6 +297,7 @@ class ReferenceKeeper:
         low = high = shown.counter
         kept = self._kept
         if kept and kept.low == kept.high and abs(kept.low - shown.counter) <= AS_AFTER_RESET:
+            # a count or two of hunting are not worth a write
             low, high = kept.low, kept.high
         reference = KeptReference(
             format=FORMAT,
@@ -313,6 +318,7 @@ class ReferenceKeeper:
     async def _write(self, reference: KeptReference, generation: int) -> None:
         if self._files is None or generation != self._generation:
             return  # read under another origin
+        # before the disk has it: who forgets meanwhile is to remove it behind this
         was_there, self._on_disk = self._on_disk, True
         try:
             await self._files.keep_reference(self._config.name, reference)
@@ -335,6 +341,7 @@ class ReferenceKeeper:
         faults = self.faults = self.faults[-FAULTS_KEPT:]
         with contextlib.suppress(OSError):  # likewise
             await self._files.keep_faults(self._config.name, faults)
+        # also if it failed: the next fault tries again
         self._faults_kept = len(faults)
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:

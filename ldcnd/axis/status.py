@@ -235,6 +235,7 @@ class AxisStatus:
     @property
     def moving(self) -> Moving:
         """Whether the axis moves, as far as readings tell; never "no" without readings that prove it."""
+        # one that cannot be read may do anything, and so may one whose start was not confirmed
         if self.link is not LinkState.UP or (self.unsure and self.unsure.from_rest):
             return Moving.UNKNOWN
         rests = self.rest.rests
@@ -316,6 +317,7 @@ class AxisStatus:
             return ends_at_s
         if self.settle is None and at_s > ends_at_s + settling.timeout_s:
             return math.inf  # not as planned: the ordinary polls tell
+        # two readings at least within the time for which it must have stayed
         return at_s + max(settling.time_s / 2, SHORTEST_READING_PAUSE_S)
 
 

@@ -87,6 +87,7 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     faults = (*reading.faults, *status.own) if status.own else reading.faults
     if reading.altered and DRIVE_CHANGED not in faults:
         faults = (*faults, DRIVE_CHANGED)
+    # any reading ends both rows: the drive answers, and its reply can be used
     if status.misses or status.in_vain or status.link is not LinkState.UP:
         status = replace(status, misses=0, in_vain=0, link=LinkState.UP)
     if status.braking:
@@ -122,20 +123,25 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         status = replace(status, rest=rest, enabled=enabled)
     if status.unsure and status.unsure.from_rest and (shows_velocity(reading) or not reading.profile_done):
         status = _with(status, unsure=None)
+    # the command fails when it comes to rest, not before: until then it may still move
     if reading.cut_short and command:
         status = _with(status, failure=reading.cut_short)
+    # nothing holds it there any more
     if not enabled and status.target is not None:
         status = replace(status, target=None)
     if faults and any(fault.stops for fault in faults):
         lost = "; its position is lost" if status.position_lost else ""
         return _fail(status, f"the drive reports a fault{lost}")
     if enabled:
+        # with its loop closed it is not driven open any more, whatever came of the stop
         if status.driven_open:
             status = replace(status, driven_open=False)
         before = status
         if command and (status.way or status.pace):
             status = _watch_course(status, event)
+        # a stop that this reading has called for has ended the command, and the axis is in error_stop
         return _take_enabled(status, event, faults) if status.stop is before.stop else status
+    # an open loop is no failure where it was asked for, or is known already
     if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
         return status
     return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
@@ -180,8 +186,10 @@ def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
     """Take a reading of a closed loop that nothing has stopped; `faults` are warnings."""
     command, rests, reading = status.command, status.rest.rests, event.reading
     if command is None:
+        # nothing but a reset leads out of error_stop, and what is not known to rest or to move changes nothing
         if status.state is AxisState.ERROR_STOP or (rests is None and status.state is not AxisState.DISABLED):
             return status
+        # without a command of this daemon: somebody else's motion, or one of before
         state = AxisState.STANDSTILL if rests else AxisState.DISCRETE_MOTION
         return status if status.state is state else replace(status, state=state)
     match command.completion:
@@ -197,11 +205,13 @@ def _take_profile_end(
     status: AxisStatus, command: ActiveCommand, event: ReadingTaken, faults: tuple[Fault, ...]
 ) -> AxisStatus:
     settling, reading, at_s = command.settling, event.reading, event.sent_at_s
+    # what has failed need not settle
     if settling is None or status.failure:
         return _finished(status)
     progress, settled = (status.settle or SettleProgress(at_s + settling.timeout_s)).observe(settling, reading, at_s)
     if settled is None:
         return _with(status, settle=progress)
+    # it may never have begun, so that it stands elsewhere is no fault of the axis
     if not settled and status.unsure:
         return _finished(status, status.unsure.why, settled=False)
     if settled or not settling.faults:
@@ -224,6 +234,7 @@ def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
         state = AxisState.ERROR_STOP
     elif not reading.enabled:
         state = AxisState.DISABLED
+    # no reset of this daemon ends it: it goes with its faults
     first = status.first_fault if status.active_faults else None
     return _with(status, first_fault=first, rest=rest, enabled=reading.enabled, state=state)
 
@@ -251,6 +262,7 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
         return _with_faults(status, (fault,), event.now_ns)  # what is before it is known by now, or answers again
     if not was_up and not event.another:
         return status
+    # a counter that nobody watches may have been set, so what it shows later is no place
     status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=NOTHING_SEEN)
     status = _with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again
@@ -311,16 +323,19 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         state=command.state,
         settle=None,
         ends_at_s=None,
+        # no reading says anything of it before the drive has it
         effective_from_s=math.inf,
         last_error=last_error,
         interlock=status.interlock if command.state is AxisState.STOPPING else "",  # that is how it ends the motion
         target=None if command.state is AxisState.CONTINUOUS_MOTION else command.target,
         target_counts=None,
         approached=False,
+        # the motion replaces the stop that readings were to show
         braking=None,
         unsure=None,
         way=command.way,
         pace=None,
+        # it counts as moving before it does, so that nothing is decided by the rest of before
         rest=RestEvidence(rests=False, commanded=status.rest.commanded),
     )
 
@@ -347,6 +362,7 @@ def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
     command = status.command
     if command is None:
         return status
+    # of the whole motion, a part of which lies behind it
     duration_s = (event.now_ns - command.since_ns) / 1e9 + event.rest_s
     command = replace(command, duration_s=duration_s)
     return replace(status, command=command, ends_at_s=event.now_s + event.rest_s, pace=event.pace)
@@ -369,6 +385,7 @@ def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
         effective_from_s=event.now_s,
         target_counts=None,
         braking=None,
+        # a loop that closes holds the shaft; one that is let go may coast, or fall
         rest=RestEvidence(rests=True if on else None, commanded=on),
     )
 
@@ -404,6 +421,7 @@ def _send_stop(status: AxisStatus, event: StopSent) -> AxisStatus:
 def _keep_stop(status: AxisStatus, event: StopUnconfirmed) -> AxisStatus:
     status = _send_stop(status, StopSent(event.mode))
     stop = status.stop
+    # the fault keeps the instant from which the stop was wanted
     if stop is None or stop.fault:
         return status
     return replace(status, stop=OpenStop(stop.mode, entry_of(STOP_UNCONFIRMED, event.now_ns), event.how))
@@ -416,6 +434,7 @@ def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus
 
 def _confirm_stop(status: AxisStatus, event: StopConfirmed) -> AxisStatus:
     stop = status.stop
+    # the acknowledgement of a halt says nothing of a power-off that was asked for meanwhile
     return status if stop is None or STRENGTH[stop.mode] > STRENGTH[event.mode] else replace(status, stop=None)
 
 
@@ -431,7 +450,9 @@ def _recall_latch(status: AxisStatus, event: LatchRecalled) -> AxisStatus:
 def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
     return replace(
         status,
+        # MC_Reset leads to Standstill or, without power, to Disabled (PLCopen part 1, state diagram, notes 3 and 4)
         state=AxisState.STANDSTILL if status.enabled else AxisState.DISABLED,
+        # a reading that was asked for before still shows what was reset
         effective_from_s=event.now_s,
         stop_latched=False,
         position_lost=False,
@@ -559,6 +580,7 @@ def _end(
     command = status.command
     # what no drive has taken has no effect to wait for: readings count
     effective_from_s = 0.0 if math.isinf(status.effective_from_s) else status.effective_from_s
+    # what ended otherwise stands elsewhere: where, the first reading at rest tells
     target = status.target if how is CommandStatus.DONE else None
     status = _with(
         status,

@@ -127,14 +127,17 @@ class AxisStops:
         """
         if not self.possible:
             return False
+        # before its packet: whatever comes to its turn from here on finds that it is void
         overtaken = self.overtake(by, by.verb if by else OVERTAKES.get(verb, verb))
         stop = self._tracker.take(StopSent(mode)).stop
         try:
             if not self.line_up:
                 return False  # its line is being brought up, or is down: it is the first thing that is sent then
+            # what waits on the line; the packet on the wire is over before the stop goes
             self._bus.withdraw(self._drive.spec.address, overtaken)
             return await self._send(stop.mode if stop else mode, verb, STOP_ROUNDS, command_id)
         finally:
+            # also when this is cancelled: what is not confirmed by now its line sends again
             if still := self._tracker.status.stop:
                 self.require(still.mode)
             self._publish()
@@ -190,6 +193,7 @@ class AxisStops:
         So does velocity mode as soon as its velocity is reached; a trapezoid is done when it stands, and settles.
         """
         status, position = self._tracker.status, reading.position_counts
+        # this daemon moves it now, or it has come to rest by itself
         if status.command is not None or status.at_rest:
             self.inherited, self._done = False, None
         elif not (reading.enabled and reading.profile_done):
@@ -215,6 +219,7 @@ class AxisStops:
         stands = verb is Verb.HALT and status.command is None and status.moving is Moving.NO
         for _ in range(rounds):
             try:
+                # a drive that is being switched off makes it a power-off, which is confirmed then
                 mode = await self._drive.stop(mode)
             except BusError as error:
                 known = status.stop and status.stop.fault  # while a line is down this comes again with every try

@@ -108,6 +108,7 @@ def straight_line(axes: Mapping[str, LineAxis]) -> StraightLine:
     if not moved:
         return StraightLine({name: _standing(axis) for name, axis in axes.items()}, 0.0, 0.0)
     share_a = min(axis.most_acceleration / axis.way for axis in moved.values())
+    # the last of them is the peak of the triangle: beyond it velocity bounds nothing
     share_v = min(*(axis.most_velocity / axis.way for axis in moved.values()), math.sqrt(share_a))
     accelerations = {name: _acceleration(axis, share_a * axis.way) for name, axis in moved.items()}
     duration_s = max(
@@ -196,6 +197,7 @@ def _acceleration(axis: LineAxis, wanted: float) -> float:
 
 def _velocity(way: float, acceleration: float, duration_s: float) -> float:
     """Return the speed at which a way takes so long with this acceleration; the triangle's where it cannot."""
+    # way = v (duration - v / a), of which the smaller v is meant
     ramps = acceleration * duration_s
     root = ramps * ramps - 4 * way * acceleration
     return (ramps - math.sqrt(root)) / 2 if root > 0 else math.sqrt(way * acceleration)

@@ -33,6 +33,7 @@ def duration_from_s(way: float, before: float, velocity: float, acceleration: fl
     after_turning = way - math.copysign(braking_way(before, acceleration), before)
     if before < 0 or after_turning < 0:  # away from the target, or too fast to stop there
         return abs(before) / acceleration + profile_duration_s(abs(after_turning), velocity, acceleration)
+    # where speeding up from `before` meets slowing down to rest
     highest = math.sqrt(acceleration * way + before * before / 2)
     if highest < velocity:
         return (2 * highest - before) / acceleration

@@ -101,6 +101,7 @@ class CommandQueue:
         """Return when a command waits, when the axis was woken, or at the deadline, in loop time."""
         if self._waiting:
             return
+        # no await between this look and the wait, so that no wake-up is lost
         self._woken.clear()
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):

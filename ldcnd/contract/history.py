@@ -1,8 +1,10 @@
 """Where an axis was at an instant: the answer to a query of `tele/<axis>/at`."""
 
+from contextlib import suppress
 from datetime import datetime
 from typing import Final
 
+from ldcnd.contract.commands import LATEST_NS
 from ldcnd.contract.errors import MalformedRequest
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.samples import InputLevels, Quality
@@ -76,17 +78,20 @@ def refuse_more_than(axis: str, count: int) -> None:
 
 
 def _instant(text: str, now_ns: int) -> int:
-    try:
+    t = -1
+    with suppress(ValueError, OverflowError):
         if text.startswith("now(") and text.endswith("s)"):
-            return now_ns + round(float(text[4:-2]) * 1e9)
-        if text.isdecimal():
-            return int(text)
-        moment = datetime.fromisoformat(text)
-        seconds = round(moment.replace(microsecond=0).timestamp())
-    except (ValueError, OverflowError):
+            t = now_ns + round(float(text[4:-2]) * 1e9)
+        elif text.isdecimal():
+            t = int(text)
+        else:
+            moment = datetime.fromisoformat(text)
+            # apart from the microseconds: a float holds no nanoseconds of an instant of today
+            t = round(moment.replace(microsecond=0).timestamp()) * 1_000_000_000 + moment.microsecond * 1000
+    if not 0 <= t <= LATEST_NS:
         raise MalformedRequest(
             f"_time={text!r} is no instant",
             value=text,
             remedy="_time=now(-2s), RFC 3339, or ns since 1970, UTC; _time=[now(-2s)..now(-1s)] for a range",
-        ) from None
-    return seconds * 1_000_000_000 + moment.microsecond * 1000
+        )
+    return t

@@ -90,12 +90,13 @@ def build_daemon(
     clock = Clock(now_ns)
     publisher = Publisher(session, Keys(config.rig), ENCODINGS[config.telemetry.encoding])
     events = EventLog(publisher, clock, instance)
-    ledger = Ledger(events.changed, clock.now_s)
+    ledger = Ledger(events.changed, clock.now_s, events.is_reserved)
 
     def note(axis: str, verb: str, status: CommandStatus, reason: str, code: str | None) -> None:
         events.note(axis, verb, status, reason, code=code)
 
     kept = KeptFiles(config.state_dir) if config.state_dir else None
+    # a reset clears what proves a reference, so it is worth keeping only where drives are taken over
     taken_over = frozenset(axis.name for bus in config.bus if bus.takes_over for axis in bus.axis)
 
     def make_axis(axis: AxisConfig, bus: Bus, driver: Drive) -> AxisService:

@@ -88,6 +88,7 @@ class CaptureStore:
         captures = sorted(self._directory.glob(f"*{SUFFIX}"))
         sizes = {path: path.stat().st_size for path in captures}
         while len(sizes) > self._files or (sum(sizes.values()) > self._total_bytes and len(sizes) > 1):
+            # names begin with the time: behind a clock that was set back the newest comes first
             oldest = next(path for path in sizes if path != newest or len(sizes) == 1)
             oldest.unlink(missing_ok=True)
             del sizes[oldest]
@@ -213,9 +214,11 @@ class CaptureWatch:
                     continue
                 causes = frozenset(_causes(line, clock.now_s()))
                 news = causes - self._known.get(name, frozenset()) - frozenset(_inherited(line))
+                # not joined with those of before: what has gone and comes again is news
                 self._known[name] = causes
                 if news:
                     await asyncio.sleep(AFTERMATH_S)
+                    # counted from here, however long the disk takes
                     self._last_s[name] = clock.now_s()
                     snapshot = snapshot_of(line, self._run)
                     await asyncio.to_thread(self._write, snapshot, "; ".join(sorted(news)))
@@ -249,6 +252,7 @@ def _causes(line: BusService, now_s: float) -> Iterator[str]:
     for axis in line.axes:
         yield from _causes_of(axis)
     if line.bus.statistics.losses:
+        # with their number, so that each loss is a cause of its own
         yield f"line down {line.bus.statistics.losses}"
     if not line.bus.on_time(now_s):
         yield "line acts too late"

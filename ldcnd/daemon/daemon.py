@@ -2,8 +2,10 @@
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Coroutine
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from typing import Any
+
+from typing_extensions import override
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
@@ -11,6 +13,7 @@ from ldcnd.axis.latches import LatchKeeper
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig
+from ldcnd.contract.errors import SessionError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import API, DaemonInfo
@@ -28,7 +31,7 @@ from ldcnd.daemon.modules import Situation
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.rig_commands import AnswerReload
 from ldcnd.line.capture import Capture
-from ldcnd.log import get_logger
+from ldcnd.log import LogLimit, get_logger
 from ldcnd.net.hand_over import Load
 from ldcnd.net.publisher import Publisher
 from ldcnd.net.session import Declaration, Session
@@ -78,13 +81,14 @@ class Daemon:
         self._run = Run(instance, clock.now_ns(), clock)
         self._serving = asyncio.Event()
         self._ending = asyncio.Event()
-        self._failure: Exception | None = None
+        self._failure: BaseException | None = None  # the first; a panic inside Zenoh is no Exception
         self.captures = _capture_watch(self, self._run)
         self._declarations: list[Declaration] = []
         self._health = HealthWatch(rig, self._keys, publisher, clock, self._load)
         plan = plan_rig(config)
         self._health.stop_bounds_s = _stop_bounds_s(plan)
         self._health.overrides = self._dispatcher.interlocks.overrides
+        self._tokens_logged = LogLimit(now_s=clock.now_s)
         self._heartbeat = heartbeat
         if heartbeat:
             self._health.heartbeat = lambda: heartbeat.health
@@ -146,34 +150,33 @@ class Daemon:
         Start: stops first, so that no line is open that cannot be stopped; then lines, questions, and commands. Stop:
         commands are refused, what moves comes to rest, tokens go, lines close.
         """
-        async with contextlib.AsyncExitStack() as declared, asyncio.TaskGroup() as group:
+        async with contextlib.AsyncExitStack() as declared, GuardedGroup(self._guarded) as group:
             declared.callback(self._dispatcher.events.flush)  # last of all
             leases = self._dispatcher.leases
             leases.group = group
             requests = Requests(self.rig, self._keys, group, self._dispatcher)
             for each in self.rig.axes.values():
                 self._watch_link(each, group)
+            # what is cancelled at the end; commands under way are not among it, they end when their lines close
             serving: list[asyncio.Task[None]] = []
             try:
                 await self._declare_stops(declared, requests)
                 serving += [
-                    group.create_task(self._guarded(bus.run()), name=f"line {bus.bus.settings.name}")
-                    for bus in self.rig.buses
+                    group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses
                 ]
                 await self._declare(declared, requests)
-                serving.append(group.create_task(self._guarded(self._watch_axes()), name="liveliness"))
-                serving.append(group.create_task(self._guarded(self._latches.run()), name="latches"))
-                serving.append(group.create_task(self._guarded(leases.run()), name="leases"))
-                serving.append(group.create_task(self._guarded(self._dispatcher.interlocks.run()), name="interlocks"))
+                serving.append(group.create_task(self._watch_axes(), name="liveliness"))
+                serving.append(group.create_task(self._latches.run(), name="latches"))
+                serving.append(group.create_task(leases.run(), name="leases"))
+                serving.append(group.create_task(self._dispatcher.interlocks.run(), name="interlocks"))
                 serving += [
-                    group.create_task(self._guarded(module.run()), name=f"module {name}")
-                    for name, module in self.rig.modules.items()
+                    group.create_task(module.run(), name=f"module {name}") for name, module in self.rig.modules.items()
                 ]
-                serving.append(group.create_task(self._guarded(self._health.run()), name="health"))
+                serving.append(group.create_task(self._health.run(), name="health"))
                 if self._heartbeat:
-                    serving.append(group.create_task(self._guarded(self._heartbeat.run()), name="heartbeat"))
+                    serving.append(group.create_task(self._heartbeat.run(), name="heartbeat"))
                 if self.captures:
-                    serving.append(group.create_task(self._guarded(self.captures.run()), name="captures"))
+                    serving.append(group.create_task(self.captures.run(), name="captures"))
                 serving += [group.create_task(_served(guest), name="guest") for guest in self._guests]
                 self._serving.set()
                 log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._run.instance)
@@ -182,7 +185,9 @@ class Daemon:
                 for axis in self.rig.axes.values():
                     axis.close()  # first: what waits now would begin behind the stop that its policy sends
                 await self._come_to_rest()
+                # behind the axes: an interlock may forbid a level while something moves
                 await self._leave_outputs()
+                # behind them, too: a reference is kept of an axis that stands
                 await self._keep_references()
                 await self._latches.settled()
                 if self._failure:
@@ -200,9 +205,11 @@ class Daemon:
         """Do part of the daemon's work; if it fails, end in order, so that axes come to rest, and fail only then."""
         try:
             await work
-        except Exception as error:  # noqa: BLE001 - whatever is wrong in here, axes must not go on unwatched
+        except (asyncio.CancelledError, GeneratorExit, KeyboardInterrupt, SystemExit):
+            raise
+        except BaseException as error:  # noqa: BLE001 - whatever is wrong in here, axes must not go on unwatched
             log.error("internal error, the daemon ends", reason=repr(error))
-            self._failure = error
+            self._failure = self._failure or error
             self._ending.set()
 
     async def _declare_stops(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
@@ -212,6 +219,7 @@ class Daemon:
             await stops.declare(self._session, self._keys)
         for declaration in stops.hand_over(requests.on_stop):
             self._declarations.append(declaration)
+            # closed behind the lines: until then stops are taken, or refused once `finish` was called
             declared.push_async_callback(declaration.close)
 
     async def _declare(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
@@ -240,6 +248,7 @@ class Daemon:
     def _on_daemon(self, key: str, alive: bool) -> None:  # noqa: FBT001 - the session's signature
         """Note which other daemons serve this rig: two of them would move every axis twice."""
         address = self._keys.parse_alive(key)
+        # the watch shows this daemon's own token as well, and those of axes
         if address.axis is not None or address.instance == self._run.instance:
             return
         log.error("another daemon serves this rig", rig=self.rig.name, instance=address.instance, alive=alive)
@@ -250,7 +259,7 @@ class Daemon:
         try:
             async with asyncio.timeout(STOP_TIME_S), asyncio.TaskGroup() as group:
                 for name, axis in self.rig.axes.items():
-                    group.create_task(self._bring_to_rest(axis), name=f"rest {name}")
+                    group.create_task(self._guarded(self._bring_to_rest(axis)), name=f"rest {name}")
         except TimeoutError:
             log.error("not everything came to rest", rig=self.rig.name, limit_s=STOP_TIME_S)
         for name, axis in self.rig.axes.items():
@@ -263,6 +272,7 @@ class Daemon:
         while axis.tracker.status.stop_pending or axis.tracker.status.is_braking:
             await axis.send_pending_stop()
             await asyncio.sleep(STOP_AGAIN_S)
+        # behind the stop, since it opens the loop of an axis that holds lent gains
         await axis.take_gains_back()
 
     async def _leave_outputs(self) -> None:
@@ -308,15 +318,25 @@ class Daemon:
                 for name, axis in self.rig.axes.items():
                     alive = axis.tracker.status.link is not LinkState.DOWN
                     if alive and name not in tokens:
-                        tokens[name] = await self._session.declare_token(
-                            self._keys.alive_axis(self._run.instance, name)
-                        )
+                        with self._unless_congested(name):
+                            tokens[name] = await self._session.declare_token(
+                                self._keys.alive_axis(self._run.instance, name)
+                            )
                     elif not alive and name in tokens:
                         await tokens.pop(name).close()
                 await asyncio.sleep(TOKEN_PERIOD_S)
         finally:
             for token in tokens.values():
                 await token.close()
+
+    @contextlib.contextmanager
+    def _unless_congested(self, axis: str) -> Iterator[None]:
+        """Go on without a token that the network does not take, and try again: nothing moves by it, or stops for it."""
+        try:
+            yield
+        except SessionError as error:
+            if (fields := self._tokens_logged.admit()) is not None:
+                log.warning("axis not shown as alive", axis=axis, reason=error.message, **fields)
 
     def _info(self) -> DaemonInfo:
         return DaemonInfo(
@@ -329,6 +349,25 @@ class Daemon:
             axes=tuple(self.rig.axes),
             buses=tuple(bus.bus.settings.name for bus in self.rig.buses),
         )
+
+
+class GuardedGroup(asyncio.TaskGroup):
+    """Tasks of which one that fails does not cancel the others."""
+
+    def __init__(self, guarded: Callable[[Coroutine[Any, Any, Any]], Coroutine[Any, Any, None]]) -> None:
+        """Begin without tasks.
+
+        Args:
+            guarded: does the work of a task; sees to what it raises.
+        """
+        super().__init__()
+        self._guarded = guarded
+
+    @override
+    def create_task(  # type: ignore[override] # its stub names what differs between versions of Python
+        self, coro: Coroutine[Any, Any, Any], **kwargs: Any
+    ) -> "asyncio.Task[Any]":
+        return super().create_task(self._guarded(coro), **kwargs)
 
 
 async def _served(guest: Callable[[], Awaitable[None]]) -> None:

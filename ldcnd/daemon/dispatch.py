@@ -157,6 +157,7 @@ class Requests:
     def on_command(self, query: Query) -> None:
         """Take a query on `@cmd/**`."""
         self._dispatcher.leases.expire()  # before anything that waited while this process or its client was frozen
+        # counted first: to decode a request takes longer, and only a flood needs to know what it asks for
         if self._pending >= PENDING_REQUESTS and not self._takes_energy_out(query):
             self._refuse(
                 query,
@@ -232,6 +233,7 @@ class Requests:
         if self._closing and not command.takes_energy_out:
             raise ShuttingDown("the daemon is stopping", axis=address.axis)
         reply = await self._dispatcher.answer(address.axis, command, query.login, partial(self._reply, query))
+        # only now: what is wrong with the request of a stop keeps no stop back
         if complaint is not None:
             raise complaint.although(f"axis {address.axis}: {command.verb} was carried out, but")
         return reply
@@ -272,6 +274,7 @@ class Requests:
         try:
             confirmed = await self._rig.stop(names)
         except BaseException:
+            # who has joined it must not wait for ever
             own.set_exception(InternalError("the stop that this one had joined was cut short"))
             own.exception()  # perhaps no other stop has joined
             raise
@@ -399,6 +402,7 @@ class Dispatcher:
                 return await self.carry_out(axis, command, login, accept)
             case Acquire():
                 lease = self.leases.acquire(command)
+                # behind it: only now is there a token to name it by
                 self._journal.asked(RIG_ITSELF, command, lease.token)
                 return lease.reply()
             case _:
@@ -422,29 +426,33 @@ class Dispatcher:
         if command.effect is Effect.QUESTION:
             return await axis.execute(command)
         if isinstance(command, Jog) and command.renews is not None:
+            # no entry in the ledger: a renewal comes several times a second, and begins nothing
             self._admit(axis_name, command)
             return axis.renew_jog(command, command.renews)
         command_id = command.command_id or self.events.next_command_id()
         client, right, accepted = command.client, UNCONDITIONAL, asyncio.Event()
         if command.takes_energy_out:
-            if self._ledger.is_taken(command_id):
+            # a stop whose id was used is no repetition: it is sent, under another one
+            if self._ledger.is_taken(command.command_id):
                 command_id = self.events.next_command_id()
             client = client or self._holder_by(axis_name, command)
         else:
-            if entry := self._ledger.repeated(command_id, axis_name, command):
+            if entry := self._ledger.repeated(command.command_id, axis_name, command):
                 return await self._answer_again(entry)
+            # behind the ledger: a repetition has an old sequence, and is answered all the same
             client = self._admit(axis_name, command) or client
             right = self._right(axis_name, command, accepted)
         hold = axis.begin_hold(command_id, command) if isinstance(command, Jog) else None
         if hold:
             right = right.also(lambda: hold.check(self._clock.now_s()))
         permit = axis.permit(command_id, command.verb, right)
-        self._ledger.open(LedgerEntry(command_id, axis_name, command, client, login))
+        self._enter(LedgerEntry(command_id, axis_name, command, client, login))
         over = self._under_way[command_id] = asyncio.Event()
         try:
             if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
 
                 def waits(ahead: str) -> None:
+                    # its sender has a reply from here on: only `not_after` bounds how long it may wait
                     accepted.set()
                     accept(self._ledger.waits(command_id, ahead))
 
@@ -459,11 +467,26 @@ class Dispatcher:
         finally:
             del self._under_way[command_id]
             over.set()
+            # a jog that was refused must not be renewed into life
             if hold and not hold.begun:
                 hold.over = True
 
+    def _enter(self, entry: LedgerEntry) -> None:
+        """Enter a command that begins.
+
+        Raises:
+            TooManyRequests: as `Ledger.open`.
+        """
+        try:
+            self._ledger.open(entry)
+        except Exception:
+            if not entry.command.takes_energy_out:
+                raise
+            log.exception("command not entered", axis=entry.axis, verb=entry.verb)  # it is carried out all the same
+
     async def _start(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
         reply = await axis.execute(command, permit)
+        # a reading may have ended it while its reply was on the way: then its end is entered already
         moving = axis.tracker.status.is_at(permit.command_id)
         ends_later = command.ends is Ends.BY_READING and moving
         status = CommandStatus.EXECUTING if ends_later else CommandStatus.DONE
@@ -515,6 +538,7 @@ class Dispatcher:
                 limit=self._instance,
                 remedy="look where the axis is, then send a new command to this run",
             )
+        # before the lease: what is refused here must use up none of its sequence
         self._refuse_late(axis, command)
         return self.authority.admit(axis, command.lease, command.sequence, self._clock.now_s())
 

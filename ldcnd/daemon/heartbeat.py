@@ -93,6 +93,7 @@ class Heartbeat:
                     output.close()
                 await asyncio.sleep(REOPEN_S)
         finally:
+            # not waited for: a driver may hang in it
             thread.shutdown(wait=False, cancel_futures=True)
 
     async def _change(self, output: Output, thread: ThreadPoolExecutor) -> None:

@@ -144,6 +144,7 @@ class Interlocks:
             module.changed = self._note_change
 
     def _rule(self, config: InterlockConfig) -> BoundRule:
+        # a look may come `within_ms / LOOKS` late, so what is read must be younger than the bound by that
         age_s = config.within_ms / 1e3 * (1 - 1 / LOOKS)
         axis = dict(self._rig.axes).get(config.of)
         holders = (config.of,) if axis else self._modules[config.of].axes
@@ -168,6 +169,7 @@ class Interlocks:
         for requirement in rule.requires:
             if text := requirement(watched):
                 return text
+        # not while an output is being written: then it may hold for those who only watch
         if rule.modules and not any(module.before for module in rule.modules):
             age_s = rule.config.within_ms / 1e3 * (1 - 1 / LOOKS)
             rule.version, rule.until_s = self._version, min(each.read_at_s for each in rule.modules) + age_s
@@ -250,6 +252,7 @@ class Interlocks:
             if rule.axis is not None or rule.config.of not in levels:
                 continue
             level = levels[rule.config.of]
+            # an output that is let go of may become anything, so every rule of it binds
             kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW
             if kind in (None, *rule.kinds) and (text := self._obstacle(rule)):
                 raise rule.violation(f"output {rule.config.of}", text)
@@ -263,6 +266,7 @@ class Interlocks:
         async with asyncio.TaskGroup() as group:
             while True:
                 try:
+                    # once a second even where only outputs are bound: overrides end by time
                     async with asyncio.timeout(min(self._period_s, 1.0)):
                         await self._changed.wait()
                 except TimeoutError:

@@ -137,6 +137,7 @@ class Authority:
             self._end(old, f"was taken by {client}" if old.client != client else "was replaced by its own client")
         lease = Lease(self._next_token(), client, wanted, duration_s, now_s + duration_s)
         self._leases[lease.token] = lease
+        # what its holder has begun, or has waiting, goes on under the new one
         self._successors.update((old.token, lease.token) for old in displaced if old.client == client)
         return lease, displaced
 
@@ -210,6 +211,7 @@ class Authority:
         if token is None:
             self._admit_without(axis, now_s)
             return
+        # each was made behind the one before it, so this comes to an end
         while token in self._successors:
             token = self._successors[token]
         lease = self._leases.get(token)
@@ -280,6 +282,7 @@ class LeaseWatch:
         while True:
             self.expire()
             left_s = self._authority.next_end_s() - self._clock.now_s()
+            # a lease that is given meanwhile lasts at least as long as this sleeps
             await asyncio.sleep(min(left_s, SHORTEST_LEASE_S))
 
     def expire(self) -> None:
@@ -324,6 +327,7 @@ class LeaseWatch:
         lease = self._authority.release(token, self._clock.now_s())
         self._show(lease.axes)
         log.info("control released", client=lease.client, axes=sorted(lease.axes), leave_running=leave_running)
+        # what is not seen to rest counts as moving
         states = {name: self._rig.axes[name].tracker.status for name in lease.axes}
         moving = [name for name, each in states.items() if each.commanded and each.moving is not Moving.NO]
         if not leave_running:
@@ -350,6 +354,7 @@ class LeaseWatch:
 
     def _lost(self, lease: Lease, axes: Iterable[str], cause: str, code: ErrorCode | None) -> None:
         axes = sorted(axes)
+        # who gives control back is there, and sets its outputs itself
         if code is ErrorCode.LEASE_EXPIRED:
             for module in self._rig.modules.values():
                 if not lease.axes.isdisjoint(module.axes):

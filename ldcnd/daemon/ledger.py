@@ -79,33 +79,48 @@ class LedgerEntry:
 class Ledger:
     """The commands of one rig, latest last."""
 
-    def __init__(self, changed: Callable[[LedgerEntry, LdcndError | None], None], now_s: Callable[[], float]) -> None:
+    def __init__(
+        self,
+        changed: Callable[[LedgerEntry, LdcndError | None], None],
+        now_s: Callable[[], float],
+        is_reserved: Callable[[str], bool] = lambda _: False,
+    ) -> None:
         """Begin empty.
 
         Args:
             changed: called with every entry and every change of status, and the error that goes with it.
             now_s: returns the time, in seconds.
+            is_reserved: tells whether an id is for commands that come without one.
         """
         self._entries: dict[str, LedgerEntry] = {}
         self._of_senders: OrderedDict[str, OrderedDict[str, None]] = OrderedDict()
         self._until_s: dict[int, float] = {}  # by fingerprint, in the order of expiry
         self._changed = changed
         self._now_s = now_s
+        self._is_reserved = is_reserved
 
-    def is_taken(self, command_id: str) -> bool:
-        """Tell whether an id names another command already, or has."""
-        return command_id in self._entries or self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s()
+    def is_taken(self, command_id: str | None) -> bool:
+        """Tell whether the id that a sender chose, if it did, names another command already, or has, or may."""
+        return command_id is not None and (
+            command_id in self._entries or self._is_remembered(command_id) or self._is_reserved(command_id)
+        )
 
-    def repeated(self, command_id: str, axis: str, command: AxisCommand[CommandReply]) -> LedgerEntry | None:
-        """Return the entry that this id has already, or None when it is new.
+    def _is_remembered(self, command_id: str) -> bool:
+        return self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s()
+
+    def repeated(self, command_id: str | None, axis: str, command: AxisCommand[CommandReply]) -> LedgerEntry | None:
+        """Return the entry that the id which a sender chose has already; None when it is new, or the sender chose none.
 
         Raises:
-            CommandIdReused: the id belongs to another command, or to one whose answer was evicted.
+            CommandIdReused: the id belongs to another command, to one whose answer was evicted, or to the daemon.
         """
+        if command_id is None:
+            return None
         entry = self._entries.get(command_id)
-        if entry is None and self._until_s.get(_fingerprint(command_id), -math.inf) > self._now_s():
+        if entry is None and (self._is_remembered(command_id) or self._is_reserved(command_id)):
+            own = "is one of those that the daemon gives" if self._is_reserved(command_id) else "was taken before"
             raise CommandIdReused(
-                f"command id {command_id!r} was taken before, its answer is not kept; it is not carried out again",
+                f"command id {command_id!r} {own}, its answer is not kept; it is not carried out again",
                 axis=axis,
                 value=command_id,
                 remedy=Remedy("{}; give every command an id of its own", step("events", "look at the events")),
@@ -141,8 +156,10 @@ class Ledger:
         Raises:
             TooManyRequests: it has an id of its own, and there is no room to remember that.
         """
+        # first: what cannot be remembered is refused before anything of it exists
         self._remember(entry)
         self._entries[entry.command_id] = entry
+        # by its login where it has one: any client may call itself by the name of another
         sender = RESTING if entry.command.takes_energy_out else entry.login or entry.client or ""
         entries = self._of_senders.setdefault(sender, OrderedDict())
         self._of_senders.move_to_end(sender)
@@ -210,6 +227,7 @@ class Ledger:
         if command.lease is not None and command.sequence is not None:
             return
         now_s = self._now_s()
+        # all live equally long, so the first to be entered is the first to expire
         while self._until_s and next(iter(self._until_s.values())) <= now_s:
             del self._until_s[next(iter(self._until_s))]
         if len(self._until_s) >= LARGEST_MEMORY:
@@ -252,6 +270,7 @@ def status_of(error: LdcndError) -> CommandStatus:
 
 
 def _fingerprint(command_id: str) -> int:
+    # 64 bits: that any two of `LARGEST_MEMORY` ids are alike has a chance of 2e-9
     return int.from_bytes(hashlib.blake2b(command_id.encode(), digest_size=8).digest(), "big")
 
 
@@ -317,10 +336,15 @@ class EventLog:
         """Return an id for a command that came without one."""
         return f"{self._run}-{next(self._serial)}"
 
+    def is_reserved(self, command_id: str) -> bool:
+        """Tell whether an id is one that `next_command_id` has returned, or may return."""
+        return command_id.startswith(f"{self._run}-")
+
     def changed(self, entry: LedgerEntry, error: LdcndError | None) -> None:
         """Take a change of the ledger; what is refused at once was never accepted."""
         if entry.status is CommandStatus.REFUSED and self._news and _is_acceptance(self._news[-1].entry, entry):
             self._news.pop()
+            # nobody has seen its number: who asks for events has them published first
             self._end -= 1
             self._sequence[entry.axis] -= 1
         seq = self._sequence.get(entry.axis, 0)
@@ -371,6 +395,7 @@ class EventLog:
         code: str | None = None,
     ) -> None:
         """Enter what concerns an axis and is in no ledger: control that was lost or refused, a stop confirmed late."""
+        # first, since what waits to be published has lower numbers
         self.flush()
         seq = self._sequence.get(axis, 0)
         self._sequence[axis] = seq + 1

@@ -106,6 +106,7 @@ class BusService:
 
     async def stop_together(self, mode: StopMode, names: frozenset[str]) -> None:
         """Stop axes with closed loops by one packet if they form groups; each must be stopped by itself besides."""
+        # which groups there are is known once the line is up; each axis is stopped by itself anyway
         if self.report is None:
             return
         try:
@@ -194,13 +195,16 @@ class BusService:
                     axis.stops.switch_off()  # nothing in the drive ends a raw duty that an earlier host has left
                 else:
                     axis.taken_over()
+            # what was found open just now, and what has come during the bring-up
             await self._send_pending_stops()
+            # once in the life of a daemon: afterwards it knows itself what it knows
             if not self._was_up:
                 for axis in self.axes:
                     await axis.recall(report)
             self.report, self._baud = report, report.baud
             self._connect(report)
             await self._scan_for_lost_drives()
+            # from here to the last axis nothing is awaited, so nobody sees the one without the other
             self.report, self.problem = None, "the line was lost"
             self._link_events.lost(f"the line was lost: {self.bus.loss_reason}".rstrip(": "))
             self._up.clear()
@@ -216,12 +220,14 @@ class BusService:
         if error.message != self.problem:
             log.error("line not up", bus=self.bus.settings.name, reason=error.message, remedy=error.remedy)
         self.problem = error.message
+        # something that answers and does not match is not silent: its axes say `not_identified`
         self.bus.proofs.lose_all(error.message, silent=not isinstance(error, NetworkMismatch))
         for axis in self.axes:
             axis.disconnected()
 
     async def _send_pending_stops(self) -> None:
         """Send what no drive has confirmed, to all axes that wait for it at once."""
+        # before the look: a stop that comes while these are sent is not lost
         self._stop_wanted.clear()
         waiting = [axis for axis in self.axes if axis.tracker.status.stop_pending or axis.tracker.status.off_again]
         if not waiting:
@@ -248,6 +254,7 @@ class BusService:
             stops = tasks.create_task(self._repeat_stops(), name=f"stops on {self.bus.settings.name}")
             pause_s = FIRST_SCAN_PAUSE_S
             while not await self._closed_within(pause_s):
+                # before the search: who is heard during it is searched for once more
                 self.bus.proofs.heard_again.clear()
                 pause_s = await self._search() if self.network.incomplete() else FIRST_SCAN_PAUSE_S
             stops.cancel()
@@ -262,6 +269,7 @@ class BusService:
                     await self._stop_wanted.wait()
             began_s = loop.time()
             await self._send_pending_stops()
+            # nothing is to be repeated: only who needs a stop ends the wait
             pause_s = None
             if any(axis.tracker.status.stop_pending for axis in self.axes):
                 # polls of a mute drive come ever more seldom: one that hears again gets its stop before them
@@ -277,6 +285,7 @@ class BusService:
         began_s = loop.time()
 
         def heard(name: str) -> None:
+            # a new poller is due at once; that of a mute drive is put off ever longer
             self._poll(self._axis(name), loop.time())
             self._stop_wanted.set()
 

@@ -27,7 +27,7 @@ class LinkEvents:
         self._what, self._code = what, code
         self._lost_at_s: float | None = None
         self._back_at_s = 0.0
-        self._said_at_s = -LONGEST_S
+        self._said_at_s = -LONGEST_S  # the first loss of all follows none
         self._stays_s = STAYS_S
         self._times = 0
         self._besides: dict[str, None] = {}
@@ -37,6 +37,7 @@ class LinkEvents:
         """Take note that it has stopped answering."""
         if self._lost_at_s is not None:
             if self._due:
+                # it did not stay: its return is told once, with how often it was lost
                 self._due.cancel()
                 self._due, self._times = None, self._times + 1
             return

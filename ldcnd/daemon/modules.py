@@ -126,7 +126,7 @@ class ModuleService:
         self._clock = clock
         self._topic = publisher.item(driver.name, TelemetryItem.IO)
         self._misses = 0
-        self._situation: Situation | None = None
+        self._situations: dict[Situation, None] = {}  # whose levels are yet to be written, the oldest first
         self._due = asyncio.Event()
         self._seen = False
         self._writes = asyncio.Lock()
@@ -162,13 +162,16 @@ class ModuleService:
             self.changed()
 
     def _observed(self, reading: IoReading, timing: Timing) -> None:
+        # from its address, but perhaps from another module
         if not self._driver.proof.holds:
             self._lost()
             return
         if self._reading is None or self._driver.restarted:
             self._returned()
+        # a reply to a request from before the write tells the level of before
         for name in [name for name, until_s in self._unread_until_s.items() if timing.sent_at_s >= until_s]:
             del self._unread_until_s[name], self.before[name]
+        # when it was asked for, since the level may have changed directly behind that
         self._misses, self._reading, self.read_at_s = 0, reading, timing.sent_at_s
         values = {
             name: each.take(reading.levels[each.line - 1], timing.true_from_s) for name, each in self._inputs.items()
@@ -196,6 +199,7 @@ class ModuleService:
             self._differs[name] = 0
             return False
         self._differs[name] = min(before + 1, DIFFERS_AFTER)
+        # said once, by the reading that completes the row
         if before != DIFFERS_AFTER - 1:
             return before == DIFFERS_AFTER
         reason = f"output {name} was set {_word(written)} and its pin shows {_word(not written)}: check what it drives"
@@ -211,6 +215,7 @@ class ModuleService:
 
     def _gone(self) -> None:
         """It is out of reach: nothing is known of its lines."""
+        # one that has never answered was not lost
         if self._seen:
             self._link_events.lost()
         self._reading, self.read_at_s = None, -math.inf
@@ -283,6 +288,7 @@ class ModuleService:
             except LdcndError:
                 self._take(values)
                 raise
+            # without an end while it is written: any reply may be to a request from before
             self._unread_until_s |= dict.fromkeys(changes, math.inf)
             self.before = {name: (values[name], self.read_at_s) for name in changes} | self.before
             try:
@@ -295,6 +301,7 @@ class ModuleService:
                         self._set[name] = level
                 return reading
             finally:
+                # also after an error: which of the packets have arrived is not known
                 self._unread_until_s |= dict.fromkeys(changes, asyncio.get_running_loop().time())
 
     async def set_timer(self, command: SetIoTimer, condition: Condition) -> IoReply:
@@ -307,6 +314,7 @@ class ModuleService:
         enabled, edges = command.mode is not IoTimer.OFF, command.mode is IoTimer.COUNTER
         with only_while(condition):
             await self._driver.set_timer(enabled=enabled, counts_edges=edges, prescale=command.prescale)
+        # sets nothing: only its last packet is sent, which reads
         reading = await self._driver.set_outputs({}, frozenset(), (None, None))
         return self._replied(reading)
 
@@ -329,12 +337,14 @@ class ModuleService:
         elif self._seen:
             self.enter(Situation.BUS)
         self._driver.restarted, self._seen = False, True
+        self._due.set()  # also for what has happened while nothing could be written
         self._link_events.back()
 
     def enter(self, situation: Situation) -> None:
-        """Have the outputs written that have a level in a situation."""
+        """Have the outputs written that have a level in a situation, once the module is within reach."""
         if any(situation.level_of(output) is not None for output in self._outputs.values()):
-            self._situation = situation
+            self._situations.pop(situation, None)
+            self._situations[situation] = None  # behind the others: what has happened last has the last word
             self._due.set()
 
     async def run(self) -> None:
@@ -342,16 +352,18 @@ class ModuleService:
         while True:
             await self._due.wait()
             self._due.clear()
-            situation, self._situation = self._situation, None
-            if situation and not await self.apply(situation):
-                await asyncio.sleep(APPLIED_AGAIN_S)
-                if not self._due.is_set():
-                    self.enter(situation)
+            while self._situations and self._reading is not None:
+                situation = next(iter(self._situations))
+                del self._situations[situation]  # before it is written: it may come again meanwhile
+                if not await self.apply(situation):
+                    if situation not in self._situations:
+                        self._situations = {situation: None} | self._situations
+                    await asyncio.sleep(APPLIED_AGAIN_S)
 
     async def apply(self, situation: Situation) -> bool:
         """Write the outputs that have a level in a situation; one that may not be written stays as it is.
 
-        Returns False when packets were lost.
+        Returns False when packets were lost, or the module is out of reach.
         """
         complete = True
         for name, output in self._outputs.items():
@@ -362,7 +374,7 @@ class ModuleService:
             try:
                 await self._write({output.line: level}, frozenset(), (None, None), lambda: None)
             except LdcndError as error:
-                complete = complete and not isinstance(error, BusError)
+                complete = complete and self._driver.proof.holds and not isinstance(error, BusError)
                 log.warning("output not set", module=self.name, output=name, reason=error.message)
                 self._note(
                     situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value

@@ -78,6 +78,7 @@ class Reloader:
                         limit=reload.revision,
                         remedy="look at the changes again, then reload",
                     )
+                # all of them before the first is changed
                 for axis in reload.axes:
                     admit(axis)
                 self._take(reload, budget)
@@ -98,6 +99,7 @@ class Reloader:
 
     def _prepare(self, running: RigConfig) -> "tuple[ReloadPlan, RigBudget]":
         reload = plan_reload(running, self._load())
+        # before anything is taken: polls that the line cannot carry are refused whole
         return reload, require_plan(reload.config)
 
     def _take(self, reload: "ReloadPlan", budget: RigBudget) -> None:
@@ -172,6 +174,7 @@ def _bus(running: BusConfig, wanted: BusConfig) -> BusConfig:
     if running.family != wanted.family:
         return running
     wanted_axes = {axis.name: axis for axis in wanted.axis}
+    # an axis that is missing from the file stays as it is until the restart
     axes = tuple(_axis(axis, wanted_axes.get(axis.name, axis)) for axis in running.axis)
     return running.model_copy(update={"axis": axes})
 
@@ -186,6 +189,7 @@ def _axis(running: AxisConfig, wanted: AxisConfig) -> AxisConfig:
         return running
     merged = running.model_copy(update={key: getattr(wanted, key) for key in running.reloadable})
     try:
+        # validated anew, since `model_copy` checks nothing
         return type(running).model_validate(merged.model_dump())
     except ValidationError as error:
         reasons = "; ".join(detail["msg"].removeprefix("Value error, ") for detail in error.errors())

@@ -99,6 +99,7 @@ class OwnedRig:
         chosen = [self.axes[name] for name in names]
         async with asyncio.TaskGroup() as group:
             for bus in self.buses:
+                # closed loops only: a stop that holds would close the open ones of its group
                 closed = frozenset(
                     axis.config.name for axis in bus.axes if axis in chosen and axis.tracker.status.enabled
                 )

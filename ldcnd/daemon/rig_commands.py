@@ -210,6 +210,7 @@ class RigCommands:
                 service, to_place = self._rig.axes[axis], command.position is not None
                 turns = not to_place and command.distance is None
                 causes = service.obstacles_to_motion(absolute=to_place, turns=turns, speed=command.velocity)
+                # a preview names no lease
                 not_admitted = refused(lambda: self._admit(axis, None))
                 return service.preview(command, tuple(each.text for each in _causes(service, not_admitted + causes)))
             case ReportShadow():
@@ -268,6 +269,7 @@ class RigCommands:
             status, said, code = status_of(error), f"{what}: {error.message}", error.code.value
             raise
         finally:
+            # what only reads is not entered
             if what:
                 self._note_outputs(module.name, (status, said, command.client or holder, login), code)
         return reply
@@ -440,6 +442,7 @@ async def _all_of(
         try:
             return await execute(name, request)
         except LdcndError as error:
+            # refused before its turn it never meets the others, who would wait for it in vain
             rendezvous.fail(error)
             return error
 
@@ -530,6 +533,7 @@ async def rehearse(rig: OwnedRig, request: Rehearse) -> RehearsalReply:
         policy = axis.config.loss.daemon
     else:
         bus = _bus_of(rig, request.axis)
+        # what is down already cannot be lost
         bus.check_up()
         bus.bus.drop("rehearsed loss")
         try:

@@ -60,6 +60,7 @@ def require_writable(rig: RigConfig) -> None:
     for key, directory in (("state_dir", rig.state_dir), ("captures.directory", rig.captures.directory)):
         if directory is None:
             continue
+        # the nearest folder that is there: those below it the daemon makes itself
         there = next(place for place in (directory.absolute(), *directory.absolute().parents) if place.exists())
         if not (there.is_dir() and os.access(there, os.W_OK | os.X_OK)):
             allowed = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
@@ -93,6 +94,7 @@ def last_words(speak: Callable[[], object]) -> Iterator[None]:
     """
 
     def aborted(number: int, _frame: FrameType | None) -> None:
+        # first: another abort, while this one speaks, ends the process at once
         signal.signal(number, signal.SIG_DFL)
         try:
             speak()
@@ -139,6 +141,7 @@ def _hold(device: Path) -> int | None:
             remedy="give the daemon write access, or set hold_cpu_awake = false",
         )
         return None
+    # 0 microseconds, as a 32-bit number
     os.write(descriptor, bytes(4))
     log.info("processor held awake", device=str(device))
     return descriptor
@@ -240,6 +243,7 @@ class Service:
         await self._daemon.wait_serving()
         while True:
             await self._asked.wait()
+            # before the file is read: who asks meanwhile means what it says by then
             self._asked.clear()
             await self._assure(systemd.reloading(self._monotonic_ns()))
             self._remark = await self._reload()

@@ -150,6 +150,7 @@ class Query:
             InternalError: the query was answered already.
         """
         self._refuse_second_answer()
+        # before it is sent: if that fails, `__del__` must not answer a second time
         self._answered = True
         self._send(tuple(self._answers))
 
@@ -226,6 +227,7 @@ class HandOver(Generic[ItemT]):
                 self._items.popleft()
                 self._lost += 1
             self._items.append(item)
+            # one wake-up serves a batch: each of them is a system call
             if self._woken:
                 return
             self._woken = True
@@ -256,6 +258,7 @@ class HandOver(Generic[ItemT]):
                 self._deliver(item)
         finally:
             with self._lock:
+                # also when a callback has raised: it is not the fault of those that wait behind it
                 self._woken = bool(self._items)
             if self._woken:
                 self._loop.call_soon(self._drain)
@@ -316,6 +319,7 @@ class Intake:
         del source
         with self._lock:
             capacity = self._capacity
+            # asked only then, since it parses the key, on Zenoh's thread
             if self._pending >= capacity and self._spared(key):
                 capacity = PENDING_URGENT_QUERIES
             if self._pending >= capacity:

@@ -72,6 +72,7 @@ async def _tcp_refusal(endpoint: str, address: str) -> str:
 async def _tls_refusal(endpoint: str, address: str, root: str | None) -> str:
     context = ssl.create_default_context(cadata=root)
     try:
+        # in TLS 1.3 a client's handshake is over before the server has judged its certificate (RFC 8446, 2)
         async with _connected(address, context):
             return (
                 f"{endpoint} answers but refuses this login: no certificate, one that has ended,"

@@ -123,6 +123,7 @@ class Reads:
         read = self._current = self._current or self._next()
         if read is None:
             return
+        # first: the others get their turns even if this step raises
         self._wake()
         try:
             next(read.steps)

@@ -12,6 +12,10 @@ from concurrent.futures import Future
 from functools import partial
 from typing import TypeVar
 
+from ldcnd.log import get_logger
+
+log = get_logger("workers")
+
 ResultT = TypeVar("ResultT")
 
 Job = Callable[[], None]
@@ -50,6 +54,7 @@ class Workers:
         """Have a job done that must not raise. Any thread, never blocks."""
         ended: Future[None] | None = None
         with self._lock:
+            # in the lock, so that `stop` puts its marks behind every job that was taken
             self._jobs.put(job)
             if self._free:
                 self._free -= 1
@@ -84,6 +89,7 @@ class Workers:
         try:
             async with asyncio.timeout(timeout_s):
                 return await asyncio.wrap_future(future)
+        # also of a caller that was cancelled: what comes into being meanwhile would be nobody's
         except (TimeoutError, asyncio.CancelledError):
             future.add_done_callback(partial(self._undo, undo))
             raise
@@ -94,6 +100,7 @@ class Workers:
             if not self._stopping:
                 self._stopping = True
                 for _ in self._ended:
+                    # one for each thread: who has taken its own takes nothing more
                     self._jobs.put(None)
         try:
             async with asyncio.timeout(timeout_s):
@@ -115,7 +122,10 @@ class Workers:
     def _work(self, ended: Future[None]) -> None:
         try:
             while job := self._jobs.get():
-                job()
+                try:
+                    job()
+                except BaseException:  # a panic in Zenoh is no Exception; those who wait are not to blame for it
+                    log.exception("bug on a worker thread", thread=self._name)
                 # what the job holds must not live until the next one comes
                 del job
                 with self._lock:

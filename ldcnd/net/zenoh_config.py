@@ -45,6 +45,7 @@ def zenoh_config(settings: ZenohSettings) -> zenoh.Config:
     wanted = settings.required() | {
         path: value
         for path, value in settings.optional().items()
+        # a file counts where it says something else than Zenoh says by itself
         if value or not settings.config_file or config.get_json(path) == default.get_json(path)
     }
     for path, value in wanted.items():

@@ -105,6 +105,7 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
         )
     config = zenoh_config(settings)
     listen, connect = endpoints(config, "listen"), endpoints(config, "connect")
+    # only who listens serves many: a client that connects keeps Zenoh's single sending thread
     if listen:
         provide_threads()
     workers = Workers("zenoh open", 1)
@@ -152,7 +153,7 @@ class ZenohSession(Session):
         self._session = session
         self._loop = asyncio.get_running_loop()
         self._workers = Workers("zenoh", OTHER_THREADS)
-        self._ordered_workers = Workers("zenoh in order", 1)
+        self._ordered_workers = Workers("zenoh in order", 1)  # a single thread: nothing that it sends is overtaken
         self._urgent_workers = Workers("zenoh stops", ANSWER_THREADS)
         self._command_workers = Workers("zenoh commands", ANSWER_THREADS)
         self._read_workers = Workers("zenoh reads", ANSWER_THREADS)
@@ -163,6 +164,7 @@ class ZenohSession(Session):
         self._logins: dict[str, str | None] = {}
         self._link_changes: object = None  # the listener, once a login was asked for
         self._stamps = Stamps(session.new_timestamp().get_id())
+        # a query or sample does not tell its sender otherwise; the number, which nobody reads, is 0
         self._source_info = zenoh.SourceInfo(session.id, 0)
         self._closed = False
 
@@ -181,6 +183,7 @@ class ZenohSession(Session):
         timestamp = self._stamps.of(measured_at_ns)
         outlet = self._outlets.get(key) or self._new_outlet(key, qos)
         try:
+            # a declared publisher has one quality of service for all that it sends
             declared = outlet.publisher if outlet.qos is qos else None
             put = declared.put if declared else partial(self._session.put, key, **TRAVEL[qos])
             put(payload, encoding=encoding, timestamp=timestamp, attachment=attachment, source_info=self._source_info)
@@ -213,6 +216,7 @@ class ZenohSession(Session):
         self._must_be_open()
         outlet = self._outlets.get(key)
         try:
+            # as its values, because Zenoh keeps the order of one priority only
             self._session.delete(key, source_info=self._source_info, **TRAVEL[outlet.qos if outlet else Qos.EVENT])
         except zenoh.ZError as error:
             raise SessionError(f"{key}: cannot delete: {error}") from error
@@ -238,8 +242,10 @@ class ZenohSession(Session):
     async def _serve(self, key: str, intake: QueryIntake, workers: Workers, *, complete: bool) -> Declaration:
         def take(asked: zenoh.Query) -> None:
             source = asked.source_info
+            # any client can put any session here, or none: it bounds and records, and permits nothing
             named = "" if source is None else str(source.source_id.zid)
             key = str(asked.key_expr)
+            # first: a query for which there is no room costs this thread no copy of its payload
             admission = intake.admit(named, key)
             if admission is None:
                 # beyond the bound the query ends here, which may hold up the links that share this thread
@@ -259,6 +265,7 @@ class ZenohSession(Session):
             )
 
         return await self._declare(
+            # called on Zenoh's thread: the default starts a thread of Python for each declaration
             lambda: self._session.declare_queryable(key, Callback(take, indirect=False), complete=complete),
             intake.close,
             intake.load,
@@ -269,6 +276,7 @@ class ZenohSession(Session):
         path = _AnswerPath(asked, self._refusals, self._stamps.stamp_id, lambda: None)
         key = str(asked.key_expr)
         path.answer((Answer(key, *encode(error_reply(intake.refusal(key, source)), Encoding.JSON), is_error=True),))
+        # not on closing: thousands may wait, and they have `DRAIN_TIME_S` in all
         if not self._closed:
             time.sleep(REFUSAL_PAUSE_S)
 
@@ -294,6 +302,7 @@ class ZenohSession(Session):
         found: list[zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]] = []
 
         def declare() -> _Undeclarable:
+            # a ring drops its oldest; a full FIFO would block Zenoh's thread, and what comes behind it on the same link
             found.append(self._session.declare_subscriber(key, RingChannel(kept)))
             return found[0]
 
@@ -326,10 +335,13 @@ class ZenohSession(Session):
             self._session.get(
                 zenoh.Selector(key, dict(parameters)),
                 Callback(collector.take, collector.end, indirect=False),
+                # BEST_MATCHING asks one complete queryable only: of two daemons by mistake one carries a command out
                 target=zenoh.QueryTarget.ALL if everyone else zenoh.QueryTarget.BEST_MATCHING,
+                # Zenoh's default keeps one reply for each key: that of another daemon would be hidden
                 consolidation=zenoh.ConsolidationMode.NONE,
                 timeout=timeout_s,
                 priority=zenoh.Priority.REAL_TIME if urgent else zenoh.Priority.INTERACTIVE_HIGH,
+                # "not batched during transmission, in order to reduce latency" (zenoh, `Sample.express`)
                 express=True,
                 payload=payload if payload or encoding else None,
                 encoding=encoding or None,
@@ -339,6 +351,7 @@ class ZenohSession(Session):
 
         try:
             async with asyncio.timeout(timeout_s + QUERY_GRACE_S):
+                # on a worker: a query that the link cannot take blocks, it is never dropped
                 await workers.run(ask, timeout_s, lambda _: None)
                 await collector.done.wait()
         except zenoh.ZError as error:
@@ -371,9 +384,11 @@ class ZenohSession(Session):
 
     async def close(self) -> None:
         """Refuse what was not begun, send the answers there are, leave; what Zenoh cannot finish is left to itself."""
+        # with the session all its declarations have gone
         if self._closed:
             return
         self._closed = True
+        # first: what was not begun is refused, and the refusals still find their workers
         for declared in self._declared:
             declared.stop()
         closer = Workers("zenoh close", 1)
@@ -397,6 +412,7 @@ class ZenohSession(Session):
     ) -> Declaration:
         self._must_be_open()
         try:
+            # one that comes into being too late is nobody's, and would go on being served
             entity = await self._workers.run(make, DECLARE_TIME_S, lambda late: late.undeclare())
         except zenoh.ZError as error:
             raise SessionError(f"cannot declare: {error}") from error
@@ -450,6 +466,7 @@ class ZenohSession(Session):
             except zenoh.ZError as error:
                 log.debug("publisher not declared", key=key, reason=str(error))
 
+        # a declaration can block on a peer that takes nothing; until it is made, values go by `Session.put`
         self._workers.submit(declare)
         return outlet
 
@@ -476,10 +493,12 @@ class _AnswerPath:
         try:
             for answer in answers:
                 if answer.is_error:
+                    # with no quality of service: Zenoh ignores it here, a reply travels as its query did
                     asked.reply_err(answer.payload, encoding=answer.encoding)
                 else:
                     stamp = to_stamp(answer.measured_at_ns, self.stamp_id)
                     asked.reply(answer.key, answer.payload, encoding=answer.encoding, timestamp=stamp)
+            # the client waits until the query is dropped, and Python may keep it for longer than this
             asked.drop()  # type: ignore[no-untyped-call] # the stub leaves its result open
         except zenoh.ZError as error:
             if (fields := _LOST_ANSWERS.admit()) is not None:

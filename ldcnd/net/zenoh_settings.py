@@ -43,7 +43,9 @@ class ZenohSettings:
         """Return what holds whatever the configuration file says."""
         return {
             **({"mode": self.mode} if self.mode else {}),
+            # otherwise a session whose port is in use opens all the same, and listens nowhere
             "listen/exit_on_failure": True,
+            # Zenoh's own pauses are 1 s and more: a router that is back would be found that much later
             "connect/retry": {"period_init_ms": RETRY_MS[0], "period_max_ms": RETRY_MS[1]},
             "metadata": {"name": self.instance},
             # every sample carries when it was true
@@ -52,8 +54,10 @@ class ZenohSettings:
             "transport/shared_memory/enabled": False,
             # with it, listing the connected peers ends the program
             "transport/unicast/lowlatency": False,
+            # each side announces its own: it is this process whose silence the others are to notice
             "transport/link/tx/lease": LEASE_MS,
             "transport/link/tx/queue/congestion_control/block/wait_before_close": WAIT_BEFORE_CLOSE_US,
+            # Zenoh's default is 1 ms for each message that finds no room; a poll brings five, and the loop would wait
             "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,
         }
 
@@ -63,6 +67,7 @@ class ZenohSettings:
             "listen/endpoints": self.listen,
             "connect/endpoints": self.connect,
             "scouting/multicast/enabled": False,
+            # with gossip peers connect to each other, past the access rules of the router between them
             "scouting/gossip/enabled": False,
         }
 

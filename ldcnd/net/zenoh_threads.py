@@ -46,6 +46,7 @@ def _let_senders_wait() -> bool:
         with contextlib.suppress(OSError):  # it has ended, or may not be changed
             if (thread / "comm").read_text().startswith(SENDERS):
                 found = True
+                # who has given them another policy has meant it
                 if os.sched_getscheduler(int(thread.name)) == os.SCHED_OTHER:
                     os.sched_setscheduler(int(thread.name), os.SCHED_BATCH, os.sched_param(0))
     return found

@@ -18,6 +18,7 @@ class ZenohQos(TypedDict):
     express: bool
 
 
+# with BLOCK the node "will wait for queue to progress" (zenoh, `CongestionControl`), and the bus loop with it
 _DROP = zenoh.CongestionControl.DROP
 TRAVEL: Mapping[Qos, ZenohQos] = {
     Qos.TELEMETRY: {"congestion_control": _DROP, "priority": zenoh.Priority.DATA, "express": False},
@@ -27,6 +28,8 @@ TRAVEL: Mapping[Qos, ZenohQos] = {
 }
 
 
+LATEST_STAMP_NS = 2**32 * 10**9 - 1
+"""The last instant that Zenoh can stamp: 32 bits of seconds since 1970 end in 2106."""
 _PUT, _PUT_OF_OURS = zenoh.SampleKind.PUT, SampleKind.PUT
 """Looked up once: a recorder takes 50,000 samples a second."""
 
@@ -66,8 +69,13 @@ def to_answers(key: str, replies: Sequence[zenoh.Reply], timeout_s: float) -> li
 
 
 def to_stamp(at_ns: int | None, stamp_id: zenoh.TimestampId) -> zenoh.Timestamp | None:
-    """Return Zenoh's timestamp of an instant; exact, its resolution is a quarter of a nanosecond."""
-    return None if at_ns is None else zenoh.Timestamp(zenoh.NTP64(*divmod(at_ns, 10**9)), stamp_id)
+    """Return Zenoh's timestamp of an instant; exact, its resolution is a quarter of a nanosecond.
+
+    One that Zenoh cannot hold has none: a client may name any, and beyond its range `NTP64` panics.
+    """
+    if at_ns is None or not 0 <= at_ns <= LATEST_STAMP_NS:
+        return None
+    return zenoh.Timestamp(zenoh.NTP64(*divmod(at_ns, 10**9)), stamp_id)
 
 
 class Stamps:

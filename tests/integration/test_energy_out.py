@@ -10,13 +10,24 @@ from typing import NoReturn
 import pytest
 
 from ldcnd.client.lease import control
-from ldcnd.contract.commands import Halt, MoveAbsolute, MoveVelocity, Power, QuickStop, Reset, SetGains, Stop
-from ldcnd.contract.errors import LeaseExpired, OutcomeUnknown, TransportLost
+from ldcnd.contract.commands import (
+    Halt,
+    MoveAbsolute,
+    MoveVelocity,
+    Power,
+    QuickStop,
+    Reset,
+    SetGains,
+    SetPosition,
+    Stop,
+)
+from ldcnd.contract.errors import CommandIdReused, LeaseExpired, OutcomeUnknown, TransportLost
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.dispatch import PENDING_REQUESTS
+from ldcnd.daemon.ledger import Ledger
 from ldcnd.drives.ldcn.registers import RESET_BAUD
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
@@ -229,3 +240,34 @@ async def test_a_client_that_has_lost_control_still_halts_and_switches_off():
                 await held.command("x", Power(on=True))
 
         assert await rests(chain, "power")
+
+
+async def test_ids_that_the_daemon_has_yet_to_give_are_nobody_elses(monkeypatch):
+    """Whoever took them beforehand had the commands of others refused, and in the end every halt."""
+    monkeypatch.setattr("ldcnd.daemon.ledger.ANSWERS_PER_SENDER", 8)
+    async with leased_rig() as (rig, _, lease):
+        first = await rig.client.command("x", SetPosition(position=0.0, lease=lease))
+        run_of, _, serial = first.command_id.rpartition("-")
+        theirs = SetPosition(position=0.0, lease=lease, client="mallory")
+        for number in range(int(serial) + 1, int(serial) + 9):
+            with pytest.raises(CommandIdReused):
+                await rig.client.command("x", theirs.model_copy(update={"command_id": f"{run_of}-{number}"}))
+        await rig.client.command("x", SetPosition(position=5.0, lease=lease))
+        assert await ask(rig, "@stop", {}) == (None, "")
+        for number in range(10):
+            await rig.client.command("x", theirs.model_copy(update={"command_id": f"mallory {number}"}))
+        for _ in range(10):
+            await rig.client.command("x", Halt(command_id=f"{run_of}-{serial}"))
+
+
+async def test_a_halt_that_cannot_be_entered_is_sent_all_the_same(monkeypatch):
+    def fails(*_: object) -> NoReturn:
+        raise KeyError
+
+    async with leased_rig() as (rig, chain, lease):
+        await run(rig, lease)
+        monkeypatch.setattr(Ledger, "open", fails)
+        await rig.client.command("x", Halt())
+        await asyncio.sleep(1.0)
+
+        assert drive(chain, 1).loop.trajectory.at_rest

@@ -4,11 +4,12 @@ import asyncio
 
 import pytest
 
+from ldcnd.axis.stopping import AxisStops
 from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
-from ldcnd.contract.errors import LeaseExpired, LeaseHeld, LeaseRequired
+from ldcnd.contract.errors import LeaseExpired, LeaseHeld, LeaseRequired, SessionError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.leases import Acquire, LeaseReply
 from ldcnd.contract.rig_commands import Rehearsal, Rehearse
@@ -214,3 +215,50 @@ async def test_an_internal_error_brings_axes_to_rest_before_it_ends_the_daemon(m
 
     assert drive(chain, 1).loop.trajectory.at_rest
     assert drive(chain, 1).loop.servo_on
+
+
+@pytest.mark.promise("error-ends-in-order")
+@pytest.mark.parametrize("error", [ZeroDivisionError, BaseException])
+async def test_an_internal_error_while_one_axis_is_brought_to_rest_leaves_no_other_one_running(monkeypatch, error):
+    """It was cancelled with the task of a lease, and of the end of the daemon; a panic of Zenoh is no Exception."""
+    chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
+    to_rest = AxisStops.bring_to_rest
+
+    async def fails(stops: AxisStops, *args: object, **kwargs: object) -> bool:
+        if stops is rig.daemon.rig.axes["x"].stops:
+            raise error
+        return await to_rest(stops, *args, **kwargs)
+
+    with pytest.raises(BaseExceptionGroup):  # noqa: PT012 - the daemon's, with the error that ended it
+        async with running_rig(load_config(SIMULATED), {"line0": chain}) as rig:
+            lease = await rig.client.ask(Acquire(client="ann", axes=("x",), lease_s=1.0))
+            await jogging(rig, lease, "x")
+            await rig.client.command("y", Power(on=True))
+            await rig.client.command("y", MoveVelocity(velocity=5.0))
+            monkeypatch.setattr(AxisStops, "bring_to_rest", fails)
+            await asyncio.sleep(4.0)  # the lease ends, and the daemon
+    await asyncio.sleep(1.0)
+
+    assert drive(chain, 2).loop.trajectory.at_rest
+
+
+async def test_a_network_that_takes_no_token_for_a_while_stops_no_axis(monkeypatch):
+    """The daemon ended for it, and brought everything to rest."""
+    async with running_rig(load_config(SIMULATED)) as rig:
+        await rig.until("x", lambda state: state.link == "up")
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", MoveVelocity(velocity=5.0))
+        bus, session = rig.daemon.rig.lines["line0"].bus, type(rig.session)
+
+        async def takes_none(_session: object, key: str) -> None:
+            raise SessionError(f"{key}: cannot declare within 5 s: a peer takes nothing")
+
+        with monkeypatch.context() as patched:
+            patched.setattr(session, "declare_token", takes_none)
+            bus.drop("a cable that comes loose")
+            await rig.until("x", lambda state: state.link == "down")
+            await rig.until("x", lambda state: state.link == "up")
+            await asyncio.sleep(1.0)
+            await rig.client.command("y", Power(on=True))
+        await asyncio.sleep(1.0)
+        assert (await rig.client.state("y")).enabled

@@ -121,6 +121,20 @@ async def test_an_output_has_its_level_after_the_loss_of_its_client_and_keeps_it
         assert driven(rig) == LOW
 
 
+@pytest.mark.parametrize("lamp", [{}, {"bus": "high"}], ids=["alone", "before another situation"])
+async def test_an_output_has_its_level_after_the_loss_of_its_client_while_its_line_was_down(lamp):
+    """It was refused once, as out of reach, and forgotten."""
+    outputs = {"lock": {"line": LOCK, "loss": {"client": "low"}}, "lamp": {"line": LOCK + 1, "loss": lamp}}
+    chain = chain_of_machine()
+    async with running_machine(machine(module={"outputs": outputs}), chain) as rig:
+        lease = (await rig.client.ask(Acquire(client="ann", axes=("rotor", "table"), lease_s=2.0))).lease
+        await rig.client.ask(SetIo(module="cabinet", high=("lock",), low=("lamp",), lease=lease))
+        chain.unplug(asyncio.get_running_loop().time(), 5.0)
+        await asyncio.sleep(15.0)
+        assert driven(rig) == LOW
+        assert bool(rig.io.latch & 1 << LOCK) == bool(lamp)
+
+
 @pytest.mark.long
 async def test_an_output_has_its_level_after_a_loss_of_the_line_and_at_the_end_of_the_daemon():
     chain = chain_of_machine()

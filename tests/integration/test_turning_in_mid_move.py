@@ -82,6 +82,33 @@ async def test_a_motion_that_could_not_turn_before_the_limit_begins_from_rest(di
         assert rig.position_mm == pytest.approx(request_.position, abs=0.1)
 
 
+SLOW = {"position": 1, "velocity": 1, "state": 1}
+
+
+@dialects
+@pytest.mark.parametrize("polled_before_s", [0.2, 0.7])
+@pytest.mark.parametrize(
+    ("place_mm", "request_"),
+    [
+        (20.0, MoveVelocity(velocity=-1.0, duration_s=0.5, acceleration=100.0, buffer_mode=BufferMode.ABORTING)),
+        (28.0, MoveVelocity(velocity=40.0, acceleration=400.0)),
+    ],
+    ids=["follows", "changes"],
+)
+async def test_what_follows_in_mid_move_counts_from_where_the_axis_is_by_then(
+    dialect: Dialect, place_mm, request_, polled_before_s
+):
+    """Where it was at the last poll may be a second ago, and the limit that much nearer."""
+    async with dialect_rig(dialect, WIDE, limits=LIMITS, rates=SLOW) as rig:
+        await asyncio.sleep(polled_before_s)
+        await at_speed(rig, place_mm)
+        with contextlib.suppress(LdcndError):
+            await rig.send(request_)
+        most = await farthest_mm(rig, 4.0)
+
+    assert most < LIMIT_MM + BEYOND_MM
+
+
 @dialects
 @pytest.mark.sweep(2)
 async def test_a_jog_that_could_not_turn_before_the_limit_comes_to_rest_first(dialect: Dialect):
@@ -94,6 +121,24 @@ async def test_a_jog_that_could_not_turn_before_the_limit_comes_to_rest_first(di
         slow = Jog(velocity=-1.0, acceleration=20.0, hold_s=1.0, renews=began.command_id)
         await rig.send(slow)
         most = await farthest_mm(rig, 4.0)
+
+    assert most < LIMIT_MM + BEYOND_MM
+
+
+@dialects
+async def test_a_jog_that_comes_to_rest_before_it_turns_gets_no_goal_meanwhile(dialect: Dialect):
+    """Its drive would take the goal at once, and slow down at the acceleration that is too low for that."""
+    async with dialect_rig(dialect, WIDE, limits=LIMITS) as rig:
+        await rig.power_on()
+        jog = Jog(velocity=20.0, acceleration=60.0, hold_s=0.2)
+        held = {"renews": (await rig.send(jog)).command_id}
+        while rig.position_mm < 17.5:
+            await rig.send(jog.model_copy(update=held))
+            await asyncio.sleep(0.005)
+        back, most = Jog(velocity=-1.0, acceleration=4.0, hold_s=0.2).model_copy(update=held), 0.0
+        for _ in range(40):
+            await rig.send(back)
+            most = max(most, await farthest_mm(rig, 0.1))
 
     assert most < LIMIT_MM + BEYOND_MM
 

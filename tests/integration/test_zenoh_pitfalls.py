@@ -7,7 +7,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -16,19 +16,19 @@ import pytest
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config
 from ldcnd.contract.codec import decode
-from ldcnd.contract.commands import ErrorReply
+from ldcnd.contract.commands import ErrorReply, ReportShadow, Why
 from ldcnd.contract.errors import ErrorCode, ValueOutOfRange
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import StateSample
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.net.hand_over import Query
-from ldcnd.net.session import Session
+from ldcnd.net.session import Qos, Session
 from ldcnd.net.zenoh_config import endpoints, zenoh_config
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import LEASE_MS, ZenohSettings
 from tests.support.rig import SIMULATED
 from tests.support.router import router
-from tests.support.session_pair import JSON, KEYS, POSITION, Pair, echo, free_endpoint, served, until
+from tests.support.session_pair import JSON, KEYS, POSITION, Pair, echo, free_endpoint, served, subscribed, until
 
 pytestmark = pytest.mark.real_time
 
@@ -200,6 +200,28 @@ async def test_answers_are_kept_although_they_have_one_key(pair: Pair, endpoint:
             return len(await pair.client.query(POSITION)) == 2
 
         await until(both)
+
+
+@pytest.mark.parametrize("at_ns", [-1, 2**32 * 10**9, 2**63 - 1])
+async def test_an_instant_that_zenoh_cannot_stamp_ends_neither_daemon_nor_reads(pair: Pair, at_ns: int):
+    """Its time stamps end in 2106 and begin in 1970; elsewhere it raises, or panics, where none may be caught."""
+
+    def at_that_instant(query: Query) -> Iterator[None]:
+        query.reply(b"1", JSON, key=POSITION, measured_at_ns=at_ns)
+        query.finish()
+        yield
+
+    await pair.server.serve_reads(POSITION, at_that_instant, complete=False)
+    await served(pair.client, POSITION)
+    samples = await subscribed(pair.server, pair.client)
+    pair.server.publisher(POSITION, encoding=JSON, qos=Qos.TELEMETRY)(b"2", at_ns)
+    async with asyncio.timeout(2):
+        assert (await samples.get()).payload == b"2"
+
+    async with serving_daemon(pair.server, "one"):
+        report = ReportShadow(t=max(at_ns, 0), learning=True, judged=0)
+        assert await RigClient(pair.client, "sim").ask(report, "x")
+        assert await RigClient(pair.client, "sim").ask(Why(), "x")
 
 
 async def test_the_token_of_a_frozen_program_vanishes_within_its_lease(pair: Pair, endpoint: str):

@@ -76,6 +76,20 @@ async def test_what_work_raises_reaches_its_caller_and_spares_the_worker() -> No
     assert await workers.stop(2)
 
 
+async def test_a_job_that_raises_costs_the_others_no_thread() -> None:
+    workers = Workers("test", 1)
+
+    def fails() -> None:
+        raise KeyboardInterrupt  # no Exception, as a panic in Zenoh
+
+    for _ in range(3):
+        workers.submit(fails)
+    result = await workers.run(lambda: 42, 2, print)
+
+    assert result == 42
+    assert await workers.stop(2)
+
+
 async def test_stopping_finishes_the_jobs_there_are() -> None:
     workers, done = Workers("test", 1), []
     for number in range(5):

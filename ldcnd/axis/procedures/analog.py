@@ -48,6 +48,7 @@ class AnalogMove(EndlessMotion):
         await self.permit.load(
             AnalogMotion(request.target, abs(plan.motion.velocity_counts_per_s), plan.motion.acceleration_counts_per_s2)
         )
+        # before the start: if that is not confirmed the motion is ended all the same
         self._until_s = motion.clock.now_s() + self._timeout_s
         self._failure = f"not there within {self._timeout_s:g} s"
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE)

@@ -53,6 +53,7 @@ class ApproachMove(Procedure):
         if motion.latest().cut_short:
             motion.tracker.take(CommandOver())
             return False
+        # planned anew: limits and the speed override may be others by now
         goal = motion.plan_to(self._goal.position or 0.0, self._request.velocity, self._request.acceleration)
         await self.permit.load(goal.motion)
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=goal)

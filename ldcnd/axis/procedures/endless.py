@@ -53,6 +53,7 @@ class EndlessMotion(Procedure):
         """Tell whether it must be stopped now to stand before a software limit; if not, work out by when at last."""
         motion, limits = self._motion, self._motion.config.limits
         self._stop_at_s = NEVER_S
+        # it does not know where its limits are
         if not motion.tracker.status.referenced:
             return False
         here = motion.scale.position(reading.position_counts)

@@ -109,6 +109,7 @@ class Rendezvous(ABC):
         """
         self._missing.discard(name)
         if not self._missing and not self._started.done():
+            # the others no longer count the time: from here on the line bounds it
             self._met.set()
             await self._start()
         with contextlib.suppress(TimeoutError):
@@ -121,6 +122,7 @@ class Rendezvous(ABC):
                     " was started"
                 )
             )
+        # for a caller that gives up nothing is cancelled: the others wait for the same
         await asyncio.shield(self._started)
 
     @abstractmethod

@@ -110,6 +110,7 @@ class HomeSequence(Procedure):
         if search.method is HomeMethod.INDEX:
             check_index_is_seen(motion, plan, search.index_width)
         if search.move_to is not None:
+            # what follows the search must be possible before it begins
             guards.check_position(tracker, motion.config.limits, search.move_to)
         # the limit switches may not have been in sight at the last poll
         off_switch = runs_onto_switch(search, motion.scale.counts_per_unit) and self._on_switch(await motion.read())
@@ -171,6 +172,7 @@ class HomeSequence(Procedure):
         self._leg = leg
         motion.tracker.take(PlaceUnknown())
         opens_loop = search.stop is HomeStop.OFF or search.method is HomeMethod.POSITION_ERROR
+        # before the start: if that is not confirmed the search ends all the same
         self.deadline_s = motion.clock.now_s() + search.timeout_s
         await motion.start(
             self.permit, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH

@@ -93,6 +93,7 @@ class Holds:
 
     def begin(self, command_id: str, request: Jog, now_s: float) -> Hold:
         """Remember a jog from its command on, also while that waits."""
+        # whoever ended without being told is cleared away here
         self._holds = {name: hold for name, hold in self._holds.items() if not hold.over and hold.until_s > now_s}
         hold = self._holds[command_id] = Hold(self._axis, command_id, request, now_s)
         return hold
@@ -161,6 +162,7 @@ class HeldJog(Procedure):
             return await self._run()
         finally:
             command = self._motion.tracker.status.command
+            # also when its start was not confirmed: it may run, and a renewal must reach it
             self._hold.begun = command is not None and command.command_id == self.permit.command_id
 
     def is_of(self, hold: Hold) -> bool:
@@ -196,6 +198,7 @@ class HeldJog(Procedure):
             if self.wants_step and not await self._turns_in_time():
                 await self._slow_down()
                 return True
+            # its goal stays until it stands; from there it goes on
             if not motion.driver.retargets:
                 return True
         if self._phase is _Phase.RESTS or self.wants_step or motion.clock.now_s() >= self._extend_at_s:
@@ -224,9 +227,11 @@ class HeldJog(Procedure):
         """Have the drive run to a goal that is as far ahead as it may be."""
         motion, asked = self._motion, self._asked
         here = (await motion.read()).position_counts  # the latest reading may be as old as the rates let it be
+        # again, because the reading has taken its time
         self.permit.ask_to_move()
         plan, velocity, reach_s, at_limit = self._plan(motion.scale.position(here), asked.velocity, asked.acceleration)
         await self.permit.load(plan.motion)
+        # as planned: by now something else may be asked for, which is the next step
         self._wanted = asked
         self._phase = _Phase.ENDS if at_limit else _Phase.RUNS  # also if it is unknown whether the drive has started
         extends = motion.driver.retargets and not at_limit
@@ -241,6 +246,7 @@ class HeldJog(Procedure):
         forward = velocity > 0
         longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(steady.motion.velocity_counts_per_s)
         reach_s = min(self._reach_s, longest_s)
+        # with the ramp at its end behind it, so that it has its velocity for `reach_s`
         way = abs(steady.velocity) * reach_s + steady.velocity**2 / (2 * steady.acceleration)
         end, at_limit = motion.end_ahead(here, way if forward else -way)
         return motion.plan_to(end, abs(velocity), acceleration), steady.velocity, reach_s, at_limit
@@ -256,7 +262,8 @@ class HeldJog(Procedure):
         await motion.driver.stop(StopMode.SMOOTH)
         motion.begin(self.permit.command_id, self.permit.verb, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         motion.tracker.take(MotionStarted(motion.clock.now_s()))
-        self._phase = _Phase.SLOWS
+        # no next goal before it stands: at another acceleration the limit ahead may be too near
+        self._phase, self._extend_at_s = _Phase.SLOWS, math.inf
 
     async def _stop(self, reason: str) -> bool:
         self._hold.over = True  # nobody renews it while the packets of the stop are under way

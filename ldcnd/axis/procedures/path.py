@@ -225,6 +225,7 @@ class SharedPath(Rendezvous):
         member = share.member
         steps = member.steps[share.sent : share.sent + walking(member.motion.driver).path_packet]
         if steps:
+            # before they are sent: if the reply is lost the drive may hold them, and would walk them twice
             share.sent += len(steps)
             await member.permit.add_points(steps)
 
@@ -295,6 +296,7 @@ class PathMember(Procedure):
             self.permit.check_state()
             walking(motion.driver).check_path()
             status = await walking(motion.driver).path_status()
+            # the drive would walk what is left of an earlier path first
             if status.points or status.running or not status.enabled:
                 raise WrongState(
                     f"axis {motion.config.name}: {status.points} points of an earlier path are left in the drive",

@@ -55,6 +55,7 @@ class ProbeMove(Procedure):
             check_index_is_seen(motion, plan, width)
         target = plan.motion.target_counts or 0
         speed = plan.motion.velocity_counts_per_s
+        # it is latched at the next servo cycle, and a count is no less than one
         self._error_counts = speed * homing(motion.driver).capture_s + 1
         self._ahead = HomeMethod.FORWARD_LIMIT if target > here else HomeMethod.REVERSE_LIMIT
         first, *others = self._methods

@@ -41,6 +41,7 @@ class PwmRun(EndlessMotion):
         self.check_room(request.duty)
         duty = request.duty if motion.scale.counts_per_unit > 0 else -request.duty
         await self.permit.load(PwmOutput(duty, acceleration.acceleration_counts_per_s2))
+        # before the start: if that is not confirmed the motor is stopped all the same
         self._until_s = motion.clock.now_s() + request.duration_s
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE, opens_loop=True)
         return motion.reply(

@@ -106,6 +106,7 @@ class SetPoint(Procedure):
                 limit=bounds.rate,
                 remedy="send them more slowly",
             )
+        # a stream that was late gets no credit for it
         self._due_s = max(due_s, now_s)
 
     def _check_step(self, target: int, bounds: TrackingConfig) -> None:

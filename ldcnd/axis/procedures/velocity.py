@@ -8,7 +8,7 @@ that are armed do so without it. PIC-SERVO SC takes a new trapezoid at any time:
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import COUNTER_SHARE, AxisMotion
+from ldcnd.axis.motion import COUNTER_SHARE, LATENCY_S, AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.status import Completion
@@ -36,10 +36,15 @@ class VelocityChange(EndlessMotion):
         self._velocity, self.acceleration = plan.velocity, plan.acceleration
         speed_counts = plan.motion.velocity_counts_per_s
         run_s = motion.run_s(request.duration_s, speed_counts)
+        by_s = motion.clock.now_s() + LATENCY_S
+        await motion.read()  # the latest reading may be as old as the rates let it be
+        self.permit.ask_to_move()
         self.check_room(plan.velocity)
+        self.permit.by_s = by_s
         await self.permit.load(plan.motion)
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
         last_s = run_s + motion.ramp_s(request.duration_s, plan)
+        # before the start: if that is not confirmed the motion is ended all the same
         self._until_s = motion.clock.now_s() + min(last_s, COUNTER_SHARE * room_s)
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
         _, at_limit = motion.end_ahead(motion.here, plan.velocity * last_s)
