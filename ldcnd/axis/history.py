@@ -143,7 +143,7 @@ def _between(
     error = fastest * ((1 - share) * start[1] + share * end[1]) / 1e9 + (1.0 if still else COUNTS)
     curve = max(abs(bend), abs(bend_later))
     spare = error + BEND * max(0.0, curve - 2 * error) * min(1.0, 4 * share * (1 - share) + 0.1)
-    placed = AxisScale(scale.unit, scale.counts_per_unit, None, start[4])
+    placed = AxisScale(scale.units, scale.counts_per_unit, None, start[4])
     ends = sorted(placed.position(each) for each in (min(low - spare, value - error), max(high + spare, value + error)))
     speed = slope + (2 * share - 1) * ((1 - share) * parts[0] + share * parts[1]) / length_s
     ripple = (BEND_OF_VELOCITY * curve + 2 * error) / length_s + RIPPLE * start[3]

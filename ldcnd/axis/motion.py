@@ -14,7 +14,6 @@ from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
 from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.rest import Settling, window_counts
 from ldcnd.axis.scale import AxisScale
@@ -36,7 +35,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, StopMode
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, QuietDrive, StopMode
 
 COUNTER_SHARE = 0.99
 """Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""

@@ -76,7 +76,7 @@ def axes_table(axes: list[AxisNow]) -> list[str]:
             now.condition.position(_digits(now), now.info.unit, now.age_s),
             now.condition.state,
             f"moving {_motion(now.seen)}",
-            f"link {now.state.link if now.state else 'unknown'}",
+            f"link {now.last.state.link if now.last.state else 'unknown'}",
             ", ".join(now.condition.notes),
         )
         for now in axes
@@ -98,12 +98,13 @@ def _motion(seen: AxisSeen) -> str:
 
 
 def _digits(now: AxisNow) -> str | None:
-    return f"{now.position.value:.{decimals(now.info)}f}" if now.position else None
+    position = now.last.position
+    return f"{position.value:.{decimals(now.info)}f}" if position else None
 
 
 def row(now: AxisNow) -> AxisRow:
     """Return an axis as `--json` has it."""
-    state = now.state
+    state = now.last.state
     return AxisRow(
         **now.info.model_dump(),
         **dict(now.seen),
@@ -151,8 +152,8 @@ class Watched:
     def begin(self, now: AxisNow) -> None:
         """Take what is known of an axis before its first sample."""
         self._now[now.info.axis] = now
-        if now.state:
-            self._states[now.info.axis] = now.state
+        if now.last.state:
+            self._states[now.info.axis] = now.last.state
 
     def text(self, name: str, sample: Sample) -> str:
         """Return a sample in words, with the condition of its axis where that matters."""

@@ -391,6 +391,8 @@ class Move(AxisCommand[CommandReply]):
 
     buffer_mode: BufferMode = BufferMode.REFUSE
     """Effect if the axis moves already."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
 
 
 class Direction(StrEnum):
@@ -410,8 +412,6 @@ class MoveAbsolute(Move):
     """Target in axis units; on an axis with a modulo any turn of it is meant."""
     velocity: float | None = Field(default=None, gt=0)
     """Speed in units a second; the axis default when missing."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     direction: Direction | None = None
     """Way to turn, on an axis with a modulo only; the shortest when missing."""
 
@@ -425,8 +425,6 @@ class MoveRelative(Move):
     """Distance in axis units, signed."""
     velocity: float | None = Field(default=None, gt=0)
     """Speed in units a second; the axis default when missing."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
 
 
 class MoveVelocity(Move):
@@ -439,8 +437,6 @@ class MoveVelocity(Move):
 
     velocity: float
     """Velocity in units a second, positive forward, not 0."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     duration_s: float | None = Field(default=None, gt=0, le=86_400)
     """Duration at the velocity, in seconds, at most the axis's `longest_run_s`; that, or without it the software limit
     ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also when daemon and client are gone:
@@ -462,8 +458,6 @@ class Jog(Move):
 
     velocity: float
     """Velocity in units a second, positive forward, not 0."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     hold_s: float = Field(default=0.4, ge=SHORTEST_HOLD_S, le=LONGEST_HOLD_S)
     """Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog."""
     renews: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)

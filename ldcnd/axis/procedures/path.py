@@ -16,8 +16,8 @@ from ldcnd.axis.permit import Permit, start_path
 from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.group import Rendezvous
-from ldcnd.axis.quiet_drive import walking
 from ldcnd.axis.status import Completion
+from ldcnd.axis.unmoved import walking
 from ldcnd.contract.commands import CommandReply, MoveAbsolute
 from ldcnd.contract.errors import (
     BusError,

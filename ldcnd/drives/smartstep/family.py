@@ -161,8 +161,6 @@ def _polls(bus: SmartStepBusConfig, timing: LineTiming) -> list[Poll]:
                         rate_hz=rate_hz,
                         cost=_times(words, cost),
                         mean_s=words * cost.longest_s,
-                        request_bytes=words * len(word.request),
-                        reply_bytes=words * word.reply_bytes,
                         exchanges=words,
                     )
                 )
@@ -193,6 +191,8 @@ def _times(words: int, cost: Cost) -> Cost:
         reply_s=words * cost.reply_s,
         overhead_s=words * cost.overhead_s,
         ends_early=False,
+        request_bytes=words * cost.request_bytes,
+        reply_bytes=words * cost.reply_bytes,
     )
 
 
