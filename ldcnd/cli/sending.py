@@ -315,7 +315,8 @@ def derived_question(
     def callback(target: Target, /, axis: str | None = None, *, yes: bool = True, **given: Any) -> None:  # noqa: ANN401
         if not yes and not click.confirm(confirm.format(axis=axis), err=True):
             raise click.Abort
-        request = of_options(command, **given)
+        who = {"client": NAME} if command.about is About.RIG and "client" in command.model_fields else {}
+        request = of_options(command, **given, **who)
 
         async def work(client: RigClient) -> tuple[ReplyT, AxisInfo | None, *tuple[Typed, ...]]:
             if axis is None:
@@ -347,7 +348,11 @@ def _derived(
     before: Sequence[click.Parameter],
     behind: Sequence[click.Parameter],
 ) -> Derived:
-    fields = {each: described for each, described in command.model_fields.items() if each not in _SENT_BY_ITSELF}
+    fields = {
+        each: described
+        for each, described in command.model_fields.items()
+        if each not in _SENT_BY_ITSELF or (each == LEASE and described.is_required())
+    }
     params: list[click.Parameter] = list(before)
     for field, described in fields.items():
         kind, many = (Quantity(), False) if field in DIMENSIONS else _kind(described.annotation)
@@ -365,6 +370,7 @@ def _derived(
     )
 
 
+LEASE = "lease"
 _SENT_BY_ITSELF = frozenset({*AxisCommand.model_fields, "leases"})
 """Fields that prove permission and prevent a second execution."""
 
@@ -384,6 +390,7 @@ class _FieldOption(click.Option):
             is_flag=is_flag,
             multiple=many,
             required=described.is_required(),
+            envvar="LDCND_LEASE" if field == LEASE else None,
         )
         self._command = command
         self._field = field
