@@ -356,9 +356,9 @@ def string_reference(
     if address % 2:
         raise ValueOutOfRange(f"unit {unit}: string address {address:04X}H is odd", value=address)
     command = CommandPacket(
-        unit, Function.STRING_REFERENCE, address, _string_count(byte_count, profile.string_count_unit)
+        unit, Function.STRING_REFERENCE, address, _string_count(byte_count, profile.trace.string_count_unit)
     )
-    allowed = _VARIANTS if profile.string_checksum is StringChecksum.AUTO else (profile.string_checksum,)
+    allowed = _VARIANTS if profile.trace.string_checksum is StringChecksum.AUTO else (profile.trace.string_checksum,)
     longest = PACKET_CHARACTERS + 4 * command.data + TRAILER_CHARACTERS
     expected = PACKET_CHARACTERS + 2 * byte_count
     if StringChecksum.TRAILER in allowed:

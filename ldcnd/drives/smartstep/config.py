@@ -1,7 +1,6 @@
 """The configuration of SmartStep lines and units, beside what every line and axis has."""
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
@@ -12,64 +11,13 @@ from ldcnd.drives.axis_config import AxisConfig, RatesConfig
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.smartstep.packet import HIGHEST_UNIT
 from ldcnd.drives.smartstep.profiles import (
-    ByteOrder,
-    CommandPulseGear,
-    CountUnit,
     Echo,
     EepromWrite,
     Framing,
     SmartStepProfile,
-    StringChecksum,
-    TraceWordLayout,
-    TriggerMap,
+    SmartStepTraceConfig,
     Wiring,
 )
-
-
-class SmartStepTraceConfig(Frozen):
-    """How the trace of one unit is taken to work where its manual leaves room."""
-
-    word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
-    """Place of the signal's bit and the value in a word of the trace memory; raw leaves words as they are."""
-    byte_order: ByteOrder = ByteOrder.BIG
-    """Half of a word that comes first in a string."""
-    string_checksum: StringChecksum = StringChecksum.AUTO
-    """Bytes that the checksum of a string reply covers; auto takes every variant until the drive shows which."""
-    string_count_unit: CountUnit = CountUnit.BYTES
-    """Unit of the count in a string reference."""
-    chunk_bytes: int = Field(default=200, ge=2, le=1000)
-    """How much of the memory is read at once, even; 2 ms of the line for each byte."""
-    verify: bool = True
-    """Read everything until two readings agree: the checksum may not cover it."""
-    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
-    """Gearing of command pulses to motor speed."""
-    trigger_map: TriggerMap | None = None
-    """The bits of the trigger condition; without them the host watches for the trigger."""
-    verified: bool = False
-    """Whether the layout was compared with the drive, see `ldcnd doctor verify`; values are uncertain until then."""
-
-    @field_validator("chunk_bytes")
-    @classmethod
-    def _whole_words(cls, value: int) -> int:
-        if value % 2:
-            raise ValueError("chunk_bytes is even: a word of the trace memory has two bytes")
-        return value
-
-    def assumed_of(self, profile: SmartStepProfile) -> SmartStepProfile:
-        """Return a drive's profile with these assumptions."""
-        return replace(
-            profile,
-            trace_word_layout=self.word_layout,
-            trace_byte_order=self.byte_order,
-            string_checksum=self.string_checksum,
-            string_count_unit=self.string_count_unit,
-            trace_chunk_bytes=self.chunk_bytes,
-            trace_verify=self.verify,
-            command_pulse_gear=self.command_pulse_gear,
-            trigger_map=self.trigger_map,
-            trace_verified=self.verified,
-        )
-
 
 MODEL = "smartstep"
 EARLIER = 1.0
@@ -231,7 +179,7 @@ class SmartStepBusConfig(BusConfig):
     def profile(self, axis: SmartStepAxisConfig) -> SmartStepProfile:
         """Return how one of its drives is taken to behave."""
         line, unit = self.smartstep, axis.smartstep
-        profile = SmartStepProfile(
+        return SmartStepProfile(
             framing=line.framing,
             wiring=line.wiring,
             echo=Echo(line.echo),
@@ -241,5 +189,5 @@ class SmartStepBusConfig(BusConfig):
             run_active_low=unit.run_active_low,
             reset_active_low=unit.reset_active_low,
             alarm_output_high=unit.alarm_output_high,
+            trace=unit.trace,
         )
-        return unit.trace.assumed_of(profile)

@@ -198,13 +198,13 @@ def _times(words: int, cost: Cost) -> Cost:
 
 def price_list(profile: SmartStepProfile = PROFILE) -> PriceList:
     """Return the exchanges of a drive; a reading is one word, for any item."""
-    chunk = commands.string_reference(ANY_UNIT, TRACE_1_AREA[0], profile.trace_chunk_bytes, profile)
+    chunk = commands.string_reference(ANY_UNIT, TRACE_1_AREA[0], profile.trace.chunk_bytes, profile)
     exchanges: dict[str, Exchange[Any]] = {
         "read word": commands.reference(ANY_UNIT, 0),
         "write trace register": commands.write_trace_register(ANY_UNIT, next(iter(TraceRegister)), 0),
         "set operating mode": commands.set_operating_mode(ANY_UNIT, OperatingMode.NORMAL),
         "probe": commands.probe(ANY_UNIT),
-        f"read string of {profile.trace_chunk_bytes} bytes": chunk,
+        f"read string of {profile.trace.chunk_bytes} bytes": chunk,
     }
     return PriceList(
         node_baud=float(BAUD),

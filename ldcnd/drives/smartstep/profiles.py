@@ -6,10 +6,10 @@ bears on traces with the drive; the values of its traces are uncertain until the
 Source: manual, all chapters; where it is silent, public manuals of related drives.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
 from ldcnd.contract.frozen import Frozen
 
@@ -111,6 +111,36 @@ class TriggerMap(Frozen):
     """Enable bit of the falling edge."""
 
 
+class SmartStepTraceConfig(Frozen):
+    """How the trace of one unit is taken to work where its manual leaves room."""
+
+    word_layout: TraceWordLayout = TraceWordLayout.MSB_IO  # the figure of manual 4 (9) is lost
+    """Place of the signal's bit and the value in a word of the trace memory; raw leaves words as they are."""
+    byte_order: ByteOrder = ByteOrder.BIG  # manual 4 (9) is silent; words of commands have the high byte first
+    """Half of a word that comes first in a string."""
+    string_checksum: StringChecksum = StringChecksum.AUTO  # manual 2.2: its place is given, not what it covers
+    """Bytes that the checksum of a string reply covers; auto takes every variant until the drive shows which."""
+    string_count_unit: CountUnit = CountUnit.BYTES  # manual 2.2 says "data count"; 1000 addresses hold 500 points
+    """Unit of the count in a string reference."""
+    chunk_bytes: int = Field(default=200, ge=2, le=1000)  # manual 2.2 gives no longest string
+    """How much of the memory is read at once, even; 2 ms of the line for each byte."""
+    verify: bool = True
+    """Read everything until two readings agree: the checksum may not cover it."""
+    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN  # manual 4, "Unit conversion", has it both ways
+    """Gearing of command pulses to motor speed."""
+    trigger_map: TriggerMap | None = None  # the figure of manual 4 (7) is lost
+    """The bits of the trigger condition; without them the host watches for the trigger."""
+    verified: bool = False
+    """Whether the layout was compared with the drive, see `ldcnd doctor verify`; values are uncertain until then."""
+
+    @field_validator("chunk_bytes")
+    @classmethod
+    def _whole_words(cls, value: int) -> int:
+        if value % 2:
+            raise ValueError("chunk_bytes is even: a word of the trace memory has two bytes")
+        return value
+
+
 RESPONSE_S = 0.3
 """A drive answers within 0.2 s (manual 2.1), taken as command CR to first reply character, plus 0.1 s of margin."""
 
@@ -124,9 +154,7 @@ class SmartStepProfile:
         gap_s: the longest silence inside a reply.
         quiet_s: silence before each command.
         attempts: how often a repeatable command is sent in all; like `gap_s` and `quiet_s` it is for the line's owner.
-        trace_chunk_bytes: 2 to 1000, even.
-        trace_verify: read each chunk twice; the string checksum may not cover the data.
-        trace_verified: the layout, byte order and gear of traces were compared with this drive.
+        trace: how its traces are taken to work.
     """
 
     framing: Framing = Framing.SEVEN_EVEN  # manual 2.1; soft parity for adapters that cannot make it
@@ -137,24 +165,20 @@ class SmartStepProfile:
     quiet_s: float = 0.005
     attempts: int = 3
     eeprom_write: EepromWrite = EepromWrite.ALLOW
-    string_checksum: StringChecksum = StringChecksum.AUTO  # manual 2.2: its place is given, not what it covers
-    string_count_unit: CountUnit = CountUnit.BYTES  # manual 2.2 says "data count"; 1000 addresses hold 500 points
-    trace_chunk_bytes: int = 200  # manual 2.2 gives no longest string
-    trace_verify: bool = True
-    trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO  # the figure of manual 4 (9) is lost
-    trace_byte_order: ByteOrder = ByteOrder.BIG  # manual 4 (9) is silent; words of commands have the high byte first
-    trigger_map: TriggerMap | None = None  # the figure of manual 4 (7) is lost
-    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN  # manual 4, "Unit conversion", has it both ways
     encoder_counts_per_rev: int = 8000  # the divisor of the speed formula, manual 4, "Unit conversion"
-    trace_verified: bool = False
     run_active_low: bool = True  # manual 3, 8005H, gives bits, not their levels; this one and the next two are inferred
     reset_active_low: bool = True
     alarm_output_high: bool = True
+    trace: SmartStepTraceConfig = field(default_factory=SmartStepTraceConfig)
 
     @property
     def trigger_word(self) -> TriggerWordSource:
         """Where the drive's own trigger comes from."""
-        return TriggerWordSource.CONFIGURED if self.trigger_map else TriggerWordSource.NONE
+        return TriggerWordSource.CONFIGURED if self.trace.trigger_map else TriggerWordSource.NONE
+
+    def with_trace(self, **assumed: object) -> "SmartStepProfile":
+        """Return it with other assumptions about its traces."""
+        return replace(self, trace=self.trace.model_copy(update=assumed))
 
 
 SMARTSTEP = SmartStepProfile()

@@ -300,7 +300,7 @@ def trigger_level(profile: SmartStepProfile, constants: TraceConstants, data: Da
 
 
 def _gear(profile: SmartStepProfile, constants: TraceConstants) -> float:
-    match profile.command_pulse_gear:
+    match profile.trace.command_pulse_gear:
         case CommandPulseGear.NUM_DEN:
             return constants.gear_numerator / constants.gear_denominator
         case CommandPulseGear.DEN_NUM:
