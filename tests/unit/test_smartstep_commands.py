@@ -24,7 +24,7 @@ from ldcnd.drives.smartstep.commands import (
 from ldcnd.drives.smartstep.monitors import SPEED_FEEDBACK
 from ldcnd.drives.smartstep.packet import CommandPacket, Function, ReplyPacket, ResponseStatus, checksum
 from ldcnd.drives.smartstep.parameters import PN100, PN304, parameter_at
-from ldcnd.drives.smartstep.profiles import SMARTSTEP, CountUnit, SmartStepProfile, StringChecksum
+from ldcnd.drives.smartstep.profiles import SMARTSTEP, CountUnit, StringChecksum
 from ldcnd.line.exchange import ReplyVerdict
 from ldcnd.sim.smartstep.unit import string_reply
 
@@ -200,7 +200,7 @@ def test_unsolicited_data_error_shows_a_drive_that_hears_itself():
 
 
 def test_profile_may_grant_another_response_time():
-    patient = with_response_time(reference(0, 0x0100), SmartStepProfile(first_character_s=1.5))
+    patient = with_response_time(reference(0, 0x0100), SMARTSTEP.with_unit(first_character_s=1.5))
 
     assert patient.response_s == pytest.approx(1.5)
     assert patient.decode(GOOD) == 40

@@ -132,7 +132,7 @@ async def _string_settings(words: Words, profile: SmartStepProfile) -> Mapping[s
                 longest = longest // 4 * 2
             else:
                 break
-        return {"string_count_unit": unit.value, "trace_chunk_bytes": min(longest, profile.trace.chunk_bytes)}
+        return {"string_count_unit": unit.value, "trace_chunk_bytes": min(longest, profile.unit.trace.chunk_bytes)}
     raise DriveFault(f"axis {words.axis}: strings have a length that no unit of their count explains", axis=words.axis)
 
 
@@ -152,7 +152,7 @@ def _agreeing(profile: SmartStepProfile, recorded: Recorded, shown: Mapping[str,
     agreeing: list[Reading] = []
     for layout, order, pulse_gear in product(LAYOUTS, ByteOrder, CommandPulseGear):
         words = {int(word or 0) for word in column}
-        if order is not profile.trace.byte_order:
+        if order is not profile.unit.trace.byte_order:
             words = {(word >> 8 | word << 8) & 0xFFFF for word in words}
         points = [decode_word(word, layout) for word in words]
         factor = scale(profile.with_trace(command_pulse_gear=pulse_gear), constants, DataObject.COMMAND_PULSE_SPEED)

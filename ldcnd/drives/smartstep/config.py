@@ -1,21 +1,18 @@
 """The configuration of SmartStep lines and units, beside what every line and axis has."""
 
-from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.samples import MonitorName
 from ldcnd.drives.axis_config import AxisConfig, RatesConfig
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.smartstep.packet import HIGHEST_UNIT
 from ldcnd.drives.smartstep.profiles import (
     Echo,
-    EepromWrite,
     Framing,
     SmartStepProfile,
-    SmartStepTraceConfig,
+    SmartStepUnitConfig,
     Wiring,
 )
 
@@ -55,48 +52,6 @@ class SmartStepLineConfig(Frozen):
             raise ValueError("wiring 2-wire is not described in the manual; set accept_two_wire = true to use it")
         if self.echo == "expect" and self.wiring is Wiring.FOUR_WIRE:
             raise ValueError("there is no echo on four wires")
-        return self
-
-
-class SmartStepUnitConfig(Frozen):
-    """How one unit is read and written, and how it is taken to behave where its manual leaves room."""
-
-    monitors: Mapping[MonitorName, float] = {}
-    """Monitors to publish, with their rates in Hz."""
-    audit_s: float = Field(default=45.0, ge=0, le=86_400)
-    """Period in which each parameter is read once, in seconds, to find what another program or a reset has changed;
-    0 never."""
-    eeprom_write: EepromWrite = EepromWrite.ALLOW
-    """Permission to write EEPROM: deny forbids it; with allow, EEPROM is written when a request names it."""
-    eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
-    """Writes of the drive's EEPROM, all parameters together, until further ones are refused; it endures 10,000."""
-    planned_response_s: float = Field(default=0.02, ge=0, le=5)
-    """How long it takes to answer as a rule, for the plan; the manual promises 0.2 s, which would leave no room."""
-    first_character_s: float = Field(default=0.3, gt=0, le=5)
-    """The longest wait for a reply; the manual says 0.2 s."""
-    encoder_counts_per_rev: int = Field(default=8000, gt=0)
-    """Pulses of the feedback counter in one turn."""
-    run_active_low: bool = True
-    """RUN is on while its input bit is 0."""
-    reset_active_low: bool = True
-    """RESET is on while its input bit is 0."""
-    alarm_output_high: bool = True
-    """/ALM is 1 in alarm."""
-    trace: SmartStepTraceConfig = SmartStepTraceConfig()
-    """How its recorder is taken to work."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, document: object) -> object:
-        if isinstance(document, dict) and document.get("eeprom_write") == "confirm":
-            raise ValueError('eeprom_write: "confirm" never differed from "allow"; use "allow" or "deny"')
-        return document
-
-    @model_validator(mode="after")
-    def _rates(self) -> Self:
-        for name, rate in self.monitors.items():
-            if not 0 <= rate <= 100:  # noqa: PLR2004 - a word takes 29 ms at least
-                raise ValueError(f"monitors.{name}: {rate} Hz is not 0 to 100")
         return self
 
 
@@ -178,16 +133,5 @@ class SmartStepBusConfig(BusConfig):
 
     def profile(self, axis: SmartStepAxisConfig) -> SmartStepProfile:
         """Return how one of its drives is taken to behave."""
-        line, unit = self.smartstep, axis.smartstep
-        return SmartStepProfile(
-            framing=line.framing,
-            wiring=line.wiring,
-            echo=Echo(line.echo),
-            first_character_s=unit.first_character_s,
-            eeprom_write=unit.eeprom_write,
-            encoder_counts_per_rev=unit.encoder_counts_per_rev,
-            run_active_low=unit.run_active_low,
-            reset_active_low=unit.reset_active_low,
-            alarm_output_high=unit.alarm_output_high,
-            trace=unit.trace,
-        )
+        line = self.smartstep
+        return SmartStepProfile(framing=line.framing, wiring=line.wiring, echo=Echo(line.echo), unit=axis.smartstep)

@@ -181,7 +181,7 @@ class UnitPoller(Poller[int | Refusal]):
         The line takes its next turn before it delivers the last reply; which word is next depends on that reply, so
         the turn after this one is put off until then.
         """
-        queued_at_s, self.due_at_s = self.due_at_s, now_s + self._profile.first_character_s + PUT_OFF_S
+        queued_at_s, self.due_at_s = self.due_at_s, now_s + self._profile.unit.first_character_s + PUT_OFF_S
         if self._misses >= MISSES_BEFORE_BACKOFF or self._one_word_only:
             self._address = Register.PRESENT_ALARM
         else:

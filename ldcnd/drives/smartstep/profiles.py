@@ -6,12 +6,15 @@ bears on traces with the drive; the values of its traces are uncertain until the
 Source: manual, all chapters; where it is silent, public manuals of related drives.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.samples import MonitorName
 
 
 class Framing(StrEnum):
@@ -145,40 +148,79 @@ RESPONSE_S = 0.3
 """A drive answers within 0.2 s (manual 2.1), taken as command CR to first reply character, plus 0.1 s of margin."""
 
 
+class SmartStepUnitConfig(Frozen):
+    """How one unit is read and written, and how it is taken to behave where its manual leaves room."""
+
+    monitors: Mapping[MonitorName, float] = {}
+    """Monitors to publish, with their rates in Hz."""
+    audit_s: float = Field(default=45.0, ge=0, le=86_400)
+    """Period in which each parameter is read once, in seconds, to find what another program or a reset has changed;
+    0 never."""
+    eeprom_write: EepromWrite = EepromWrite.ALLOW
+    """Permission to write EEPROM: deny forbids it; with allow, EEPROM is written when a request names it."""
+    eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
+    """Writes of the drive's EEPROM, all parameters together, until further ones are refused; it endures 10,000."""
+    planned_response_s: float = Field(default=0.02, ge=0, le=5)
+    """How long it takes to answer as a rule, for the plan; the manual promises 0.2 s, which would leave no room."""
+    first_character_s: float = Field(default=RESPONSE_S, gt=0, le=5)
+    """The longest wait for a reply; the manual says 0.2 s."""
+    encoder_counts_per_rev: int = Field(default=8000, gt=0)  # divides in manual 4, "Unit conversion"
+    """Pulses of the feedback counter in one turn."""
+    run_active_low: bool = True  # manual 3, 8005H, gives bits, not their levels; this one and the next two are inferred
+    """RUN is on while its input bit is 0."""
+    reset_active_low: bool = True
+    """RESET is on while its input bit is 0."""
+    alarm_output_high: bool = True
+    """/ALM is 1 in alarm."""
+    trace: SmartStepTraceConfig = SmartStepTraceConfig()
+    """How its recorder is taken to work."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, document: object) -> object:
+        if isinstance(document, dict) and document.get("eeprom_write") == "confirm":
+            raise ValueError('eeprom_write: "confirm" never differed from "allow"; use "allow" or "deny"')
+        return document
+
+    @model_validator(mode="after")
+    def _rates(self) -> Self:
+        for name, rate in self.monitors.items():
+            if not 0 <= rate <= 100:  # noqa: PLR2004 - a word takes 29 ms at least
+                raise ValueError(f"monitors.{name}: {rate} Hz is not 0 to 100")
+        return self
+
+
 @dataclass(frozen=True, slots=True)
 class SmartStepProfile:
     """How one drive is taken to behave.
 
     Attributes:
-        first_character_s: the longest wait from the end of a command to its reply.
         gap_s: the longest silence inside a reply.
         quiet_s: silence before each command.
         attempts: how often a repeatable command is sent in all; like `gap_s` and `quiet_s` it is for the line's owner.
-        trace: how its traces are taken to work.
+        unit: what is configured of it.
     """
 
     framing: Framing = Framing.SEVEN_EVEN  # manual 2.1; soft parity for adapters that cannot make it
     wiring: Wiring = Wiring.FOUR_WIRE  # manual 1.1 has no other; on two wires a drive may take its replies for commands
     echo: Echo = Echo.NONE  # not in the manual: on four wires the host's receiver is on the other pair
-    first_character_s: float = RESPONSE_S
     gap_s: float = 0.06
     quiet_s: float = 0.005
     attempts: int = 3
-    eeprom_write: EepromWrite = EepromWrite.ALLOW
-    encoder_counts_per_rev: int = 8000  # the divisor of the speed formula, manual 4, "Unit conversion"
-    run_active_low: bool = True  # manual 3, 8005H, gives bits, not their levels; this one and the next two are inferred
-    reset_active_low: bool = True
-    alarm_output_high: bool = True
-    trace: SmartStepTraceConfig = field(default_factory=SmartStepTraceConfig)
+    unit: SmartStepUnitConfig = field(default_factory=SmartStepUnitConfig)
 
     @property
     def trigger_word(self) -> TriggerWordSource:
         """Where the drive's own trigger comes from."""
-        return TriggerWordSource.CONFIGURED if self.trace.trigger_map else TriggerWordSource.NONE
+        return TriggerWordSource.CONFIGURED if self.unit.trace.trigger_map else TriggerWordSource.NONE
 
     def with_trace(self, **assumed: object) -> "SmartStepProfile":
         """Return it with other assumptions about its traces."""
-        return replace(self, trace=self.trace.model_copy(update=assumed))
+        return self.with_unit(trace=self.unit.trace.model_copy(update=assumed))
+
+    def with_unit(self, **assumed: object) -> "SmartStepProfile":
+        """Return it with other assumptions about the drive."""
+        return replace(self, unit=self.unit.model_copy(update=assumed))
 
 
 SMARTSTEP = SmartStepProfile()
