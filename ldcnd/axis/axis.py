@@ -48,17 +48,14 @@ from ldcnd.contract.commands import (
     Move,
     MoveAbsolute,
     Power,
-    Preview,
-    PreviewReply,
     QuickStop,
-    ReportShadow,
-    ShadowReply,
     Stop,
     Verb,
     kind_of,
 )
 from ldcnd.contract.errors import InterlockViolated, LdcndError, NotSupported, OutcomeUnknown, WrongState
 from ldcnd.contract.events import REFERENCE, CommandStatus
+from ldcnd.contract.questions import Preview, PreviewReply, ReportShadow, ShadowReply
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive, Moves, Readable, StopMode

@@ -39,8 +39,6 @@ from ldcnd.contract.commands import (
     MoveAnalog,
     MoveRelative,
     MoveVelocity,
-    Preview,
-    PreviewReply,
     Probe,
     QuickStop,
     SetGains,
@@ -53,6 +51,7 @@ from ldcnd.contract.errors import ConfigError, LeaseExpired
 from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import AlarmReport, ClearCounter, CounterReply, ReadAlarms
+from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.contract.samples import Quality
 from ldcnd.contract.units import Dimension, quantity_text, shown_quantity
 

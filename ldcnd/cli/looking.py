@@ -17,7 +17,7 @@ from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.client.overview import AxisNow, AxisSeen, modules_now, overview
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
-from ldcnd.contract.commands import Verb, Why, WhyReply
+from ldcnd.contract.commands import Verb
 from ldcnd.contract.condition import SILENT_S, Condition, assess
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.fault_pages import codes, page_text
@@ -25,6 +25,7 @@ from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import (
     ReadMonitors,
 )
+from ldcnd.contract.questions import Why, WhyReply
 from ldcnd.contract.samples import (
     FaultSample,
     MonitorName,

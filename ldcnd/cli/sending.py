@@ -21,11 +21,12 @@ from ldcnd.cli.quantities import number, outcome, sample_text, values_of
 from ldcnd.cli.typed import Finite, Quantity, WholeNumber, axis_of, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, PreviewReply, Verb
+from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, Verb
 from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, step
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.frozen import Frozen, attribute_docstrings
 from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.questions import PreviewReply
 from ldcnd.contract.samples import PositionSample, Sample, StateSample, TelemetryItem
 from ldcnd.contract.units import DIMENSIONS
 

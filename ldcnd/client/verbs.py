@@ -22,22 +22,16 @@ from ldcnd.contract.commands import (
     MoveVelocity,
     PinMode,
     Power,
-    Preview,
-    PreviewReply,
     Probe,
     ProbeSource,
     ProbeStop,
     QuickStop,
-    ReportShadow,
     Reset,
     SetGains,
     SetOutputs,
     SetPosition,
     SetPwm,
-    ShadowReply,
     Track,
-    Why,
-    WhyReply,
 )
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.parameters import (
@@ -61,6 +55,7 @@ from ldcnd.contract.parameters import (
     RestartEepromCount,
     WriteParameter,
 )
+from ldcnd.contract.questions import Preview, PreviewReply, ReportShadow, ShadowReply, Why, WhyReply
 from ldcnd.contract.samples import MonitorName, ShadowFigure
 from ldcnd.contract.traces import AbortTrace, TraceAbortReply
 
