@@ -36,6 +36,7 @@ MODULES = (
     "ldcnd.client.blocking",
     "ldcnd.contract.samples",
     "ldcnd.contract.commands",
+    "ldcnd.contract.questions",
     "ldcnd.contract.rig_commands",
     "ldcnd.contract.parameters",
     "ldcnd.contract.traces",

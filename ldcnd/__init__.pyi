@@ -18,27 +18,22 @@ from ldcnd.contract.commands import (
     About,
     BufferMode,
     Capability,
-    Cause,
     CommandReply,
     Direction,
     Effect,
     Ends,
     ErrorReply,
-    Hindered,
     HomeMethod,
     HomeStop,
     MotionKind,
     PinMode,
-    PreviewReply,
     ProbeSource,
     ProbeStop,
     ReceivedError,
     RemedyStep,
     Role,
-    ShadowReply,
     StopReply,
     Verb,
-    WhyReply,
 )
 from ldcnd.contract.errors import (
     AccelerationLimit,
@@ -130,6 +125,7 @@ from ldcnd.contract.parameters import (
     PlannedParameters,
     PlannedWrite,
 )
+from ldcnd.contract.questions import Cause, Hindered, PreviewReply, ShadowReply, WhyReply
 from ldcnd.contract.rig_commands import (
     AxisShare,
     CapturedInputs,

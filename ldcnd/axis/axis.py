@@ -26,7 +26,6 @@ from ldcnd.axis.preview import preview
 from ldcnd.axis.procedures.group import GroupMoveRequest
 from ldcnd.axis.procedures.jog import Hold
 from ldcnd.axis.procedures.path import PathShareRequest
-from ldcnd.axis.quiet_drive import Unmoved
 from ldcnd.axis.readings import AxisReadings, OnEnded, ReadingOutOfTurn
 from ldcnd.axis.recorder import TraceRecorder
 from ldcnd.axis.reference import ReferenceKeeper
@@ -36,6 +35,7 @@ from ldcnd.axis.stopping import AxisStops, stop_mode_of
 from ldcnd.axis.telemetry import AxisTelemetry, Note
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.axis.turns import CommandQueue
+from ldcnd.axis.unmoved import Unmoved
 from ldcnd.config.interlocks import InterlockKind
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import (
@@ -48,17 +48,14 @@ from ldcnd.contract.commands import (
     Move,
     MoveAbsolute,
     Power,
-    Preview,
-    PreviewReply,
     QuickStop,
-    ReportShadow,
-    ShadowReply,
     Stop,
     Verb,
     kind_of,
 )
 from ldcnd.contract.errors import InterlockViolated, LdcndError, NotSupported, OutcomeUnknown, WrongState
 from ldcnd.contract.events import REFERENCE, CommandStatus
+from ldcnd.contract.questions import Preview, PreviewReply, ReportShadow, ShadowReply
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Drive, Moves, Readable, StopMode

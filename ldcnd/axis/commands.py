@@ -17,7 +17,7 @@ from ldcnd.axis.events import (
 from ldcnd.axis.gains import AxisGains
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.procedure import NEVER_S, Procedure
+from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.analog import AnalogMove
 from ldcnd.axis.procedures.approach import ApproachMove
 from ldcnd.axis.procedures.group import GroupMember, GroupMoveRequest
@@ -64,7 +64,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.driver import AxisReading, CountsMotion, StopMode
-from ldcnd.line.exchange import Timing
+from ldcnd.line.exchange import NEVER_S, Timing
 
 STEP_RETRY_S = 0.2
 """Delay before a step whose packets were lost is taken again, seconds,"""
@@ -381,8 +381,11 @@ class AxisCommands:
         if guards.goes_on(request.verb, self._tracker) and not self._driver.retargets:
             return await self._undertake(VelocityChange(self._motion, permit, request))
         self._check_may_start(permit, request)
-        velocity, bounded, ends = self._plan_velocity(request)
-        reply = await self._move(permit, self._from_now(request, bounded), AxisState.CONTINUOUS_MOTION)
+        in_motion = self.goes_on(request)
+        velocity, bounded, ends = self._plan_velocity(request, in_motion=in_motion)
+        if in_motion:
+            bounded = self._motion.in_mid_move(bounded)
+        reply = await self._move(permit, bounded, AxisState.CONTINUOUS_MOTION)
         return reply.model_copy(update={"velocity": velocity, "ends": ends})
 
     async def _jog(self, permit: Permit, request: Jog) -> CommandReply:
@@ -404,11 +407,11 @@ class AxisCommands:
         position = motion.scale.position(from_counts) + request.distance
         return motion.plan_to(position, request.velocity, request.acceleration)
 
-    def _plan_velocity(self, request: MoveVelocity) -> tuple[float, MotionPlan, str]:
+    def _plan_velocity(self, request: MoveVelocity, *, in_motion: bool) -> tuple[float, MotionPlan, str]:
         """Return the velocity as the drive will have it, a trapezoid that ends even if this host dies, and how."""
         motion = self._motion
         plan = motion.plan_at(request.velocity, request.acceleration)
-        end, ends = motion.run(request.duration_s, plan, in_motion=self.goes_on(request))
+        end, ends = motion.run(request.duration_s, plan, in_motion=in_motion)
         return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration), ends
 
     async def _move(
@@ -501,7 +504,7 @@ class AxisCommands:
     _PLANNED: ClassVar[Mapping[type, Callable[[Any, Any], MotionPlan]]] = {
         MoveAbsolute: _plan_absolute,
         MoveRelative: _plan_relative,
-        MoveVelocity: lambda self, request: self._plan_velocity(request)[1],
+        MoveVelocity: lambda self, request: self._plan_velocity(request, in_motion=self.goes_on(request))[1],
         Jog: lambda self, request: self._motion.plan_at(request.velocity, request.acceleration),
     }
     """How each move is planned that may wait for another one, or take it over."""

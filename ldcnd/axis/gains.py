@@ -19,7 +19,7 @@ class AxisGains:
         self._name = motion.config.name
         self._own: Gains | None = None  # of the axis while a client has lent it others
         config = motion.config
-        self._sets = {name: Gains(**each.model_dump()) for name, each in config.gain_sets.items()}
+        self._sets = {name: each.registers for name, each in config.gain_sets.items()}
         self._of_kinds = {kind: self._sets[name] for kind, name in config.gains_for.items()}
         self._of_others = motion.driver.wanted_gains if self._of_kinds else None
 

@@ -7,7 +7,6 @@ command.
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
-from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.status import AxisStatus
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.catalogue import AXIS_COMMANDS
@@ -29,6 +28,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving
 from ldcnd.contract.units import Dimension
+from ldcnd.drives.driver import QuietDrive
 
 
 def check_reachable(axis: AxisTracker) -> None:

@@ -14,7 +14,6 @@ from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
 from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.quiet_drive import QuietDrive
 from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.rest import Settling, window_counts
 from ldcnd.axis.scale import AxisScale
@@ -36,7 +35,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, StopMode
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, QuietDrive, StopMode
 
 COUNTER_SHARE = 0.99
 """Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
@@ -52,17 +51,30 @@ class MotionPlan:
 
     Attributes:
         motion: in counts, as the registers hold it.
-        position: target in axis units; None for a motion without one.
-        velocity: in units a second, signed like the motion.
-        acceleration: in units a second squared.
+        scale: of the axis, as it was planned.
         duration_s: of the profile, without settling; None for a motion without an end.
     """
 
     motion: CountsMotion
-    position: float | None
-    velocity: float
-    acceleration: float
+    scale: AxisScale
     duration_s: float | None
+
+    @property
+    def position(self) -> float | None:
+        """Its target in axis units; None for a motion without one."""
+        target = self.motion.target_counts
+        return None if target is None else self.scale.position(target)
+
+    @property
+    def velocity(self) -> float:
+        """Its velocity in units a second: positive to a target, signed without one."""
+        per_unit = self.scale.counts_per_unit
+        return self.motion.velocity_counts_per_s / (per_unit if self.motion.target_counts is None else abs(per_unit))
+
+    @property
+    def acceleration(self) -> float:
+        """Its acceleration in units a second squared."""
+        return self.motion.acceleration_counts_per_s2 / abs(self.scale.counts_per_unit)
 
 
 def both_s(first: MotionPlan, goal: MotionPlan) -> float:
@@ -261,13 +273,7 @@ class AxisMotion:
         duration_s = profile_duration_s(
             abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
         )
-        return MotionPlan(
-            motion,
-            scale.position(target),
-            motion.velocity_counts_per_s / counts_per_unit,
-            motion.acceleration_counts_per_s2 / counts_per_unit,
-            duration_s,
-        )
+        return MotionPlan(motion, scale, duration_s)
 
     def plan_at(self, velocity: float, acceleration: float | None) -> MotionPlan:
         """Plan a motion at a constant velocity in units a second, without an end.
@@ -286,13 +292,7 @@ class AxisMotion:
         speed, rate = self._checked(velocity, acceleration)
         counts_per_unit = self.scale.counts_per_unit
         motion = self.quantise(CountsMotion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
-        return MotionPlan(
-            motion,
-            None,
-            motion.velocity_counts_per_s / counts_per_unit,
-            motion.acceleration_counts_per_s2 / abs(counts_per_unit),
-            None,
-        )
+        return MotionPlan(motion, self.scale, None)
 
     def quantise(self, motion: CountsMotion) -> CountsMotion:
         """Return a motion as the drive's registers will hold it, within the limits of the axis also after rounding.
@@ -501,14 +501,8 @@ class AxisMotion:
     def replanned(self, plan: MotionPlan, motion: CountsMotion) -> MotionPlan:
         """Return a plan with another velocity and acceleration, to the same target."""
         share = self.on_line(replace(plan, motion=motion))
-        counts_per_unit = abs(self.scale.counts_per_unit)
-        return replace(
-            plan,
-            motion=motion,
-            velocity=motion.velocity_counts_per_s / counts_per_unit,
-            acceleration=motion.acceleration_counts_per_s2 / counts_per_unit,
-            duration_s=profile_duration_s(share.way, share.most_velocity, share.most_acceleration),
-        )
+        duration_s = profile_duration_s(share.way, share.most_velocity, share.most_acceleration)
+        return replace(plan, motion=motion, duration_s=duration_s)
 
     # -- motions -----------------------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ from typing_extensions import override
 from ldcnd.contract.errors import BusError
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.driver import AxisReading, Readable
-from ldcnd.line.exchange import Exchange, Poller, Timing, next_on_grid
+from ldcnd.line.exchange import NEVER_S, Exchange, Poller, Timing, next_on_grid
 
 Deliver = Callable[[AxisReading, frozenset[TelemetryItem], Timing], bool]
 """Takes a reading; true when it is not accepted before the drive was read again."""
@@ -16,7 +16,6 @@ Missed = Callable[[BusError], None]
 
 AGAIN_S = 0.001
 """Deadline of a repeated poll, or of one at a given instant, after its due time, in seconds."""
-NEVER_S = float("inf")
 EXTRA_ITEMS = frozenset({TelemetryItem.POSITION})
 """Items of a reading at a given instant between two polls."""
 

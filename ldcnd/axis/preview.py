@@ -2,8 +2,8 @@
 
 from ldcnd.axis.motion import AxisMotion, MotionPlan, both_s
 from ldcnd.contract.codec import error_reply
-from ldcnd.contract.commands import Preview, PreviewReply
 from ldcnd.contract.errors import MalformedRequest, RequestRefused
+from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.line.bus import Bus
 
 

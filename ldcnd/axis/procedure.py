@@ -6,8 +6,7 @@ from ldcnd.axis.permit import Permit
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import CommandReply
 from ldcnd.drives.driver import AxisReading
-
-NEVER_S = float("inf")
+from ldcnd.line.exchange import NEVER_S
 
 
 class Procedure(ABC):

@@ -11,28 +11,31 @@ class AxisScale:
     """How counts of a drive and positions of its axis belong together.
 
     Attributes:
-        unit: of the axis.
+        units: in which people read positions, velocities and accelerations.
         counts_per_unit: negative where forward in axis units is backward in counts.
         modulo: length of one turn, in axis units; None for an axis without one.
         origin_counts: count of the drive at position 0. It means something only while the axis is referenced.
-        units: in which people read velocities and accelerations; None for those of the network.
     """
 
-    unit: str
+    units: AxisUnits = field(compare=False)
     counts_per_unit: float = 1.0
     modulo: float | None = None
     origin_counts: float = 0.0
-    units: AxisUnits | None = field(default=None, compare=False)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the axis's positions."""
+        return self.units.unit
 
     @classmethod
     def of(cls, config: AxisConfig) -> "AxisScale":
         """Return the scale that an axis is configured with, with its origin at count 0."""
         units = AxisUnits(config.unit, config.unit_table, config.g_velocity)
-        return cls(config.unit, config.signed_counts_per_unit, config.modulo, units=units)
+        return cls(units, config.signed_counts_per_unit, config.modulo)
 
     def text(self, value: float, dimension: Dimension) -> str:
         """Return a number in units of the axis as people read it."""
-        return quantity_text(value, self.units or AxisUnits(self.unit, {}), dimension, ".6g")
+        return quantity_text(value, self.units, dimension, ".6g")
 
     def position(self, counts: float) -> float:
         """Return the position that a count of the drive stands for, in axis units, counted through all turns."""

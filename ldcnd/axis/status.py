@@ -8,6 +8,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from operator import attrgetter
 from typing import Any
 
 from ldcnd.axis.course import Braking, Pace, Way
@@ -16,7 +17,7 @@ from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
-from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Quality
+from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Quality, StateSample
 from ldcnd.drives.driver import Fault, StopMode
 from ldcnd.line.exchange import Timing
 
@@ -112,6 +113,11 @@ class OpenStop:
     mode: StopMode
     fault: FaultEntry | None = None
     how: str = ""
+
+
+PUBLISHED = tuple(name for name in StateSample.model_fields if name not in {"t", "t_error_ns", "seq"})
+"""What a state sample says of a status: each is an attribute of it."""
+_published_of = attrgetter(*PUBLISHED)
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,25 +282,7 @@ class AxisStatus:
 
     def sample_fields(self) -> dict[str, Any]:
         """Return the fields of a state sample besides when, in its order; compared after every poll, so no model."""
-        return {
-            "quality": self.quality,
-            "state": self.state,
-            "enabled": self.enabled,
-            "referenced": self.referenced,
-            "moving": self.moving,
-            "link": self.link,
-            "stop_latched": self.stop_latched,
-            "stop_pending": self.stop_pending,
-            "command": self.command,
-            "last_error": self.last_error,
-            "interlock": self.interlock,
-            "has_reference": self.commanded,
-            "reference_lost": self.reference_lost,
-            "target": self.target,
-            "unit": self.unit,
-            "speed_override": self.speed_override,
-            "holder": self.holder,
-        }
+        return dict(zip(PUBLISHED, _published_of(self), strict=True))
 
     def is_at(self, command_id: str) -> bool:
         """Tell whether a command is under way."""

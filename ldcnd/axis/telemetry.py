@@ -5,8 +5,8 @@ from typing import Any
 
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, AxisStatus
-from ldcnd.contract.commands import ReportShadow
 from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.questions import ReportShadow
 from ldcnd.contract.samples import CurrentCommand, FaultEntry, LatchSample, Quality, ShadowSample, TelemetryItem
 from ldcnd.drives.driver import AxisReading, Drive
 from ldcnd.drives.parameter_access import MonitorValue

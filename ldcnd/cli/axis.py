@@ -39,8 +39,6 @@ from ldcnd.contract.commands import (
     MoveAnalog,
     MoveRelative,
     MoveVelocity,
-    Preview,
-    PreviewReply,
     Probe,
     QuickStop,
     SetGains,
@@ -52,6 +50,7 @@ from ldcnd.contract.commands import (
 from ldcnd.contract.errors import ConfigError, LeaseExpired
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import AlarmReport, ClearCounter, CounterReply, ReadAlarms
+from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.contract.units import Dimension, quantity_text, shown_quantity
 
 WAIT, LEAVE = (click.option(name, is_flag=True, help=text) for name, text in WAITING.items())

@@ -17,12 +17,13 @@ from ldcnd.client.events import fetch_wire_log
 from ldcnd.client.overview import last_bus_health
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.health import GuestHealth
-from ldcnd.contract.leases import SendGuestAway
+from ldcnd.contract.leases import GuestSentAway, SendGuestAway
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, read_whole
 from ldcnd.contract.rig_commands import (
     IoReply,
     OverrideInterlock,
+    OverrideReply,
     SetIo,
     SetIoTimer,
     Snapshot,
@@ -92,19 +93,6 @@ def set_io(
     target.show(*_shown(target.run(lambda client: client.ask(request))))
 
 
-@command.command("override-interlock")
-@click.argument("interlock")
-@click.option("--seconds", type=Finite(0, 600), required=True, help="How long; 0 takes it back.")
-@click.option("--reason", required=True, help="For events and log.")
-@click.option("--lease", envvar="LDCND_LEASE", required=True, help="Send it under this lease.")
-@with_target
-def override_interlock(target: Target, interlock: str, seconds: float, reason: str, lease: str) -> None:
-    """Lift the interlock INTERLOCK for service, for a time and as long as the lease lasts."""
-    request = of_options(OverrideInterlock, interlock=interlock, seconds=seconds, reason=reason, lease=lease)
-    reply = target.run(lambda client: client.ask(request))
-    target.show(reply, f"interlock {reply.interlock} is overridden for {reply.seconds:g} s by {reply.client}")
-
-
 def _shown(reply: IoReply) -> tuple[IoReply, str]:
     names = {line: name for name, line in reply.names.items()}
     known = None if reply.outputs is None else ", ".join(names.get(line, str(line)) for line in reply.outputs)
@@ -134,6 +122,17 @@ def _snapshot(reply: SnapshotReply, _axis: AxisInfo | None) -> Shown:
     yield reply, [*lines, f"all within {reply.t_error_ns / 1e6:.2f} ms of {reply.t / 1e9:.6f} s UTC"]
 
 
+def _overridden(reply: OverrideReply, _axis: AxisInfo | None) -> Shown:
+    yield reply, [f"interlock {reply.interlock} is overridden for {reply.seconds:g} s by {reply.client}"]
+
+
+def _sent_away(reply: GuestSentAway, _axis: AxisInfo | None) -> Shown:
+    controlled = f"; it controlled {', '.join(reply.axes)}" if reply.axes else ""
+    yield reply, [f"the program at {reply.port} was sent away{controlled}"]
+
+
+command.add_command(derived_question("override-interlock", OverrideInterlock, "interlock", shows=_overridden))
+command.add_command(derived_question("send-away", SendGuestAway, "port", shows=_sent_away))
 command.add_command(derived_question("set-io-timer", SetIoTimer, "module", "mode", shows=_counted))
 command.add_command(derived_question("snapshot", Snapshot, "bus", shows=_snapshot))
 
@@ -170,17 +169,6 @@ def _doing(guest: GuestHealth) -> str:
     holds = f"controls {', '.join(guest.axes)}" if guest.axes else "controls nothing"
     since = datetime.fromtimestamp(guest.since / 1e9, UTC).isoformat(timespec="seconds")
     return f"since {since}; {holds}; {guest.packets_hz:.1f} packets/s"
-
-
-@command.command("send-away")
-@click.argument("port")
-@with_target
-def send_away(target: Target, port: str) -> None:
-    """Close the terminal or the connection of the program at PORT; its axes do what `loss.client` says."""
-    request = of_options(SendGuestAway, port=port, client=NAME)
-    reply = target.run(lambda client: client.ask(request))
-    controlled = f"; it controlled {', '.join(reply.axes)}" if reply.axes else ""
-    target.show(reply, f"the program at {reply.port} was sent away{controlled}")
 
 
 @command.command("wire-log")

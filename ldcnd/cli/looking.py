@@ -17,7 +17,7 @@ from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.client.overview import AxisNow, AxisSeen, modules_now, overview
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
-from ldcnd.contract.commands import Verb, Why, WhyReply
+from ldcnd.contract.commands import Verb
 from ldcnd.contract.condition import SILENT_S, Condition, assess
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.fault_pages import codes, page_text
@@ -25,6 +25,7 @@ from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.parameters import (
     ReadMonitors,
 )
+from ldcnd.contract.questions import Why, WhyReply
 from ldcnd.contract.samples import (
     FaultSample,
     MonitorName,
@@ -76,7 +77,7 @@ def axes_table(axes: list[AxisNow]) -> list[str]:
             now.condition.position(_digits(now), now.info.unit, now.age_s),
             now.condition.state,
             f"moving {_motion(now.seen)}",
-            f"link {now.state.link if now.state else 'unknown'}",
+            f"link {now.last.state.link if now.last.state else 'unknown'}",
             ", ".join(now.condition.notes),
         )
         for now in axes
@@ -98,12 +99,13 @@ def _motion(seen: AxisSeen) -> str:
 
 
 def _digits(now: AxisNow) -> str | None:
-    return f"{now.position.value:.{decimals(now.info)}f}" if now.position else None
+    position = now.last.position
+    return f"{position.value:.{decimals(now.info)}f}" if position else None
 
 
 def row(now: AxisNow) -> AxisRow:
     """Return an axis as `--json` has it."""
-    state = now.state
+    state = now.last.state
     return AxisRow(
         **now.info.model_dump(),
         **dict(now.seen),
@@ -151,8 +153,8 @@ class Watched:
     def begin(self, now: AxisNow) -> None:
         """Take what is known of an axis before its first sample."""
         self._now[now.info.axis] = now
-        if now.state:
-            self._states[now.info.axis] = now.state
+        if now.last.state:
+            self._states[now.info.axis] = now.last.state
 
     def text(self, name: str, sample: Sample) -> str:
         """Return a sample in words, with the condition of its axis where that matters."""

@@ -16,7 +16,7 @@ from ldcnd.cli.names import whose
 from ldcnd.cli.nearest import Typed, naming_nearest
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
-from ldcnd.cli.sending import NAME, Sender, commanding, derived_for_all, halted
+from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, halted
 from ldcnd.cli.typed import Finite, Quantity, axis_of, in_units, number_of
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
@@ -24,7 +24,7 @@ from ldcnd.contract.commands import CommandReply, MoveVelocity, Power, Reset
 from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError, UnknownAxis, WrongState
 from ldcnd.contract.events import ReadOutcome
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.leases import Acquire, HolderList, ListHolders
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.rig_commands import (
     AxisMove,
@@ -148,14 +148,13 @@ def lease() -> None:
     """See who controls which axis, and take control."""
 
 
-@lease.command("list")
-@with_target
-def list_holders(target: Target) -> None:
-    """Show who controls each axis."""
-    reply = target.run(lambda client: client.ask(ListHolders()))
+def _holders(reply: HolderList, _axis: AxisInfo | None) -> Shown:
     needed = "a motion needs control" if reply.required else "an axis that is not controlled is open to all"
     lines = [f"{each.axis:8} {each.client or 'not controlled'}" for each in reply.holders]
-    target.show(reply, *lines, f"({needed})")
+    yield reply, [*lines, f"({needed})"]
+
+
+lease.add_command(derived_question("list", ListHolders, shows=_holders))
 
 
 @lease.command(context_settings={"allow_interspersed_args": False})

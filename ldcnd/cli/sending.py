@@ -21,11 +21,12 @@ from ldcnd.cli.quantities import number, outcome, sample_text, values_of
 from ldcnd.cli.typed import Finite, Quantity, WholeNumber, axis_of, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
-from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, PreviewReply, Verb
+from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, Verb
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError, UnknownAxis, step
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.frozen import Frozen, attribute_docstrings
 from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.questions import PreviewReply
 from ldcnd.contract.samples import LinkState, Moving, PositionSample, Sample, StateSample, TelemetryItem
 from ldcnd.contract.units import DIMENSIONS
 
@@ -330,7 +331,8 @@ def derived_question(
     def callback(target: Target, /, axis: str | None = None, *, yes: bool = True, **given: Any) -> None:  # noqa: ANN401
         if not yes and not click.confirm(confirm.format(axis=axis), err=True):
             raise click.Abort
-        request = of_options(command, **given)
+        who = {"client": NAME} if command.about is About.RIG and "client" in command.model_fields else {}
+        request = of_options(command, **given, **who)
 
         async def work(client: RigClient) -> tuple[ReplyT, AxisInfo | None, *tuple[Typed, ...]]:
             if axis is None:
@@ -362,7 +364,11 @@ def _derived(
     before: Sequence[click.Parameter],
     behind: Sequence[click.Parameter],
 ) -> Derived:
-    fields = {each: described for each, described in command.model_fields.items() if each not in _SENT_BY_ITSELF}
+    fields = {
+        each: described
+        for each, described in command.model_fields.items()
+        if each not in _SENT_BY_ITSELF or (each == LEASE and described.is_required())
+    }
     params: list[click.Parameter] = list(before)
     for field, described in fields.items():
         kind, many = (Quantity(), False) if field in DIMENSIONS else _kind(described.annotation)
@@ -380,6 +386,7 @@ def _derived(
     )
 
 
+LEASE = "lease"
 _SENT_BY_ITSELF = frozenset({*AxisCommand.model_fields, "leases"})
 """Fields that prove permission and prevent a second execution."""
 
@@ -399,6 +406,7 @@ class _FieldOption(click.Option):
             is_flag=is_flag,
             multiple=many,
             required=described.is_required(),
+            envvar="LDCND_LEASE" if field == LEASE else None,
         )
         self._command = command
         self._field = field

@@ -83,14 +83,22 @@ class AxisSeen(Frozen):
 
 
 @dataclass(frozen=True, slots=True)
+class LastOfAxis:
+    """The last sample of each item of an axis; None before the first."""
+
+    state: StateSample | None
+    fault: FaultSample | None
+    position: PositionSample | None
+    velocity: VelocitySample | None
+
+
+@dataclass(frozen=True, slots=True)
 class AxisNow:
     """One axis as its daemon has shown it last.
 
     Attributes:
         info: its description.
-        state: None before the first.
-        position: None before the first.
-        velocity: None before the first.
+        last: its last samples.
         age_s: age of the position by the daemon's own clock, seconds; None without one.
         rest_s: after how long the motion under way should have run its course, seconds; None without such an end.
         health: its last report; None before the first.
@@ -98,9 +106,7 @@ class AxisNow:
     """
 
     info: AxisInfo
-    state: StateSample | None
-    position: PositionSample | None
-    velocity: VelocitySample | None
+    last: LastOfAxis
     age_s: float | None
     rest_s: float | None
     health: AxisHealth | None
@@ -109,7 +115,8 @@ class AxisNow:
     @property
     def seen(self) -> AxisSeen:
         """The same in values."""
-        state, position, velocity, is_live = self.state, self.position, self.velocity, self.condition.live
+        state, position, velocity = self.last.state, self.last.position, self.last.velocity
+        is_live = self.condition.live
         return AxisSeen(
             position=position.value if position else None,
             quality=position.quality if position else None,
@@ -123,16 +130,6 @@ class AxisNow:
             rest_s=self.rest_s if is_live else None,
             condition=self.condition.notes,
         )
-
-
-@dataclass(frozen=True, slots=True)
-class LastOfAxis:
-    """The last sample of each item of an axis; None before the first."""
-
-    state: StateSample | None
-    fault: FaultSample | None
-    position: PositionSample | None
-    velocity: VelocitySample | None
 
 
 def axis_now(
@@ -152,9 +149,7 @@ def axis_now(
     ends = last.state.command.expected_end if last.state and last.state.command else None
     return AxisNow(
         info,
-        last.state,
-        last.position,
-        last.velocity,
+        last,
         age,
         max(0.0, -age_s(ends)) if ends else None,
         health,

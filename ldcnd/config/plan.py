@@ -119,8 +119,8 @@ def _described(bus: BusConfig, plan: LinePlan) -> list[PollPlan]:
         PollPlan(
             axis=poll.axis,
             address=address(poll),
-            request_bytes=poll.request_bytes,
-            reply_bytes=poll.reply_bytes,
+            request_bytes=poll.cost.request_bytes,
+            reply_bytes=poll.cost.reply_bytes,
             rate_hz=poll.rate_hz,
             longest_s=poll.cost.longest_s,
             response_s=_bounded(response_s),

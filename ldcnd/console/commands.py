@@ -18,10 +18,11 @@ from ldcnd.console.requests import body_of, json_reply
 from ldcnd.console.rigs import Rigs
 from ldcnd.contract.catalogue import BY_VERB
 from ldcnd.contract.codec import Encoding, decode, error_reply, understand
-from ldcnd.contract.commands import About, AxisCommand, Command, ErrorReply, StopReply, Why
+from ldcnd.contract.commands import About, AxisCommand, Command, ErrorReply, StopReply
 from ldcnd.contract.errors import LdcndError, UnknownVerb
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.leases import Acquire, Release, Renew
+from ldcnd.contract.questions import Why
 from ldcnd.contract.rig_commands import AxisMove, MoveTogether, SetIo, SetIoTimer, SetSpeedOverride, WalkPath
 
 STOP_TIME_S = 3.0

@@ -12,10 +12,10 @@ from ldcnd.console.conditions import Conditions
 from ldcnd.console.latest_values import LatestValues, as_msgpack
 from ldcnd.console.replies import RigReply
 from ldcnd.contract.codec import Encoding
-from ldcnd.contract.commands import Why
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.meta import CommandList
 from ldcnd.contract.plan import RigBudget
+from ldcnd.contract.questions import Why
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.log import get_logger
 

@@ -5,7 +5,7 @@ from functools import cache
 from pathlib import Path
 from types import MappingProxyType
 
-from ldcnd.contract import commands, parameters, rig_commands, traces
+from ldcnd.contract import commands, parameters, questions, rig_commands, traces
 from ldcnd.contract.commands import About, AxisCommand, Capability, Command, CommandReply, ErrorReply, StopReply, Verb
 from ldcnd.contract.events import CommandEvent
 from ldcnd.contract.frozen import Frozen, schema_name
@@ -17,7 +17,7 @@ from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.samples import SAMPLE_MODELS, MonitorSample
 from ldcnd.contract.traces import TraceChunk, TraceHeader
 
-_AXIS = (*commands.COMMANDS, *parameters.COMMANDS, *traces.COMMANDS)
+_AXIS = (*commands.COMMANDS, *questions.COMMANDS, *parameters.COMMANDS, *traces.COMMANDS)
 
 AXIS_COMMANDS: Mapping[Verb, type[AxisCommand[CommandReply]]] = MappingProxyType(
     {verb: command for verb in Verb for command in _AXIS if command.verb == verb and issubclass(command, AxisCommand)}

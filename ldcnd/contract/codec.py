@@ -17,9 +17,10 @@ import msgpack
 import pydantic
 import pydantic_core
 
-from ldcnd.contract.commands import Cause, Command, Effect, ErrorReply, Power, ReceivedError, RemedyStep
+from ldcnd.contract.commands import Command, Effect, ErrorReply, Power, ReceivedError, RemedyStep
 from ldcnd.contract.errors import ERRORS, LdcndError, MalformedRequest, PayloadTooLarge, Remedy, RemedyCommand
 from ldcnd.contract.frozen import Frozen, schema_name
+from ldcnd.contract.questions import Cause
 from ldcnd.printable import is_printable, printable
 
 MAX_PAYLOAD_BYTES = 16 * 1024

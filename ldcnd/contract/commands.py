@@ -2,8 +2,8 @@
 
 A command is sent as the payload of a query on `@cmd/<axis>/<verb>`, or on `@cmd/_/<verb>` when it is about the rig. Its
 class is the only definition: keys, schemas, time-outs, access rules and the tables of the command line, the console
-and the documentation are derived from its attributes. Commands about parameters, traces and events are defined beside
-their replies; `ldcnd.contract.catalogue` has them all.
+and the documentation are derived from its attributes. Questions are in questions.py, commands about
+parameters, traces and events beside their replies; `ldcnd.contract.catalogue` has them all.
 """
 
 from collections.abc import Collection
@@ -16,7 +16,6 @@ from pydantic import ConfigDict, Field
 
 from ldcnd.contract.errors import ErrorCode
 from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
-from ldcnd.contract.samples import MOST_SHADOW_FIGURES, ShadowFigure
 
 LATEST_NS = 2**63 - 1
 """The latest instant that every encoding takes, UTC in ns since 1970."""
@@ -391,6 +390,8 @@ class Move(AxisCommand[CommandReply]):
 
     buffer_mode: BufferMode = BufferMode.REFUSE
     """Effect if the axis moves already."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
 
 
 class Direction(StrEnum):
@@ -410,8 +411,6 @@ class MoveAbsolute(Move):
     """Target in axis units; on an axis with a modulo any turn of it is meant."""
     velocity: float | None = Field(default=None, gt=0)
     """Speed in units a second; the axis default when missing."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     direction: Direction | None = None
     """Way to turn, on an axis with a modulo only; the shortest when missing."""
 
@@ -425,8 +424,6 @@ class MoveRelative(Move):
     """Distance in axis units, signed."""
     velocity: float | None = Field(default=None, gt=0)
     """Speed in units a second; the axis default when missing."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
 
 
 class MoveVelocity(Move):
@@ -439,8 +436,6 @@ class MoveVelocity(Move):
 
     velocity: float
     """Velocity in units a second, positive forward, not 0."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     duration_s: float | None = Field(default=None, gt=0, le=86_400)
     """Duration at the velocity, in seconds, at most the axis's `longest_run_s`; that, or without it the software limit
     ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also when daemon and client are gone:
@@ -462,8 +457,6 @@ class Jog(Move):
 
     velocity: float
     """Velocity in units a second, positive forward, not 0."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
     hold_s: float = Field(default=0.4, ge=SHORTEST_HOLD_S, le=LONGEST_HOLD_S)
     """Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog."""
     renews: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
@@ -702,143 +695,6 @@ class SetOutputs(AxisCommand[CommandReply]):
     """The pin of limit switch 2 (forward)."""
 
 
-# -- questions about an axis -----------------------------------------------------------------------------------------
-
-
-class Cause(Frozen):
-    """One thing that forbids a motion."""
-
-    code: str
-    """The error code that a motion would be refused with."""
-    text: str
-    """The obstacle, in one sentence."""
-    remedy: str | None
-    """The command, or the hand, that clears it."""
-    steps: tuple[RemedyStep, ...] = ()
-    """The commands that the remedy names, in their order."""
-    page: str | None = None
-    """Path of its page below a console or the documentation."""
-    passes: bool = False
-    """It ends with the motion under way: a move with another `buffer_mode` than refuse is not refused for it."""
-
-
-class Hindered(Frozen):
-    """Commands of an axis that the same obstacles forbid, or none."""
-
-    verbs: tuple[str, ...]
-    """The commands; `power` is to close the loop, as to open it is never refused."""
-    causes: tuple[Cause, ...]
-    """The obstacles; the first is what they would be refused with, if their values are right."""
-
-
-class WhyReply(Frozen):
-    """The causal chain: the reply to `@cmd/<axis>/why`."""
-
-    axis: str
-    """The axis."""
-    can_move: bool
-    """Whether a motion within the limits would be accepted from the sender."""
-    causes: tuple[Cause, ...]
-    """The obstacles, in the order in which they have to be cleared."""
-    first_fault: str | None
-    """The first fault since the last reset; null when there was none."""
-    overrides: tuple[str, ...] = ()
-    """Overridden interlocks that bind the axis or an output of its line: which, by whom, for how long still; for
-    people."""
-    commands: tuple[Hindered, ...] = ()
-    """What forbids each command of the axis, if that was asked."""
-
-
-class Why(Command[WhyReply]):
-    """Report why an axis cannot move."""
-
-    verb = "why"
-    about = About.AXIS
-    effect = Effect.QUESTION
-
-    lease: str | None = None
-    """The lease under which the motion would be sent."""
-    absolute: bool = True
-    """Whether the motion would name a position, which needs a referenced axis."""
-    each_command: bool = False
-    """Whether to say of each command of the axis as well what forbids it."""
-
-
-class PreviewReply(Frozen):
-    """The motion as it would be; nothing was sent: the reply to `@cmd/<axis>/preview`."""
-
-    axis: str
-    """The axis."""
-    refusal: ErrorReply | None
-    """Why its values would be refused, with the nearest that would not; null when they would be accepted."""
-    obstacles: tuple[str, ...]
-    """The other obstacles now; see `why`."""
-    position: float | None = None
-    """Position at the end, in axis units; null when the motion has no end."""
-    ends: str | None = None
-    """What ends a motion at a velocity that nobody stops, and when, for people; null for all others."""
-    approach_from: float | None = None
-    """Position to which the axis would go first, to come to its end from the configured side; null when one motion
-    will do."""
-    velocity: float | None = None
-    """Velocity that the registers would hold, units a second."""
-    velocity_error: float | None = None
-    """Held velocity minus the requested one at the speed override of the rig, units a second."""
-    acceleration: float | None = None
-    """Acceleration that the registers would hold, units a second squared."""
-    acceleration_error: float | None = None
-    """Held minus requested acceleration, units a second squared."""
-    duration_s: float | None = None
-    """Duration of the profile, in seconds, without settling; null when it has no end."""
-    packets: tuple[str, ...] = ()
-    """The packets that would be sent, in hexadecimal."""
-    bus_s: float | None = None
-    """Longest time for which the move would occupy the line, in seconds."""
-
-
-class Preview(Command[PreviewReply]):
-    """Compute what a motion would do; exactly one of position, distance and velocity alone selects the motion."""
-
-    verb = "preview"
-    about = About.AXIS
-    effect = Effect.QUESTION
-
-    position: float | None = None
-    """A move to this position, in axis units."""
-    direction: Direction | None = None
-    """Way to turn to a position on an axis with a modulo."""
-    distance: float | None = None
-    """A move by this distance, in axis units."""
-    velocity: float | None = None
-    """Speed of the move; alone: a motion at this velocity, signed. Units a second."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Units a second squared; the axis default when missing."""
-
-
-class ShadowReply(Frozen):
-    """What an observer says was published: the reply to `@cmd/<axis>/report_shadow`."""
-
-    axis: str
-    """The axis."""
-
-
-class ReportShadow(Command[ShadowReply]):
-    """Publish what an observer has found in the motions of an axis, on `tele/<axis>/shadow`; it stops nothing."""
-
-    verb = "report_shadow"
-    about = About.AXIS
-    effect = Effect.QUESTION
-
-    t: int = Field(ge=0, le=LATEST_NS)
-    """Instant of the last position that the observer has seen, UTC in ns since 1970."""
-    learning: bool
-    """It still learns what is usual."""
-    judged: int = Field(ge=0, le=LARGEST_INTEGER)
-    """Motions that have taught or were judged since the observer began."""
-    figures: tuple[ShadowFigure, ...] = Field(default=(), max_length=MOST_SHADOW_FIGURES)
-    """Those of which enough is known."""
-
-
 COMMANDS: tuple[type[Command[Frozen]], ...] = (
     Power,
     MoveAbsolute,
@@ -857,8 +713,5 @@ COMMANDS: tuple[type[Command[Frozen]], ...] = (
     SetPwm,
     Track,
     SetOutputs,
-    Why,
-    Preview,
-    ReportShadow,
 )
 """The commands of this file."""

@@ -301,7 +301,7 @@ TELL_OF_THE_PAST = frozenset({"loop_opened"})
 """Faults that say what has happened and are seen in one reading only; the others say what is so while they stand."""
 _MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
 """Faults whose name says best why the position is lost."""
-_DRIVEN = frozenset({AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION})
+_DRIVEN = frozenset(each for each in AxisState if each.is_motion) - {AxisState.STOPPING}
 
 
 def line_troubles(*, up: bool, problem: str = "") -> tuple[Trouble, ...]:

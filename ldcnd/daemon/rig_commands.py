@@ -12,20 +12,7 @@ from ldcnd.axis.procedures.group import GroupMoveRequest, Meeting, Rendezvous, p
 from ldcnd.axis.procedures.path import PathShareRequest, SharedPath
 from ldcnd.contract.catalogue import AXIS_COMMANDS, verbs_for
 from ldcnd.contract.codec import remedy_steps
-from ldcnd.contract.commands import (
-    AxisCommand,
-    Capability,
-    Cause,
-    Command,
-    CommandReply,
-    Effect,
-    Hindered,
-    MoveAbsolute,
-    Preview,
-    ReportShadow,
-    Why,
-    WhyReply,
-)
+from ldcnd.contract.commands import AxisCommand, Capability, Command, CommandReply, Effect, MoveAbsolute
 from ldcnd.contract.errors import (
     InternalError,
     LdcndError,
@@ -38,6 +25,7 @@ from ldcnd.contract.events import CommandOutcome, CommandStatus, ReadEvents, Rea
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.contract.leases import GuestSentAway, Holder, HolderList, ListHolders, Release, Renew, SendGuestAway
+from ldcnd.contract.questions import Cause, Hindered, Preview, ReportShadow, Why, WhyReply
 from ldcnd.contract.rig_commands import (
     AxisShare,
     GroupMoves,

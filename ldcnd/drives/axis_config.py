@@ -12,6 +12,7 @@ from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.plan import PollPriority
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.contract.units import AxisUnits, Dimension, UnitTable, g_velocity, unit_table
+from ldcnd.drives.driver import Gains
 from ldcnd.drives.toml import DeviceIdentity, Name
 
 LEAST_TURN_COUNTS = 4
@@ -65,6 +66,11 @@ class GainsConfig(Frozen):
     """Servo rate divisor: the servo cycle is this number times 0.512 ms."""
     deadband: int = Field(default=0, ge=0, le=0xFF)
     """Added to the amplifier's output around zero."""
+
+    @property
+    def registers(self) -> Gains:
+        """The same as a drive holds it, where other values may be, too."""
+        return Gains(**self.model_dump())
 
 
 class HomeConfig(Frozen):

@@ -38,7 +38,7 @@ class LineTiming:
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Where the time of one exchange goes, in seconds.
+    """Where the time of one exchange goes, in seconds, and how long its packets are.
 
     Attributes:
         request_s: the request's bytes.
@@ -47,6 +47,8 @@ class Cost:
         overhead_s: adapter and host, until the next request can begin; for a packet that must not be repeated, also the
             time in which the line makes sure that no other reply follows.
         ends_early: a drive that answers early frees the line early; not so without a reply, or when it must linger.
+        request_bytes: length of the request.
+        reply_bytes: longest reply.
     """
 
     request_s: float
@@ -54,6 +56,8 @@ class Cost:
     reply_s: float
     overhead_s: float
     ends_early: bool = True
+    request_bytes: int = 0
+    reply_bytes: int = 0
 
     @property
     def wire_s(self) -> float:
@@ -87,6 +91,8 @@ def cost_of(exchange: Exchange[Any], timing: LineTiming) -> Cost:
         reply_s=exchange.reply_bytes * timing.bits_per_byte / timing.node_baud,
         overhead_s=timing.turnaround_s + adapter_s + linger_s,
         ends_early=answered and exchange.repeatable,
+        request_bytes=len(exchange.request),
+        reply_bytes=exchange.reply_bytes,
     )
 
 

@@ -337,8 +337,8 @@ class PollsItself(Drive):
         """Return the poller, which begins at an instant of the loop's clock."""
 
 
-class Moves(Readable):
-    """It moves. Commands raise the `BusError` that befell them; none is repeated when that could move twice.
+class QuietDrive(Readable):
+    """The calls to a drive that moves which need no permission: none of them can make it move.
 
     What only some drives can do refuses here with `NotSupported`; `capabilities` and the attributes say who can.
 
@@ -354,9 +354,6 @@ class Moves(Readable):
         path_period_s: between two points of a path; 0 for a drive that walks none.
         path_packet: maximum number of points in one packet.
         path_most_counts: largest step from one point to the next.
-        keeps_mark: it has a register that a host can set to the present position, and that a reset clears. A mark that
-            is still there proves that the drive was not reset since, so that its counter goes on from where it was.
-        about_to_renumber: awaited before the drive's counter is given another number; it may refuse that.
     """
 
     retargets: bool = False
@@ -368,8 +365,6 @@ class Moves(Readable):
     path_period_s: float = 0.0
     path_packet: int = 0
     path_most_counts: int = 0
-    keeps_mark: bool = False
-    about_to_renumber: Callable[[], Awaitable[None]] = staticmethod(nothing)
 
     @abstractmethod
     def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
@@ -386,6 +381,60 @@ class Moves(Readable):
     def room_counts(self, *, forward: bool) -> int:  # noqa: ARG002 - part of the contract
         """Return how far the position counter reaches in a direction, from where the axis was last."""
         return LARGEST_COUNT
+
+    @abstractmethod
+    async def stop(self, mode: StopMode) -> StopMode:
+        """Bring the motor to rest, before anything else that waits for the line; cancels an armed homing.
+
+        Returns:
+            How: a motor that was switched off, or is being, is switched off again whatever the request, as a stop that
+            holds would close its loop.
+        """
+
+    @abstractmethod
+    async def reset(self) -> None:
+        """Clear the drive's faults as its manual prescribes; the loop is open afterwards if there were any."""
+
+    async def clear_warnings(self) -> None:
+        """Clear what is remembered although it has not stopped anything; the loop stays as it is."""
+
+    async def captured_home(self) -> int:
+        """Return the captured home position, in counts."""
+        raise cannot(self.spec, "home")
+
+    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:  # noqa: ARG002
+        """Tell whether a reading shows the axis on a limit switch that ends its motions."""
+        return False
+
+    def check_path(self) -> None:
+        """Refuse a path that this drive cannot walk.
+
+        Raises:
+            NotSupported: it has no path mode.
+            WrongState: what it holds of its options is not known.
+        """
+        raise cannot(self.spec, "walk a path")
+
+    def path_exchanges(self) -> tuple[Exchange[Any], ...]:
+        """Return what `add_points` sends for a full packet, for looking at only."""
+        return ()
+
+    async def path_status(self) -> PathStatus:
+        """Read what it shows of a path: points that are sent at a fixed rate; it stands at the last one."""
+        raise cannot(self.spec, "walk a path")
+
+
+class Moves(QuietDrive):
+    """It moves. Commands raise the `BusError` that befell them; none is repeated when that could move twice.
+
+    Attributes:
+        keeps_mark: it has a register that a host can set to the present position, and that a reset clears. A mark that
+            is still there proves that the drive was not reset since, so that its counter goes on from where it was.
+        about_to_renumber: awaited before the drive's counter is given another number; it may refuse that.
+    """
+
+    keeps_mark: bool = False
+    about_to_renumber: Callable[[], Awaitable[None]] = staticmethod(nothing)
 
     @abstractmethod
     async def power(self, *, on: bool) -> None:
@@ -405,19 +454,6 @@ class Moves(Readable):
     async def start(self) -> None:
         """Start what was loaded; never repeated."""
 
-    @abstractmethod
-    async def stop(self, mode: StopMode) -> StopMode:
-        """Bring the motor to rest, before anything else that waits for the line; cancels an armed homing.
-
-        Returns:
-            How: a motor that was switched off, or is being, is switched off again whatever the request, as a stop that
-            holds would close its loop.
-        """
-
-    @abstractmethod
-    async def reset(self) -> None:
-        """Clear the drive's faults as its manual prescribes; the loop is open afterwards if there were any."""
-
     async def set_gains(self, gains: Gains) -> None:  # noqa: ARG002 - as are all arguments of what refuses
         """Load the registers of the position loop; they act at once.
 
@@ -430,17 +466,6 @@ class Moves(Readable):
         """Go to a position at once, without a profile; never repeated."""
         raise cannot(self.spec, "track")
 
-    async def captured_home(self) -> int:
-        """Return the captured home position, in counts."""
-        raise cannot(self.spec, "home")
-
-    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool:  # noqa: ARG002
-        """Tell whether a reading shows the axis on a limit switch that ends its motions."""
-        return False
-
-    async def clear_warnings(self) -> None:
-        """Clear what is remembered although it has not stopped anything; the loop stays as it is."""
-
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:  # noqa: ARG002
         """Use limit switch pins as outputs or inputs; None leaves a pin as it is.
 
@@ -449,23 +474,6 @@ class Moves(Readable):
             RegisterUnknown: what a pin that is not named is used as is not known.
         """
         raise cannot(self.spec, "set outputs")
-
-    def check_path(self) -> None:
-        """Refuse a path that this drive cannot walk.
-
-        Raises:
-            NotSupported: it has no path mode.
-            WrongState: what it holds of its options is not known.
-        """
-        raise cannot(self.spec, "walk a path")
-
-    def path_exchanges(self) -> tuple[Exchange[Any], ...]:
-        """Return what `add_points` sends for a full packet, for looking at only."""
-        return ()
-
-    async def path_status(self) -> PathStatus:
-        """Read what it shows of a path: points that are sent at a fixed rate; it stands at the last one."""
-        raise cannot(self.spec, "walk a path")
 
     async def add_points(self, steps: Sequence[int]) -> PathStatus:  # noqa: ARG002
         """Append points, counts from one to the next; never repeated."""

@@ -28,8 +28,6 @@ class Poll:
         rate_hz: highest rate.
         cost: with all these items.
         mean_s: with the items that it reads on average.
-        request_bytes: length of the request.
-        reply_bytes: longest reply.
         exchanges: number that it takes.
         address: of a module that is no axis.
     """
@@ -39,8 +37,6 @@ class Poll:
     rate_hz: float
     cost: Cost
     mean_s: float
-    request_bytes: int = 0
-    reply_bytes: int = 0
     exchanges: int = 1
     address: int | None = None
 

@@ -156,7 +156,9 @@ class Lane(IntEnum):
     BACKGROUND = 3
 
 
-NO_DEADLINE_S = float("inf")
+NEVER_S = float("inf")
+"""An instant that does not come, and a period that does not end, in seconds."""
+NO_DEADLINE_S = NEVER_S
 """Deadline of a poll that only uses time left by all other polls; it is never late."""
 
 

@@ -18,7 +18,7 @@ from typing import Any
 from typing_extensions import override
 
 from ldcnd.contract.errors import BadReply, BusError, LdcndError, PacketRejected, ReplyTimeout, TransportLost
-from ldcnd.line.exchange import Exchange, Lane, PacketEffect, Poller, ReplyVerdict, Resync, Timing
+from ldcnd.line.exchange import NEVER_S, Exchange, Lane, PacketEffect, Poller, ReplyVerdict, Resync, Timing
 from ldcnd.line.flight_recorder import AT_ONCE_REMARK, GUEST_REMARK, BusStatistics, WireEvent, WireLog
 from ldcnd.line.proof import Condition
 from ldcnd.line.schedule import POLL, Schedule
@@ -129,9 +129,6 @@ class PollTransaction(Transaction):
     def rejected(self) -> bool:
         self.poller.missed(PacketRejected(f"node {self.exchange.node} received a damaged packet"))
         return False
-
-
-NEVER_S = float("inf")
 
 
 class Watchdog:

@@ -246,7 +246,7 @@ def _reading(command: CommandPacket, profile: SmartStepProfile) -> Exchange[byte
     """
     exchange: Exchange[Any] = reference(command.unit, command.address)
     if command.function is Function.STRING_REFERENCE:
-        count = int(command.data * _BYTES_OF_COUNT[profile.string_count_unit])
+        count = int(command.data * _BYTES_OF_COUNT[profile.unit.trace.string_count_unit])
         exchange = string_reference(command.unit, command.address, count, profile)
     # data of a reference other than 0 are a data error, which the drive itself tells (manual 2.2, example 5)
     return replace(exchange, request=command.encode(), decode=bytes)

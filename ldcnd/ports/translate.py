@@ -29,6 +29,7 @@ from ldcnd.contract.commands import (
 from ldcnd.contract.errors import NotSupported
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import STOPS_ON_HOME, WAYS_TO_STOP, HomingControl, StopControl
+from ldcnd.drives.ldcn.homing import homing_source
 from ldcnd.drives.ldcn.packet import CommandCode, StatusFlag
 from ldcnd.drives.ldcn.profiles import HomingSource, Profile
 from ldcnd.drives.ldcn.received import (
@@ -42,7 +43,7 @@ from ldcnd.drives.ldcn.received import (
     UndefinedCommand,
     UndescribedCommand,
 )
-from ldcnd.drives.ldcn.servo import LdcnAxis, homing_source
+from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.drives.ldcn.trajectory import (
     ProfileMode,
     Trajectory,

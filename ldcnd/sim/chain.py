@@ -18,13 +18,13 @@ from dataclasses import dataclass
 from enum import Enum
 from functools import partial
 
+from ldcnd.line.exchange import NEVER_S
 from ldcnd.sim.faults import FaultInjector, FaultPlan, LineFault
 
 BITS_PER_BYTE = 10
 """Start, eight data, stop (or seven data and parity)."""
 BAUD_TOLERANCE = 0.045
 """A receiver samples the stop bit right up to about this difference of the two clocks."""
-NEVER_S = math.inf
 NOISE = b""
 """What a module understands of bytes at another rate than its own."""
 _ALMOST = 1e-6

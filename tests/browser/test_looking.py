@@ -8,8 +8,9 @@ import pytest
 
 from ldcnd.cli.params import load_parameters
 from ldcnd.client.traces import fetch_trace, load_trace, trace_header
-from ldcnd.contract.commands import HomeMethod, HomeStop, MoveVelocity, Power, ReportShadow, SetGains
+from ldcnd.contract.commands import HomeMethod, HomeStop, MoveVelocity, Power, SetGains
 from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.questions import ReportShadow
 from ldcnd.contract.samples import ShadowFigure
 from ldcnd.contract.traces import MOST_CHANNELS, MOST_SAMPLES, TracePhase, TriggerKind
 from tests.support.process import ROOT

@@ -27,7 +27,7 @@ from ldcnd.drives.smartstep.packet import (
     piece_bytes,
 )
 from ldcnd.drives.smartstep.parameters import PN100
-from ldcnd.drives.smartstep.profiles import ByteOrder, SmartStepProfile, StringChecksum
+from ldcnd.drives.smartstep.profiles import SMARTSTEP, ByteOrder, StringChecksum
 from ldcnd.drives.smartstep.trace_data import split_words
 from ldcnd.line.exchange import Exchange, ReplyVerdict
 from ldcnd.sim.smartstep.unit import SimulatedUnit
@@ -39,7 +39,7 @@ EXCHANGES: list[Exchange] = [
     write_eeprom(0, PN100, 40),
     execute(0),
     probe(0),
-    *(string_reference(0, 0x3000, 4, SmartStepProfile(string_checksum=variant)) for variant in StringChecksum),
+    *(string_reference(0, 0x3000, 4, SMARTSTEP.with_trace(string_checksum=variant)) for variant in StringChecksum),
 ]
 digits = st.text("0123456789ABCDEF", max_size=30).map(str.encode)
 

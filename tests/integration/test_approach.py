@@ -4,9 +4,10 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Preview, Stop
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Stop
 from ldcnd.contract.errors import PositionLimit
 from ldcnd.contract.events import ReadEvents
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig
 

@@ -8,7 +8,7 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config
-from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb, Why
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, QuickStop, Reset, Verb
 from ldcnd.contract.errors import (
     CommandExpired,
     CommandIdReused,
@@ -22,6 +22,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.leases import SHORTEST_LEASE_S, Acquire, ListHolders
+from ldcnd.contract.questions import Why
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.line_config import GroupConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

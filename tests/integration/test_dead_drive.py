@@ -5,7 +5,8 @@ from itertools import pairwise
 
 import pytest
 
-from ldcnd.contract.commands import Power, Why
+from ldcnd.contract.commands import Power
+from ldcnd.contract.questions import Why
 from ldcnd.contract.samples import LinkState
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

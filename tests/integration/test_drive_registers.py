@@ -4,9 +4,10 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Preview, SetGains, SetOutputs
+from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, SetGains, SetOutputs
 from ldcnd.contract.errors import LdcndError, RegisterUnknown, ReplyTimeout, ValueOutOfRange, WrongState
 from ldcnd.contract.meta import Provenance
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import LinkState, Quality, TelemetryItem
 from ldcnd.drives.ldcn.controls import LimitPins
 from ldcnd.drives.ldcn.packet import CommandCode

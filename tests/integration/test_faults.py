@@ -16,9 +16,9 @@ from ldcnd.contract.commands import (
     SetGains,
     SetPosition,
     SetPwm,
-    Why,
 )
 from ldcnd.contract.errors import DriveFault, NotReferenced, WrongState
+from ldcnd.contract.questions import Why
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.ldcn.faults import FaultCode, LdcnFault
 from ldcnd.sim.ldcn.power import FaultCondition

@@ -17,7 +17,6 @@ from ldcnd.contract.commands import (
     MoveRelative,
     MoveVelocity,
     Power,
-    Preview,
     Reset,
     SetPosition,
     SetPwm,
@@ -25,6 +24,7 @@ from ldcnd.contract.commands import (
     Track,
 )
 from ldcnd.contract.errors import CommandExpired, ErrorCode, LdcndError, StopLatched, WrongState
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import StopMode
 from tests.support.dialect_rig import AXIS, V4, dialect_rig

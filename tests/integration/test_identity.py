@@ -8,10 +8,11 @@ import pytest
 
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.commands import Halt, MoveVelocity, Power, Reset, SetGains, SetOutputs, Stop, Why
+from ldcnd.contract.commands import Halt, MoveVelocity, Power, Reset, SetGains, SetOutputs, Stop
 from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import AxisUnreachable, LeaseHeld, NotIdentified, OutcomeUnknown, WrongState
 from ldcnd.contract.leases import Acquire
+from ldcnd.contract.questions import Why
 from ldcnd.contract.rig_commands import SetIo, SetIoTimer
 from ldcnd.contract.samples import AxisState, LinkState, Moving
 from ldcnd.drives.ldcn.packet import CommandCode

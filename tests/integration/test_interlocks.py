@@ -13,16 +13,15 @@ from ldcnd.contract.commands import (
     MoveRelative,
     MoveVelocity,
     Power,
-    Preview,
     Reset,
     SetPosition,
     Stop,
-    Why,
 )
 from ldcnd.contract.condition import assess
 from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseHeld, LeaseUnknown
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, Release
+from ldcnd.contract.questions import Preview, Why
 from ldcnd.contract.rig_commands import OverrideInterlock, SetIo
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem

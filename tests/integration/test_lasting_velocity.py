@@ -5,9 +5,10 @@ import asyncio
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.contract.commands import BufferMode, Halt, MoveVelocity, Power, Preview, SetPosition
+from ldcnd.contract.commands import BufferMode, Halt, MoveVelocity, Power, SetPosition
 from ldcnd.contract.errors import PositionLimit, ValueOutOfRange
 from ldcnd.contract.events import CommandStatus, ReadOutcome
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState
 from ldcnd.testing import simulated_rig
 from tests.support.chain_rig import rig_on

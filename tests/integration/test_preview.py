@@ -2,8 +2,9 @@
 
 import pytest
 
-from ldcnd.contract.commands import MoveAbsolute, Power, Preview
+from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.errors import MalformedRequest
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.line.flight_recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig

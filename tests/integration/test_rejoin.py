@@ -8,9 +8,10 @@ import pytest
 
 from ldcnd.client.overview import overview
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power, Reset, Why
+from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power, Reset
 from ldcnd.contract.errors import WrongState
 from ldcnd.contract.keys import Keys
+from ldcnd.contract.questions import Why
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES
 from ldcnd.drives.ldcn.packet import CommandCode

@@ -7,17 +7,9 @@ from contextlib import asynccontextmanager
 import pytest
 from pydantic import ValidationError
 
-from ldcnd.contract.commands import (
-    Direction,
-    Home,
-    MoveAbsolute,
-    MoveRelative,
-    MoveVelocity,
-    Preview,
-    SetPosition,
-    Track,
-)
+from ldcnd.contract.commands import Direction, Home, MoveAbsolute, MoveRelative, MoveVelocity, SetPosition, Track
 from ldcnd.contract.errors import NotSupported, OutcomeUnknown, WrongState
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.sim.plant import MotorPlant

@@ -15,8 +15,8 @@ from ldcnd.client.kept_gains import KeptGains, forget, gains_in, keep
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config
-from ldcnd.contract.commands import ReportShadow
 from ldcnd.contract.errors import ConfigError, NotSupported
+from ldcnd.contract.questions import ReportShadow
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.axis_config import RatesConfig
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

@@ -4,10 +4,11 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, Preview, SetPwm, Track
+from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, SetPwm, Track
 from ldcnd.contract.errors import LeaseHeld, WrongState
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState
 from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, dialect_rig

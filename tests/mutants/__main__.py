@@ -22,8 +22,8 @@ SUBJECTS = (
         "bus", "exchange", "line", "proof", "schedule", "settings",
     )),
     *(f"ldcnd/drives/ldcn/{name}.py" for name in (
-        "addressing", "adoption", "commands", "controls", "faults", "gathering", "groups", "io_module", "network",
-        "packet", "path", "received", "record", "registers", "servo", "trajectory",
+        "access", "addressing", "adoption", "commands", "controls", "faults", "gains", "gathering", "groups", "homing",
+        "io_module", "network", "packet", "path", "received", "record", "registers", "servo", "trajectory",
     )),
     *(f"ldcnd/drives/smartstep/{name}.py" for name in (
         "commands", "drive", "ledger", "modes", "monitors", "network", "packet", "parameter_store", "parameters",

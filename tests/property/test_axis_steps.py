@@ -21,11 +21,12 @@ from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, PastFault, Quality
+from ldcnd.contract.units import AxisUnits
 from ldcnd.drives.driver import AxisReading, Fault, StopMode
 from tests.support.axis_bench import AT_REST, put, tracked
 
 STEPS, HISTORIES = 120, 60
-SCALE = AxisScale("mm", -500.0, modulo=360.0)
+SCALE = AxisScale(AxisUnits("mm", {}), -500.0, modulo=360.0)
 FAULTS = (
     Fault("overheat", "hot"),
     Fault("wrap", "wrapped", stops=False),

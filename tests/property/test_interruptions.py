@@ -39,7 +39,6 @@ from ldcnd.contract.commands import (
     MoveVelocity,
     PinMode,
     Power,
-    Preview,
     QuickStop,
     Reset,
     SetGains,
@@ -47,12 +46,12 @@ from ldcnd.contract.commands import (
     SetPosition,
     SetPwm,
     Track,
-    Why,
 )
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.contract.leases import Acquire, ListHolders, Release, Renew
+from ldcnd.contract.questions import Preview, Why
 from ldcnd.contract.rig_commands import AxisMove, AxisPath, MoveTogether, WalkPath
 from ldcnd.contract.samples import LinkState, StateSample
 from ldcnd.contract.traces import TakeTrace

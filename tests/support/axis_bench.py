@@ -25,6 +25,7 @@ from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.samples import Sample, TelemetryItem
+from ldcnd.contract.units import AxisUnits
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import (
     NO_CEILING,
@@ -196,7 +197,7 @@ def tracked(name: str = "x", unit: str = "mm", **fields: Any) -> AxisTracker:
     """Return the tracker of an axis whose drive is known to be the one that is meant."""
     proof = Proofs().expect(1, f"axis {name}", name)
     proof.prove()
-    return AxisTracker(AxisStatus(name, AxisScale(unit), **fields), proof)
+    return AxisTracker(AxisStatus(name, AxisScale(AxisUnits(unit, {})), **fields), proof)
 
 
 def put(tracker: AxisTracker, **fields: Any) -> None:

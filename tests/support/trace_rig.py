@@ -12,8 +12,9 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.drives.axis_config import AxisConfig, RatesConfig
-from ldcnd.drives.smartstep.config import SmartStepAxisConfig, SmartStepUnitConfig
+from ldcnd.drives.smartstep.config import SmartStepAxisConfig
 from ldcnd.drives.smartstep.parameters import PN000
+from ldcnd.drives.smartstep.profiles import SmartStepUnitConfig
 from ldcnd.drives.smartstep.trace_data import DataObject, IoObject, TracePoint
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.net.zenoh_session import open_zenoh_session

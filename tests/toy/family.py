@@ -215,7 +215,7 @@ class ToyFamily(Family[ToyBusConfig]):
         timing = LineTiming(BAUD, BAUD, adapter_latency_s=settings.adapter_latency_ms / 1000)
         cost = cost_of(exchange(1, Op.STATUS), timing)
         polls = [
-            Poll(axis.name, tuple(rates), max(rates.values()), cost, cost.mean_s, FRAME_BYTES, FRAME_BYTES)
+            Poll(axis.name, tuple(rates), max(rates.values()), cost, cost.mean_s)
             for axis in settings.axis
             if (rates := axis.rates.wanted_hz(adc=False))
         ]

@@ -4,8 +4,9 @@ from pydantic import Field
 from typing_extensions import override
 
 from ldcnd.contract.frozen import Frozen
+from ldcnd.line.exchange import NEVER_S
 from ldcnd.line.transport import Opener
-from ldcnd.sim.chain import NEVER_S, Chain, Module, ModuleReply
+from ldcnd.sim.chain import Chain, Module, ModuleReply
 from ldcnd.sim.family import SimulatedFamily
 from ldcnd.sim.line import open_simulated_line
 from ldcnd.sim.line_config import FaultyLineConfig

@@ -14,7 +14,6 @@ from ldcnd.contract.commands import (
     MoveVelocity,
     PinMode,
     Power,
-    Preview,
     Reset,
     SetGains,
     SetOutputs,
@@ -34,6 +33,7 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.events import CommandStatus
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.samples import AxisState, Moving
 from ldcnd.drives.driver import CountsMotion, Fault, Gains, StopMode
 from tests.support.axis_bench import GAINS, RUNNING, AxisBench, axis_bench, put, raising

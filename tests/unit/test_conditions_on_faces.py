@@ -16,7 +16,7 @@ from ldcnd.cli.looking import Watched, axes_table, rig_table
 from ldcnd.cli.looking import row as row_of
 from ldcnd.client.axis import Axis
 from ldcnd.client.fleet import AxisReport, RigReport
-from ldcnd.client.overview import AxisNow
+from ldcnd.client.overview import AxisNow, LastOfAxis
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.contract.codec import Encoding, encode
@@ -178,7 +178,7 @@ def published(at: Known) -> list[Publication]:
 def axis_now(at: Known) -> AxisNow:
     health = at.line.axes[0]
     condition = assess(at.state, at.faults, health, age_s=at.case.age_s, line_up=at.case.line_up)
-    return AxisNow(INFO, at.state, at.position, None, at.case.age_s, None, health, condition)
+    return AxisNow(INFO, LastOfAxis(at.state, at.faults, at.position, None), at.case.age_s, None, health, condition)
 
 
 def axis_list(at: Known) -> str:

@@ -26,7 +26,6 @@ from ldcnd.contract.commands import (
     MoveRelative,
     MoveVelocity,
     Power,
-    Preview,
     Probe,
     QuickStop,
     Reset,
@@ -37,7 +36,6 @@ from ldcnd.contract.commands import (
     Stop,
     Track,
     Verb,
-    Why,
 )
 from ldcnd.contract.errors import (
     CommandExpired,
@@ -56,6 +54,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.leases import Acquire, LeaseReply, ListHolders, Release, Renew
+from ldcnd.contract.questions import Preview, Why
 from ldcnd.contract.rig_commands import AxisMove, MoveTogether, Rehearsal, Rehearse
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.dispatch import PENDING_REQUESTS, Dispatcher, Requests

@@ -8,7 +8,7 @@ from ldcnd.contract.errors import BadReply, NotSupported, ValueOutOfRange
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import LeaderlessGroup, Node
-from ldcnd.drives.ldcn.controls import HomingControl, IoOption, LimitPins, StopControl
+from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, StopControl
 from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PROFILES
 from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud
@@ -134,8 +134,6 @@ def test_what_could_act_twice_is_never_repeated():
         commands.save_home(NODE),
         commands.set_baud(LeaderlessGroup(0xFF), 115_200),
         commands.hard_reset(NODE),
-        commands.reset_position_relative_to_home(Node(1, SC)),
-        commands.set_position(Node(1, SC), 7),
     )
 
     assert not any(exchange.repeatable for exchange in exchanges)
@@ -362,24 +360,13 @@ def test_homing_that_a_device_cannot_do_is_refused(profile, control):
 # -- what only some devices have -------------------------------------------------------------------------------------
 
 
-def test_command_8_means_limit_pins_on_version_4_and_options_on_sc():
+def test_command_8_sets_limit_pins_on_version_4_alone():
     pins = LimitPins.LIMIT1_HIGH | LimitPins.LIMIT2_INPUT
 
     assert commands.io_control(Node(1, V4), pins).request[2:-1] == b"\x18\x09"
-    assert commands.set_options(Node(1, SC), IoOption(0x90)).request == bytes.fromhex("aa 01 18 90 a9")
     for profile in (LS_182AP, V3, SC):
         with pytest.raises(NotSupported):
             commands.io_control(Node(1, profile), pins)
-    with pytest.raises(NotSupported):
-        commands.set_options(Node(1, V4), IoOption(0))
-
-
-def test_only_sc_resets_its_position_to_something_else_than_zero():
-    for profile in (LS_182AP, V4):
-        with pytest.raises(NotSupported):
-            commands.set_position(Node(1, profile), 5)
-        with pytest.raises(NotSupported):
-            commands.reset_position_relative_to_home(Node(1, profile))
 
 
 def test_a_module_that_is_only_identified_is_never_moved():

@@ -9,6 +9,7 @@ from ldcnd.contract.errors import BadReply, NotSupported, ReplyTimeout, ValueOut
 from ldcnd.contract.meta import Provenance
 from ldcnd.drives.driver import AnalogMotion, Ceiling, CountsMotion, Gains, HomeCapture, PwmOutput, StopMode
 from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, pin_bits
+from ldcnd.drives.ldcn.homing import home_methods, homing_control, opens_loop
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import (
     LS_173AP,
@@ -21,7 +22,6 @@ from ldcnd.drives.ldcn.profiles import (
 )
 from ldcnd.drives.ldcn.record import DriveState
 from ldcnd.drives.ldcn.registers import REPLY_LOST, Assumed, Known, ServoRegisters, Unknown
-from ldcnd.drives.ldcn.servo import home_methods, homing_control, opens_loop
 from ldcnd.drives.ldcn.trajectory import ProfileMode, Trajectory, quantised, trajectory_of
 
 GAINS = Gains(kp=350, kd=3000, ki=400, il=400, ol=250, cl=0, el=4000, sr=1)

@@ -2,7 +2,8 @@
 
 import pytest
 
-from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, ModuleReply, received_at
+from ldcnd.line.exchange import NEVER_S
+from ldcnd.sim.chain import Chain, Delivery, Module, ModuleReply, received_at
 
 HOST_BYTE_S = 10 / 19_200
 

@@ -24,7 +24,7 @@ from ldcnd.drives.smartstep.commands import (
 from ldcnd.drives.smartstep.monitors import SPEED_FEEDBACK
 from ldcnd.drives.smartstep.packet import CommandPacket, Function, ReplyPacket, ResponseStatus, checksum
 from ldcnd.drives.smartstep.parameters import PN100, PN304, parameter_at
-from ldcnd.drives.smartstep.profiles import CountUnit, SmartStepProfile, StringChecksum
+from ldcnd.drives.smartstep.profiles import SMARTSTEP, CountUnit, StringChecksum
 from ldcnd.line.exchange import ReplyVerdict
 from ldcnd.sim.smartstep.unit import string_reply
 
@@ -200,7 +200,7 @@ def test_unsolicited_data_error_shows_a_drive_that_hears_itself():
 
 
 def test_profile_may_grant_another_response_time():
-    patient = with_response_time(reference(0, 0x0100), SmartStepProfile(first_character_s=1.5))
+    patient = with_response_time(reference(0, 0x0100), SMARTSTEP.with_unit(first_character_s=1.5))
 
     assert patient.response_s == pytest.approx(1.5)
     assert patient.decode(GOOD) == 40
@@ -220,7 +220,7 @@ VARIANTS = [StringChecksum.HEADER, StringChecksum.ALL, StringChecksum.TRAILER]
 @pytest.mark.parametrize("sent", VARIANTS)
 @pytest.mark.parametrize("expected", [StringChecksum.AUTO, *VARIANTS])
 def test_variant_is_accepted_only_where_the_profile_allows_it(sent, expected):
-    exchange = string_reference(1, 0x3000, 8, SmartStepProfile(string_checksum=expected))
+    exchange = string_reference(1, 0x3000, 8, SMARTSTEP.with_trace(string_checksum=expected))
     packet = string_reply(COMMAND, DATA, sent)
 
     if expected in (sent, StringChecksum.AUTO):
@@ -242,7 +242,7 @@ def test_all_zero_data_fit_both_variants_without_trailer():
 def test_damaged_data_under_a_checksum_are_corrupt():
     packet = bytearray(string_reply(COMMAND, DATA, StringChecksum.ALL))
     packet[20] = ord("5")
-    exchange = string_reference(1, 0x3000, 8, SmartStepProfile(string_checksum=StringChecksum.ALL))
+    exchange = string_reference(1, 0x3000, 8, SMARTSTEP.with_trace(string_checksum=StringChecksum.ALL))
 
     assert exchange.check(bytes(packet)) is ReplyVerdict.CORRUPT
 
@@ -250,7 +250,7 @@ def test_damaged_data_under_a_checksum_are_corrupt():
 def test_good_trailer_does_not_excuse_a_bad_header():
     packet = bytearray(string_reply(COMMAND, DATA, StringChecksum.TRAILER))
     packet[12] ^= 1
-    exchange = string_reference(1, 0x3000, 8, SmartStepProfile(string_checksum=StringChecksum.TRAILER))
+    exchange = string_reference(1, 0x3000, 8, SMARTSTEP.with_trace(string_checksum=StringChecksum.TRAILER))
 
     assert exchange.check(bytes(packet)) is ReplyVerdict.CORRUPT
 
@@ -283,7 +283,7 @@ def test_other_count_unit_is_named(digits, unit):
 
 @pytest.mark.parametrize(("unit", "count"), [(CountUnit.BYTES, 8), (CountUnit.WORDS, 4), (CountUnit.CHARS, 16)])
 def test_count_is_given_in_the_unit_of_the_profile(unit, count):
-    profile = SmartStepProfile(string_count_unit=unit)
+    profile = SMARTSTEP.with_trace(string_count_unit=unit)
     command = CommandPacket(1, Function.STRING_REFERENCE, 0x3000, count)
 
     exchange = string_reference(1, 0x3000, 8, profile)

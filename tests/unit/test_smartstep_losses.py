@@ -11,13 +11,13 @@ from ldcnd.contract.traces import TakeTrace, TraceTrigger, TriggerKind
 from ldcnd.drives.smartstep.addresses import EEPROM_AREA, RAM_AREA, OperatingMode, Register, TraceRegister
 from ldcnd.drives.smartstep.packet import Function, decode_command
 from ldcnd.drives.smartstep.parameters import PN102
-from ldcnd.drives.smartstep.profiles import SmartStepProfile
+from ldcnd.drives.smartstep.profiles import SMARTSTEP
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP
 from tests.support.smartstep_line import LosingUnit, executes_in_a_fresh_mode_only, smartstep_line
 
 WITHIN_S = 30.0
-SHORT = SmartStepProfile(trace_chunk_bytes=1000, trigger_map=BENCH_TRIGGER_MAP)
+SHORT = SMARTSTEP.with_trace(chunk_bytes=1000, trigger_map=BENCH_TRIGGER_MAP)
 LOSSES = [("request",), ("reply",), ("request", "reply"), ("reply", "request", "reply")]
 
 

@@ -32,7 +32,7 @@ from ldcnd.drives.smartstep.monitors import (
     run_is_on,
     signed_word,
 )
-from ldcnd.drives.smartstep.profiles import SmartStepProfile
+from ldcnd.drives.smartstep.profiles import SMARTSTEP, SmartStepProfile
 
 
 def test_monitors_fill_8000h_to_800fh():
@@ -79,7 +79,7 @@ def test_healthy_drive_with_run_on_has_low_levels():
 
 
 def test_levels_can_be_turned_round_by_the_profile():
-    profile = SmartStepProfile(run_active_low=False, reset_active_low=False, alarm_output_high=False)
+    profile = SMARTSTEP.with_unit(run_active_low=False, reset_active_low=False, alarm_output_high=False)
 
     assert run_is_on(profile, InputSignal.RUN)
     assert reset_is_on(profile, InputSignal.RESET)

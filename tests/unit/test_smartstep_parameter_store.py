@@ -21,7 +21,7 @@ from ldcnd.contract.parameters import Memory, WriteParameter
 from ldcnd.drives.smartstep.addresses import OperatingMode
 from ldcnd.drives.smartstep.commands import set_operating_mode
 from ldcnd.drives.smartstep.parameters import PN000, PN100, PN102, PN202, PN304, PN402
-from ldcnd.drives.smartstep.profiles import EepromWrite, SmartStepProfile
+from ldcnd.drives.smartstep.profiles import SMARTSTEP, EepromWrite
 from ldcnd.line.flight_recorder import WireEvent, WireRecord
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.smartstep.variant import SimulatedVariant
@@ -91,7 +91,7 @@ async def test_eeprom_is_not_written_without_a_ledger_nor_where_it_is_denied(tmp
     async with smartstep_line([drive]) as line:
         with pytest.raises(NotSupported, match="ledger"):
             await line.axis("u1").parameters.write(to_eeprom("Pn100", 120))
-    denying = SmartStepProfile(eeprom_write=EepromWrite.DENY)
+    denying = SMARTSTEP.with_unit(eeprom_write=EepromWrite.DENY)
     async with smartstep_line([simulated(1)], profile=denying, ledger=tmp_path / "ledger.json") as line:
         with pytest.raises(NotSupported, match="forbids"):
             await line.axis("u1").parameters.write(to_eeprom("Pn100", 120))

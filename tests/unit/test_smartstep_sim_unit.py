@@ -17,7 +17,7 @@ from ldcnd.drives.smartstep.commands import (
 from ldcnd.drives.smartstep.monitors import Counter, CounterReading
 from ldcnd.drives.smartstep.packet import DAMAGED, ResponseStatus, decode_command, decode_reply
 from ldcnd.drives.smartstep.parameters import PN000, PN100, PN202
-from ldcnd.drives.smartstep.profiles import ByteOrder, CountUnit, SmartStepProfile, StringChecksum
+from ldcnd.drives.smartstep.profiles import SMARTSTEP, ByteOrder, CountUnit, StringChecksum
 from ldcnd.drives.smartstep.trace_data import split_words
 from ldcnd.line.exchange import Exchange
 from ldcnd.sim.smartstep.unit import CHARACTER_S, SimulatedUnit
@@ -174,7 +174,7 @@ def test_unit_without_power_is_silent_and_starts_afresh():
 def test_trace_is_read_from_every_variant_of_drive(variant, order, count_unit):
     unit = unit_with(SimulatedVariant(string_checksum=variant, trace_byte_order=order, string_count_unit=count_unit))
     unit.drive.recorder.rings[1][100:104] = [0x0001, 0x8001, 0x7FFF, 0xFFFE]
-    profile = SmartStepProfile(string_count_unit=count_unit)
+    profile = SMARTSTEP.with_trace(string_count_unit=count_unit)
 
     reply = ask(unit, string_reference(0, 0x38C8, 8, profile))
 

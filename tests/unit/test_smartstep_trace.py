@@ -1,7 +1,6 @@
 """Tests of the recorder of a SmartStep: what the tracer does on a line that fails, and the upload of its memories."""
 
 import asyncio
-from dataclasses import replace
 
 import pytest
 
@@ -53,7 +52,7 @@ async def fetched(drive, profile):
 
 async def test_everything_is_read_twice_unless_told_otherwise():
     words, _, twice = await fetched(filled(), SmartStepProfile())
-    _, _, once = await fetched(filled(), SmartStepProfile(trace_verify=False))
+    _, _, once = await fetched(filled(), SMARTSTEP.with_trace(verify=False))
 
     assert words == RAMP
     assert (once, twice) == (5, 10)
@@ -61,7 +60,7 @@ async def test_everything_is_read_twice_unless_told_otherwise():
 
 async def test_pieces_that_are_too_long_for_a_drive_are_halved():
     words, _, exchanges = await fetched(
-        filled(SimulatedVariant(longest_string_bytes=50)), SmartStepProfile(trace_verify=False)
+        filled(SimulatedVariant(longest_string_bytes=50)), SMARTSTEP.with_trace(verify=False)
     )
 
     assert words == RAMP
@@ -119,7 +118,7 @@ async def test_memory_that_never_rests_is_no_trace():
             disturbing.cancel()
 
 
-TRIGGERED = SmartStepProfile(trigger_map=BENCH_TRIGGER_MAP)
+TRIGGERED = SMARTSTEP.with_trace(trigger_map=BENCH_TRIGGER_MAP)
 NEVER = TraceTrigger(channel="speed_feedback", kind=TriggerKind.RISING, level=4000.0)
 
 
@@ -272,7 +271,7 @@ async def test_a_triggered_trace_whose_execute_got_lost_waits_in_a_drive_that_ha
 async def test_values_are_uncertain_until_the_layout_was_verified_on_the_drive():
     async with smartstep_line([running()]) as line:
         assumed = await taken(line, channels=("speed_feedback",))
-    async with smartstep_line([running()], profile=replace(SMARTSTEP, trace_verified=True)) as line:
+    async with smartstep_line([running()], profile=SMARTSTEP.with_trace(verified=True)) as line:
         verified = await taken(line, channels=("speed_feedback",))
 
     assert "ldcnd doctor verify" in assumed.problems[0]

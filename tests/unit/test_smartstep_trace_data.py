@@ -5,7 +5,6 @@ from ldcnd.drives.smartstep.profiles import (
     SMARTSTEP,
     ByteOrder,
     CommandPulseGear,
-    SmartStepProfile,
     TraceWordLayout,
 )
 from ldcnd.drives.smartstep.trace_data import (
@@ -187,14 +186,14 @@ def test_data_15000_is_full_scale(data, full, unit):
     ("gear", "rpm"), [(CommandPulseGear.NUM_DEN, 3000), (CommandPulseGear.DEN_NUM, 187.5), (CommandPulseGear.NONE, 750)]
 )
 def test_50_pulses_in_two_time_units_by_each_reading_of_the_gear(gear, rpm):
-    profile = SmartStepProfile(command_pulse_gear=gear)
+    profile = SMARTSTEP.with_trace(command_pulse_gear=gear)
 
     assert 50 * scale(profile, CONSTANTS, DataObject.COMMAND_PULSE_SPEED) == pytest.approx(rpm)
 
 
 @pytest.mark.parametrize("gear", CommandPulseGear)
 def test_all_readings_agree_at_gear_one(gear):
-    profile = SmartStepProfile(command_pulse_gear=gear)
+    profile = SMARTSTEP.with_trace(command_pulse_gear=gear)
 
     assert scale(profile, TraceConstants(250, 300, 4500), DataObject.COMMAND_PULSE_SPEED) == pytest.approx(15.0)
 

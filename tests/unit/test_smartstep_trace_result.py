@@ -2,12 +2,12 @@ import pytest
 
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.traces import TraceTrigger, TriggerKind
-from ldcnd.drives.smartstep.profiles import SMARTSTEP, SmartStepProfile
+from ldcnd.drives.smartstep.profiles import SMARTSTEP
 from ldcnd.drives.smartstep.trace_data import TraceConstants
 from ldcnd.drives.smartstep.trace_result import CHANNELS, assign, trigger_condition, trigger_operand
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP
 
-MAPPED = SmartStepProfile(trigger_map=BENCH_TRIGGER_MAP)
+MAPPED = SMARTSTEP.with_trace(trigger_map=BENCH_TRIGGER_MAP)
 CONSTANTS = TraceConstants(cyclec_us=250, maxtrqc=300, osvelcc=4500)
 
 

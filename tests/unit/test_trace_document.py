@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ldcnd.contract.codec import decode
 from ldcnd.contract.traces import TakeTrace
-from ldcnd.drives.smartstep.config import SmartStepTraceConfig
+from ldcnd.drives.smartstep.profiles import SmartStepTraceConfig
 
 TEXT = (Path(__file__).parents[2] / "docs" / "how-to" / "take-a-trace.md").read_text(encoding="utf-8")
 

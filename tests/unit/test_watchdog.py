@@ -3,7 +3,8 @@ from collections.abc import Callable
 
 import pytest
 
-from ldcnd.line.line import NEVER_S, Watchdog
+from ldcnd.line.exchange import NEVER_S
+from ldcnd.line.line import Watchdog
 
 
 class CountingLoop:

@@ -10,11 +10,12 @@ from typing_extensions import override
 
 from ldcnd.axis.motion import LATENCY_S, AxisMotion
 from ldcnd.axis.permit import Permit
-from ldcnd.axis.procedure import NEVER_S, Procedure
+from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.axis.trapezoid import braking_way
 from ldcnd.contract.errors import PositionLimit
 from ldcnd.drives.driver import AxisReading
+from ldcnd.line.exchange import NEVER_S
 
 WATCH_S = 0.05
 """Time between two readings while such a motion runs, seconds, whatever the poll rates."""

@@ -15,13 +15,13 @@ from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.probe import check_index_is_seen
-from ldcnd.axis.quiet_drive import QuietDrive, homing
 from ldcnd.axis.status import Completion
+from ldcnd.axis.unmoved import homing
 from ldcnd.contract.commands import CommandReply, Home, HomeMethod, HomeStop
 from ldcnd.contract.errors import MalformedRequest, NotSupported
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig, HomeConfig
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, HomeCapture, StopMode
+from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, HomeCapture, QuietDrive, StopMode
 from ldcnd.log import get_logger
 
 log = get_logger("axis")

@@ -6,7 +6,7 @@ first. Permission is checked before every packet. An end of one member ends all:
 
 import asyncio
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from typing_extensions import override
 
@@ -16,8 +16,8 @@ from ldcnd.axis.permit import Permit, start_path
 from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.group import Rendezvous
-from ldcnd.axis.quiet_drive import walking
 from ldcnd.axis.status import Completion
+from ldcnd.axis.unmoved import walking
 from ldcnd.contract.commands import CommandReply, MoveAbsolute
 from ldcnd.contract.errors import (
     BusError,
@@ -407,7 +407,7 @@ class PathMember(Procedure):
             motion.tracker.take(CommandOver(f"the drive ended its path at {commanded_counts} counts, not at {target}"))
             motion.publish_state()
             return False
-        at_end = MotionPlan(self.plan.motion, self.plan.position, self.plan.velocity, self.plan.acceleration, 0.0)
+        at_end = replace(self.plan, duration_s=0.0)
         motion.begin(
             self.permit.command_id, self.permit.verb, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=at_end
         )

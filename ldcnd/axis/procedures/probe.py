@@ -11,8 +11,8 @@ from ldcnd.axis.events import CommandFailing
 from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
-from ldcnd.axis.quiet_drive import homing
 from ldcnd.axis.status import Completion
+from ldcnd.axis.unmoved import homing
 from ldcnd.contract.commands import CommandReply, HomeMethod, Probe, ProbeStop
 from ldcnd.contract.errors import MalformedRequest, NotSupported, VelocityLimit
 from ldcnd.contract.samples import AxisState, LatchSample

@@ -14,9 +14,10 @@ from ldcnd.client.kept_gains import open_loop
 from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
 from ldcnd.contract.codec import rebuild_error
-from ldcnd.contract.commands import PreviewReply, Verb
+from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import CommandAborted, LdcndError, Remedy, StopLatched, WrongState, step
 from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.questions import PreviewReply
 from ldcnd.drives.axis_config import AxisConfig
 
 STILL_COUNTS = 2

@@ -9,7 +9,7 @@ Source: manual 2.2, data string reference command; 3, 8005H and 8007H; 4, settin
 import asyncio
 import sys
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
@@ -78,10 +78,9 @@ async def verify_traces(bus: Bus, words: Words, profile: SmartStepProfile, act: 
     strings = await _string_settings(words, profile)
     for key, setting in strings.items():
         yield Verified(key, setting, f"{setting}, by strings of several lengths")
-    profile = replace(
-        profile,
+    profile = profile.with_trace(
         string_count_unit=CountUnit(str(strings["string_count_unit"])),
-        trace_chunk_bytes=int(strings["trace_chunk_bytes"]),
+        chunk_bytes=int(strings["trace_chunk_bytes"]),
         string_checksum=StringChecksum.AUTO,
     )
     await act(PULSES)
@@ -120,7 +119,7 @@ async def _string_settings(words: Words, profile: SmartStepProfile) -> Mapping[s
         DriveFault: no unit fits.
     """
     for unit in CountUnit:
-        tried = replace(profile, string_count_unit=unit)
+        tried = profile.with_trace(string_count_unit=unit)
         try:
             await words.ask(string_reference(words.unit, TRACE_1_AREA.start, SHORTEST_STRING_BYTES, tried))
         except BadReply:
@@ -133,7 +132,7 @@ async def _string_settings(words: Words, profile: SmartStepProfile) -> Mapping[s
                 longest = longest // 4 * 2
             else:
                 break
-        return {"string_count_unit": unit.value, "trace_chunk_bytes": min(longest, profile.trace_chunk_bytes)}
+        return {"string_count_unit": unit.value, "trace_chunk_bytes": min(longest, profile.unit.trace.chunk_bytes)}
     raise DriveFault(f"axis {words.axis}: strings have a length that no unit of their count explains", axis=words.axis)
 
 
@@ -153,10 +152,10 @@ def _agreeing(profile: SmartStepProfile, recorded: Recorded, shown: Mapping[str,
     agreeing: list[Reading] = []
     for layout, order, pulse_gear in product(LAYOUTS, ByteOrder, CommandPulseGear):
         words = {int(word or 0) for word in column}
-        if order is not profile.trace_byte_order:
+        if order is not profile.unit.trace.byte_order:
             words = {(word >> 8 | word << 8) & 0xFFFF for word in words}
         points = [decode_word(word, layout) for word in words]
-        factor = scale(replace(profile, command_pulse_gear=pulse_gear), constants, DataObject.COMMAND_PULSE_SPEED)
+        factor = scale(profile.with_trace(command_pulse_gear=pulse_gear), constants, DataObject.COMMAND_PULSE_SPEED)
         # A monitor has whole units; a point whole counts, and one layout loses the lowest bit of them.
         slack = 1.0 + 2 * factor
         if all(

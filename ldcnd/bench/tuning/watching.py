@@ -13,9 +13,9 @@ from ldcnd.bench.tuning.report import TuningReport
 from ldcnd.bench.tuning.shadow import LEARNT_MOTIONS, FigureAlarm, FigureName, LearnedFigures, Shadow
 from ldcnd.client.kept_gains import file_of, gains_in
 from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.commands import ReportShadow
 from ldcnd.contract.errors import ConfigError, LdcndError, NotSupported, WrongState
 from ldcnd.contract.meta import AxisInfo
+from ldcnd.contract.questions import ReportShadow
 from ldcnd.contract.samples import FigureRange, PositionSample, Quality, ShadowFigure, StateSample
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.profiles import PROFILES, Profile

@@ -20,11 +20,8 @@ from ldcnd.drives.ldcn.controls import (
     HomingControl,
     IoOption,
     LimitPins,
-    PositionReset,
-    StartUp,
     StopControl,
     check_homing,
-    check_options,
     check_stop,
 )
 from ldcnd.drives.ldcn.packet import (
@@ -207,8 +204,6 @@ RESET_SETTLE_S = 0.1
 """Time for a module to restart after Hard Reset, seconds; the manuals name no time."""
 COMMON_TOP_BAUD = 125_000
 """The highest rate of any model but PIC-SERVO SC; which rates a model has is checked with the configuration."""
-EEPROM_SETTLE_S = 0.3
-"""Time for PIC-SERVO SC to write its EEPROM and to restart, seconds; the data sheet names no time."""
 COMMON_COMMANDS = frozenset(
     {
         CommandCode.SET_ADDRESS,
@@ -250,28 +245,6 @@ def reset_position(to: Destination[ReplyT]) -> Exchange[ReplyT]:
     """Set position counter and command position to 0; not to be sent during a trapezoidal move."""
     # executed a second time, it would lose what the motor has turned meanwhile
     return _exchange(to, CommandCode.RESET_POSITION, repeatable=False)
-
-
-def reset_position_relative_to_home(to: Destination[ReplyT]) -> Exchange[ReplyT]:
-    """Make the captured home position the new zero.
-
-    Raises:
-        NotSupported: the module is no PIC-SERVO SC.
-    """
-    _require_sc(to, "resetting the position relative to home")
-    return _exchange(to, CommandCode.RESET_POSITION, bytes((PositionReset.RELATIVE_TO_HOME,)), repeatable=False)
-
-
-def set_position(to: Destination[ReplyT], position: int) -> Exchange[ReplyT]:
-    """Set the position counter, in counts.
-
-    Raises:
-        NotSupported: the module is no PIC-SERVO SC.
-        ValueOutOfRange: the position does not fit.
-    """
-    _require_sc(to, "setting the position counter")
-    data = bytes((PositionReset.SET_POSITION,)) + POSITION.encode(position)
-    return _exchange(to, CommandCode.RESET_POSITION, data, repeatable=False)
 
 
 def set_address(to: Destination[ReplyT], address: int, group: int, *, leader: bool = False) -> Exchange[ReplyT]:
@@ -387,18 +360,6 @@ def io_control(to: Destination[ReplyT], pins: LimitPins, *, fast_path: bool = Fa
     return _exchange(to, CommandCode.IO_CONTROL, bytes((pins | (IoOption.FAST_PATH if fast_path else 0),)))
 
 
-def set_options(to: Destination[ReplyT], options: IoOption) -> Exchange[ReplyT]:
-    """Choose limit protection, output mode and path rate of a PIC-SERVO SC; what is left out is switched off.
-
-    Raises:
-        NotSupported: the module is no PIC-SERVO SC.
-        ValueOutOfRange: options that exclude each other.
-    """
-    _require_sc(to, "options of I/O Control")
-    check_options(options)
-    return _exchange(to, CommandCode.IO_CONTROL, bytes((options,)))
-
-
 def add_path_points(
     to: Destination[ReplyT], points: Sequence[PathPoint], *, fast_path: bool = False
 ) -> Exchange[ReplyT]:
@@ -477,23 +438,6 @@ def hard_reset(to: Node | LeaderlessGroup) -> Exchange[None]:
     return unanswered(to.address, request, RESET_SETTLE_S, repeatable=False, effect=EFFECTS[CommandCode.HARD_RESET])
 
 
-def configure_start_up(to: Node, start_up: StartUp) -> Exchange[None]:
-    """Save gains, velocity, acceleration and these options in the EEPROM, or erase it without `SAVE`; then reset.
-
-    The module restarts as after Hard Reset. Saved values are restored by a loss of its supply only. With
-    `AMPLIFIER_ON` and `SERVO_ON` it energises its motor then, at the latest when it is given an address.
-
-    Raises:
-        NotSupported: the module is no PIC-SERVO SC.
-        ValueOutOfRange: the address is a group's: it would rewrite every module in it.
-    """
-    _require_sc(to, "saving its configuration")
-    # address 0 is every module that receives and has none, a group is all of it: one EEPROM is meant
-    ADDRESS.check(to.address)
-    request = encode_packet(Packet(to.address, CommandCode.HARD_RESET, bytes((start_up,))))
-    return unanswered(to.address, request, EEPROM_SETTLE_S, repeatable=False)
-
-
 def _exchange(
     to: Destination[ReplyT],
     command: CommandCode,
@@ -522,8 +466,3 @@ def _dialect(to: Destination[ReplyT]) -> Profile:
     if to.profile is None:
         raise NotSupported(f"group {to.address:02X}: this command differs between dialects, so the profile is needed")
     return to.profile
-
-
-def _require_sc(to: Destination[ReplyT], what: str) -> None:
-    if not _dialect(to).sc_extensions:
-        raise NotSupported(f"{_dialect(to).title} does not support {what}")

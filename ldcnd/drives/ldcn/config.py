@@ -10,7 +10,7 @@ from typing_extensions import override
 from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.axis_config import MovedAxisConfig
-from ldcnd.drives.driver import AxisSpec, Gains
+from ldcnd.drives.driver import AxisSpec
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, PIC_IO, PROFILES, HomingSource, Support, at_clock
 from ldcnd.drives.ldcn.registers import baud_divisor, encode_gains
 from ldcnd.drives.line_config import BAUDS, BusConfig, InputConfig, OutputConfig
@@ -44,7 +44,7 @@ class LdcnAxisConfig(MovedAxisConfig):
         """Refuse gains that the registers of this model do not take."""
         for gains in filter(None, (self.gains, *self.gain_sets.values())):
             try:
-                encode_gains(PROFILES[self.model], Gains(**gains.model_dump()))
+                encode_gains(PROFILES[self.model], gains.registers)
             except (ValueOutOfRange, NotSupported) as error:
                 raise ValueError(f"gains of {self.model}: {error.message}") from None
         return self
@@ -61,7 +61,7 @@ class LdcnAxisConfig(MovedAxisConfig):
 
     def spec(self) -> AxisSpec:
         """Return the driver's settings."""
-        gains = Gains(**self.gains.model_dump()) if self.gains else None
+        gains = self.gains.registers if self.gains else None
         limit_stop = self.switch_active == "high" if self.limit_switches == "stop" else None
         return AxisSpec(self.name, self.address, self.model, gains, self.identity, limit_stop)
 

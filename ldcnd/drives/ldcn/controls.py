@@ -118,19 +118,6 @@ def check_stop(control: StopControl, profile: Profile | None) -> None:
         raise NotSupported(f"{profile.title if profile else 'the group'} has no motion lock")
 
 
-def check_options(control: IoOption) -> None:
-    """Refuse a combination of options that PIC-SERVO SC does not allow.
-
-    Raises:
-        ValueOutOfRange: two options exclude each other, or a bit that must be clear is set.
-    """
-    if control & ~IoOption(0xFC):
-        raise ValueOutOfRange(f"I/O control {int(control):02X}: bits 0 and 1 must be clear", value=int(control))
-    for pair in EXCLUSIVE_OPTIONS:
-        if control & pair == pair:
-            raise ValueOutOfRange(f"I/O control {int(control):02X}: {pair!r} exclude each other", value=int(control))
-
-
 def check_homing(control: HomingControl, profile: Profile | None) -> None:
     """Refuse a control byte of Set Homing that the device does not define; without a profile, one that none defines.
 

@@ -178,8 +178,7 @@ def _polls(bus: LdcnBusConfig, timing: LineTiming, prices: Mapping[str, PriceLis
         items = tuple(item.value for item in rates_hz)
         # drives in analog positioning send their converter's value with every reply
         longest = price.reading(frozenset(TelemetryItem))
-        size = len(longest.request), longest.reply_bytes
-        polls.append(Poll(axis.name, items, rate_hz, cost_of(longest, timing), mean_s, *size))
+        polls.append(Poll(axis.name, items, rate_hz, cost_of(longest, timing), mean_s))
     return polls
 
 
@@ -194,8 +193,7 @@ def _module_polls(bus: LdcnBusConfig, timing: LineTiming) -> list[Poll]:
             exchange, item, rate_hz = watch_module(module.address), "status byte", 1.0 / PERIOD_S
         cost = cost_of(exchange, timing)
         name = module.name or f"address {module.address}"
-        size = len(exchange.request), exchange.reply_bytes
-        polls.append(Poll(name, (item,), rate_hz, cost, cost.mean_s, *size, address=module.address))
+        polls.append(Poll(name, (item,), rate_hz, cost, cost.mean_s, address=module.address))
     return polls
 
 

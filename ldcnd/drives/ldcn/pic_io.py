@@ -306,13 +306,6 @@ def send_io_command(to: IoNode, command: IoCommand) -> Exchange[IoStatus]:
     return replace(exchange, unseen=True)
 
 
-def define_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:
-    """Choose what the module adds to every reply, this one included; keep `IoNode.items` in step."""
-    return to.exchange(
-        encode_packet(Packet(to.address, CommandCode.DEFINE_STATUS, bytes((items,)))), items, repeatable=True
-    )
-
-
 def read_io_status(to: IoNode, items: IoItem) -> Exchange[IoStatus]:
     """Request these items once instead of the default ones."""
     request = encode_packet(Packet(to.address, CommandCode.READ_STATUS, bytes((items,))))

@@ -1,7 +1,7 @@
 """One LDCN or NMC servo drive as a `Drive`: which packets a command takes.
 
-What is known of it is in record.py, what its motions are to it in trajectory.py. Versions 1 and 2 of PIC-SERVO do not
-stop on home by themselves: the host stops them.
+What is known of it is in record.py, what its motions are to it in trajectory.py, its captures are in homing.py and its
+gains in gains.py.
 
 Positions are counts since the drive was reset, whatever its 32-bit counter says: where a motion would leave the range
 of the counter, Reset Position sets it back beforehand, at standstill, and the host adds what it has set back.
@@ -12,8 +12,7 @@ Sources: LS-182AP manual, "Initializing procedure", "System status", "Absolute p
 import asyncio
 import contextlib
 from collections.abc import Sequence
-from dataclasses import asdict, replace
-from types import MappingProxyType
+from dataclasses import replace
 from typing import Any
 
 from typing_extensions import override
@@ -26,9 +25,7 @@ from ldcnd.contract.errors import (
     NotSupported,
     OutcomeUnknown,
     PacketRejected,
-    RegisterUnknown,
     Remedy,
-    RequestRefused,
     ValueOutOfRange,
     WrongState,
     step,
@@ -52,13 +49,16 @@ from ldcnd.drives.driver import (
     StopMode,
 )
 from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.access import STATE_ITEMS, ServoAccess
 from ldcnd.drives.ldcn.commands import Node
-from ldcnd.drives.ldcn.controls import HomingControl, LimitPins, StopControl, blocking_pin, pin_bits
+from ldcnd.drives.ldcn.controls import LimitPins, StopControl, pin_bits
 from ldcnd.drives.ldcn.faults import FaultCode, sensor_lost
+from ldcnd.drives.ldcn.gains import GainRegisters
+from ldcnd.drives.ldcn.homing import Homing, home_methods, opens_loop
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusItem, StatusPacket, status_decoder
-from ldcnd.drives.ldcn.profiles import HomingSource, Profile
+from ldcnd.drives.ldcn.profiles import Profile
 from ldcnd.drives.ldcn.record import DriveState
-from ldcnd.drives.ldcn.registers import FAST_PATH, FRACTION, LIMIT_PINS, TRAJECTORY_CONTROL, ServoRegisters, Unknown
+from ldcnd.drives.ldcn.registers import FAST_PATH, FRACTION, LIMIT_PINS, TRAJECTORY_CONTROL, ServoRegisters
 from ldcnd.drives.ldcn.trajectory import (
     MOST_POINTS_PER_PACKET,
     PathPoint,
@@ -75,76 +75,6 @@ from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, Lane
 from ldcnd.log import get_logger
 
-SOURCES = MappingProxyType(
-    {
-        HomeMethod.REVERSE_LIMIT: HomingSource.LIMIT1,
-        HomeMethod.FORWARD_LIMIT: HomingSource.LIMIT2,
-        HomeMethod.INDEX: HomingSource.INDEX,
-        HomeMethod.POSITION_ERROR: HomingSource.POSITION_ERROR,
-        HomeMethod.CURRENT: HomingSource.CURRENT,
-    }
-)
-OPPOSITE_LIMITS = MappingProxyType(
-    {HomeMethod.REVERSE_LIMIT: HomeMethod.FORWARD_LIMIT, HomeMethod.FORWARD_LIMIT: HomeMethod.REVERSE_LIMIT}
-)
-STOPS = MappingProxyType(
-    {
-        StopMode.SMOOTH: HomingControl.STOP_SMOOTH,
-        StopMode.ABRUPT: HomingControl.STOP_ABRUPT,
-        StopMode.OFF: HomingControl.MOTOR_OFF,
-    }
-)
-
-
-def homing_source(profile: Profile, method: HomeMethod) -> HomingSource:
-    """Return the input or event that a method watches on this device."""
-    if profile.limit1_is_forward:
-        method = OPPOSITE_LIMITS.get(method, method)
-    return SOURCES[method]
-
-
-def home_methods(profile: Profile) -> frozenset[HomeMethod]:
-    """Return what can capture the home position of this device."""
-    return frozenset(method for method in SOURCES if homing_source(profile, method) & profile.homing_sources)
-
-
-def homing_control(profile: Profile, capture: HomeCapture) -> HomingControl:
-    """Return the control byte that arms a capture.
-
-    An excess position error opens the loop by itself, so no way to stop goes with it.
-    """
-    control = HomingControl(homing_source(profile, capture.method))
-    for method in capture.also:
-        control |= HomingControl(homing_source(profile, method))
-    if profile.stops_on_home and capture.method is not HomeMethod.POSITION_ERROR:
-        control |= STOPS[capture.stop]
-    return control
-
-
-def opens_loop(profile: Profile, capture: HomeCapture) -> bool:
-    """Tell whether the drive opens its loop by itself when it has captured."""
-    if capture.method is HomeMethod.POSITION_ERROR:
-        return True
-    return profile.stops_on_home and capture.stop is StopMode.OFF
-
-
-def _limits_ahead(motion: CountsMotion | AnalogMotion | PwmOutput, here_counts: int) -> tuple[HomeMethod, ...]:
-    """Return the limit switches that a motion may run onto; both where the drive finds the direction itself."""
-    match motion:
-        case AnalogMotion():
-            return (HomeMethod.FORWARD_LIMIT, HomeMethod.REVERSE_LIMIT)
-        case PwmOutput():
-            way = motion.duty
-        case CountsMotion(None):
-            way = motion.velocity_counts_per_s
-        case CountsMotion():
-            way = (motion.target_counts or 0) - here_counts
-    if way == 0:
-        return ()
-    return (HomeMethod.FORWARD_LIMIT if way > 0 else HomeMethod.REVERSE_LIMIT,)
-
-
-ANY_LIMIT = HomingControl.LIMIT1 | HomingControl.LIMIT2
 LEAST_SET_BACK = 1000
 """A counter so near to 0 is not set back: whether Reset Position was executed must show in it."""
 log = get_logger("ldcn")
@@ -159,7 +89,6 @@ def _shifted(motion: CountsMotion, offset_counts: int) -> CountsMotion:
 
 REACHED_COUNTS = 16
 """So close to its target a finished profile counts as having run."""
-STATE_ITEMS = StatusItem.POSITION | StatusItem.VELOCITY | StatusItem.AUX
 PATH_CYCLES = 64
 """Servo cycles of a path point: the longer period, which leaves most of the line to others."""
 PATH_MOST_COUNTS = most_step(PATH_CYCLES)
@@ -204,6 +133,9 @@ class LdcnAxis(Moves):
         self.state = DriveState(spec.name, profile, self._book)
         self._bus = bus
         self._node = Node(spec.address, profile)
+        self._of = ServoAccess(spec, profile, bus, self._node, self._book, self.state)
+        self._gains = GainRegisters(self._of)
+        self._homing = Homing(self._of)
         self._initialised = False
         self.path_period_s = PATH_CYCLES * profile.servo_cycle_s
         self.path_packet = MOST_POINTS_PER_PACKET
@@ -307,7 +239,7 @@ class LdcnAxis(Moves):
             first, offset = (commands.reset_position(self._node),), self.state.counts
         if self.state.known.closed and self._book.wanted_gains and not self._book.loaded:
             first = (commands.set_gain(self._node, self._book.wanted_gains), *first)
-        trajectory = trajectory_of(_shifted(motion, offset), self._next_divisor(), self.profile)
+        trajectory = trajectory_of(_shifted(motion, offset), self._gains.next_divisor(), self.profile)
         return *first, commands.load_trajectory(self._node, trajectory), commands.start_motion(self._node)
 
     async def power(self, *, on: bool) -> None:
@@ -334,7 +266,7 @@ class LdcnAxis(Moves):
         await self._switch(commands.close_loop(self._node), Lane.COMMAND, pic_ae=True, closed=True)
         # pos_error is set while the loop is open, and sticky
         await self._clear_sticky_bits()
-        status = await self._bus.execute(commands.read_status(self._node, StatusItem.AUX))
+        status = await self._of.read(StatusItem.AUX)
         faults = self.state.faults(status)
         if status.aux is None or not status.aux & AuxFlag.SERVO_ON:
             causes = "; ".join(fault.text for fault in faults) or "it does not say why"
@@ -346,7 +278,7 @@ class LdcnAxis(Moves):
 
     async def _check_without_power_driver(self) -> None:
         """Switch the power driver off first where it may be on, so that the drive says what is wrong at present."""
-        status = await self._bus.execute(commands.read_status(self._node, StatusItem.AUX))
+        status = await self._of.read(StatusItem.AUX)
         if status.aux is not None and status.aux & AuxFlag.SERVO_ON:
             return
         await self.stop(StopMode.OFF)
@@ -358,7 +290,7 @@ class LdcnAxis(Moves):
         Raises:
             DriveFault: it has a fault that keeps the motor off.
         """
-        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        status = await self._of.read(STATE_ITEMS)
         standing = [fault for fault in self.state.faults(status) if fault.stops]
         if standing:
             raise DriveFault(
@@ -392,7 +324,7 @@ class LdcnAxis(Moves):
 
     async def _initialise_registers(self) -> None:
         """Do what the LS-182AP manual requires once after a reset: amplifier off, no distance to go."""
-        status = await self._bus.execute(commands.read_status(self._node, StatusItem.POSITION | StatusItem.AUX))
+        status = await self._of.read(StatusItem.POSITION | StatusItem.AUX)
         if status.aux is None or status.aux & AuxFlag.SERVO_ON:
             return  # taken over with its loop closed: initialised long ago
         trajectory = Trajectory(
@@ -429,12 +361,7 @@ class LdcnAxis(Moves):
                 await self._stop_motor(STOP_CONTROLS[mode])
         finally:
             self._switching_off -= off
-        # an armed capture would stop a later motion, and end it as if it had found its home
-        if self.state.homing_armed:
-            with contextlib.suppress(RequestRefused):  # not known to be this drive: the next motion disarms it
-                await self._bus.execute(commands.set_homing(self._node, HomingControl(0)), Lane.STOP)
-                self.state.homing_armed = False
-        self.state.guard, self.state.guard_hit = "", False
+        await self._homing.disarm()
         return mode
 
     async def reset(self) -> None:
@@ -455,54 +382,7 @@ class LdcnAxis(Moves):
 
     @override
     def quantise(self, motion: CountsMotion, most: Ceiling = NO_CEILING) -> CountsMotion:
-        return quantised(motion, self._next_divisor(), self.profile, most)
-
-    def _next_divisor(self) -> int:
-        """Return the servo rate divisor in which the next motion will be loaded.
-
-        Raises:
-            RegisterUnknown: it is not known, and no gains are there to be loaded.
-        """
-        divisor = self._book.next_divisor
-        if divisor is None:
-            raise self._unknown("sr", Remedy("{}", step("set_gains", "send set_gains with all gains")))
-        return divisor
-
-    def _unknown(self, register: str, remedy: str) -> RegisterUnknown:
-        holding = self._book[register]
-        why = f": {holding.why}" if isinstance(holding, Unknown) else ""
-        return RegisterUnknown(
-            f"axis {self.spec.name}: what register {register} of the drive holds is not known{why}",
-            axis=self.spec.name,
-            value=register,
-            remedy=remedy,
-        )
-
-    async def _load_gains(self) -> int:
-        """Have the drive hold the gains that it should before a motion; return the servo rate divisor in force.
-
-        "If the servo rate divisor is modified, the time dependent velocity and acceleration parameters will also have
-        to be modified" (LS-182AP manual, "Servo Control"). Set Gain is idempotent and moves nothing at standstill. What
-        is loaded are the gains that were acknowledged last, or the configured ones: a change that was reported as
-        failed does not take effect later by itself.
-
-        Raises:
-            RegisterUnknown: the divisor is not known, and the axis moves or has no gains to be loaded.
-        """
-        book = self._book
-        if book.wanted_gains is not None and not book.loaded:
-            if await self._stands():
-                await self.set_gains(book.wanted_gains)
-            elif book.divisor is None:
-                raise self._unknown("sr", Remedy("{} and wait: at standstill the gains are loaded again", step("halt")))
-        return self._next_divisor() if book.divisor is None else book.divisor
-
-    async def _stands(self) -> bool:
-        """Read the drive: no profile of a closed loop runs, and it shows no more velocity than a loop that hunts."""
-        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
-        if status.aux is not None and not status.aux & AuxFlag.SERVO_ON:
-            return True
-        return bool(status.flags & StatusFlag.MOVE_DONE) and abs(status.velocity or 0) <= 1
+        return quantised(motion, self._gains.next_divisor(), self.profile, most)
 
     async def load(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, home: HomeCapture | None = None) -> None:
         """See `Moves`. A motion lock, set by homing on a limit switch, is lifted: the command is to move on.
@@ -512,9 +392,9 @@ class LdcnAxis(Moves):
             WrongState: the limit switch pin that would be homed on is an output; or the target is beyond the counter,
                 and the axis does not stand.
             DriveFault: the analog sensor is out of its range.
-            RegisterUnknown: see `_load_gains`.
+            RegisterUnknown: see `GainRegisters.ensure`.
         """
-        divisor = await self._load_gains()
+        divisor = await self._gains.ensure()
         if isinstance(motion, CountsMotion):
             target = motion.target_counts
             if target is not None and abs(target - self.state.offset_counts) > LARGEST_COUNT:
@@ -530,7 +410,7 @@ class LdcnAxis(Moves):
         # LS-182AP from version 22 on locks motion when a capture on a limit switch has stopped it
         if self.state.motion_locked:
             await self._bus.execute(commands.stop_motor(self._node, StopControl.AMP_ENABLE | StopControl.LOCK_DISABLE))
-        await self._arm(motion, home)
+        await self._homing.arm(motion, home)
         await self._load(trajectory)
         self.state.loaded(
             absolute=isinstance(motion, AnalogMotion),
@@ -548,7 +428,7 @@ class LdcnAxis(Moves):
             WrongState: the axis does not stand, or the counter is at 0 already.
             OutcomeUnknown: the counter is as it was.
         """
-        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        status = await self._of.read(STATE_ITEMS)
         before = status.position or 0
         if not status.flags & StatusFlag.MOVE_DONE or status.velocity:
             raise WrongState(
@@ -576,7 +456,7 @@ class LdcnAxis(Moves):
         self._book.forget("the position counter was set back", ("position",))
         with contextlib.suppress(OutcomeUnknown):
             await self._bus.execute(commands.reset_position(self._node))
-        self.state.reading(await self._bus.execute(commands.read_status(self._node, STATE_ITEMS)))
+        self.state.reading(await self._of.read(STATE_ITEMS))
         if self.state.setting_back:
             self.state.setting_back = 0
             raise OutcomeUnknown(
@@ -585,78 +465,6 @@ class LdcnAxis(Moves):
                 remedy="send the motion again",
             )
         log.info("position counter set back", axis=self.spec.name, counts=before)
-
-    async def _arm(self, motion: CountsMotion | AnalogMotion | PwmOutput, home: HomeCapture | None) -> None:
-        """Arm the requested capture, or the one that stops the motion at the limit switch ahead, or none.
-
-        It "can also be used as a safety shutoff" (PIC-SERVO manual, 5.2, "Set Homing Mode"). Only the drive's home
-        register changes: the reference is the host's.
-        """
-        self.state.guard, self.state.guard_hit = "", False
-        control, guard = HomingControl(0), ""
-        if home is not None:
-            for method in (home.method, *home.also):
-                self._check_pin(method)
-            control = homing_control(self.profile, home)
-            if home.guarded and self.spec.limit_stop is not None:
-                control |= (await self._guard(motion, active=self.spec.limit_stop))[0] & ANY_LIMIT
-        elif self.spec.limit_stop is not None:
-            control, guard = await self._guard(motion, active=self.spec.limit_stop)
-        if control or self.state.homing_armed:
-            self.state.homing_armed = True  # before it is, so that a stop in between disarms it
-            await self._bus.execute(commands.set_homing(self._node, control))
-        if control:
-            await self._check_armed()
-        self.state.homing_armed = bool(control)
-        self.state.guard = guard
-
-    async def _check_armed(self) -> None:
-        """Refuse a motion that its drive would not end: what was captured before would pass for its home.
-
-        Raises:
-            WrongState: the drive does not show that it looks for its home.
-        """
-        # "the home_in_progress bit in the status byte is set when this command is issued" (PIC-SERVO manual, 5.2)
-        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
-        if not status.flags & StatusFlag.HOME_IN_PROGRESS:
-            raise WrongState(
-                f"axis {self.spec.name}: the drive has acknowledged that it looks for its home, and does not show it;"
-                " nothing was started",
-                axis=self.spec.name,
-                remedy="send it again; if that repeats, look whether the signal changes while the axis stands",
-            )
-
-    async def _guard(
-        self, motion: CountsMotion | AnalogMotion | PwmOutput, *, active: bool
-    ) -> tuple[HomingControl, str]:
-        """Return what stops a motion at the limit switches that it may run onto, and their name.
-
-        Only switches ahead are armed: a capture comes with every change, also with that of leaving the other one. A
-        drive that turns round in mid-move has the other one ahead until it has.
-
-        Raises:
-            WrongState: the axis stands on the switch ahead, or its pin is an output.
-        """
-        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
-        reading = self.state.reading(status)
-        ahead = _limits_ahead(motion, reading.position_counts)
-        onward = _limits_ahead(CountsMotion(None, reading.velocity_counts_per_s, 1.0), reading.position_counts)
-        levels = {HomeMethod.FORWARD_LIMIT: reading.forward_limit, HomeMethod.REVERSE_LIMIT: reading.reverse_limit}
-        control = HomingControl(0)
-        for method in ahead:
-            self._check_pin(method)
-            if levels[method] is active and len(ahead) == 1:
-                raise WrongState(
-                    f"axis {self.spec.name} stands on its {method.value.replace('_', ' ')} switch",
-                    axis=self.spec.name,
-                    value=method.value,
-                    remedy="move the other way",
-                )
-        ahead += tuple(method for method in onward if method not in ahead and levels[method] is not active)
-        stop = StopMode.OFF if isinstance(motion, PwmOutput) else StopMode.SMOOTH
-        for method in ahead:
-            control |= homing_control(self.profile, HomeCapture(method, stop))
-        return control, " or ".join(f"{method.value.replace('_', ' ')} switch" for method in ahead)
 
     @override
     def room_counts(self, *, forward: bool) -> int:
@@ -687,31 +495,13 @@ class LdcnAxis(Moves):
 
     async def _check_sensor(self) -> None:
         """Refuse an analog motion while the sensor reads like a broken one (manual, "Analog positioning sensor")."""
-        status = await self._bus.execute(commands.read_status(self._node, StatusItem.ADC))
+        status = await self._of.read(StatusItem.ADC)
         if sensor_lost(self.profile, status.adc):
             raise DriveFault(
                 f"axis {self.spec.name}: the analog sensor reads {status.adc}: {FaultCode.SENSOR_FAULT.remedy}",
                 axis=self.spec.name,
                 value=FaultCode.SENSOR_FAULT.value,
                 remedy="check the sensor's cable",
-            )
-
-    def _check_pin(self, method: HomeMethod) -> None:
-        pin = blocking_pin(method)
-        if pin not in LIMIT_PINS:
-            return
-        is_input, holding = LIMIT_PINS[pin][0], self._book[pin]
-        if isinstance(holding, Unknown) and set(holding.among) - {is_input}:
-            remedy = step("set_outputs", 'send set_outputs with "input"', limit1="input", limit2="input")
-            raise self._unknown(pin, Remedy("{}", remedy))
-        if self._book.known(pin) not in (None, is_input):
-            raise WrongState(
-                f"axis {self.spec.name}: the {method} pin is an output",
-                axis=self.spec.name,
-                value=method.value,
-                remedy=Remedy(
-                    "{}", step("set_outputs", 'send set_outputs with "input"', limit1="input", limit2="input")
-                ),
             )
 
     async def start(self) -> None:
@@ -740,7 +530,7 @@ class LdcnAxis(Moves):
 
     async def _has_started(self) -> bool:
         """Look for a witness: a profile that runs, the target reached, or a velocity."""
-        status = await self._bus.execute(commands.read_status(self._node, STATE_ITEMS))
+        status = await self._of.read(STATE_ITEMS)
         control, velocity = self._book.known(TRAJECTORY_CONTROL), self._book.known("velocity")
         # "clear when in the middle of a trapezoidal profile move" (PIC-SERVO manual, 5.3): this drive runs
         if control is None or not control & TrajectoryControl.SERVO or not status.flags & StatusFlag.MOVE_DONE:
@@ -759,7 +549,7 @@ class LdcnAxis(Moves):
             ValueOutOfRange: beyond the drive's 32-bit counter.
             OutcomeUnknown: the reply was lost.
         """
-        await self._load_gains()
+        await self._gains.ensure()
         control = StopControl.AMP_ENABLE | StopControl.HERE
         counter = position_counts - self.state.offset_counts
         # "if the stopping position is too far from the current position, a position error will be generated" (ibid.,
@@ -789,7 +579,7 @@ class LdcnAxis(Moves):
                 f"axis {self.spec.name}: {self.profile.title} has no path mode", axis=self.spec.name, value="path"
             )
         if self._book.known(FAST_PATH) != 0:  # a fast path, left by another host, would run at twice the speed
-            raise self._unknown(FAST_PATH, 'restart the daemon with start = "reset"')
+            raise self._of.unknown(FAST_PATH, 'restart the daemon with start = "reset"')
 
     @override
     def path_exchanges(self) -> tuple[Exchange[Any], ...]:
@@ -798,7 +588,7 @@ class LdcnAxis(Moves):
 
     @override
     async def path_status(self) -> PathStatus:
-        status = await self._bus.execute(commands.read_status(self._node, PATH_ITEMS))
+        status = await self._of.read(PATH_ITEMS)
         position, error, aux, points = status.position, status.position_error, status.aux, status.bit7
         if position is None or error is None or aux is None or points is None:
             raise BadReply(f"axis {self.spec.name}: the status packet lacks what shows a path")
@@ -823,10 +613,7 @@ class LdcnAxis(Moves):
 
     @override
     async def captured_home(self) -> int:
-        status = await self._bus.execute(commands.read_status(self._node, StatusItem.HOME))
-        if status.home is None:
-            raise BadReply(f"axis {self.spec.name}: the status packet lacks the home position")
-        return status.home + self.state.offset_counts
+        return await self._homing.captured()
 
     # -- what proves that its counter goes on ------------------------------------------------------------------------
 
@@ -853,18 +640,7 @@ class LdcnAxis(Moves):
 
     @override
     async def set_gains(self, gains: Gains) -> None:
-        exchange = commands.set_gain(self._node, gains)
-        if self.profile.divisor_slows_profile and self._book.divisor != gains.sr and not await self._stands():
-            raise WrongState(
-                f"axis {self.spec.name} moves: another servo rate divisor would change its velocity",
-                axis=self.spec.name,
-                value=gains.sr,
-                remedy=Remedy("{} and wait", step("halt")),
-            )
-        # a lost reply leaves each register the old or the new value, and the next motion loads them again
-        with self._book.writing(asdict(gains)):
-            await self._bus.execute(exchange)
-        self._book.wanted_gains = gains
+        await self._gains.load(gains)
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:
         """See `Moves`; PIC-SERVO version 4 only."""
@@ -875,7 +651,7 @@ class LdcnAxis(Moves):
         for (name, bits), mode in zip(LIMIT_PINS.items(), (limit1, limit2), strict=True):
             value = self._book.known(name) if mode is None else pin_bits(mode, *bits)
             if value is None:
-                raise self._unknown(
+                raise self._of.unknown(
                     name, Remedy("{}", step("set_outputs", "send set_outputs with both limit1 and limit2"))
                 )
             values[name] = int(value)

@@ -207,7 +207,7 @@ def probe(unit: int) -> Exchange[None]:
 
 def with_response_time(exchange: Exchange[ValueT], profile: SmartStepProfile) -> Exchange[ValueT]:
     """Return the exchange with the response time of a profile instead of the manual's."""
-    return replace(exchange, response_s=profile.first_character_s)
+    return replace(exchange, response_s=profile.unit.first_character_s)
 
 
 def is_self_hearing(unit: int, stray: bytes) -> bool:
@@ -356,9 +356,10 @@ def string_reference(
     if address % 2:
         raise ValueOutOfRange(f"unit {unit}: string address {address:04X}H is odd", value=address)
     command = CommandPacket(
-        unit, Function.STRING_REFERENCE, address, _string_count(byte_count, profile.string_count_unit)
+        unit, Function.STRING_REFERENCE, address, _string_count(byte_count, profile.unit.trace.string_count_unit)
     )
-    allowed = _VARIANTS if profile.string_checksum is StringChecksum.AUTO else (profile.string_checksum,)
+    checksum = profile.unit.trace.string_checksum
+    allowed = _VARIANTS if checksum is StringChecksum.AUTO else (checksum,)
     longest = PACKET_CHARACTERS + 4 * command.data + TRAILER_CHARACTERS
     expected = PACKET_CHARACTERS + 2 * byte_count
     if StringChecksum.TRAILER in allowed:
@@ -369,7 +370,7 @@ def string_reference(
         expected,
         _string_checker(command, allowed),
         _string_decoder(command, allowed, byte_count),
-        profile.first_character_s,
+        profile.unit.first_character_s,
         repeatable=True,
         total_bytes=lambda data: piece_bytes(data, longest),
         effect=PacketEffect.READS,

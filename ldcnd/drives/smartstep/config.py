@@ -1,75 +1,20 @@
 """The configuration of SmartStep lines and units, beside what every line and axis has."""
 
-from collections.abc import Mapping
-from dataclasses import replace
 from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.samples import MonitorName
 from ldcnd.drives.axis_config import AxisConfig, RatesConfig
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.smartstep.packet import HIGHEST_UNIT
 from ldcnd.drives.smartstep.profiles import (
-    ByteOrder,
-    CommandPulseGear,
-    CountUnit,
     Echo,
-    EepromWrite,
     Framing,
     SmartStepProfile,
-    StringChecksum,
-    TraceWordLayout,
-    TriggerMap,
+    SmartStepUnitConfig,
     Wiring,
 )
-
-
-class SmartStepTraceConfig(Frozen):
-    """How the trace of one unit is taken to work where its manual leaves room."""
-
-    word_layout: TraceWordLayout = TraceWordLayout.MSB_IO
-    """Place of the signal's bit and the value in a word of the trace memory; raw leaves words as they are."""
-    byte_order: ByteOrder = ByteOrder.BIG
-    """Half of a word that comes first in a string."""
-    string_checksum: StringChecksum = StringChecksum.AUTO
-    """Bytes that the checksum of a string reply covers; auto takes every variant until the drive shows which."""
-    string_count_unit: CountUnit = CountUnit.BYTES
-    """Unit of the count in a string reference."""
-    chunk_bytes: int = Field(default=200, ge=2, le=1000)
-    """How much of the memory is read at once, even; 2 ms of the line for each byte."""
-    verify: bool = True
-    """Read everything until two readings agree: the checksum may not cover it."""
-    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN
-    """Gearing of command pulses to motor speed."""
-    trigger_map: TriggerMap | None = None
-    """The bits of the trigger condition; without them the host watches for the trigger."""
-    verified: bool = False
-    """Whether the layout was compared with the drive, see `ldcnd doctor verify`; values are uncertain until then."""
-
-    @field_validator("chunk_bytes")
-    @classmethod
-    def _whole_words(cls, value: int) -> int:
-        if value % 2:
-            raise ValueError("chunk_bytes is even: a word of the trace memory has two bytes")
-        return value
-
-    def assumed_of(self, profile: SmartStepProfile) -> SmartStepProfile:
-        """Return a drive's profile with these assumptions."""
-        return replace(
-            profile,
-            trace_word_layout=self.word_layout,
-            trace_byte_order=self.byte_order,
-            string_checksum=self.string_checksum,
-            string_count_unit=self.string_count_unit,
-            trace_chunk_bytes=self.chunk_bytes,
-            trace_verify=self.verify,
-            command_pulse_gear=self.command_pulse_gear,
-            trigger_map=self.trigger_map,
-            trace_verified=self.verified,
-        )
-
 
 MODEL = "smartstep"
 EARLIER = 1.0
@@ -107,48 +52,6 @@ class SmartStepLineConfig(Frozen):
             raise ValueError("wiring 2-wire is not described in the manual; set accept_two_wire = true to use it")
         if self.echo == "expect" and self.wiring is Wiring.FOUR_WIRE:
             raise ValueError("there is no echo on four wires")
-        return self
-
-
-class SmartStepUnitConfig(Frozen):
-    """How one unit is read and written, and how it is taken to behave where its manual leaves room."""
-
-    monitors: Mapping[MonitorName, float] = {}
-    """Monitors to publish, with their rates in Hz."""
-    audit_s: float = Field(default=45.0, ge=0, le=86_400)
-    """Period in which each parameter is read once, in seconds, to find what another program or a reset has changed;
-    0 never."""
-    eeprom_write: EepromWrite = EepromWrite.ALLOW
-    """Permission to write EEPROM: deny forbids it; with allow, EEPROM is written when a request names it."""
-    eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
-    """Writes of the drive's EEPROM, all parameters together, until further ones are refused; it endures 10,000."""
-    planned_response_s: float = Field(default=0.02, ge=0, le=5)
-    """How long it takes to answer as a rule, for the plan; the manual promises 0.2 s, which would leave no room."""
-    first_character_s: float = Field(default=0.3, gt=0, le=5)
-    """The longest wait for a reply; the manual says 0.2 s."""
-    encoder_counts_per_rev: int = Field(default=8000, gt=0)
-    """Pulses of the feedback counter in one turn."""
-    run_active_low: bool = True
-    """RUN is on while its input bit is 0."""
-    reset_active_low: bool = True
-    """RESET is on while its input bit is 0."""
-    alarm_output_high: bool = True
-    """/ALM is 1 in alarm."""
-    trace: SmartStepTraceConfig = SmartStepTraceConfig()
-    """How its recorder is taken to work."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _renamed(cls, document: object) -> object:
-        if isinstance(document, dict) and document.get("eeprom_write") == "confirm":
-            raise ValueError('eeprom_write: "confirm" never differed from "allow"; use "allow" or "deny"')
-        return document
-
-    @model_validator(mode="after")
-    def _rates(self) -> Self:
-        for name, rate in self.monitors.items():
-            if not 0 <= rate <= 100:  # noqa: PLR2004 - a word takes 29 ms at least
-                raise ValueError(f"monitors.{name}: {rate} Hz is not 0 to 100")
         return self
 
 
@@ -230,16 +133,5 @@ class SmartStepBusConfig(BusConfig):
 
     def profile(self, axis: SmartStepAxisConfig) -> SmartStepProfile:
         """Return how one of its drives is taken to behave."""
-        line, unit = self.smartstep, axis.smartstep
-        profile = SmartStepProfile(
-            framing=line.framing,
-            wiring=line.wiring,
-            echo=Echo(line.echo),
-            first_character_s=unit.first_character_s,
-            eeprom_write=unit.eeprom_write,
-            encoder_counts_per_rev=unit.encoder_counts_per_rev,
-            run_active_low=unit.run_active_low,
-            reset_active_low=unit.reset_active_low,
-            alarm_output_high=unit.alarm_output_high,
-        )
-        return unit.trace.assumed_of(profile)
+        line = self.smartstep
+        return SmartStepProfile(framing=line.framing, wiring=line.wiring, echo=Echo(line.echo), unit=axis.smartstep)

@@ -210,7 +210,7 @@ class SmartStepAxis(PollsItself):
     def interpret(self, latest: UnitWords) -> AxisReading:
         """Return what the latest words of the drive say together."""
         words = latest.words
-        counts_per_s_per_rpm = self.profile.encoder_counts_per_rev / 60.0
+        counts_per_s_per_rpm = self.profile.unit.encoder_counts_per_rev / 60.0
         present = alarm(words[Register.PRESENT_ALARM])
         out = alarm_is_out(self.profile, output_levels(words[OUTPUT_SIGNALS.address]))
         # 91 and 92 are titled alarms: whether they stop the motor is what /ALM says (manual 3, alarm and output tables)

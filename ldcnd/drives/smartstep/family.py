@@ -161,8 +161,6 @@ def _polls(bus: SmartStepBusConfig, timing: LineTiming) -> list[Poll]:
                         rate_hz=rate_hz,
                         cost=_times(words, cost),
                         mean_s=words * cost.longest_s,
-                        request_bytes=words * len(word.request),
-                        reply_bytes=words * word.reply_bytes,
                         exchanges=words,
                     )
                 )
@@ -183,7 +181,7 @@ def _urgent(bus: SmartStepBusConfig, timing: LineTiming) -> Urgent:
 
 
 def _planned(axis: SmartStepAxisConfig) -> SmartStepProfile:
-    return replace(PROFILE, first_character_s=axis.smartstep.planned_response_s)
+    return PROFILE.with_unit(first_character_s=axis.smartstep.planned_response_s)
 
 
 def _times(words: int, cost: Cost) -> Cost:
@@ -193,18 +191,20 @@ def _times(words: int, cost: Cost) -> Cost:
         reply_s=words * cost.reply_s,
         overhead_s=words * cost.overhead_s,
         ends_early=False,
+        request_bytes=words * cost.request_bytes,
+        reply_bytes=words * cost.reply_bytes,
     )
 
 
 def price_list(profile: SmartStepProfile = PROFILE) -> PriceList:
     """Return the exchanges of a drive; a reading is one word, for any item."""
-    chunk = commands.string_reference(ANY_UNIT, TRACE_1_AREA[0], profile.trace_chunk_bytes, profile)
+    chunk = commands.string_reference(ANY_UNIT, TRACE_1_AREA[0], profile.unit.trace.chunk_bytes, profile)
     exchanges: dict[str, Exchange[Any]] = {
         "read word": commands.reference(ANY_UNIT, 0),
         "write trace register": commands.write_trace_register(ANY_UNIT, next(iter(TraceRegister)), 0),
         "set operating mode": commands.set_operating_mode(ANY_UNIT, OperatingMode.NORMAL),
         "probe": commands.probe(ANY_UNIT),
-        f"read string of {profile.trace_chunk_bytes} bytes": chunk,
+        f"read string of {profile.unit.trace.chunk_bytes} bytes": chunk,
     }
     return PriceList(
         node_baud=float(BAUD),

@@ -147,17 +147,17 @@ def driver_type(word: int) -> DriverType | int:
 
 def run_is_on(profile: SmartStepProfile, levels: InputSignal) -> bool:
     """Return whether RUN requests servo-on; which level does is an assumption of the profile."""
-    return bool(levels & InputSignal.RUN) is not profile.run_active_low
+    return bool(levels & InputSignal.RUN) is not profile.unit.run_active_low
 
 
 def reset_is_on(profile: SmartStepProfile, levels: InputSignal) -> bool:
     """Return whether RESET requests an alarm reset; which level does is an assumption of the profile."""
-    return bool(levels & InputSignal.RESET) is not profile.reset_active_low
+    return bool(levels & InputSignal.RESET) is not profile.unit.reset_active_low
 
 
 def alarm_is_out(profile: SmartStepProfile, levels: OutputSignal) -> bool:
     """Tell whether /ALM says alarm; which level does is an assumption of the profile."""
-    return bool(levels & OutputSignal.ALM) is profile.alarm_output_high
+    return bool(levels & OutputSignal.ALM) is profile.unit.alarm_output_high
 
 
 NO_ALARM = 0x0099

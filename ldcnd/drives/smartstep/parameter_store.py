@@ -278,7 +278,7 @@ class UnitParameters(ParameterAccess):
     # -- checks ------------------------------------------------------------------------------------------------------
 
     def _check_eeprom(self) -> None:
-        if self._profile.eeprom_write is EepromWrite.DENY:
+        if self._profile.unit.eeprom_write is EepromWrite.DENY:
             raise NotSupported(
                 f"axis {self._axis}: the configuration forbids writing EEPROM",
                 axis=self._axis,

@@ -34,7 +34,7 @@ from ldcnd.drives.smartstep.parameters import PARAMETERS
 from ldcnd.drives.smartstep.profiles import SmartStepProfile
 from ldcnd.drives.smartstep.words import stray_packets
 from ldcnd.line.bus import Bus
-from ldcnd.line.exchange import Exchange, Poller, Timing, next_on_grid
+from ldcnd.line.exchange import NEVER_S, Exchange, Poller, Timing, next_on_grid
 from ldcnd.log import get_logger
 
 log = get_logger("smartstep")
@@ -42,7 +42,6 @@ log = get_logger("smartstep")
 MISSES_BEFORE_BACKOFF = 3
 FIRST_BACKOFF_S = 1.0
 LONGEST_BACKOFF_S = 10.0
-NEVER_S = float("inf")
 STRAY_WAIT_S = 0.3
 """A drive that received its own reply has answered by then: its longest response time and some margin."""
 ALARM_HISTORY_PAUSE_S = 0.5
@@ -182,7 +181,7 @@ class UnitPoller(Poller[int | Refusal]):
         The line takes its next turn before it delivers the last reply; which word is next depends on that reply, so
         the turn after this one is put off until then.
         """
-        queued_at_s, self.due_at_s = self.due_at_s, now_s + self._profile.first_character_s + PUT_OFF_S
+        queued_at_s, self.due_at_s = self.due_at_s, now_s + self._profile.unit.first_character_s + PUT_OFF_S
         if self._misses >= MISSES_BEFORE_BACKOFF or self._one_word_only:
             self._address = Register.PRESENT_ALARM
         else:

@@ -6,12 +6,15 @@ bears on traces with the drive; the values of its traces are uncertain until the
 Source: manual, all chapters; where it is silent, public manuals of related drives.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from typing import Self
 
-from pydantic import Field
+from pydantic import Field, field_validator, model_validator
 
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.samples import MonitorName
 
 
 class Framing(StrEnum):
@@ -111,8 +114,80 @@ class TriggerMap(Frozen):
     """Enable bit of the falling edge."""
 
 
+class SmartStepTraceConfig(Frozen):
+    """How the trace of one unit is taken to work where its manual leaves room."""
+
+    word_layout: TraceWordLayout = TraceWordLayout.MSB_IO  # the figure of manual 4 (9) is lost
+    """Place of the signal's bit and the value in a word of the trace memory; raw leaves words as they are."""
+    byte_order: ByteOrder = ByteOrder.BIG  # manual 4 (9) is silent; words of commands have the high byte first
+    """Half of a word that comes first in a string."""
+    string_checksum: StringChecksum = StringChecksum.AUTO  # manual 2.2: its place is given, not what it covers
+    """Bytes that the checksum of a string reply covers; auto takes every variant until the drive shows which."""
+    string_count_unit: CountUnit = CountUnit.BYTES  # manual 2.2 says "data count"; 1000 addresses hold 500 points
+    """Unit of the count in a string reference."""
+    chunk_bytes: int = Field(default=200, ge=2, le=1000)  # manual 2.2 gives no longest string
+    """How much of the memory is read at once, even; 2 ms of the line for each byte."""
+    verify: bool = True
+    """Read everything until two readings agree: the checksum may not cover it."""
+    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN  # manual 4, "Unit conversion", has it both ways
+    """Gearing of command pulses to motor speed."""
+    trigger_map: TriggerMap | None = None  # the figure of manual 4 (7) is lost
+    """The bits of the trigger condition; without them the host watches for the trigger."""
+    verified: bool = False
+    """Whether the layout was compared with the drive, see `ldcnd doctor verify`; values are uncertain until then."""
+
+    @field_validator("chunk_bytes")
+    @classmethod
+    def _whole_words(cls, value: int) -> int:
+        if value % 2:
+            raise ValueError("chunk_bytes is even: a word of the trace memory has two bytes")
+        return value
+
+
 RESPONSE_S = 0.3
 """A drive answers within 0.2 s (manual 2.1), taken as command CR to first reply character, plus 0.1 s of margin."""
+
+
+class SmartStepUnitConfig(Frozen):
+    """How one unit is read and written, and how it is taken to behave where its manual leaves room."""
+
+    monitors: Mapping[MonitorName, float] = {}
+    """Monitors to publish, with their rates in Hz."""
+    audit_s: float = Field(default=45.0, ge=0, le=86_400)
+    """Period in which each parameter is read once, in seconds, to find what another program or a reset has changed;
+    0 never."""
+    eeprom_write: EepromWrite = EepromWrite.ALLOW
+    """Permission to write EEPROM: deny forbids it; with allow, EEPROM is written when a request names it."""
+    eeprom_budget: int = Field(default=9000, ge=0, le=10_000)
+    """Writes of the drive's EEPROM, all parameters together, until further ones are refused; it endures 10,000."""
+    planned_response_s: float = Field(default=0.02, ge=0, le=5)
+    """How long it takes to answer as a rule, for the plan; the manual promises 0.2 s, which would leave no room."""
+    first_character_s: float = Field(default=RESPONSE_S, gt=0, le=5)
+    """The longest wait for a reply; the manual says 0.2 s."""
+    encoder_counts_per_rev: int = Field(default=8000, gt=0)  # divides in manual 4, "Unit conversion"
+    """Pulses of the feedback counter in one turn."""
+    run_active_low: bool = True  # manual 3, 8005H, gives bits, not their levels; this one and the next two are inferred
+    """RUN is on while its input bit is 0."""
+    reset_active_low: bool = True
+    """RESET is on while its input bit is 0."""
+    alarm_output_high: bool = True
+    """/ALM is 1 in alarm."""
+    trace: SmartStepTraceConfig = SmartStepTraceConfig()
+    """How its recorder is taken to work."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, document: object) -> object:
+        if isinstance(document, dict) and document.get("eeprom_write") == "confirm":
+            raise ValueError('eeprom_write: "confirm" never differed from "allow"; use "allow" or "deny"')
+        return document
+
+    @model_validator(mode="after")
+    def _rates(self) -> Self:
+        for name, rate in self.monitors.items():
+            if not 0 <= rate <= 100:  # noqa: PLR2004 - a word takes 29 ms at least
+                raise ValueError(f"monitors.{name}: {rate} Hz is not 0 to 100")
+        return self
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,41 +195,32 @@ class SmartStepProfile:
     """How one drive is taken to behave.
 
     Attributes:
-        first_character_s: the longest wait from the end of a command to its reply.
         gap_s: the longest silence inside a reply.
         quiet_s: silence before each command.
         attempts: how often a repeatable command is sent in all; like `gap_s` and `quiet_s` it is for the line's owner.
-        trace_chunk_bytes: 2 to 1000, even.
-        trace_verify: read each chunk twice; the string checksum may not cover the data.
-        trace_verified: the layout, byte order and gear of traces were compared with this drive.
+        unit: what is configured of it.
     """
 
     framing: Framing = Framing.SEVEN_EVEN  # manual 2.1; soft parity for adapters that cannot make it
     wiring: Wiring = Wiring.FOUR_WIRE  # manual 1.1 has no other; on two wires a drive may take its replies for commands
     echo: Echo = Echo.NONE  # not in the manual: on four wires the host's receiver is on the other pair
-    first_character_s: float = RESPONSE_S
     gap_s: float = 0.06
     quiet_s: float = 0.005
     attempts: int = 3
-    eeprom_write: EepromWrite = EepromWrite.ALLOW
-    string_checksum: StringChecksum = StringChecksum.AUTO  # manual 2.2: its place is given, not what it covers
-    string_count_unit: CountUnit = CountUnit.BYTES  # manual 2.2 says "data count"; 1000 addresses hold 500 points
-    trace_chunk_bytes: int = 200  # manual 2.2 gives no longest string
-    trace_verify: bool = True
-    trace_word_layout: TraceWordLayout = TraceWordLayout.MSB_IO  # the figure of manual 4 (9) is lost
-    trace_byte_order: ByteOrder = ByteOrder.BIG  # manual 4 (9) is silent; words of commands have the high byte first
-    trigger_map: TriggerMap | None = None  # the figure of manual 4 (7) is lost
-    command_pulse_gear: CommandPulseGear = CommandPulseGear.NUM_DEN  # manual 4, "Unit conversion", has it both ways
-    encoder_counts_per_rev: int = 8000  # the divisor of the speed formula, manual 4, "Unit conversion"
-    trace_verified: bool = False
-    run_active_low: bool = True  # manual 3, 8005H, gives bits, not their levels; this one and the next two are inferred
-    reset_active_low: bool = True
-    alarm_output_high: bool = True
+    unit: SmartStepUnitConfig = field(default_factory=SmartStepUnitConfig)
 
     @property
     def trigger_word(self) -> TriggerWordSource:
         """Where the drive's own trigger comes from."""
-        return TriggerWordSource.CONFIGURED if self.trigger_map else TriggerWordSource.NONE
+        return TriggerWordSource.CONFIGURED if self.unit.trace.trigger_map else TriggerWordSource.NONE
+
+    def with_trace(self, **assumed: object) -> "SmartStepProfile":
+        """Return it with other assumptions about its traces."""
+        return self.with_unit(trace=self.unit.trace.model_copy(update=assumed))
+
+    def with_unit(self, **assumed: object) -> "SmartStepProfile":
+        """Return it with other assumptions about the drive."""
+        return replace(self, unit=self.unit.model_copy(update=assumed))
 
 
 SMARTSTEP = SmartStepProfile()

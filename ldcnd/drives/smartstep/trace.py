@@ -151,7 +151,7 @@ class SmartStepTracer(Tracer):
         """See `Tracer`. Checks everything that needs no reply before the first exchange with the drive."""
         words, profile = self._words, self._profile
         assignment = assign(words.axis, request.channels)
-        by_host = request.trigger is not None and profile.trigger_map is None
+        by_host = request.trigger is not None and profile.unit.trace.trigger_map is None
         no_word = TriggerWordSource.HOST if by_host else TriggerWordSource.NONE
         drives_trigger = None if by_host else request.trigger
         condition = trigger_condition(words.axis, profile, assignment, drives_trigger)

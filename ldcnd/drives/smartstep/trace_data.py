@@ -277,7 +277,7 @@ def scale(profile: SmartStepProfile, constants: TraceConstants, data: DataObject
             return constants.osvelcc / FULL_SCALE
         case DataObject.COMMAND_PULSE_SPEED:
             per_minute = _US_PER_MINUTE / (2 * constants.cyclec_us)
-            return _gear(profile, constants) * per_minute / profile.encoder_counts_per_rev
+            return _gear(profile, constants) * per_minute / profile.unit.encoder_counts_per_rev
         case DataObject.POSITION_DEVIATION:
             return 1.0
 
@@ -300,7 +300,7 @@ def trigger_level(profile: SmartStepProfile, constants: TraceConstants, data: Da
 
 
 def _gear(profile: SmartStepProfile, constants: TraceConstants) -> float:
-    match profile.command_pulse_gear:
+    match profile.unit.trace.command_pulse_gear:
         case CommandPulseGear.NUM_DEN:
             return constants.gear_numerator / constants.gear_denominator
         case CommandPulseGear.DEN_NUM:

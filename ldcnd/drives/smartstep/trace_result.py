@@ -153,7 +153,7 @@ def trigger_condition(
     """
     if trigger is None:
         return NO_TRIGGER
-    kind, bits = trigger.kind, profile.trigger_map
+    kind, bits = trigger.kind, profile.unit.trace.trigger_map
     if kind not in EDGES:
         raise NotSupported(
             f"axis {axis}: the drive triggers on edges only, not on {kind.value!r}",
@@ -223,7 +223,7 @@ def granted_channels(
     profile: SmartStepProfile, constants: TraceConstants, assignment: Assignment
 ) -> tuple[TraceChannel, ...]:
     """Describe the channels of a trace."""
-    raw = profile.trace_word_layout is TraceWordLayout.RAW
+    raw = profile.unit.trace.word_layout is TraceWordLayout.RAW
     channels = []
     for name in assignment.channels:
         data = DATA.get(name)
@@ -259,7 +259,7 @@ def recorded(
         first_s: the first sample was taken between these instants, in loop time.
     """
     words = memory.in_order()
-    points = tuple(tuple(decode_word(word, profile.trace_word_layout) for word in column) for column in words)
+    points = tuple(tuple(decode_word(word, profile.unit.trace.word_layout) for word in column) for column in words)
     zero = settings[TraceRegister.PTRGNO]
     interval_s = period_s(settings[TraceRegister.SMPTMS], constants.cyclec_us)
     return Recorded(
@@ -281,7 +281,7 @@ def _column(
 ) -> tuple[float | None, ...]:
     if data is None:
         return tuple(None if point.io is None else float(point.io) for point in points)
-    factor = 1.0 if profile.trace_word_layout is TraceWordLayout.RAW else scale(profile, constants, data)
+    factor = 1.0 if profile.unit.trace.word_layout is TraceWordLayout.RAW else scale(profile, constants, data)
     return tuple(point.value * factor for point in points)
 
 
@@ -289,10 +289,10 @@ def _problems(
     profile: SmartStepProfile, assignment: Assignment, points: tuple[tuple[TracePoint, ...], ...]
 ) -> list[str]:
     """Say why values are uncertain: how the words are laid out was not compared with the drive, or cannot be."""
-    if profile.trace_word_layout is TraceWordLayout.RAW:
+    if profile.unit.trace.word_layout is TraceWordLayout.RAW:
         return ["the words of the trace memory are published as they are, without a layout"]
     problems = []
-    if not profile.trace_verified:
+    if not profile.unit.trace.verified:
         problems.append("the layout of its words is assumed: `ldcnd doctor verify` compares it with the drive")
     for memory, column in enumerate(points):
         if not is_beyond_full_scale(column):
@@ -300,9 +300,9 @@ def _problems(
         if assignment.data[memory] in (DataObject.TORQUE_REFERENCE, DataObject.SPEED_FEEDBACK):
             problems.append(
                 f"trace {memory + 1} has values beyond {FULL_SCALE}, so its words are hardly laid out as"
-                f" {profile.trace_word_layout.value}"
+                f" {profile.unit.trace.word_layout.value}"
             )
-        elif profile.trace_word_layout is not TraceWordLayout.LSB_IO_MASK:  # which alone has room for 16 bits
+        elif profile.unit.trace.word_layout is not TraceWordLayout.LSB_IO_MASK:  # which alone has room for 16 bits
             problems.append(f"trace {memory + 1} goes beyond {FULL_SCALE}: what a drive records then is not known")
     return problems
 
@@ -370,11 +370,11 @@ def _info(
         osvelcc=constants.osvelcc,
         gear_numerator=constants.gear_numerator if geared else None,
         gear_denominator=constants.gear_denominator if geared else None,
-        encoder_counts_per_rev=profile.encoder_counts_per_rev,
-        word_layout=profile.trace_word_layout.value,
-        byte_order=profile.trace_byte_order.value,
+        encoder_counts_per_rev=profile.unit.encoder_counts_per_rev,
+        word_layout=profile.unit.trace.word_layout.value,
+        byte_order=profile.unit.trace.byte_order.value,
         string_checksum=memory.string_checksum.value,
-        string_count_unit=profile.string_count_unit.value,
+        string_count_unit=profile.unit.trace.string_count_unit.value,
         trigger_word_source=memory.trigger_word_source.value,
-        command_pulse_gear=profile.command_pulse_gear.value,
+        command_pulse_gear=profile.unit.trace.command_pulse_gear.value,
     )

@@ -10,7 +10,6 @@ Source: manual 2.2, data string reference command; 4, settings 9.
 import asyncio
 import contextlib
 from collections.abc import Callable
-from dataclasses import replace
 
 from ldcnd.contract.errors import BadReply, ByteCountRefused, ReplyTimeout
 from ldcnd.drives.smartstep.commands import ChecksumPin, Refusal, StringReply, string_reference
@@ -42,9 +41,9 @@ class TraceUpload:
     @property
     def string_checksum(self) -> StringChecksum:
         """Which variant was found or is taken; AUTO while the replies leave a choice."""
-        if self._profile.string_checksum is StringChecksum.AUTO:
+        if self._profile.unit.trace.string_checksum is StringChecksum.AUTO:
             return self._pin.pinned
-        return self._profile.string_checksum
+        return self._profile.unit.trace.string_checksum
 
     async def fetch(self, trace: int, read: Callable[[float], None] = lambda _: None) -> tuple[int, ...]:
         """Return the words of trace memory 1 or 2, in the order of the memory.
@@ -59,14 +58,14 @@ class TraceUpload:
             BusError: the line failed.
         """
         data, reported = b"", 0.0
-        chunks = chunk_plan(trace, self._profile.trace_chunk_bytes)
+        chunks = chunk_plan(trace, self._profile.unit.trace.chunk_bytes)
         whole = sum(chunk.byte_count for chunk in chunks)
         for chunk in chunks:
             data += await self._fetch(chunk)
             if len(data) / whole >= reported + REPORTED_EACH:
                 reported = len(data) / whole
                 read(reported)
-        return split_words(data, self._profile.trace_byte_order)
+        return split_words(data, self._profile.unit.trace.byte_order)
 
     async def _fetch(self, chunk: Chunk) -> bytes:
         """Return the bytes of a chunk, in smaller pieces when the drive refuses that length."""
@@ -81,7 +80,7 @@ class TraceUpload:
 
     async def _agreed(self, chunk: Chunk) -> bytes:
         data = await self._read(chunk)
-        if not self._profile.trace_verify:
+        if not self._profile.unit.trace.verify:
             return data
         for _ in range(ROUNDS):
             again = await self._read(chunk)
@@ -93,7 +92,7 @@ class TraceUpload:
         )
 
     async def _read(self, chunk: Chunk) -> bytes:
-        profile = replace(self._profile, string_checksum=self.string_checksum)
+        profile = self._profile.with_trace(string_checksum=self.string_checksum)
         exchange = string_reference(self._words.unit, chunk.address, chunk.byte_count, profile)
         for _ in range(ROUNDS - 1):
             with contextlib.suppress(ReplyTimeout):

@@ -40,8 +40,6 @@ from ldcnd.lab.secop.link import AxisLink, Update, described_by, linked
 from ldcnd.listen_address import ListenAddress
 
 ResultT = TypeVar("ResultT")
-LONGEST_START_S = 12.0
-"""Longest wait for the port, in seconds."""
 
 
 class ValueModule(Readable):  # type: ignore[misc] # frappy has no types

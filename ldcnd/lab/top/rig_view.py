@@ -138,7 +138,7 @@ class RigView:
             self._latest(keys.telemetry(axis, TelemetryItem.VELOCITY), VelocitySample),
         )
         now = axis_now(info, last, line, lambda t: self._clock.age_s(t, now_s), silent)
-        state, position, health, condition = now.state, now.position, now.health, now.condition
+        state, position, health, condition = last.state, last.position, now.health, now.condition
         worst = next(iter(condition.troubles), None)
         news = state.last_error or "" if state else ""  # how the last command ended, where nothing is wrong
         return AxisGlance(

@@ -39,7 +39,8 @@ from ldcnd.drives.ldcn.received import (
     received_command,
 )
 from ldcnd.drives.ldcn.registers import RESET_BAUD, RESET_BAUD_CODE, actual_baud, module_baud
-from ldcnd.sim.chain import BITS_PER_BYTE, NEVER_S, Module, ModuleReply
+from ldcnd.line.exchange import NEVER_S
+from ldcnd.sim.chain import BITS_PER_BYTE, Module, ModuleReply
 from ldcnd.sim.ldcn.quirks import CommandBuffer, ModuleSettings, UnknownBaud
 
 EVERYBODY = 0xFF

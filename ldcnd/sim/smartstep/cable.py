@@ -13,7 +13,8 @@ from typing_extensions import override
 
 from ldcnd.drives.smartstep.packet import DAMAGED, add_parity, strip_parity
 from ldcnd.drives.smartstep.profiles import Framing, Wiring
-from ldcnd.sim.chain import NEVER_S, Chain, Delivery, Module, ModuleReply
+from ldcnd.line.exchange import NEVER_S
+from ldcnd.sim.chain import Chain, Delivery, Module, ModuleReply
 from ldcnd.sim.faults import FaultPlan
 from ldcnd.sim.smartstep.unit import CHARACTER_S, SimulatedUnit, Transmission
 

@@ -1,58 +1,26 @@
-"""A drive without the calls that can move it: those are methods of a permit."""
+"""What is asked of a drive before it moves, and what stands for the motion of one that takes none."""
 
-from typing import Any, NoReturn, Protocol
+from typing import Any, NoReturn
 
 from typing_extensions import override
 
-from ldcnd.contract.commands import HomeMethod, Verb
 from ldcnd.contract.errors import NotSupported
 from ldcnd.contract.samples import TelemetryItem
 from ldcnd.drives.driver import (
     NO_CEILING,
     AnalogMotion,
     AxisReading,
-    AxisSpec,
     Ceiling,
     CountsMotion,
     Drive,
-    Gains,
     HomeCapture,
     Moves,
-    PathStatus,
     PwmOutput,
+    QuietDrive,
     StopMode,
     cannot,
 )
 from ldcnd.line.exchange import Exchange
-
-
-class QuietDrive(Protocol):
-    """Calls to a drive that need no permission: none of them can make it move."""
-
-    spec: AxisSpec
-    capabilities: frozenset[Verb]
-    adc_full_scale: int | None
-    retargets: bool
-    wanted_gains: Gains | None
-    holds_gains: bool
-    home_methods: frozenset[HomeMethod]
-    capture_s: float
-    deceleration_counts_per_s2: float | None
-    path_period_s: float
-    path_packet: int
-    path_most_counts: int
-
-    def quantise(self, motion: CountsMotion, most: Ceiling = ...) -> CountsMotion: ...  # noqa: D102 - of `Moves`, as all of these
-    def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
-    def room_counts(self, *, forward: bool) -> int: ...  # noqa: D102
-    async def stop(self, mode: StopMode) -> StopMode: ...  # noqa: D102
-    async def reset(self) -> None: ...  # noqa: D102
-    async def clear_warnings(self) -> None: ...  # noqa: D102
-    async def captured_home(self) -> int: ...  # noqa: D102
-    def stands_on(self, limit: HomeMethod, reading: AxisReading) -> bool: ...  # noqa: D102
-    def check_path(self) -> None: ...  # noqa: D102
-    def path_exchanges(self) -> tuple[Exchange[Any], ...]: ...  # noqa: D102
-    async def path_status(self) -> PathStatus: ...  # noqa: D102
 
 
 def homing(drive: QuietDrive) -> QuietDrive:

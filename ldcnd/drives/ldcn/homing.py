@@ -1,0 +1,200 @@
+"""Captures of an LDCN or NMC servo drive: its home position, and limit switches that stop its motions.
+
+Versions 1 and 2 of PIC-SERVO do not stop on home by themselves: the host stops them.
+Sources: PIC-SERVO manual, 5.2, "Set Homing Mode"; LS-182AP manual, "System status".
+"""
+
+import contextlib
+from types import MappingProxyType
+
+from ldcnd.contract.commands import HomeMethod
+from ldcnd.contract.errors import BadReply, Remedy, RequestRefused, WrongState, step
+from ldcnd.drives.driver import AnalogMotion, CountsMotion, HomeCapture, PwmOutput, StopMode
+from ldcnd.drives.ldcn import commands
+from ldcnd.drives.ldcn.access import STATE_ITEMS, ServoAccess
+from ldcnd.drives.ldcn.controls import HomingControl, blocking_pin
+from ldcnd.drives.ldcn.packet import StatusFlag, StatusItem
+from ldcnd.drives.ldcn.profiles import HomingSource, Profile
+from ldcnd.drives.ldcn.registers import LIMIT_PINS, Unknown
+from ldcnd.line.exchange import Lane
+
+ANY_LIMIT = HomingControl.LIMIT1 | HomingControl.LIMIT2
+SOURCES = MappingProxyType(
+    {
+        HomeMethod.REVERSE_LIMIT: HomingSource.LIMIT1,
+        HomeMethod.FORWARD_LIMIT: HomingSource.LIMIT2,
+        HomeMethod.INDEX: HomingSource.INDEX,
+        HomeMethod.POSITION_ERROR: HomingSource.POSITION_ERROR,
+        HomeMethod.CURRENT: HomingSource.CURRENT,
+    }
+)
+OPPOSITE_LIMITS = MappingProxyType(
+    {HomeMethod.REVERSE_LIMIT: HomeMethod.FORWARD_LIMIT, HomeMethod.FORWARD_LIMIT: HomeMethod.REVERSE_LIMIT}
+)
+STOPS = MappingProxyType(
+    {
+        StopMode.SMOOTH: HomingControl.STOP_SMOOTH,
+        StopMode.ABRUPT: HomingControl.STOP_ABRUPT,
+        StopMode.OFF: HomingControl.MOTOR_OFF,
+    }
+)
+
+
+def homing_source(profile: Profile, method: HomeMethod) -> HomingSource:
+    """Return the input or event that a method watches on this device."""
+    if profile.limit1_is_forward:
+        method = OPPOSITE_LIMITS.get(method, method)
+    return SOURCES[method]
+
+
+def home_methods(profile: Profile) -> frozenset[HomeMethod]:
+    """Return what can capture the home position of this device."""
+    return frozenset(method for method in SOURCES if homing_source(profile, method) & profile.homing_sources)
+
+
+def homing_control(profile: Profile, capture: HomeCapture) -> HomingControl:
+    """Return the control byte that arms a capture.
+
+    An excess position error opens the loop by itself, so no way to stop goes with it.
+    """
+    control = HomingControl(homing_source(profile, capture.method))
+    for method in capture.also:
+        control |= HomingControl(homing_source(profile, method))
+    if profile.stops_on_home and capture.method is not HomeMethod.POSITION_ERROR:
+        control |= STOPS[capture.stop]
+    return control
+
+
+def opens_loop(profile: Profile, capture: HomeCapture) -> bool:
+    """Tell whether the drive opens its loop by itself when it has captured."""
+    if capture.method is HomeMethod.POSITION_ERROR:
+        return True
+    return profile.stops_on_home and capture.stop is StopMode.OFF
+
+
+def limits_ahead(motion: CountsMotion | AnalogMotion | PwmOutput, here_counts: int) -> tuple[HomeMethod, ...]:
+    """Return the limit switches that a motion may run onto; both where the drive finds the direction itself."""
+    match motion:
+        case AnalogMotion():
+            return (HomeMethod.FORWARD_LIMIT, HomeMethod.REVERSE_LIMIT)
+        case PwmOutput():
+            way = motion.duty
+        case CountsMotion(None):
+            way = motion.velocity_counts_per_s
+        case CountsMotion():
+            way = (motion.target_counts or 0) - here_counts
+    if way == 0:
+        return ()
+    return (HomeMethod.FORWARD_LIMIT if way > 0 else HomeMethod.REVERSE_LIMIT,)
+
+
+class Homing:
+    """Arms and disarms the captures of one drive; only its home register changes, the reference is the host's."""
+
+    def __init__(self, of: ServoAccess) -> None:
+        self._of = of
+
+    async def arm(self, motion: CountsMotion | AnalogMotion | PwmOutput, home: HomeCapture | None) -> None:
+        """Arm the requested capture, or the one that stops the motion at the limit switch ahead, or none.
+
+        It "can also be used as a safety shutoff" (PIC-SERVO manual, 5.2, "Set Homing Mode").
+        """
+        self._of.state.guard, self._of.state.guard_hit = "", False
+        control, guard = HomingControl(0), ""
+        if home is not None:
+            for method in (home.method, *home.also):
+                self._check_pin(method)
+            control = homing_control(self._of.profile, home)
+            if home.guarded and self._of.spec.limit_stop is not None:
+                control |= (await self._guard(motion, active=self._of.spec.limit_stop))[0] & ANY_LIMIT
+        elif self._of.spec.limit_stop is not None:
+            control, guard = await self._guard(motion, active=self._of.spec.limit_stop)
+        if control or self._of.state.homing_armed:
+            self._of.state.homing_armed = True  # before it is, so that a stop in between disarms it
+            await self._of.bus.execute(commands.set_homing(self._of.node, control))
+        if control:
+            await self._check_armed()
+        self._of.state.homing_armed = bool(control)
+        self._of.state.guard = guard
+
+    async def _check_armed(self) -> None:
+        """Refuse a motion that its drive would not end: what was captured before would pass for its home.
+
+        Raises:
+            WrongState: the drive does not show that it looks for its home.
+        """
+        # "the home_in_progress bit in the status byte is set when this command is issued" (PIC-SERVO manual, 5.2)
+        status = await self._of.read(STATE_ITEMS)
+        if not status.flags & StatusFlag.HOME_IN_PROGRESS:
+            raise WrongState(
+                f"axis {self._of.spec.name}: the drive has acknowledged that it looks for its home, and does not show"
+                " it; nothing was started",
+                axis=self._of.spec.name,
+                remedy="send it again; if that repeats, look whether the signal changes while the axis stands",
+            )
+
+    async def _guard(
+        self, motion: CountsMotion | AnalogMotion | PwmOutput, *, active: bool
+    ) -> tuple[HomingControl, str]:
+        """Return what stops a motion at the limit switches that it may run onto, and their name.
+
+        Only switches ahead are armed: a capture comes with every change, also with that of leaving the other one. A
+        drive that turns round in mid-move has the other one ahead until it has.
+
+        Raises:
+            WrongState: the axis stands on the switch ahead, or its pin is an output.
+        """
+        status = await self._of.read(STATE_ITEMS)
+        reading = self._of.state.reading(status)
+        ahead = limits_ahead(motion, reading.position_counts)
+        onward = limits_ahead(CountsMotion(None, reading.velocity_counts_per_s, 1.0), reading.position_counts)
+        levels = {HomeMethod.FORWARD_LIMIT: reading.forward_limit, HomeMethod.REVERSE_LIMIT: reading.reverse_limit}
+        control = HomingControl(0)
+        for method in ahead:
+            self._check_pin(method)
+            if levels[method] is active and len(ahead) == 1:
+                raise WrongState(
+                    f"axis {self._of.spec.name} stands on its {method.value.replace('_', ' ')} switch",
+                    axis=self._of.spec.name,
+                    value=method.value,
+                    remedy="move the other way",
+                )
+        ahead += tuple(method for method in onward if method not in ahead and levels[method] is not active)
+        stop = StopMode.OFF if isinstance(motion, PwmOutput) else StopMode.SMOOTH
+        for method in ahead:
+            control |= homing_control(self._of.profile, HomeCapture(method, stop))
+        return control, " or ".join(f"{method.value.replace('_', ' ')} switch" for method in ahead)
+
+    def _check_pin(self, method: HomeMethod) -> None:
+        pin = blocking_pin(method)
+        if pin not in LIMIT_PINS:
+            return
+        is_input, holding = LIMIT_PINS[pin][0], self._of.book[pin]
+        if isinstance(holding, Unknown) and set(holding.among) - {is_input}:
+            remedy = step("set_outputs", 'send set_outputs with "input"', limit1="input", limit2="input")
+            raise self._of.unknown(pin, Remedy("{}", remedy))
+        if self._of.book.known(pin) not in (None, is_input):
+            raise WrongState(
+                f"axis {self._of.spec.name}: the {method} pin is an output",
+                axis=self._of.spec.name,
+                value=method.value,
+                remedy=Remedy(
+                    "{}", step("set_outputs", 'send set_outputs with "input"', limit1="input", limit2="input")
+                ),
+            )
+
+    async def disarm(self) -> None:
+        """Disarm what is armed, behind a stop, so that it stops no later motion."""
+        # an armed capture would stop a later motion, and end it as if it had found its home
+        if self._of.state.homing_armed:
+            with contextlib.suppress(RequestRefused):  # not known to be this drive: the next motion disarms it
+                await self._of.bus.execute(commands.set_homing(self._of.node, HomingControl(0)), Lane.STOP)
+                self._of.state.homing_armed = False
+        self._of.state.guard, self._of.state.guard_hit = "", False
+
+    async def captured(self) -> int:
+        """Return the captured home position, in counts."""
+        status = await self._of.read(StatusItem.HOME)
+        if status.home is None:
+            raise BadReply(f"axis {self._of.spec.name}: the status packet lacks the home position")
+        return status.home + self._of.state.offset_counts
