@@ -37,6 +37,8 @@ SCAN_SHARE = 0.01
 STOP_SHARE = 0.1
 """Share of the line's time for the stops that a drive did not hear; more where the longest pause requires it."""
 FIRST_STOP_PAUSE_S = 0.02
+LEAST_STOP_PAUSE = 2
+"""Pause between two rounds of such stops, in multiples of a round, where that is longer than the longest pause."""
 
 
 class BusService:
@@ -274,7 +276,9 @@ class BusService:
             if any(axis.tracker.status.stop_pending for axis in self.axes):
                 # polls of a mute drive come ever more seldom: one that hears again gets its stop before them
                 took_s = loop.time() - began_s
-                pause_s = min(took_s / STOP_SHARE + FIRST_STOP_PAUSE_S, LONGEST_SCAN_PAUSE_S)
+                # where each lost answer takes long, the search, which brings it back, still gets the most of the line
+                longest_s = max(LONGEST_SCAN_PAUSE_S, LEAST_STOP_PAUSE * took_s)
+                pause_s = min(took_s / STOP_SHARE + FIRST_STOP_PAUSE_S, longest_s)
 
     async def _search(self) -> float:
         """Search once for lost drives; return how long to wait until the next search, in seconds.

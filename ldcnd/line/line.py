@@ -200,8 +200,8 @@ LATE_S = 1.0
 CLOCK_TOLERANCE = 0.9
 """A drive's baud clock may be 3 % fast and a time stamp a little early: bytes count as too early below this share."""
 PROBE_ROUNDS = 3
-GONE_PAUSE_S = 0.25
-"""Shortest time between two probes of a node that has been gone for long, in seconds."""
+GONE_PAUSE = 5
+"""Shortest time between two probes of a node that has been gone for long, in multiples of the margin."""
 LONGEST_QUARANTINE = 20
 """Longest wait for silence, in multiples of `quiet_s`; a line that is never silent is flushed after that."""
 READS = PacketEffect.READS  # looked up slowly in its class
@@ -732,7 +732,7 @@ class Line(Receiver):
         gone = exchange is None or mute.misses.get(exchange.node, 0) > PROBE_ROUNDS
         self._probes_left = 0 if gone else self._probes_left - 1
         self._in_step = self._probes_left == 0  # silence and flush have to do where no node proves it
-        if exchange and not (gone and now_s < self._probed_s + GONE_PAUSE_S):
+        if exchange and not (gone and now_s < self._probed_s + GONE_PAUSE * self._settings.margin_s):
             self._probed_s = now_s
             self._send(Transaction(exchange, Lane.STOP, now_s), now_s, "probe")
         else:
