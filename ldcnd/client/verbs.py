@@ -95,25 +95,25 @@ class AxisVerbs(ABC):
         position: float | str,
         *,
         buffer_mode: BufferMode = BufferMode.REFUSE,
-        acceleration: float | str | None = None,
         velocity: float | str | None = None,
+        acceleration: float | str | None = None,
         direction: Direction | None = None,
     ) -> Motion:
         """Move to a position on a trapezoidal profile.
 
         Args:
             buffer_mode: Effect if the axis moves already.
-            acceleration: Acceleration in units a second squared; the axis default when missing.
             position: Target in axis units; on an axis with a modulo any turn of it is meant.
             velocity: Speed in units a second; the axis default when missing.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
             direction: Way to turn, on an axis with a modulo only; the shortest when missing.
         """
         return await self._start(
             MoveAbsolute,
             buffer_mode=buffer_mode,
-            acceleration=acceleration,
             position=position,
             velocity=velocity,
+            acceleration=acceleration,
             direction=direction,
         )
 
@@ -122,19 +122,19 @@ class AxisVerbs(ABC):
         distance: float | str,
         *,
         buffer_mode: BufferMode = BufferMode.REFUSE,
-        acceleration: float | str | None = None,
         velocity: float | str | None = None,
+        acceleration: float | str | None = None,
     ) -> Motion:
         """Move by a distance from the commanded position; becomes absolute when it is admitted.
 
         Args:
             buffer_mode: Effect if the axis moves already.
-            acceleration: Acceleration in units a second squared; the axis default when missing.
             distance: Distance in axis units, signed.
             velocity: Speed in units a second; the axis default when missing.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
         """
         return await self._start(
-            MoveRelative, buffer_mode=buffer_mode, acceleration=acceleration, distance=distance, velocity=velocity
+            MoveRelative, buffer_mode=buffer_mode, distance=distance, velocity=velocity, acceleration=acceleration
         )
 
     async def move_velocity(
@@ -149,14 +149,14 @@ class AxisVerbs(ABC):
 
         Args:
             buffer_mode: Effect if the axis moves already.
-            acceleration: Acceleration in units a second squared; the axis default when missing.
             velocity: Velocity in units a second, positive forward, not 0.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
             duration_s: Duration at the velocity, in seconds, at most the axis's `longest_run_s`; that, or without it
                 the software limit ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also
                 when daemon and client are gone: it is a move of so many units.
         """
         return await self._start(
-            MoveVelocity, buffer_mode=buffer_mode, acceleration=acceleration, velocity=velocity, duration_s=duration_s
+            MoveVelocity, buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, duration_s=duration_s
         )
 
     async def jog(
@@ -172,13 +172,13 @@ class AxisVerbs(ABC):
 
         Args:
             buffer_mode: Effect if the axis moves already.
-            acceleration: Acceleration in units a second squared; the axis default when missing.
             velocity: Velocity in units a second, positive forward, not 0.
+            acceleration: Acceleration in units a second squared; the axis default when missing.
             hold_s: Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog.
             renews: The command id of the jog that goes on; without it a new one begins. A renewal leaves no event.
         """
         return await self._start(
-            Jog, buffer_mode=buffer_mode, acceleration=acceleration, velocity=velocity, hold_s=hold_s, renews=renews
+            Jog, buffer_mode=buffer_mode, velocity=velocity, acceleration=acceleration, hold_s=hold_s, renews=renews
         )
 
     async def halt(self) -> Motion:

@@ -390,8 +390,6 @@ class Move(AxisCommand[CommandReply]):
 
     buffer_mode: BufferMode = BufferMode.REFUSE
     """Effect if the axis moves already."""
-    acceleration: float | None = Field(default=None, gt=0)
-    """Acceleration in units a second squared; the axis default when missing."""
 
 
 class Direction(StrEnum):
@@ -411,6 +409,8 @@ class MoveAbsolute(Move):
     """Target in axis units; on an axis with a modulo any turn of it is meant."""
     velocity: float | None = Field(default=None, gt=0)
     """Speed in units a second; the axis default when missing."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
     direction: Direction | None = None
     """Way to turn, on an axis with a modulo only; the shortest when missing."""
 
@@ -424,6 +424,8 @@ class MoveRelative(Move):
     """Distance in axis units, signed."""
     velocity: float | None = Field(default=None, gt=0)
     """Speed in units a second; the axis default when missing."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
 
 
 class MoveVelocity(Move):
@@ -436,6 +438,8 @@ class MoveVelocity(Move):
 
     velocity: float
     """Velocity in units a second, positive forward, not 0."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
     duration_s: float | None = Field(default=None, gt=0, le=86_400)
     """Duration at the velocity, in seconds, at most the axis's `longest_run_s`; that, or without it the software limit
     ahead or `jog_horizon_s`, when missing. The drive itself ends it with a ramp, also when daemon and client are gone:
@@ -457,6 +461,8 @@ class Jog(Move):
 
     velocity: float
     """Velocity in units a second, positive forward, not 0."""
+    acceleration: float | None = Field(default=None, gt=0)
+    """Acceleration in units a second squared; the axis default when missing."""
     hold_s: float = Field(default=0.4, ge=SHORTEST_HOLD_S, le=LONGEST_HOLD_S)
     """Longest time between two renewals, in seconds by the clock of the daemon; then it ends the jog."""
     renews: str | None = Field(default=None, min_length=1, max_length=LONGEST_NAME)
