@@ -62,7 +62,7 @@ def stop_rig(target: Target, axis: str | None) -> None:
             codes.add(UNREACHABLE if isinstance(reply, SessionError) else FAILED)
             show_error(reply, f"{whose}{NOT_STOPPED}")
             continue
-        target.show(reply, f"{whose}stopped and latched: {', '.join(reply.confirmed) or 'none'}", rig=rig)
+        target.show(reply, f"{whose}stop latched, confirmed by {', '.join(reply.confirmed) or 'none'}", rig=rig)
         if reply.warning:
             show_lines(f"{whose}{reply.warning}", err=True)
         if reply.shortfall:

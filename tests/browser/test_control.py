@@ -145,7 +145,7 @@ async def test_a_second_console_on_the_host_takes_no_login_from_a_page_that_move
         await desk.page.keyboard.press("Escape")
 
         await house.sim.until("x", lambda state: state.stop_latched and state.moving == "no")
-        await expect(desk.page.get_by_text("You control x")).to_be_visible()
+        await expect(desk.page.get_by_text("You control sim · x")).to_be_visible()
 
 
 async def test_a_page_whose_cookies_are_gone_says_so_and_still_ends_motions(house):

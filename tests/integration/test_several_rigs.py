@@ -50,7 +50,7 @@ def test_a_stop_without_a_rig_stops_every_rig_and_says_which_axes_confirmed(two_
     ran = here.run(line)
 
     axes = "x" if "x" in line.split() else "x, y, z, c"
-    assert said(ran) == [f"mill: stopped and latched: {axes}", f"sim: stopped and latched: {axes}"]
+    assert said(ran) == [f"mill: stop latched, confirmed by {axes}", f"sim: stop latched, confirmed by {axes}"]
     assert (ran.code, ran.errors) == (0, "")
     assert [state.stop_latched for state in states(here, mill)] == [True, True]
 
@@ -68,7 +68,7 @@ def test_a_rig_that_is_named_is_stopped_alone(two_rigs):
 
     ran = here.run("stop --rig mill")
 
-    assert (ran.code, said(ran)) == (0, ["mill: stopped and latched: x, y, z, c"])
+    assert (ran.code, said(ran)) == (0, ["mill: stop latched, confirmed by x, y, z, c"])
     assert [state.stop_latched for state in states(here, mill)] == [False, True]
 
 

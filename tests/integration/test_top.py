@@ -37,7 +37,7 @@ async def test_a_rig_is_watched_and_stopped_with_one_key_and_printed_where_there
             await rig.command("x", MoveAbsolute(position=90.0, velocity=5.0))
             await until(pilot, lambda: states()["x"] == "moving to a target")
             await pilot.press("escape")
-            await until(pilot, lambda: "stopped and latched: x, y, z, c" in str(answer.content))
+            await until(pilot, lambda: "stop latched, confirmed by x, y, z, c" in str(answer.content))
             await until(pilot, lambda: states()["x"] != "moving to a target")
 
             await pilot.resize_terminal(80, 24)

@@ -67,6 +67,6 @@ async def test_what_a_drive_can_do_can_be_typed(tmp_path):
     assert went["move X 1"].errors.startswith("there is no axis 'X'; did you mean 'x'?")
     assert went["bus list --rig sum"].errors.startswith("no rig 'sum' answers; did you mean 'sim'?")
     assert "position" in went["trace take x"].printed.splitlines()
-    assert went["stop"].printed == "sim: stopped and latched: x, y, z, c\n"
+    assert went["stop"].printed == "sim: stop latched, confirmed by x, y, z, c\n"
     assert went["power off"].printed.count("power done") == 4
     assert not state.enabled

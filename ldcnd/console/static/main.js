@@ -19,7 +19,7 @@ import { StopAll, Stops } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
 import { loginIsGone } from "./session/api.js";
 import { feed } from "./session/feed.js";
-import { axesOf, axisNamed, changed, commissions, failure, isWhole, rigs, useRigs, watch } from "./session/rigs.js";
+import { axesOf, axisNamed, changed, commissions, failure, isWhole, namesOf, rigs, titleOf, useRigs, watch } from "./session/rigs.js";
 
 const PAGES = [
   ["rig", "Rig", RigPage],
@@ -62,7 +62,7 @@ function Summary() {
       ${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : calm("Nothing needs attention")}<//>
     ${[...rigs.values()].filter((rig) => !rig.worth && slowed(rig)).map((rig) => html`<${Mark} level="warn"
       >${rigs.size > 1 ? `${rig.name}: ` : ""}speed override ${number(overrideOf(rig), 0)} %${overrideOf(rig) === 0 ? ": nothing moves" : ""}<//> `)}
-    ${mine.length > 0 && html` <span class="mine">You control ${mine.map((axis) => axis.name).join(", ")}</span>`}
+    ${mine.length > 0 && html` <span class="mine">You control ${namesOf(mine)}</span>`}
   </p>`;
 }
 
@@ -74,13 +74,13 @@ function Strip({ at }) {
   if (axis) return html`<${AxisStrip} axis=${axis} />`;
   const known = axesOf().filter((each) => each.info);
   const moving = known.filter((each) => each.condition.live && each.state?.moving === "yes");
-  const unsure = known.filter((each) => !each.condition.live || each.state?.moving === "unknown").map(({ name }) => name);
+  const unsure = known.filter((each) => !each.condition.live || each.state?.moving === "unknown");
   const [worst] = problems(rigs.values());
   return html`<div class="strip">
     <span class="moving">${moving.length
-      ? moving.slice(0, MOST_MOVING).map((each) => html`<a href=${`#/axis/${each.rig.name}/${each.name}`}>${each.name}</a> <${PlaceAndTarget} axis=${each} /> `)
+      ? moving.slice(0, MOST_MOVING).map((each) => html`<a href=${`#/axis/${each.rig.name}/${each.name}`}>${titleOf(each)}</a> <${PlaceAndTarget} axis=${each} /> `)
       : !unsure.length && html`<span class="quiet">${calm("Nothing moves")}</span>`}${moving.length > MOST_MOVING && ` and ${moving.length - MOST_MOVING} more move`}${
-      unsure.length > 0 && html` <span class="mark" data-level="bad">not known whether ${unsure.slice(0, MOST_MOVING).join(", ")}${
+      unsure.length > 0 && html` <span class="mark" data-level="bad">not known whether ${namesOf(unsure.slice(0, MOST_MOVING))}${
         unsure.length > MOST_MOVING && ` and ${unsure.length - MOST_MOVING} more`} move</span>`}</span>
     ${worst && html`<span class="worst mark" data-level=${worst.level}>${worst.places[0].where}${worst.places.length > 1 ? ` and ${worst.places.length - 1} more` : ""}: ${worst.text}</span>`}
   </div>`;
@@ -144,9 +144,9 @@ function Console() {
   }, []);
   const [, title, Page] = PAGES.find(([page]) => page === at.page) ?? ["axis", at.axis ?? "Axis", AxisPage];
   useEffect(() => {
-    const place = at.page === "axis" ? `Axis ${at.axis}` : title;
+    const place = at.page === "axis" ? `Axis ${titleOf({ rig: { name: at.rig }, name: at.axis })}` : title;
     document.title = `${lost.size ? "Control lost – " : ""}${place} – ldcnd`;
-  }, [at.page, at.axis, lost.size]);
+  }, [at.page, at.rig, at.axis, lost.size, rigs.size]);
 
   return html`<a class="skip" href="#main" onClick=${(event) => {
     event.preventDefault();

@@ -142,5 +142,5 @@ def _fill(table: "DataTable[Text]", rows: Sequence[tuple[tuple[str, ...], Severi
 
 def _stopped(reply: StopReply) -> str:
     """Return what became of a stop."""
-    stopped = f"stopped and latched: {', '.join(reply.confirmed) or 'none'}"
+    stopped = f"stop latched, confirmed by {', '.join(reply.confirmed) or 'none'}"
     return ". ".join(part for part in (reply.shortfall.removesuffix("."), stopped, reply.warning) if part)

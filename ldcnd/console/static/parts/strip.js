@@ -3,6 +3,7 @@
 import { html, useState } from "../html.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
+import { titleOf } from "../session/rigs.js";
 import { Action } from "./controls.js";
 import { clock, decimalsOf, number } from "./format.js";
 import { Homed, Place, StateWord, TroubleWords } from "./state.js";
@@ -24,7 +25,7 @@ export function AxisStrip({ axis }) {
   const [answered, setAnswered] = useState(null);
   const tell = (what) => (reply) => setAnswered(`${what} at ${clock(Date.now() * 1e6)}: ${came(reply)}.`);
   return html`<div class="strip of-axis">
-    <span class="where"><b>${axis.name}</b> <${PlaceAndTarget} axis=${axis} /></span>
+    <span class="where"><b>${titleOf(axis)}</b> <${PlaceAndTarget} axis=${axis} /></span>
     <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /><${TroubleWords} axis=${axis} /></span>
     ${axis.can("stop") && html`<span class="endings" role="group" aria-label=${`End a motion of ${axis.name}`}>
       <${Action} calms act=${() => command(axis, "halt")} onDone=${tell("Halt")} obstacle=${toHalt} reason="halt-way"

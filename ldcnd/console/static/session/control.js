@@ -3,7 +3,7 @@
 import { clock } from "../parts/format.js";
 import { ask, asJson, axisPath, nameThisPage, rigPath } from "./api.js";
 import { moves } from "./obstacles.js";
-import { changed, rigs } from "./rigs.js";
+import { changed, namesOf, rigs } from "./rigs.js";
 
 const OPEN_AGAIN_MS = 1_000;
 /** As the console's `HELD_S` wants it, several times over. */
@@ -172,7 +172,7 @@ function noteLost(axis, why, taker) {
 /** Return what was lost, a sentence for each reason. */
 export function lostInWords() {
   return [...lost.values()].map(({ taker, why, at, axes }) => {
-    const [names, when] = [axes.map(({ name }) => name).join(", "), clock(at).slice(0, -4)];
+    const [names, when] = [namesOf(axes), clock(at).slice(0, -4)];
     return taker ? `At ${when} ${taker} took control of ${names}.` : `At ${when} control of ${names} was lost: ${why}`;
   });
 }

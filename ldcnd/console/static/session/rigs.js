@@ -360,6 +360,16 @@ export function axesOf() {
   return [...rigs.values()].flatMap((rig) => [...rig.axes.values()]);
 }
 
+/** The name of an axis for a person, with that of its rig where there are several: rigs have axes of the same name. */
+export function titleOf({ rig, name }) {
+  return rigs.size > 1 ? `${rig.name} · ${name}` : name;
+}
+
+/** The names of axes for a person. */
+export function namesOf(axes) {
+  return axes.map(titleOf).join(", ");
+}
+
 /** The axis that an address names; null while, or because, there is none. */
 export function axisNamed(at) {
   const axis = rigs.get(at.rig)?.axes.get(at.axis);
