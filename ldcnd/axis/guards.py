@@ -277,7 +277,7 @@ BY_VERB: Mapping[Verb, Needs] = {
     Verb.MOVE_ABSOLUTE: Needs((*STILL, check_referenced), TO_MOVE),
     Verb.TRACK: Needs((*STILL, check_referenced), TO_MOVE),
     Verb.RESET: Needs((check_reachable, check_stop_confirmed, check_stands, check_not_forced)),
-    Verb.SET_POSITION: Needs((check_reachable, check_stands, check_not_latched, check_position_kept)),
+    Verb.SET_POSITION: Needs((check_reachable, check_stands, check_position_kept)),
     Verb.TRACE: Needs(at_packet=(check_reachable,)),
     Verb.TRACE_ABORT: Needs(),
     Verb.RESTART_EEPROM_COUNT: Needs(),  # the count is the daemon's own

@@ -109,6 +109,10 @@ class StatusView(Protocol):
         """Its place is known."""
 
     @property
+    def stop_latched(self) -> bool:
+        """A stop is latched."""
+
+    @property
     def at_rest(self) -> bool:
         """Its readings prove that nothing moves."""
 

@@ -367,7 +367,11 @@ class GuardedGroup(asyncio.TaskGroup):
     def create_task(  # type: ignore[override] # its stub names what differs between versions of Python
         self, coro: Coroutine[Any, Any, Any], **kwargs: Any
     ) -> "asyncio.Task[Any]":
-        return super().create_task(self._guarded(coro), **kwargs)
+        task = super().create_task(self._guarded(coro), **kwargs)
+        task.add_done_callback(
+            lambda _: coro.close()
+        )  # of a task that is cancelled before it begins nothing is awaited
+        return task
 
 
 async def _served(guest: Callable[[], Awaitable[None]]) -> None:

@@ -12,10 +12,6 @@ from concurrent.futures import Future
 from functools import partial
 from typing import TypeVar
 
-from ldcnd.log import get_logger
-
-log = get_logger("workers")
-
 ResultT = TypeVar("ResultT")
 
 Job = Callable[[], None]
@@ -124,8 +120,10 @@ class Workers:
             while job := self._jobs.get():
                 try:
                     job()
-                except BaseException:  # a panic in Zenoh is no Exception; those who wait are not to blame for it
-                    log.exception("bug on a worker thread", thread=self._name)
+                except BaseException:  # noqa: BLE001 - a panic in Zenoh is no Exception; who waits is not to blame for it
+                    from ldcnd.log import get_logger  # noqa: PLC0415 - what only asks loads no log
+
+                    get_logger("workers").exception("bug on a worker thread", thread=self._name)
                 # what the job holds must not live until the next one comes
                 del job
                 with self._lock:

@@ -26,7 +26,7 @@ from ldcnd.contract.commands import (
     SetGains,
     SetPosition,
 )
-from ldcnd.contract.errors import NotSupported
+from ldcnd.contract.errors import NotSupported, StopLatched
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.ldcn.controls import STOPS_ON_HOME, WAYS_TO_STOP, HomingControl, StopControl
 from ldcnd.drives.ldcn.homing import homing_source
@@ -189,6 +189,7 @@ class GuestServo:
 
         Raises:
             NotSupported: there is no command of an axis that does the same.
+            StopLatched: it would renumber an axis whose stop is latched.
         """
         match command:
             case LoadTrajectory(trajectory):
@@ -209,6 +210,9 @@ class GuestServo:
             case ResetPosition(relative_to_home=True):
                 return Meaning(zeroes_home=True)
             case ResetPosition(position):
+                # it is sent at the start of many programs: after a stop a person expects the axis where it was stopped
+                if self._status().stop_latched:
+                    raise StopLatched("a stop is latched: the position is kept until `reset`")
                 place = position / self._status().scale.counts_per_unit
                 return Meaning(SetPosition(position=place, client=self._client), zeroes=position)
             case _:

@@ -158,6 +158,7 @@ async def test_a_duty_that_replaces_another_is_refused_during_a_stop():
 async def test_a_target_that_the_drive_would_wrap_is_refused():
     async with dialect_rig(V4) as rig:
         await rig.power_on()
+        await asyncio.sleep(1.5)  # it is polled meanwhile
         axis = rig.rig.daemon.rig.axes[AXIS]
         axis.tracker.reading = replace(axis.tracker.latest(), position_counts=-0x70000000)
         refusal = axis.preview(Preview(position=0x60000000 / 1000), ()).refusal
