@@ -562,7 +562,8 @@ class Line(Receiver):
         if arrived:
             self._statistics.bytes_in += len(arrived)
             self._log.add(now_s, WireEvent.RECEIVED, arrived)
-        if self._distrusted:
+        # behind a stop that goes out on a line out of step it is the reply to that one which is distrusted
+        if self._distrusted and following is None:
             self._discard_reply(transaction, reply, _OLDER, now_s)
             return
         timing = self._count_reply(transaction, reply, sent_at_s, byte_s, now_s)
