@@ -54,6 +54,7 @@ class DriveState:
     Attributes:
         known: what decides on the meaning of its status.
         homing_armed: a capture was armed and has not been seen to come.
+        arming: packets that arm a capture are on their way: what a reading shows of it may be of before.
         loop_may_open: the loop is open on purpose (PWM mode), or will be once home is captured: then the position
             error flag, which every open loop shows, is no fault.
         motion_locked: the drive refuses motion since it homed on a limit switch.
@@ -78,7 +79,7 @@ class DriveState:
     def restarted(self) -> None:
         """The drive was reset or lost power: nothing that was sent before holds any more."""
         self.known = AFTER_RESET
-        self.homing_armed = False
+        self.homing_armed = self.arming = False
         self.loop_may_open = False
         self.motion_locked = False
         self.guard = ""
@@ -146,7 +147,7 @@ class DriveState:
             self.offset_counts += self.setting_back
             self.setting_back = 0
         self.counts = counts = counter + self.offset_counts
-        if not homing:
+        if not (homing or self.arming):
             self.homing_armed = False
             self.guard_hit = bool(self.guard)
         self.motion_locked = locked

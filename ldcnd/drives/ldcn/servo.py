@@ -603,8 +603,11 @@ class LdcnAxis(Moves):
         elif self.spec.limit_stop is not None:
             control, guard = await self._guard(motion, active=self.spec.limit_stop)
         if control or self.state.homing_armed:
-            self.state.homing_armed = True  # before it is, so that a stop in between disarms it
-            await self._bus.execute(commands.set_homing(self._node, control))
+            self.state.homing_armed = self.state.arming = True  # before it is, so that a stop in between disarms it
+            try:
+                await self._bus.execute(commands.set_homing(self._node, control))
+            finally:
+                self.state.arming = False
         if control:
             await self._check_armed()
         self.state.homing_armed = bool(control)
