@@ -301,6 +301,12 @@ class Bus:
         if self._line:
             self._line.kick()
 
+    def move_poller(self, poller: Poller[Any]) -> None:
+        """Move the turn of a poller to its `due_at_s`; not of one that was removed, or went with the line."""
+        self._schedule.reschedule(poller, poller.due_at_s)
+        if self._line:
+            self._line.kick()
+
     def remove_poller(self, poller: Poller[Any]) -> None:
         """Stop polling; a poll on the wire is still delivered."""
         self._schedule.remove(poller)

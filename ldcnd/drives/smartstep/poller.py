@@ -234,8 +234,8 @@ class UnitPoller(Poller[int | Refusal]):
     def _next_turn(self, at_s: float) -> None:
         """Request the next turn; the line may take it before this returns."""
         self.due_at_s = at_s
-        if self._bus.is_open:
-            self._bus.add_poller(self)
+        # not added: it may have been replaced while its poll was on the wire, or its line lost while it waited
+        self._bus.move_poller(self)
 
     # -- items -------------------------------------------------------------------------------------------------------
 
