@@ -108,6 +108,7 @@ class Job(Transaction):
             try:
                 self.condition()
             except LdcndError as error:
+                # at a repetition: the node may have executed the one before, although its reply was lost
                 self.fail(error if self.attempts_left == self.attempts else error.although(SENT_IN_VAIN))
                 return False
         self.attempts_left -= 1  # what the condition forbids was no attempt
@@ -414,12 +415,14 @@ class Bus:
         at_baud: int | None = None,
     ) -> Job:
         """Queue an exchange; the outcome is that of the job's future."""
+        # here, in the caller's context: when its turn comes, another one is running
         condition = None if exchange.effect in ALWAYS_SENT else self.proofs.condition(exchange, lane)
         job = Job(exchange, lane, self._loop, attempts or self.settings.attempts, condition)
         job.then_baud, job.at_baud = then_baud, at_baud
         if self._line is None:
             raise self._down()
         self._schedule.push(job, lane)
+        # it may be sent at once, and the port be lost over it: the job has its outcome then
         self._line.kick()
         return job
 
@@ -469,6 +472,7 @@ class Bus:
         """Serve the line until it is lost or the caller is cancelled; then every caller has its outcome."""
         self.statistics.openings += 1
         self.wire_log.add(self._loop.time(), WireEvent.OPENED)
+        # who was silent on the line before may be there now: it is polled at its rate, not ever more seldom
         self._schedule.mute.forget()
         self._line = line = Line(
             self.settings,
@@ -486,6 +490,7 @@ class Bus:
             line.kick()
             await self._closed.wait()
         finally:
+            # before the port, which may drain for a second: no caller waits for that
             line.close("the bus was closed", for_good=True)
             await transport.close()
 

@@ -217,6 +217,7 @@ class WireLog:
             blocks.append(_Block(latest))
             latest.clear()
         while blocks and (self._room_bytes < 0 or blocks[0].times_s[-1] < too_old_s):
+            # the newest record is in it, and stays
             if len(blocks) == 1 and not latest:
                 break
             oldest = blocks.popleft()
@@ -261,6 +262,7 @@ class LatencyHistogram:
 
     def add(self, duration_s: float) -> None:
         """Count one duration, in seconds, not negative."""
+        # in units of 64 us
         bucket = int(duration_s * 15625).bit_length()
         self.counts[bucket if bucket < BUCKETS else -1] += 1
         self.total_s += duration_s
