@@ -138,6 +138,7 @@ LDCN = LdcnFamily()
 
 def open_ldcn_line(settings: LdcnBusConfig, opener: Opener | None = None) -> UnopenedLine:
     """Return a line that is not open yet, which is opened by its port or by `opener`."""
+    # every line begins at the rate of power-up; a serial server keeps its own, which the configuration names
     baud = settings.baud if settings.port.startswith(SOCKET) else baud_at_reset(settings.clock_hz)
     line = ldcn_line(
         bus_settings(settings, baud, cycle=servo_cycle(settings), coalesce_s=settings.coalesce_ms / 1000),

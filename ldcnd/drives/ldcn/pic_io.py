@@ -300,6 +300,7 @@ def send_io_command(to: IoNode, command: IoCommand) -> Exchange[IoStatus]:
     Raises:
         ValueOutOfRange: see `encode_io_command`.
     """
+    # a second one would start servos of the group once more, or capture a later instant
     repeatable = not isinstance(command, SynchOutput | SynchInput)
     exchange = to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable)
     # what its lines read is not what it was told: an output shows the level of its pin, and a direction nothing

@@ -231,6 +231,7 @@ class LdcnAxis(Moves):
         else:
             self.state.taken_over(status)
             self._book.taken_over()
+        # a closed loop proves that another host has done what the manual wants after a reset
         self._initialised = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
 
     @property
@@ -268,6 +269,7 @@ class LdcnAxis(Moves):
 
     def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
         """See `Readable`. The loss of the analog sensor shows only in its value."""
+        # not known counts as yes: only a value shows that the sensor is lost
         senses = self.profile.analog_target and self.state.known.absolute is not False
         prepared = self._readings.get((items, senses))
         if prepared is None:
@@ -301,8 +303,7 @@ class LdcnAxis(Moves):
     def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         first: tuple[Exchange[Any], ...] = ()
         offset = self.state.offset_counts
-        # "the goal position should not differ from the current position by more than 0x7FFFFFFF" (PIC-SERVO manual,
-        # 5.2)
+        # the goal "should not differ from the current position by more" than 0x7FFFFFFF (PIC-SERVO manual, 5.2)
         if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
             first, offset = (commands.reset_position(self._node),), self.state.counts
         if self.state.known.closed and self._book.wanted_gains and not self._book.loaded:
@@ -320,9 +321,7 @@ class LdcnAxis(Moves):
             await self.stop(StopMode.OFF)
             return
         # it may have been reset unseen, and then "all gain parameters and limit values are set to zero"
-        if self._book.wanted_gains and not (
-            self.state.known.closed and self._book.loaded
-        ):  # it may have been reset unseen
+        if self._book.wanted_gains and not (self.state.known.closed and self._book.loaded):
             await self.set_gains(self._book.wanted_gains)
         if self.profile.pic_ae_diagnostics and self.state.known.pic_ae is not False:
             await self._check_without_power_driver()
@@ -380,6 +379,7 @@ class LdcnAxis(Moves):
         """Send Stop Motor, and take note of what became of power driver and loop."""
         try:
             await self._bus.execute(exchange, lane)
+        # cancelled or lost: it may have been executed, so nothing is believed of loop and power driver
         except BaseException:
             self.state.switched_unconfirmed(pic_ae=pic_ae)
             raise
@@ -417,11 +417,11 @@ class LdcnAxis(Moves):
         # a stop that holds would close the loop of a motor that was switched off
         if self.switched_off:
             mode = StopMode.OFF
-        # "the current command velocity and the goal velocity will be set to zero": in some firmware that is the
-        # register
+        # "the goal velocity will be set to 0" (manuals, "Stop Motor"): in some firmware that is the register
         self._book.forget("some firmware clears it with a stop", ("velocity",))
         off = mode is StopMode.OFF
         shows_nothing = self.state.loop_may_open and not self.switched_off
+        # counted before it is sent: a stop that holds, queued meanwhile, would close the loop behind it
         self._switching_off += off
         try:
             await self._stop_motor(STOP_CONTROLS[mode])
@@ -577,6 +577,7 @@ class LdcnAxis(Moves):
         with contextlib.suppress(OutcomeUnknown):
             await self._bus.execute(commands.reset_position(self._node))
         self.state.reading(await self._bus.execute(commands.read_status(self._node, STATE_ITEMS)))
+        # `reading` has not seen it begin anew
         if self.state.setting_back:
             self.state.setting_back = 0
             raise OutcomeUnknown(
@@ -656,6 +657,7 @@ class LdcnAxis(Moves):
                     remedy="move the other way",
                 )
         ahead += tuple(method for method in onward if method not in ahead and levels[method] is not active)
+        # a smooth stop would close the loop that a raw duty has open
         stop = StopMode.OFF if isinstance(motion, PwmOutput) else StopMode.SMOOTH
         for method in ahead:
             control |= homing_control(self.profile, HomeCapture(method, stop))
@@ -682,8 +684,6 @@ class LdcnAxis(Moves):
         The manuals let a smooth stop use "the current acceleration rate" and do not say whether loading makes a rate
         current or only a start does; after a reset the difference is a motor that is never slowed down.
         """
-        # "causing the motor to decelerate to a stop at the current acceleration rate" (PIC-SERVO manual, 5.2, "Stop
-        # Motor")
         standing = Trajectory(velocity=0, acceleration=trajectory.acceleration, mode=ProfileMode.VELOCITY)
         await self._load(standing)
         await self._bus.execute(commands.start_motion(self._node))
@@ -867,6 +867,7 @@ class LdcnAxis(Moves):
         # a lost reply leaves each register the old or the new value, and the next motion loads them again
         with self._book.writing(asdict(gains)):
             await self._bus.execute(exchange)
+        # only now: what was not acknowledged must not be loaded later by itself
         self._book.wanted_gains = gains
 
     async def set_outputs(self, limit1: PinMode | None, limit2: PinMode | None) -> None:

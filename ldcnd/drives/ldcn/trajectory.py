@@ -233,6 +233,7 @@ def trajectory_of(motion: CountsMotion | AnalogMotion | PwmOutput, servo_divisor
         case PwmOutput():
             return Trajectory(
                 acceleration=acceleration,
+                # with an acceleration, although PWM mode has none: the smooth stop that ends it decelerates by it
                 pwm_or_target=round(abs(motion.duty) * MOST_PWM),
                 servo=False,
                 reverse=motion.duty < 0,
@@ -243,6 +244,7 @@ def trajectory_of(motion: CountsMotion | AnalogMotion | PwmOutput, servo_divisor
                 velocity=programmed_velocity(motion.velocity_counts_per_s, servo_divisor, profile),
                 acceleration=acceleration,
                 pwm_or_target=motion.target_counts,
+                # "The direction bit is calculated internally" (LS-182AP manual, "Absolute positioning mode")
                 mode=ProfileMode.VELOCITY,
             )
         case CountsMotion():
@@ -261,6 +263,7 @@ def _check_analog_target(target: int, profile: Profile) -> None:
     if not profile.analog_target:
         raise NotSupported(f"{profile.title} cannot move to an analog target")
     shift = SENSOR_BITS - profile.adc_bits
+    # rounded inwards on a converter that is coarser
     low, high = -(-SENSOR_LEAST >> shift), SENSOR_MOST >> shift
     if not low <= target <= high:
         nearest = low if target < low else high
@@ -347,6 +350,7 @@ def _programmed(what: str, unit: str, value: float, ceiling: float, factor: floa
             limit=nearest,
             nearest=nearest,
         )
+    # `round` would take the even one of two that are equally near
     register = math.floor(value * factor + 0.5)
     if register > ceiling * factor * (1 + ROUNDING):
         register -= 1

@@ -133,7 +133,7 @@ class SmartStepProfile:
     wiring: Wiring = Wiring.FOUR_WIRE  # manual 1.1 has no other; on two wires a drive may take its replies for commands
     echo: Echo = Echo.NONE  # not in the manual: on four wires the host's receiver is on the other pair
     first_character_s: float = RESPONSE_S
-    gap_s: float = 0.06
+    gap_s: float = 0.06  # manual 2.1 gives no such time, nor the next one
     quiet_s: float = 0.005
     attempts: int = 3
     eeprom_write: EepromWrite = EepromWrite.ALLOW

@@ -245,10 +245,12 @@ class SmartStepTracer(Tracer):
             before = await words.read(register)
             if before == value:
                 continue
+            # before it is set: if that reply is lost, the register is put back all the same
             originals[register] = before
             try:
                 await words.ask(write_trace_register(words.unit, register, value))
             except AddressRefused as refusal:
+                # refused, so it has what it had
                 del originals[register]
                 raise NotSupported(
                     f"axis {words.axis}: the drive does not let {register.name} ({register:04X}H) be set",
@@ -428,6 +430,7 @@ class ArmedSmartStep(ArmedTrace):
         Raises:
             DriveFault: it was ended from elsewhere.
         """
+        # those before the trigger may have been taken while it was waited for
         points = POINTS - self._setup.settings[TraceRegister.PTRGNO]
         needed_s = (points - 1) * self._setup.interval_s * (1 - CLOCK_ERROR)
         if ended_at_s - self._execution.sent_s < needed_s:
