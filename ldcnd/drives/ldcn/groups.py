@@ -145,7 +145,7 @@ class Groups:
                     commands.start_path(commands.LeaderlessGroup(group.address, profile, self._rate.cycle_s))
                 )
             else:
-                await self._bus.execute(commands.start_path(Node(group.address, profile)))
+                await self._bus.execute(commands.start_path(Node(group.address, profile)), once=True)
             sent = True
             stuck = [name for name in sorted(names) if not (await self._drives[name].path_status()).running]
         except LdcndError as error:
@@ -260,7 +260,8 @@ class Groups:
             )
             return
         leader = self._drives[group.leader]
-        await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)))
+        # a leader that has received it damaged speaks for itself only: the others may have started
+        await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)), once=True)
 
     async def _started(self, name: str, motion: CountsMotion, came_from: int) -> bool:
         """Tell from the drive's status whether it has set out, or has arrived already."""
