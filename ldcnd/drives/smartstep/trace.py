@@ -496,25 +496,23 @@ class ArmedSmartStep(ArmedTrace):
 
 async def put_back(words: Words, originals: Mapping[TraceRegister, int]) -> bool:
     """Set registers to what they were; bounded, whatever the line does. Return whether all of them are."""
-    for register, value in originals.items():
-        done = False
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(LEAVE_S):
-                while not done:
-                    try:
-                        await words.ask(write_trace_register(words.unit, register, value))
-                        done = True
-                    except ReplyTimeout:
-                        continue
-                    except LdcndError as error:
-                        log.error(
-                            "register not put back", axis=words.axis, register=register.name, reason=error.message
-                        )
-                        return False
-        if not done:
-            log.error("register not put back in time", axis=words.axis, register=register.name, value=value)
-            return False
-    return True
+    return all([await _put_back_one(words, register, value) for register, value in originals.items()])
+
+
+async def _put_back_one(words: Words, register: TraceRegister, value: int) -> bool:
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LEAVE_S):
+            while True:
+                try:
+                    await words.ask(write_trace_register(words.unit, register, value))
+                except ReplyTimeout:
+                    continue
+                except LdcndError as error:
+                    log.error("register not put back", axis=words.axis, register=register.name, reason=error.message)
+                    return False
+                return True
+    log.error("register not put back in time", axis=words.axis, register=register.name, value=value)
+    return False
 
 
 async def require_settings(words: Words, settings: Mapping[TraceRegister, int], lane: Lane) -> None:
