@@ -150,6 +150,7 @@ class WireEntries(Collection[WireEntry]):
         """Take what there is, and leave out what is older than the last record by more than `kept_s`."""
         self._blocks, self._latest = tuple(blocks), tuple(latest)
         if self._latest:
+            # blocks go as a whole, so the oldest one may reach back further than what was asked for
             too_old_s = self._latest[-1][0] - kept_s
         else:
             too_old_s = self._blocks[-1].times_s[-1] - kept_s if self._blocks else 0.0

@@ -163,6 +163,7 @@ class Proofs:
 
     def answered(self, node: int) -> None:
         """Take note that a node answers which had not answered before."""
+        # it may be another module by now, so its answer is no proof: it only says that there is one to identify
         if (proof := self._nodes.get(node)) and not proof.holds:
             self.heard_again.set()
 

@@ -144,6 +144,7 @@ class Rfc2217Port(TcpPort):
                 raise self._refused(f"it has {made} instead of {value} for {setting.name.lower().replace('_', ' ')}")
         for value in (NO_FLOW_CONTROL, DTR_ON, RTS_ON):
             self._set(PortSetting.CONTROL, value)
+        # tried before a drive is set to one, as on a port of this machine
         rates = {baud: await self._settled(PortSetting.RATE, baud) for baud in (*STANDARD_BAUDS, *bauds)}
         self._bauds = tuple(baud for baud, made in rates.items() if makes(baud, made))
         for baud in bauds:

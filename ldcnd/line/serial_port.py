@@ -350,6 +350,7 @@ def _settle_rates(port: _Serial, settings: SerialSettings) -> None:
         _Refused: not those that the line needs.
     """
     port.bauds = tuple(baud for baud in STANDARD_BAUDS if makes(baud, port.tune(baud)))
+    # the rate of opening comes last: the port is left at it
     for baud in (settings.working_baud, settings.baud):
         if baud and not makes(baud, made := port.tune(baud)):
             raise _Refused(

@@ -60,6 +60,7 @@ def price_list(model: str, baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock
     node = Node(ANY_ADDRESS, profile)
     everything = StatusItem.POSITION | StatusItem.ADC | StatusItem.VELOCITY | StatusItem.AUX | StatusItem.HOME
     common = {
+        # identity, and what only some models have: it adds nothing to the reply of the others
         "read status, all items": commands.read_status(node, everything | StatusItem(0xE0)),
         "no operation": commands.no_operation(node),
     }

@@ -146,6 +146,7 @@ class LdcnNetwork(Network):
             for each in self._expected
         }
         for group in plan.addresses:
+            # after a reset every module is in the group of everybody, so a packet to it needs the proofs of all
             members = (address for address in self._proofs if group in (EVERYBODY, plan.place(address).address))
             bus.proofs.expect_group(group, members)
         self._rate = LineRate(
@@ -398,6 +399,7 @@ class LdcnNetwork(Network):
             return None
         await self._rate.everybody_to(self._rate.working)
         for address, identity in modules.items():
+            # "verify that all modules are operating properly at the new Baud rate" (PIC-SERVO manual, 4.1)
             if await self._rate.who_is(address, patient=True) != identity:
                 return address
         return None

@@ -161,6 +161,7 @@ def decode_io_command(packet: Packet) -> IoCommand | None:
         case CommandCode.STOP_MOTOR:
             return SetSynchOutput(lines, data[2], data[3])
         case CommandCode.IO_CONTROL:
+            # bit 0 enables, bit 1 counts edges, bits 5 and 4 prescale (data sheet, 3.1)
             return SetTimerMode(bool(data[0] & 0x01), bool(data[0] & 0x02), PRESCALES[data[0] >> 4 & 0x03])
         case _:
             return SynchInput()

@@ -116,6 +116,7 @@ def encode_trajectory(profile: Profile, trajectory: Trajectory) -> bytes:
     trapezoidal = trajectory.servo and trajectory.mode is ProfileMode.TRAPEZOIDAL
     if trajectory.relative and not (trapezoidal and profile.sc_extensions):
         raise NotSupported(f"{profile.title} has no relative moves, or this is no trapezoidal one")
+    # bit 6 "is ignored in trapezoidal profile mode" (LS-182AP manual)
     if trapezoidal and trajectory.reverse:
         raise NotSupported("a trapezoidal move takes its direction from the position, not from the reverse bit")
     if trajectory.servo and trajectory.pwm_or_target and not profile.analog_target:
@@ -342,6 +343,7 @@ def _profile_tick_s(servo_divisor: int, profile: Profile) -> float:
 
 def _programmed(what: str, unit: str, value: float, ceiling: float, factor: float, most_register: int) -> int:
     most = most_register / factor
+    # this comparison is false for what is not a number, too
     if not 0 <= value <= most:
         nearest = most if value > most else 0.0
         raise ValueOutOfRange(
@@ -419,6 +421,7 @@ def encode_point(point: PathPoint, *, fast_path: bool) -> int:
             limit=most,
             nearest=most if point.counts > 0 else -most,
         )
+    # sign and magnitude, not two's complement: bit 0 is the sign
     word = abs(point.counts) * _SPEED_FRACTION // point.cycles
     if point.cycles == periods[0]:
         word |= LONG_PERIOD

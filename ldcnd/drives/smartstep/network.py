@@ -245,6 +245,7 @@ class SmartStepNetwork(Network):
         stored = unit_number(await words.read(PN000.eeprom_address))
         if stored != unit.spec.address:
             remarks.append(f"{who}: Pn000.2 makes it unit {stored} at its next power-on")
+        # which level means so is not in the manual (3, 8106H), so it is a remark and forbids nothing
         if FunctionSwitch.PARAMETERS_RULE not in function_switches(await words.read(Register.FUNCTION_SWITCHES)):
             remarks.append(f"{who}: its switches seem to overrule parameters (switch 6 is off)")
         return remarks

@@ -208,6 +208,7 @@ class UnitParameters(ParameterAccess):
                 return Written(before, written=False, remarks=_pending(parameter, before))
             await self._write_eeprom(parameter, before.stored, request.value)
         after = await self._read(parameter)
+        # an acknowledgement repeats what was sent, not what is held (manual 2.2, example 2)
         held = after.active if request.memory is Memory.RAM else after.stored
         if held != request.value:
             raise DriveFault(

@@ -241,6 +241,7 @@ class SmartStepTracer(Tracer):
         words = self._words
         for name, largest in request.full_scale.items():
             register = FULL_SCALE_REGISTERS[name]
+            # 0 would leave nothing to scale by
             value = min(max(1, math.ceil(largest)), 0xFFFF)
             before = await words.read(register)
             if before == value:
