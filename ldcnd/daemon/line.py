@@ -374,7 +374,7 @@ class BusService:
             )
         elif isinstance(drive, Readable):
             rates_hz = axis.config.rates.wanted_hz(adc=bool(drive.adc_full_scale))
-            poller = AxisPoller(drive, rates_hz, now_s, taken.judge, taken.miss, self.bus.add_poller)
+            poller = AxisPoller(drive, rates_hz, now_s, taken.judge, taken.miss, self.bus.move_poller)
             taken.ask_at = poller.ask_at
         else:
             raise TypeError(f"axis {axis.config.name}: its drive can be read in no way")

@@ -313,6 +313,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             raise ValueError(f"velocity {self.velocity} is above limits.velocity {limits.velocity}")
         if limits.acceleration is not None and self.acceleration > limits.acceleration:
             raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
+        # made once here, so that what is wrong with them is said of the file
         _ = self.unit_table, self.g_velocity
         self._check_gain_sets()
         self._check_tracking()
@@ -342,6 +343,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
     def _check_gain_sets(self) -> None:
         """Refuse sets that `gains` do not stand for, and names of sets that there are not."""
         for name, gains in self.gain_sets.items():
+            # velocity and acceleration "will also have to be modified" with it (LS-182AP manual, "Servo Control")
             if self.gains is None or gains.sr != self.gains.sr:
                 raise ValueError(f"gain_sets.{name}: its sr is not that of gains")
         for kind, name in self.gains_for.items():
@@ -355,6 +357,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             return
         step_counts = tracking.step * abs(self.signed_counts_per_unit)
         for gains in filter(None, (self.gains, *self.gain_sets.values())):
+            # "if the stopping position is too far ... a position error will be generated" (both manuals, "Stop Motor")
             if step_counts >= gains.el:
                 raise ValueError(f"tracking.step is {step_counts:g} counts, not below gains.el {gains.el}")
         if limits.velocity is not None and tracking.step * tracking.rate > limits.velocity:

@@ -114,6 +114,7 @@ def plan_line(
     """
     tasks = [poll.task for poll in polls]
     probes = [urgent.probe] if urgent.probe else []
+    # a stop does not interrupt what is on the wire, and nothing else goes before it
     longest_s = max([urgent.command_s, *(task.cost_s for task in tasks)])
     stop_s = longest_s + urgent.stop_s
     return LinePlan(
@@ -132,6 +133,7 @@ def plan_line(
 
 def _mean_load(polls: Sequence[Poll], cycle: ServoCycle | None) -> float:
     lengths_s: Sequence[float] = [poll.mean_s for poll in polls]
+    # one drive alone leaves nothing to choose
     if cycle and len(polls) > 1:
         lengths_s = mean_lengths_s(tuple(PolledDrive(poll.rate_hz, poll.mean_cost) for poll in polls), cycle)
     return math.fsum(poll.rate_hz * length_s for poll, length_s in zip(polls, lengths_s, strict=True))

@@ -80,6 +80,7 @@ def meets_deadlines(tasks: Sequence[PeriodicTask], *urgent: PeriodicTask) -> boo
     classes = _classes(tasks)
     urgent_s = max((each.cost_s for each in urgent), default=0.0)
     busy_s = _busy_period_s(everything, max([urgent_s, *(task.cost_s for task in tasks)]))
+    # demand grows at deadlines only, and nothing behind the longest busy period can be the first to be late
     deadlines_s = {turn * period_s for period_s in classes for turn in range(1, int(busy_s / period_s) + 2)}
     for at_s in deadlines_s:
         demand_s = math.fsum(int(at_s / period_s + _ALMOST) * each.cost_s for period_s, each in classes.items())
@@ -135,6 +136,7 @@ def _classes(tasks: Sequence[PeriodicTask]) -> dict[float, _Class]:
 
 def _busy_period_s(tasks: Sequence[PeriodicTask], blocking_s: float) -> float:
     """Return how long the line can be busy without a gap."""
+    # fixed point: the work that comes in while the line is busy keeps it busy; it ends as the load is below `FULL`
     longer_s = blocking_s + math.fsum(task.cost_s for task in tasks)
     busy_s = 0.0
     while longer_s > busy_s + _ALMOST:
@@ -169,11 +171,13 @@ def _response_s(
     before_s = max([blocking_s, *less_urgent]) + math.floor(at_s / task.period_s + _ALMOST) * task.cost_s
     rivals = list(ahead)
     for period_s, each in classes.items():
+        # its own earlier turns are in `before_s` already
         cost_s = each.cost_s - task.cost_s if period_s == task.period_s else each.cost_s
         turns = math.floor(deadline_s / period_s + _ALMOST)
         if turns > 0 and cost_s > 0.0:
             rivals.append((period_s, cost_s, turns))
     all_rivals_s = before_s + math.fsum(cost_s * turns for _, cost_s, turns in rivals)
+    # even behind all of them it would not be later than what is known: most offsets end here
     if all_rivals_s + task.cost_s - at_s <= known_s:
         return known_s
     start_s, later_s = -1.0, 0.0

@@ -74,9 +74,11 @@ def _rehearse(
         poller.next_exchange(now_s)
         queue.schedule(poller, poller.due_at_s)
         timing = poller.answer(now_s)
+        # as the line does it: the next poll is chosen while this one is under way
         queue.choose_ahead(order.free_at_s(poller.node, timing.true_from_s, poller.reply_s))
         order.observe(poller.node, timing)
         over_s = timing.received_at_s + poller.drive.cost.overhead_s
+        # until cycles are known the order is that of chance
         if number >= learning:
             lengths_s[poller.node].append(over_s - now_s)
         now_s = over_s

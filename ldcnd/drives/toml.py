@@ -33,6 +33,7 @@ class Variants:
         """Read a table by its own model before it is taken for the common one."""
 
         def read(document: object) -> object:
+            # an instance is there already; what is neither is refused by the common model, in its words
             return self.choose(document).model_validate(document) if isinstance(document, dict) else document
 
         return core_schema.no_info_before_validator_function(read, handler(source))
@@ -102,6 +103,7 @@ def _unknown_key(document_type: type[BaseModel], loc: tuple[int | str, ...]) -> 
     if name in REMOVED_KEYS:
         return f"no longer supported: {REMOVED_KEYS[name]}"
     keys = _keys_at(document_type, loc[:-1])
+    # in one of the models that may stand there, but not in the one that was chosen
     if name in keys:
         return "drives of another family have this key"
     close = difflib.get_close_matches(name, keys, n=1)

@@ -13,6 +13,7 @@ SYS_TTY = Path("/sys/class/tty")
 BY_ID = Path("/dev/serial/by-id")
 TIOCGICOUNT = 0x545D
 ICOUNTS = struct.Struct("20i")
+# in `struct serial_icounter_struct` behind cts, dsr, rng, dcd, rx and tx
 _FRAME, _OVERRUN, _PARITY, _BREAK, _BUFFER_OVERRUN = range(6, 11)
 
 
@@ -93,6 +94,7 @@ def adapter_of(path: Path, sys_tty: Path = SYS_TTY, by_id: Path = BY_ID) -> Adap
     """
     node = path.resolve().name
     device = sys_tty / node / "device"
+    # sysfs knows nothing of pseudo-terminals
     if path.resolve().parent.name == "pts":
         return Adapter(node, "", None, None, None)
     if not device.exists():

@@ -109,6 +109,7 @@ class Job(Transaction):
             try:
                 self.condition()
             except LdcndError as error:
+                # at a repetition: the node may have executed the one before, although its reply was lost
                 self.fail(error if self.attempts_left == self.attempts else error.although(SENT_IN_VAIN))
                 return False
         self.attempts_left -= 1  # what the condition forbids was no attempt
@@ -304,6 +305,12 @@ class Bus:
         if self._line:
             self._line.kick()
 
+    def move_poller(self, poller: Poller[Any]) -> None:
+        """Move the turn of a poller to its `due_at_s`; not of one that was removed, or went with the line."""
+        self._schedule.reschedule(poller, poller.due_at_s)
+        if self._line:
+            self._line.kick()
+
     def remove_poller(self, poller: Poller[Any]) -> None:
         """Stop polling; a poll on the wire is still delivered."""
         self._schedule.remove(poller)
@@ -411,6 +418,7 @@ class Bus:
         at_baud: int | None = None,
     ) -> Job:
         """Queue an exchange; the outcome is that of the job's future."""
+        # here, in the caller's context: when its turn comes, another one is running
         condition = None if exchange.effect in ALWAYS_SENT else self.proofs.condition(exchange, lane)
         job = Job(exchange, lane, self._loop, attempts or self.settings.attempts, condition)
         job.then_baud, job.at_baud = then_baud, at_baud
@@ -419,6 +427,7 @@ class Bus:
         self._schedule.push(job, lane)
         if job.guest:
             job.future.add_done_callback(partial(self._taken, job))
+        # it may be sent at once, and the port be lost over it: the job has its outcome then
         self._line.kick()
         return job
 
@@ -474,6 +483,7 @@ class Bus:
         """Serve the line until it is lost or the caller is cancelled; then every caller has its outcome."""
         self.statistics.openings += 1
         self.wire_log.add(self._loop.time(), WireEvent.OPENED)
+        # who was silent on the line before may be there now: it is polled at its rate, not ever more seldom
         self._schedule.mute.forget()
         self._line = line = Line(
             self.settings,
@@ -491,6 +501,7 @@ class Bus:
             line.kick()
             await self._closed.wait()
         finally:
+            # before the port, which may drain for a second: no caller waits for that
             line.close("the bus was closed", for_good=True)
             await transport.close()
 

@@ -82,6 +82,7 @@ def parse_capture(text: str) -> Capture:
     title, *lines = text.splitlines() or [""]
     if title != TITLE:
         raise MalformedRequest(f"not a capture: the first line is not {TITLE!r}", value=title)
+    # up to the first record: what comments say of records may look like a fact
     facts = (match for line in takewhile(lambda line: line.startswith("#"), lines) if (match := _FACT.fullmatch(line)))
     try:
         header = CaptureHeader.model_validate({fact[1]: json.loads(fact[2]) for fact in facts})

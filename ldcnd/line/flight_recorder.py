@@ -150,6 +150,7 @@ class WireEntries(Collection[WireEntry]):
         """Take what there is, and leave out what is older than the last record by more than `kept_s`."""
         self._blocks, self._latest = tuple(blocks), tuple(latest)
         if self._latest:
+            # blocks go as a whole, so the oldest one may reach back further than what was asked for
             too_old_s = self._latest[-1][0] - kept_s
         else:
             too_old_s = self._blocks[-1].times_s[-1] - kept_s if self._blocks else 0.0
@@ -217,6 +218,7 @@ class WireLog:
             blocks.append(_Block(latest))
             latest.clear()
         while blocks and (self._room_bytes < 0 or blocks[0].times_s[-1] < too_old_s):
+            # the newest record is in it, and stays
             if len(blocks) == 1 and not latest:
                 break
             oldest = blocks.popleft()
@@ -261,6 +263,7 @@ class LatencyHistogram:
 
     def add(self, duration_s: float) -> None:
         """Count one duration, in seconds, not negative."""
+        # in units of 64 us
         bucket = int(duration_s * 15625).bit_length()
         self.counts[bucket if bucket < BUCKETS else -1] += 1
         self.total_s += duration_s

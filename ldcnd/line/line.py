@@ -280,6 +280,7 @@ class Line(Receiver):
         if self.phase is Phase.IDLE:
             self._next()
         elif self.phase is Phase.QUARANTINE and self._schedule.stop_waits():
+            # it waits for the flush alone, see `_begin_quarantine`
             self._watchdog.set(self._loop.time())
 
     def distrust(self) -> None:
@@ -295,6 +296,7 @@ class Line(Receiver):
         if self.phase is Phase.IDLE:
             self._begin_quarantine(self._loop.time())
         elif self.phase is Phase.REPLY and self._transaction and self._transaction.exchange.repeatable:
+            # any other one lingers: if a late reply comes in its place, its own follows and shows that
             self._distrusted, self._missing = True, NOT_PLAIN
 
     def deliver(self) -> None:
@@ -317,6 +319,7 @@ class Line(Receiver):
         """
         if self.phase is Phase.CLOSED:
             return
+        # first: what is delivered may queue something, and `kick` must not find a line that takes it
         self.phase = Phase.CLOSED
         self._watchdog.cancel()
         self.deliver()
@@ -327,6 +330,7 @@ class Line(Receiver):
             ReplyTimeout(f"node {transaction.exchange.node}: {reason} before the reply came")
         ):
             self._schedule.requeue(transaction, transaction.lane)
+        # drains the schedule: what was to be sent again has its outcome there
         self._report_loss(reason)
 
     # -- sending -----------------------------------------------------------------------------------------------------
@@ -362,6 +366,7 @@ class Line(Receiver):
                 if poller is None:
                     return None
                 wanted_at_s, exchange = poller.due_at_s, poller.next_exchange(now_s)
+                # a poll passes neither proof nor permission: those are asked of jobs only
                 if exchange.effect is not READS:
                     raise AssertionError(f"the poll {exchange.request.hex(' ')} does not say that it only reads")
                 return PollTransaction(poller, exchange, wanted_at_s)
@@ -377,6 +382,7 @@ class Line(Receiver):
     def _send(self, transaction: Transaction, now_s: float, remark: str) -> None:
         if transaction.at_baud:
             self._transaction = transaction
+            # the line has its owner already: if the port is lost over the rate, `close` reports that to it
             self._tune(transaction.at_baud, for_good=False)
             if self.phase is Phase.CLOSED:
                 return
@@ -430,6 +436,7 @@ class Line(Receiver):
             self._echo += request
         if poller := transaction.poller:
             self._schedule.reschedule(poller, poller.due_at_s)
+        # last, so that the log has the request before the loss, and `close` reports it as one that was on the wire
         if failure:
             self.transport_lost(failure)
 
@@ -464,6 +471,7 @@ class Line(Receiver):
     @override
     def data_received(self, data: bytes) -> None:
         now_s, transaction = self._loop.time(), self._transaction
+        # nearly every reply: whole, in one piece, and no sooner than the wire can have carried it
         if transaction and len(data) == self._missing and now_s >= self._whole_from_s:
             reply = self._held + data
             if transaction.exchange.check(reply) is ReplyVerdict.INTACT:
@@ -520,6 +528,7 @@ class Line(Receiver):
     def _judge(self, transaction: Transaction, reply: bytes, verdict: ReplyVerdict, now_s: float) -> None:
         """Accept a whole reply, or wait whether another one follows."""
         if self._distrusted:
+            # its node has most likely obeyed, so the second one goes behind stops that were not sent yet
             if verdict is ReplyVerdict.INTACT and transaction.lane is Lane.STOP:
                 transaction.doubt()
             self._discard_reply(transaction, reply, _OLDER, now_s)
@@ -555,13 +564,15 @@ class Line(Receiver):
             arrived: those of its bytes that are not noted yet.
         """
         slow, sent_at_s, byte_s = transaction.slow_to_deliver, self._sent_at_s, self.byte_s
+        # before the next request is written, which has the rate of the line
         if transaction.then_baud or transaction.at_baud:
             self._release(transaction, transaction.then_baud)
         following, failure = self._write_next(now_s, push=slow)
         if arrived:
             self._statistics.bytes_in += len(arrived)
             self._log.add(now_s, WireEvent.RECEIVED, arrived)
-        if self._distrusted:
+        # behind a stop that goes out on a line out of step it is the reply to that one which is distrusted
+        if self._distrusted and following is None:
             self._discard_reply(transaction, reply, _OLDER, now_s)
             return
         timing = self._count_reply(transaction, reply, sent_at_s, byte_s, now_s)
@@ -569,6 +580,7 @@ class Line(Receiver):
         self._schedule.record_reply(transaction.exchange, timing if is_poll else None)
         undelivered, waits = self.undelivered, False
         if not undelivered:
+            # the oldest one that waits decides, so that none waits for longer
             self._deliver_by_s = now_s + self._coalesce_s
         if joins := slow or bool(undelivered):
             undelivered.append((transaction, reply, timing))
@@ -677,8 +689,10 @@ class Line(Receiver):
         self._note_stray(data, now_s)
         if self.phase is Phase.QUARANTINE and not self._schedule.stop_waits():
             quiet_s = self._resync.quiet_s
+            # each late byte begins the silence anew, but no node that babbles keeps the line for good
             self._watchdog.set(min(now_s + quiet_s, self._quarantined_s + LONGEST_QUARANTINE * quiet_s))
         elif self.phase is Phase.IDLE:
+            # nothing was asked: it answers something older, and the next reply may, too
             self._require_probe()
             self._begin_quarantine(now_s)
 
@@ -704,6 +718,7 @@ class Line(Receiver):
         # 16 nulls, a millisecond, and whatever was received is dropped (PIC-SERVO manual, 4.1, network initialization);
         # a lone end of line is no command of 14 characters, so a SmartStep is silent about it (SmartStep manual, 2.1)
         self.phase = Phase.FLUSH
+        # an adapter may return the flush late, and what is left of it would be stray behind the next request
         flush, echo_s = self._resync.flush, self._settings.margin_s if self._settings.echo else 0.0
         self._watchdog.set(now_s + len(flush) * self.byte_s + self._resync.settle_s + echo_s)
         if not flush:

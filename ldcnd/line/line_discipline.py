@@ -19,11 +19,14 @@ from ldcnd.line.transport import (
     Rs485Config,
 )
 
+# _IOR('T', 0x2A, 44 bytes), as on x86 and ARM; where it is another number it fails, and no rate is known
 TCGETS2 = 0x802C542A
 """Reads `struct termios2`, whose speeds also hold rates without a constant of their own."""
+# four words of flags, line discipline and 19 control characters, speed of input and of output
 TERMIOS2 = struct.Struct("4I20B2I")
 TIOCGRS485 = 0x542E
 TIOCSRS485 = 0x542F
+# flags, both delays in ms, five words of padding
 SERIAL_RS485 = struct.Struct("3I5I")
 
 PortFault = (OSError, ValueError, OverflowError, termios.error)
@@ -51,6 +54,7 @@ def switch_direction(descriptor: int, wanted: Rs485Config) -> str:
         fcntl.ioctl(descriptor, TIOCSRS485, request)
         flags, before_ms, after_ms, *_ = SERIAL_RS485.unpack(fcntl.ioctl(descriptor, TIOCGRS485, bytes(len(request))))
     except OSError as error:
+        # drivers without it say so in each of these ways
         if error.errno in (errno.ENOTTY, errno.EINVAL, errno.EOPNOTSUPP):
             return "its driver cannot switch the transmitter of an RS-485 line"
         return f"its driver refuses to switch the transmitter: {error}"

@@ -39,6 +39,7 @@ def port_opener(
             # clients read configurations too, also where there are no terminals of POSIX
             from ldcnd.line.serial_port import SerialSettings, open_serial_port  # noqa: PLC0415
 
+            # a pattern is looked for in sysfs, which must not hold up the loop
             path = await asyncio.to_thread(_device, port)
             return await open_serial_port(SerialSettings(path, baud, framing, working_baud=working_baud, rs485=rs485))
 

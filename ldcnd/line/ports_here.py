@@ -79,6 +79,7 @@ def held_by(device: Path, proc: Path = PROC) -> tuple[str, ...]:
         node = device.stat()
     except OSError:
         return ()
+    # as /proc/locks writes it: device of the file system in hexadecimal, inode in decimal
     place = f"{os.major(node.st_dev):02x}:{os.minor(node.st_dev):02x}:{node.st_ino}"
     found = {pid for pid, locked in _locks(proc) if locked == place}
     for program in proc.glob("[0-9]*"):

@@ -157,11 +157,13 @@ class Proofs:
 
     def missed(self, node: int, misses: int) -> None:
         """Note how many exchanges in a row a node has left unanswered."""
+        # one that is lost already keeps its reason: that it restarted, or that another module is there, says more
         if misses >= MISSES_UNTIL_LOST and (proof := self._nodes.get(node)) and proof.holds:
             proof.lose(f"address {node} has stopped answering")
 
     def answered(self, node: int) -> None:
         """Take note that a node answers which had not answered before."""
+        # it may be another module by now, so its answer is no proof: it only says that there is one to identify
         if (proof := self._nodes.get(node)) and not proof.holds:
             self.heard_again.set()
 
@@ -190,6 +192,7 @@ class Proofs:
         passes = _pass.get() if exchange.effect is PacketEffect.ARRANGES else None
 
         def condition() -> None:
+            # a bring-up is freed from the proof, which it is about to find, and not from the caller's permission
             if not (passes and passes.holds):
                 self.check(exchange.node)
             if permission:

@@ -37,6 +37,7 @@ class PortSetting(IntEnum):
     CONTROL = 5
 
 
+# values of SET-CONTROL (RFC 2217, section 3); a port of this machine is opened with both outputs on, too
 NO_FLOW_CONTROL, DTR_ON, RTS_ON = 1, 8, 11
 FRAMINGS = {"8n1": (8, 1, 1), "7e1": (7, 3, 1)}
 """Data bits, parity and stop bits as RFC 2217 numbers them."""
@@ -132,6 +133,7 @@ class Rfc2217Port(TcpPort):
         """
         for option in WANTED:
             self._stream.write(bytes((IAC, WILL, option, IAC, DO, option)))
+        # the one without which nothing can be set; where binary transmission is refused, `_next` ends it
         while COM_PORT not in self._telnet.agreed:
             await self._next()
         values = dict(
@@ -142,6 +144,7 @@ class Rfc2217Port(TcpPort):
                 raise self._refused(f"it has {made} instead of {value} for {setting.name.lower().replace('_', ' ')}")
         for value in (NO_FLOW_CONTROL, DTR_ON, RTS_ON):
             self._set(PortSetting.CONTROL, value)
+        # tried before a drive is set to one, as on a port of this machine
         rates = {baud: await self._settled(PortSetting.RATE, baud) for baud in (*STANDARD_BAUDS, *bauds)}
         self._bauds = tuple(baud for baud, made in rates.items() if makes(baud, made))
         for baud in bauds:
@@ -158,6 +161,7 @@ class Rfc2217Port(TcpPort):
 
     @override
     def write(self, data: bytes) -> None:
+        # a data byte of 255 is sent twice (RFC 854), as in a setting
         super().write(data.replace(b"\xff", b"\xff\xff"))
 
     @override
@@ -176,6 +180,7 @@ class Rfc2217Port(TcpPort):
             self._stream.abort()
 
     def _set(self, setting: PortSetting, value: int) -> None:
+        # SET-BAUDRATE has four octets, the others one (RFC 2217, section 3)
         width = 4 if setting is PortSetting.RATE else 1
         said = value.to_bytes(width, "big").replace(b"\xff", b"\xff\xff")
         self._stream.write(bytes((IAC, SB, COM_PORT, setting)) + said + bytes((IAC, SE)))

@@ -74,6 +74,7 @@ class Schedule(Generic[JobT]):
         """
         waiting = self._jobs[lane]
         if len(waiting) >= LANE_LIMITS[lane]:
+            # those whose callers have gone are left in the queue until room is needed: none of them is sent
             waiting = self._jobs[lane] = deque(other for other in waiting if not other.abandoned)
         if len(waiting) >= LANE_LIMITS[lane]:
             raise BusBusy(
@@ -187,6 +188,7 @@ class Schedule(Generic[JobT]):
         """
         if timing and self._order:
             self._order.observe(exchange.node, timing)
+        # silence behind a packet that draws no reply says nothing of who is there
         if not exchange.reply_bytes or exchange.node not in self.mute.misses:
             return
         self._proofs.answered(exchange.node)
@@ -254,6 +256,7 @@ class MuteNodes:
         if beyond < 0:
             return 0.0
         self._backed_off.add(node)
+        # together they take the fraction that one may take, so each pauses the longer the more they are
         many = len(self._backed_off)
         doubled_s = many * FIRST_BACKOFF_S * 2.0 ** min(10, beyond)
         return min(doubled_s, many * lost_s / MUTE_SHARE, LONGEST_BACKOFF_S)
@@ -446,6 +449,7 @@ class PollQueue:
         ahead = self._ahead
         if ahead is None:
             return self._take(now_s) if self.is_due(now_s) else None
+        # the one chosen ahead keeps its place: it goes next
         if self._is_overtaken(ahead, now_s):
             return self._take(now_s)
         self._ahead = None
@@ -543,11 +547,13 @@ class PhaseTracker:
         if not self._count or tick_s - self._tick_s > LONGEST_GAP_S:
             self._tick_s, self._count, self.locked = tick_s, 1, False
             return
+        # sooner than half a cycle after the one before, it tells nothing of the length
         if cycles < 1:
             return
         self._count = count = self._count + 1
         expected_s = self._tick_s + cycles * self._period_s
         error_s = tick_s - expected_s
+        # of a line through n equidistant points its end is corrected by 2(2n - 1) / n(n + 1), its slope by 6 / n(n + 1)
         weight = max(FORGETTING, 2.0 * (2 * count - 1) / (count * (count + 1)))
         drift_weight = max(FORGETTING_DRIFT, 6.0 / (count * (count + 1)))
         self._tick_s = expected_s + min(1.0, weight) * error_s
@@ -582,6 +588,7 @@ class PhaseOrder:
         guard_s = self.guard_s
         for poller in pollers:
             tracker = self._trackers.get(poller.node)
+            # what a drive takes on average whose cycle is not known
             wait_s = self._cycle_s / 2
             if tracker and tracker.locked:
                 wait_s = tracker.wait_s(now_s + self._request_s[poller.node] + guard_s)
@@ -607,9 +614,11 @@ class PhaseOrder:
         tracker = self._trackers.get(node)
         if tracker is None:
             tracker = self._trackers[node] = PhaseTracker(self._cycle_s)
+        # `true_until_s` is reckoned at the line's rate, and the drive sends at what its divisor makes of it
         began_s = timing.received_at_s - self._stretch * (timing.received_at_s - timing.true_until_s)
         expected_s = self._expected_s.pop(node, None)
         if expected_s is not None and tracker.locked:
+            # a whole cycle later than expected: the request came too late for the one that was meant
             missed = began_s - timing.true_from_s > expected_s + self._cycle_s / 2
             step = GUARD_UP if missed else -GUARD_DOWN
             self.guard_s = min(max(0.0, self.guard_s + step * self._cycle_s), MOST_GUARD * self._cycle_s)

@@ -91,6 +91,7 @@ async def open_serial_port(settings: SerialSettings) -> Transport:
     opening = loop.run_in_executor(None, _open, settings)
     try:
         async with asyncio.timeout(OPEN_TIME_S):
+            # open(2) cannot be interrupted: should it end after all, `_close_unwanted` gives the port back
             port = await asyncio.shield(opening)
     except _Refused as refused:
         message = f"{settings.path} cannot be opened: {refused}; {refused.remedy}"
@@ -192,7 +193,7 @@ class SerialPort(Transport):
         try:
             data = os.read(self._descriptor, READ_BYTES)
         except BlockingIOError:
-            return
+            return  # `collect` asks without knowing whether anything is there
         except OSError as error:
             self._give_up(self._gone(str(error)))
             return
@@ -282,6 +283,7 @@ class SerialPort(Transport):
 
     async def _drain(self) -> None:
         loop = asyncio.get_running_loop()
+        # `_end` drops what has not left by then
         with contextlib.suppress(TimeoutError, *PortFault):
             async with asyncio.timeout(DRAIN_TIME_S):
                 await loop.run_in_executor(None, self._port.drain)
@@ -301,6 +303,7 @@ class SerialPort(Transport):
             return
         self._loop.remove_reader(self._descriptor)
         with contextlib.suppress(*PortFault):
+            # closing waits for unsent bytes, by default for 30 s (setserial(8), closing_wait)
             self._port.reset_output_buffer()
         self._stream.abort()
 
@@ -316,6 +319,7 @@ def _open(settings: SerialSettings) -> _Serial:
         parity=serial.PARITY_EVEN if seven_even else serial.PARITY_NONE,
         timeout=0,
         write_timeout=0,
+        # False would have pyserial release the lock, None leaves it alone
         exclusive=settings.exclusive or None,
     )
     try:
@@ -346,6 +350,7 @@ def _settle_rates(port: _Serial, settings: SerialSettings) -> None:
         _Refused: not those that the line needs.
     """
     port.bauds = tuple(baud for baud in STANDARD_BAUDS if makes(baud, port.tune(baud)))
+    # the rate of opening comes last: the port is left at it
     for baud in (settings.working_baud, settings.baud):
         if baud and not makes(baud, made := port.tune(baud)):
             raise _Refused(

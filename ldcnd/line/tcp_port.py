@@ -71,6 +71,7 @@ class TcpPort(Transport):
         self._stream = stream
         self._incoming = incoming
         end = stream.get_extra_info("socket")
+        # otherwise a request waits for the acknowledgement of the bytes before it
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         end.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, UNACKNOWLEDGED_MS)
         end.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
@@ -85,6 +86,7 @@ class TcpPort(Transport):
 
     @override
     def write(self, data: bytes) -> None:
+        # asyncio drops what is written to a stream that is closing, without an error
         if self._incoming.reason or self._stream.is_closing():
             raise self._incoming.lost("the far end closed it")
         self._stream.write(data)

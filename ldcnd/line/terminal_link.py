@@ -60,6 +60,7 @@ class TerminalLink:
         if self._link.is_symlink() and self._link.readlink() == self._terminal:
             self._link.unlink()
         with suppress(OSError):
+            # while it is held: afterwards the file could be the next simulator's
             lock_of(self._link).unlink()
         os.close(self._lock)
 
@@ -80,8 +81,10 @@ def why_not_served(path: str) -> str:
     try:
         lock = os.open(lock_of(link), os.O_RDONLY | os.O_CLOEXEC)
     except OSError:
+        # made by another program: there is no lock beside it
         return _why_younger(link)
     try:
+        # this is refused as long as the simulator lives, which holds the lock for itself
         fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         its_own = os.pread(lock, 4096, 0).decode(errors="replace").strip()

@@ -143,6 +143,7 @@ class Incoming(asyncio.Protocol):
     def attach(self, receiver: Receiver) -> None:
         """Deliver to `receiver` from now on; a port that is lost already is reported from the loop, not from here."""
         self._receiver = receiver
+        # a server that closes at once has done so before the line is there
         if self.ended.is_set():
             asyncio.get_running_loop().call_soon(self._report)
 

@@ -22,7 +22,7 @@ from ldcnd.drives.driver import CountsMotion, HomeCapture, StopMode
 from ldcnd.drives.ldcn.commands import spaced
 from ldcnd.drives.ldcn.config import LineSpec
 from ldcnd.drives.ldcn.controls import StopControl
-from ldcnd.drives.ldcn.packet import CommandCode
+from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 from ldcnd.drives.network import GroupSpec, StartPolicy
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -69,6 +69,34 @@ async def test_members_start_with_one_packet_and_nobody_else_does(line_spec):
     assert [drive(chain, address).loop.position for address in (1, 4)] == [0, 0]
     assert abs(drive(chain, 2).loop.position - 20_000) <= 1
     assert abs(drive(chain, 3).loop.position + 20_000) <= 1
+
+
+async def test_a_start_that_the_leader_alone_has_received_damaged_is_not_sent_again(monkeypatch):
+    chain = chain_of()
+    leader = chain.modules[2]
+    start = encode_packet(Packet(0x81, CommandCode.START_MOTION))
+    damaged = []
+
+    def hear_all(data, starts_at_s, byte_s):
+        if data == start and not damaged:
+            damaged.append(data)
+            data = data[:-1] + b"\x00"
+        for number, value in enumerate(data):
+            leader.hear(value, starts_at_s + (number + 1) * byte_s)
+
+    monkeypatch.setattr(leader, "hear_all", hear_all)
+    async with bare_network(chain, AXES, line=LED_PAIR) as line:
+        await up(line)
+        before = len(line.sent())
+
+        with pytest.raises(OutcomeUnknown, match="all were commanded to stop"):
+            await line.network.start_group({"a2": THERE, "a3": BACK}, wanted)
+        started = [packet for packet in line.sent(before) if packet.command is CommandCode.START_MOTION]
+        await asyncio.sleep(3)
+
+    assert damaged
+    assert len(started) == 1
+    assert max(abs(drive(chain, address).loop.position) for address in (2, 3)) < 100
 
 
 def is_leader(packet):

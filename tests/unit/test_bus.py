@@ -107,6 +107,23 @@ async def test_a_line_that_is_distrusted_proves_that_it_is_in_step_before_it_bel
     assert rig.bus.statistics.resynchronisations == 1
 
 
+async def test_a_stop_behind_what_must_not_be_repeated_has_its_outcome_on_a_line_that_is_distrusted():
+    rig = Rig()
+
+    async with running(rig) as callers:
+        start = callers.create_task(rig.bus.execute(toy.exchange(1, repeatable=False)), name="start")
+        await asyncio.sleep(0)
+        rig.bus.distrust()
+        stop = callers.create_task(rig.bus.execute(toy.exchange(2), Lane.STOP), name="stop")
+        await asyncio.wait((start, stop), timeout=5.0)
+        outcomes = [each.result() if each.done() else None for each in (start, stop)]
+        rig.bus.drop("the test is over")
+        stop.cancel()
+
+    assert outcomes == [1, 2]
+    assert rig.sent() == [1, 2, 2]
+
+
 async def outcome_of(call: Coroutine[Any, Any, int]) -> int | LdcndError:
     try:
         return await call

@@ -200,6 +200,27 @@ async def test_a_stop_that_comes_while_a_search_is_being_armed_disarms_it():
     ]  # fmt: skip
 
 
+async def test_a_stop_disarms_a_search_that_a_poll_of_just_before_did_not_show_yet():
+    drive = await powered()
+    altered = []
+
+    async def polled() -> None:
+        altered.append((await drive.bus.execute(drive.axis.reading(frozenset()))).altered)
+
+    async def stopped() -> None:
+        await polled()
+        await drive.axis.stop(StopMode.SMOOTH)
+        raise ReplyTimeout("the line was taken for the stop")
+
+    drive.bus.instead[CommandCode.SET_HOMING_MODE] = polled
+    drive.bus.after[CommandCode.SET_HOMING_MODE] = stopped
+    with pytest.raises(ReplyTimeout):
+        await drive.axis.load(JOG, home=HomeCapture(HomeMethod.INDEX))
+
+    assert drive.module.loop.search is None
+    assert altered == ["", ""]
+
+
 async def test_a_motion_that_is_no_search_disarms_the_search_before_it():
     drive = await powered()
     await drive.axis.load(JOG, home=HomeCapture(HomeMethod.INDEX))

@@ -307,6 +307,22 @@ async def test_a_drive_that_joins_late_and_hears_itself_is_asked_for_one_word_on
     assert {data[3:7] for data in sent} == {b"850A"}
 
 
+async def test_a_poller_that_is_removed_while_its_poll_is_on_the_wire_sends_nothing_more():
+    async with smartstep_line([simulated(1)]) as line:
+        ignore = ReadingListeners(lambda *_: None, lambda *_: None, lambda *_: None, lambda _: None)
+        poller = line.axis("u1").own_poller(asyncio.get_running_loop().time(), ignore)
+        line.bus.add_poller(poller)
+        await asyncio.sleep(3.0)
+        while line.bus.is_idle:
+            await asyncio.sleep(0.001)
+
+        line.bus.remove_poller(poller)
+        sent = line.bus.statistics.exchanges
+        await asyncio.sleep(10.0)
+
+    assert line.bus.statistics.exchanges == sent
+
+
 async def test_an_alarm_that_came_and_went_between_two_readings_is_told_within_a_minute():
     drive, heard = simulated(1), Heard()
     drive.drive.alarm_history[0] = 0x0010

@@ -16,6 +16,7 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.traces import TakeTrace, TraceTrigger, TriggerKind
+from ldcnd.drives.smartstep.addresses import TraceRegister
 from ldcnd.drives.smartstep.commands import reference
 from ldcnd.drives.smartstep.modes import EXECUTE_ATTEMPTS
 from ldcnd.drives.smartstep.parameters import PN202, PN203
@@ -25,13 +26,20 @@ from ldcnd.drives.smartstep.profiles import (
     SmartStepProfile,
     StringChecksum,
 )
+from ldcnd.drives.smartstep.trace import put_back
 from ldcnd.drives.smartstep.trace_upload import TraceUpload
 from ldcnd.line.exchange import Lane
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.sim.faults import FaultKind, FaultPlan, LineFault
 from ldcnd.sim.smartstep.unit import SimulatedUnit
 from ldcnd.sim.smartstep.variant import BENCH_TRIGGER_MAP, SimulatedVariant
-from tests.support.smartstep_line import executes_in_a_fresh_mode_only, losing_once, simulated, smartstep_line
+from tests.support.smartstep_line import (
+    LosingUnit,
+    executes_in_a_fresh_mode_only,
+    losing_once,
+    simulated,
+    smartstep_line,
+)
 
 RAMP = [(7 * point) & 0xFFFF for point in range(500)]
 
@@ -337,6 +345,17 @@ async def test_a_smaller_full_scale_resolves_finer_and_is_put_back():
         assert recorded.drive.osvelcc == 450
         assert recorded.values[0][250] == pytest.approx(90.0, abs=0.04)
         assert (await line.axis("u1").words.read(0x8702)) == 4500
+
+
+async def test_a_full_scale_is_put_back_also_behind_one_that_the_line_loses():
+    unit = LosingUnit(1, lambda _, packet: "request" if packet.startswith(b"W118701") else None)
+    async with smartstep_line([unit]) as line:
+        words = line.axis("u1").words
+
+        restored = await put_back(words, {TraceRegister.MAXTRQC: 123, TraceRegister.OSVELCC: 456})
+
+        assert not restored
+        assert await words.read(TraceRegister.OSVELCC) == 456
 
 
 async def test_a_full_scale_that_the_drive_does_not_take_is_said():

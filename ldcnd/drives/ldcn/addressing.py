@@ -245,6 +245,7 @@ class LineRate:
         self.reset_s = reset_s
         self.at_reset = baud_at_reset(clock_hz)
         self.cycle_s = CYCLE_CLOCKS / clock_hz
+        # as the code 0x14, printed for 57600 baud in both manuals, makes 59524
         made = round(actual_baud(baud_divisor(working, codes, clock_hz), clock_hz))
         table = working == FASTEST_BAUD  # of PIC-SERVO SC, which sets exactly this rate
         self.missed_by = (made,) if not table and abs(made - working) > LARGE_DEVIATION * working else ()
@@ -335,6 +336,7 @@ class LineRate:
                 return identity_in(await ask())
             except (StopLatched, CommandAborted):
                 continue  # a stop of this axis took the question off the queue: it says nothing about the module
+            # silence, two replies at once, or noise: in none of them has a module said who it is
             except (ReplyTimeout, OutcomeUnknown, BadReply, PacketRejected):
                 return None
 
@@ -343,6 +345,7 @@ class LineRate:
         received = bytearray()
         exchange = read_identity(address)
 
+        # called with every piece, so that bytes too few for a reply are no silence either
         def length(data: bytes) -> int:
             received[:] = data
             return exchange.reply_bytes
@@ -406,6 +409,7 @@ class Addressing:
         # no reply tells which have obeyed, so each group is reset, whether it has members at present or not
         burst = self.rate.spaced([commands.hard_reset(commands.LeaderlessGroup(address)).request for address in groups])
         reset = unanswered(EVERYBODY, burst, settle_s, repeatable=False, effect=PacketEffect.ARRANGES)
+        # nothing tells whether a packet without a reply was damaged on its way
         for _ in range(2):
             await self._bus.execute(reset)
 
@@ -505,6 +509,7 @@ class Addressing:
         for _ in range(ADDRESSING_ATTEMPTS):
             if await self._set_address(Node(waiting, ANY_DIALECT), address, self._plan.place(address).address):
                 return True
+            # it answers from the new address: a reply that was lost leaves open whether it has moved
             if await self.rate.who_is(address, patient=True):
                 return True
         return False

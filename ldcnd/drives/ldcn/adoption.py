@@ -79,6 +79,7 @@ class Adoption:
         await self.search()
         identities = {address: found.identity for address, found in self.found.items()}
         problems = list(differences(self._expected, identities))
+        # addresses follow the chain from 1 on, so one module more has the next one
         if not problems and (more := await self._rate.who_is(len(self._expected) + 1)):
             problems.append(f"address {len(self._expected) + 1}: {more} is not configured")
         bauds = sorted({found.baud for found in self.found.values()})
@@ -121,6 +122,7 @@ class Adoption:
         for address, (found, _) in watched.items():
             if moves(before[address], after[address]):
                 obstacles.append(f"address {address}, {found.identity}, moves")
+        # the manuals have no watchdog: what moves goes on without its host
         silent = [each for each in self._expected if each.address not in self.found]
         if silent and (self.found or not await self._newcomer()):
             obstacles += [f"address {each.address} ({each.what}) does not answer and may move" for each in silent]
@@ -153,6 +155,7 @@ class Adoption:
             for each in self._expected:
                 if each.address in self.found:
                     continue
+                # at most rates nobody is: each silent address would cost all of the bus's attempts there
                 identity = await self._rate.who_is(each.address, patient=heard or baud == self._rate.working)
                 if identity:
                     heard = True
@@ -176,6 +179,7 @@ class Adoption:
         node = Node(each.address, each.profile)
         try:
             await self._bus.execute(commands.no_operation(node))
+        # the line, not the module
         except BusDown:
             raise
         except BusError:

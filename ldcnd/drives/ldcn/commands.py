@@ -98,9 +98,8 @@ class Node(Destination[StatusPacket]):
         Raises:
             NotSupported: of this module nothing but status byte and identity can be decoded.
         """
-        # "A non-permanent version of the define status command: ... subsequent status packets will include only the
-        # data
-        # bytes previously specified" (PIC-SERVO manual, 5.2, "Read Status")
+        # after Read Status, too, "subsequent status packets will include only the data bytes previously specified"
+        # (PIC-SERVO manual, 5.2)
         asked = self.items if items is None else items
         if self.profile.support is Support.IDENTIFY and asked & ~StatusItem.IDENTITY:
             raise NotSupported(f"{self.profile.title}: only status byte and identity can be decoded, not {asked!r}")

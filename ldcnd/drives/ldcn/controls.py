@@ -106,8 +106,10 @@ def check_stop(control: StopControl, profile: Profile | None) -> None:
         NotSupported: "stop here" on PIC-SERVO version 1, "lock disable" where there is no lock, the bit for the
             advanced features where there are none.
     """
+    # "only one of the bits 1, 2, 3 or 4 should be set at the same time" (both manuals, "Stop Motor")
     if (control & WAYS_TO_STOP).bit_count() > 1:
         raise ValueOutOfRange(f"stop control {int(control):02X}: at most one of bits 1 to 4", value=int(control))
+    # "5-7: Clear all to 0" (LS-182AP manual): later devices define 5 and 7
     if control & ~(ALL_STOP_BITS | StopControl.ADVANCED):
         raise ValueOutOfRange(f"stop control {int(control):02X}: bit 6 must be clear", value=int(control))
     if control & StopControl.ADVANCED and not (profile and profile.advanced_stop):
@@ -127,6 +129,7 @@ def check_homing(control: HomingControl, profile: Profile | None) -> None:
     """
     stops = control & STOPS_ON_HOME
     sources = HomingSource(control & ~STOPS_ON_HOME)
+    # "one (and only one) of bits 2, 4 or 5" (both manuals, "Set Homing Mode")
     if stops.bit_count() > 1:
         raise ValueOutOfRange(f"homing control {int(control):02X}: at most one of bits 2, 4, 5", value=int(control))
     if stops and not sources:

@@ -60,6 +60,7 @@ def price_list(model: str, baud: int, codes: BaudCodes = BaudCodes.MANUAL, clock
     node = Node(ANY_ADDRESS, profile)
     everything = StatusItem.POSITION | StatusItem.ADC | StatusItem.VELOCITY | StatusItem.AUX | StatusItem.HOME
     common = {
+        # identity, and what only some models have: it adds nothing to the reply of the others
         "read status, all items": commands.read_status(node, everything | StatusItem(0xE0)),
         "no operation": commands.no_operation(node),
     }
@@ -138,6 +139,7 @@ LDCN = LdcnFamily()
 
 def open_ldcn_line(settings: LdcnBusConfig, opener: Opener | None = None) -> UnopenedLine:
     """Return a line that is not open yet, which is opened by its port or by `opener`."""
+    # every line begins at the rate of power-up; a serial server keeps its own, which the configuration names
     baud = settings.baud if settings.port.startswith(SOCKET) else baud_at_reset(settings.clock_hz)
     line = ldcn_line(
         bus_settings(settings, baud, cycle=servo_cycle(settings), coalesce_s=settings.coalesce_ms / 1000),

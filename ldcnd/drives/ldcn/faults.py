@@ -17,6 +17,7 @@ from types import MappingProxyType
 from ldcnd.drives.ldcn.packet import AuxFlag, StatusFlag, StatusPacket
 from ldcnd.drives.ldcn.profiles import Profile
 
+# A/D values "less than 8" and "more than 1015" disable it (LS-182AP manual, "Analog positioning sensor control")
 SENSOR_LEAST = 8
 SENSOR_MOST = 1015
 SENSOR_BITS = 10
@@ -198,6 +199,7 @@ def _power_driver_off(status: StatusPacket, known: Knowledge) -> list[LdcnFault]
 def _power_driver_not_known(status: StatusPacket, known: Knowledge) -> list[LdcnFault]:
     """Read a status that means one thing with Pic_ae = 0 and another with 1, with the loop open."""
     flags = status.flags
+    # what was seen while the meaning was known still holds: nothing has cleared it since
     if known.latched:
         return [known.latched]
     if not flags & StatusFlag.POWER_ON:
@@ -225,6 +227,7 @@ def _power_driver_on(profile: Profile, status: StatusPacket, known: Knowledge) -
 
 
 def _power_driver_cause(status: StatusPacket) -> LdcnFault:
+    # bits 6 and 5 of the rows that have Power_on = 0 and Pic_ae = 1 (LS-182AP manual, "Diagnostic bits")
     match bool(status.flags & StatusFlag.LIMIT2), bool(status.flags & StatusFlag.LIMIT1):
         case True, True:
             return LdcnFault(FaultCode.OVERHEAT, latched=True)
@@ -234,6 +237,7 @@ def _power_driver_cause(status: StatusPacket) -> LdcnFault:
             return LdcnFault(FaultCode.OVERCURRENT, latched=True)
         case _ if status.aux is None:
             return _UNREADABLE
+    # the rows of stop input and of encoder or Hall sensors differ in this bit alone
     if status.aux & AuxFlag.INDEX:
         return LdcnFault(FaultCode.STOP_INPUT, latched=True)
     return LdcnFault(FaultCode.ENCODER_OR_HALL, latched=True, loses_position=True)

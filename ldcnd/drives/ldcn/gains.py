@@ -59,4 +59,5 @@ class GainRegisters:
         # a lost reply leaves each register the old or the new value, and the next motion loads them again
         with self._of.book.writing(asdict(gains)):
             await self._of.bus.execute(exchange)
+        # only now: what was not acknowledged must not be loaded later by itself
         self._of.book.wanted_gains = gains

@@ -243,6 +243,7 @@ class Gathering:
         at_reset = self._rate.at_reset
         if any(each.profile.sc_extensions for each in self.places):
             await self._rate.execute_at(at_reset, commands.hard_reset(UNADDRESSED))
+        # before the packet: if its reply is lost, the module may be there
         self._waiting.append(address)
         self._empty.discard(address)
         await self._acknowledged(at_reset, commands.set_address(UNADDRESSED, address, WAITING_GROUP))
@@ -267,6 +268,7 @@ class Gathering:
         One that is deaf, behind one that restarts, keeps its waiting address: it is looked for there later.
         """
         reset = commands.hard_reset(commands.LeaderlessGroup(WAITING_GROUP))
+        # one that has missed Set Baud Rate is still at the rate of power-up
         for baud in dict.fromkeys((self._bus.baud, self._rate.at_reset)):
             await self._rate.execute_at(baud, reset)
         self._empty.update(self._waiting)
@@ -295,6 +297,7 @@ class Gathering:
         return Stock(tuple(silent), present)
 
     async def _answers(self, address: int) -> bool:
+        # one lost reply must not make a silent place of a working drive
         return await self._rate.who_is(address) is not None or await self._rate.who_is(address) is not None
 
     async def _acknowledged(self, baud: int | None, exchange: Exchange[StatusPacket]) -> None:
@@ -403,6 +406,7 @@ class Gathering:
                     return None
             self._waiting.remove(now[name])
             now[name] = await self._park()
+            # a reset makes one neighbour deaf, and its new address gives that one back: anything else has other causes
             if len(deaf) + len(hidden) > 1 or not all([await self._answers(address) for address in deaf]):
                 return None
             if deaf:
@@ -451,11 +455,13 @@ class Gathering:
         for address, identity in stock.waiting.items():
             here, there = address, await self._fresh()
             self._waiting.append(there)
+            # an intact identity is most likely that of one module, but two that answer in step look like one
             for _ in range(SPLITS if identity is None else 1):
                 await self._move_some(here, there)
                 if await self._rate.listen(there):
                     if await self._rate.listen(here):
                         return True
+                    # all of them have moved: once more, from there
                     here, there = there, here
         return False
 

@@ -87,6 +87,7 @@ class Groups:
         )
         try:
             await self._bus.execute(stop, Lane.STOP)
+        # also when it failed: nobody answers a group, and the packet may have arrived
         finally:
             for group in groups:
                 for name in group.members:
@@ -144,7 +145,7 @@ class Groups:
                     commands.start_path(commands.LeaderlessGroup(group.address, profile, self._rate.cycle_s))
                 )
             else:
-                await self._bus.execute(commands.start_path(Node(group.address, profile)))
+                await self._bus.execute(commands.start_path(Node(group.address, profile)), once=True)
             sent = True
             stuck = [name for name in sorted(names) if not (await self._drives[name].path_status()).running]
         except LdcndError as error:
@@ -195,6 +196,7 @@ class Groups:
             status = await self._frozen(name)
             position, home = status.position or 0, status.home or 0
             captured = (before[name].flags ^ status.flags) & StatusFlag.HOME_IN_PROGRESS
+            # a capture has come in between and overwritten it, or it still holds another place than that of the axis
             if captured or (home == before[name].home and position != home):
                 raise ReplyTimeout(f"axis {name}: the drive missed the instant", axis=name)
             positions[name] = home + self._drives[name].state.offset_counts
@@ -222,6 +224,7 @@ class Groups:
 
     def _quiet_s(self, groups: list[Group]) -> float:
         """Return how long the line rests after a burst: a servo cycle, and replies of leaders, which are not read."""
+        # status byte and checksum of each: bring-up has drives add nothing to their replies
         leaders = sum(group.leader is not None for group in groups)
         return (
             commands.group_quiet_s(self._rate.cycle_s) + 2 * leaders * self._bus.settings.bits_per_byte / self._bus.baud
@@ -257,16 +260,19 @@ class Groups:
             )
             return
         leader = self._drives[group.leader]
-        await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)))
+        # a leader that has received it damaged speaks for itself only: the others may have started
+        await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)), once=True)
 
     async def _started(self, name: str, motion: CountsMotion, came_from: int) -> bool:
         """Tell from the drive's status whether it has set out, or has arrived already."""
         status = await self._read(name, READY_ITEMS)
         if not status.flags & StatusFlag.MOVE_DONE:
             return True
+        # in velocity mode it is clear only "when accelerating from one velocity to the next" (manuals, status byte)
         if motion.target_counts is None:
             return bool(status.velocity)
         is_at = self._counts(name, status)
+        # so short that it was over before it was read: then it is nearer to its target than to where it began
         return abs(is_at - motion.target_counts) <= abs(is_at - came_from)
 
     async def _stop_all(self, group: Group) -> None:

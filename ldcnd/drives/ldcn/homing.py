@@ -110,8 +110,12 @@ class Homing:
         elif self._of.spec.limit_stop is not None:
             control, guard = await self._guard(motion, active=self._of.spec.limit_stop)
         if control or self._of.state.homing_armed:
-            self._of.state.homing_armed = True  # before it is, so that a stop in between disarms it
-            await self._of.bus.execute(commands.set_homing(self._of.node, control))
+            state = self._of.state
+            state.homing_armed = state.arming = True  # before it is, so that a stop in between disarms it
+            try:
+                await self._of.bus.execute(commands.set_homing(self._of.node, control))
+            finally:
+                state.arming = False
         if control:
             await self._check_armed()
         self._of.state.homing_armed = bool(control)
@@ -160,6 +164,7 @@ class Homing:
                     remedy="move the other way",
                 )
         ahead += tuple(method for method in onward if method not in ahead and levels[method] is not active)
+        # a smooth stop would close the loop that a raw duty has open
         stop = StopMode.OFF if isinstance(motion, PwmOutput) else StopMode.SMOOTH
         for method in ahead:
             control |= homing_control(self._of.profile, HomeCapture(method, stop))

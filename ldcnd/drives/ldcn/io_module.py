@@ -141,6 +141,7 @@ class IoModule(Poller[IoStatus], IoDriver):
 
     @override
     def deliver(self, reply: IoStatus, timing: Timing) -> None:
+        # no bit of it is defined but that of a checksum error (PIC-I/O data sheet, 3.2)
         self.status = 0
         self.observed(self._reading(reply), timing)
 
@@ -178,8 +179,10 @@ class IoModule(Poller[IoStatus], IoDriver):
         if levels or inputs:
             directions = dict.fromkeys(levels, 1) | dict.fromkeys(inputs, 0)
             asked = {DIRECTIONS[line]: out for line, out in directions.items()}
+            # a set bit makes an input
             turned = None if self._book.holds(asked) else SetDirection(~self._mask_after(asked) & ALL_LINES)
             latch = await self._levels_after(levels, directions)
+            # before the levels: Set Output ignores the bits of inputs (data sheet, 3.1)
             if turned:
                 with self._book.writing(asked):
                     # told twice, as all of them; the second time whatever has come meanwhile, see below

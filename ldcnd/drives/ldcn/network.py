@@ -146,6 +146,7 @@ class LdcnNetwork(Network):
             for each in self._expected
         }
         for group in plan.addresses:
+            # after a reset every module is in the group of everybody, so a packet to it needs the proofs of all
             members = (address for address in self._proofs if group in (EVERYBODY, plan.place(address).address))
             bus.proofs.expect_group(group, members)
         self._rate = LineRate(
@@ -175,6 +176,7 @@ class LdcnNetwork(Network):
             return await self._bring_up()
 
     async def _bring_up(self) -> BringUpReport:
+        # until they are found again there is nobody to ask whether the line is in step
         self._identities.clear()
         self._watches.clear()
         self._rate.working = self._baud
@@ -191,9 +193,11 @@ class LdcnNetwork(Network):
                 report = self._up(adopted.identities, self._take_over(adopted), reset=False)
                 return replace(report, open_loops=found_open, restarted=restarted)
         for drive in self._drives.values():
+            # before the first reset leaves: from then on nothing that was sent is sure to hold
             drive.forget()
         for module in self._io.values():
             module.forget()
+        # before it begins: it can be cut short behind any of its packets
         self._half_reset = True
         modules, found = await self._start_afresh()
         self._half_reset = False
@@ -217,6 +221,7 @@ class LdcnNetwork(Network):
             return await self._adoption.attempt()
         except NetworkMismatch as error:
             refused = error
+        # gathering sets addresses and rates: only on a line that was ours, or that may even be reset
         reads_only = not self._was_up and self._line.adopt_fallback is AdoptFallback.REFUSE
         if reads_only or not self._gathering.possible:
             raise refused
@@ -342,6 +347,7 @@ class LdcnNetwork(Network):
                 await self._addressing.with_leaders()
                 return modules, ()
         modules = await self._address_afresh()
+        # the rate at which all of them have just answered
         self._rate.working = self._rate.at_reset
         await self._addressing.with_leaders()
         told = f"address {deaf} does not answer at {self._baud} baud; the line stays at {self._rate.at_reset}"
@@ -393,6 +399,7 @@ class LdcnNetwork(Network):
             return None
         await self._rate.everybody_to(self._rate.working)
         for address, identity in modules.items():
+            # "verify that all modules are operating properly at the new Baud rate" (PIC-SERVO manual, 4.1)
             if await self._rate.who_is(address, patient=True) != identity:
                 return address
         return None
@@ -521,6 +528,7 @@ class LdcnNetwork(Network):
             if identity is None:
                 continue
             if different := each.differs(identity):
+                # it answers, so this is no loss of power: a wrong module is at the address
                 proof.lose(different, silent=False)
                 continue
             if not await self._answers_plainly(each):

@@ -248,8 +248,8 @@ class StatusFlag(IntFlag):
     OVERCURRENT = 0x04  # reserved on LS-182AP
     # "set if motor power is greater than 12v" (ibid.)
     POWER_ON = 0x08
+    # "also set whenever the position servo is disabled. Must be cleared by user" (ibid.)
     POSITION_ERROR = 0x10
-    # "also set whenever the position servo is disabled. Must be cleared by user" is said of the bit above (ibid.)
     LIMIT1 = 0x20  # LS-182AP: reverse limit, or diagnostic bit
     LIMIT2 = 0x40  # LS-182AP: forward limit, or diagnostic bit
     # "reset to zero once the home position has been captured" (ibid.)
@@ -425,4 +425,5 @@ def _layout(
         present = bool(mask & bit)
         order.append(len(layout) if present else 0)
         layout += code if present else ""
+    # x: the checksum, judged before
     return Struct(f"{layout}x"), itemgetter(*order)

@@ -161,6 +161,7 @@ def decode_io_command(packet: Packet) -> IoCommand | None:
         case CommandCode.STOP_MOTOR:
             return SetSynchOutput(lines, data[2], data[3])
         case CommandCode.IO_CONTROL:
+            # bit 0 enables, bit 1 counts edges, bits 5 and 4 prescale (data sheet, 3.1)
             return SetTimerMode(bool(data[0] & 0x01), bool(data[0] & 0x02), PRESCALES[data[0] >> 4 & 0x03])
         case _:
             return SynchInput()
@@ -300,6 +301,7 @@ def send_io_command(to: IoNode, command: IoCommand) -> Exchange[IoStatus]:
     Raises:
         ValueOutOfRange: see `encode_io_command`.
     """
+    # a second one would start servos of the group once more, or capture a later instant
     repeatable = not isinstance(command, SynchOutput | SynchInput)
     exchange = to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable)
     # what its lines read is not what it was told: an output shows the level of its pin, and a direction nothing

@@ -120,9 +120,12 @@ class Profile:
     top_baud: int = 125_000
     baud_keys: bool = False
     any_divisor: bool = True
+    # "encoder transition rate: 500 KHz (max.)" (PIC-SERVO manual, 3.2)
     encoder_counts_per_s: int = 500_000
     most_velocity: int = 0x7FFF_FFFF
+    # "position error limit EL (0 - 0x3FFF)" (both manuals, "Set Gain")
     most_error_limit: int = 0x3FFF
+    # "a positive number when moving in reverse direction" (LS-182AP manual, "Define Status")
     velocity_sign: int = -1
     limit1_is_forward: bool = False
     live_aux: bool = False
@@ -166,6 +169,7 @@ PIC_SERVO_V3 = replace(
     name="pic-servo-v3",
     title="PIC-SERVO version 3",
     versions=range(3, 4),
+    # "0xE6 (for version 4 and higher - use 0xD6 for versions 1, 2 & 3)" (PIC-SERVO manual, 5.2)
     gain_bytes=13,
     limit_outputs=False,  # the manual describes version 4; not verified for older ones, nor for the next
 )
@@ -174,6 +178,7 @@ PIC_SERVO_V2 = replace(
     name="pic-servo-v2",
     title="PIC-SERVO version 2",
     versions=range(2, 3),
+    # bits 2, 4 and 5 of Set Homing Mode: "don't care (versions 1 & 2)" (ibid.)
     stops_on_home=False,
 )
 PIC_SERVO_V1 = replace(
@@ -181,6 +186,7 @@ PIC_SERVO_V1 = replace(
     name="pic-servo-v1",
     title="PIC-SERVO version 1",
     versions=range(1, 2),
+    # "stop here (not available on version 1)" (ibid., "Stop Motor")
     stop_here=False,
 )
 PIC_SERVO_SC = Profile(
@@ -197,8 +203,10 @@ PIC_SERVO_SC = Profile(
     baud_keys=True,
     any_divisor=False,
     encoder_counts_per_s=2_500_000,
+    # 2.5 MHz in a cycle of 0.512 ms (SC data sheet, 5.2)
     most_velocity=1280 << 16,
     most_error_limit=0x7FFF,
+    # the manual of the vendor's SC board tests the polarity so; the data sheet does not say
     velocity_sign=1,
     limit1_is_forward=True,
     live_aux=True,
@@ -231,6 +239,7 @@ LS_173AP = Profile(
     analog_target=True,
     offset_on_the_fly=True,
     current_limit=False,
+    # "encoder transition rate up to 2MHz" (LS-182AP manual, "Features")
     encoder_counts_per_s=2_000_000,
 )
 LS_182AP = replace(
@@ -240,6 +249,7 @@ LS_182AP = replace(
     versions=range(20, 256),
     adc_bytes=2,
     adc_bits=10,
+    # "(n = n + 2 bytes)" (LS-182AP manual); its printed examples with 14 data bytes have the form of the LS-173AP
     pwm_bytes=2,
     homing_sources=HomingSource.LIMIT1 | HomingSource.LIMIT2 | HomingSource.INDEX | HomingSource.POSITION_ERROR,
     motion_lock_from=22,

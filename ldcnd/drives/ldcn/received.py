@@ -297,6 +297,7 @@ def _decode(profile: Profile, packet: Packet) -> tuple[ReceivedCommand, int]:
         case CommandCode.LOAD_TRAJECTORY:
             return LoadTrajectory(decode_trajectory(profile, data)), trajectory_bytes(profile, TrajectoryControl(first))
         case CommandCode.SET_GAIN:
+            # whether a load without it sets the multiplier back to 1 is not in the data sheet: both are simulated
             short = profile.sc_extensions and len(data) < profile.gain_bytes
             return SetGain(decode_gains(profile, data), short), _gain_bytes(profile, len(data))
         case CommandCode.STOP_MOTOR:
@@ -341,6 +342,7 @@ def _decode_by_dialect(profile: Profile, packet: Packet, first: int) -> tuple[Re
             return IoControl(first), 1
         case CommandCode.ADD_PATH_POINTS if profile.path_points:
             points = tuple(int.from_bytes(data[at : at + 2], "little") for at in range(0, len(data) - 1, 2))
+            # what becomes of half a point is not in the data sheet
             return AddPathPoints(points, data[-1] if len(data) % 2 else None), 2 * len(points)
         case CommandCode.HARD_RESET if data and profile.sc_extensions:
             return HardReset(first), 1

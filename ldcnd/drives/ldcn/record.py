@@ -54,6 +54,7 @@ class DriveState:
     Attributes:
         known: what decides on the meaning of its status.
         homing_armed: a capture was armed and has not been seen to come.
+        arming: packets that arm a capture are on their way: what a reading shows of it may be of before.
         loop_may_open: the loop is open on purpose (PWM mode), or will be once home is captured: then the position
             error flag, which every open loop shows, is no fault.
         motion_locked: the drive refuses motion since it homed on a limit switch.
@@ -78,7 +79,7 @@ class DriveState:
     def restarted(self) -> None:
         """The drive was reset or lost power: nothing that was sent before holds any more."""
         self.known = AFTER_RESET
-        self.homing_armed = False
+        self.homing_armed = self.arming = False
         self.loop_may_open = False
         self.motion_locked = False
         self.guard = ""
@@ -142,11 +143,13 @@ class DriveState:
         faults = self.faults(status)
         homing, locked, enabled, done, reverse, forward, index, stop_input, pic_ae = self._shown.levels
         counter = status.position
+        # it counts from 0 again: nearer to that than to where it was, the command was executed
         if self.setting_back and abs(counter) < abs(self.setting_back) / 2:
             self.offset_counts += self.setting_back
             self.setting_back = 0
         self.counts = counts = counter + self.offset_counts
-        if not homing:
+        # "lowered" once "the home position has been found" (manuals, "Set Homing Mode"), and before it is armed
+        if not (homing or self.arming):
             self.homing_armed = False
             self.guard_hit = bool(self.guard)
         self.motion_locked = locked
@@ -186,8 +189,10 @@ class DriveState:
         """Return what the flags mean now that the faults are known."""
         profile, known = self._profile, self.known
         logosol, powered, closed = profile.pic_ae_diagnostics, flags & _POWER_ON, aux & _SERVO_ON
+        # otherwise bits 5 and 6 are part of a code of its cause (LS-182AP manual, "Diagnostic bits")
         shows_limits = not logosol or (bool(known.pic_ae) and bool(powered))
         stop_input = None
+        # bit 5 shows it only then (ibid., row "STOP input activated"), and a loop that is closed excludes it
         if logosol and (closed or (known.pic_ae is False and powered)):
             stop_input = not (closed or flags & _LIMIT1)
         reverse, forward = (_LIMIT2, _LIMIT1) if profile.limit1_is_forward else (_LIMIT1, _LIMIT2)
@@ -198,6 +203,7 @@ class DriveState:
             bool(flags & _MOVE_DONE),
             bool(flags & reverse) if shows_limits else None,
             bool(flags & forward) if shows_limits else None,
+            # the bit tells a stop input from a lost encoder then
             None if logosol and not powered else bool(aux & _INDEX) is profile.live_aux,
             stop_input,
             known.pic_ae,
@@ -212,6 +218,7 @@ class DriveState:
             if not (open_on_purpose and fault.code is FaultCode.POSITION_ERROR)
         )
         cause = next((fault for fault in found if fault.latched and fault.stops), None)
+        # without this byte the loop counts as open, and every open loop shows the position error flag
         if status.aux is not None:
             self.known = replace(self.known, latched=cause, seen=True)
         return tuple(
@@ -226,5 +233,6 @@ class DriveState:
             # PIC-SERVO closes its loop whatever the amplifier (manual, 5.2), a Logosol drive does not
             pic_ae = True if logosol else self.known.pic_ae
             self.known = replace(self.known, pic_ae=pic_ae, nothing_latched=False, latched=None, closed=True)
+        # "if there is no more fault condition Power_on will be set to 1" (LS-182AP manual, "Diagnostic bits")
         elif logosol and self.known.pic_ae is False and status.flags & StatusFlag.POWER_ON:
             self.known = replace(self.known, nothing_latched=True)

@@ -101,7 +101,9 @@ _KI = RegisterField("KI", 2, 0, 0x7FFF)
 _IL = RegisterField("IL", 2, 0, 0x7FFF)
 _OL = RegisterField("OL", 1, 0, 0xFF)
 _CL = RegisterField("CL", 1, 0, 0xFF)
+# "reserved. Must be set to 0" (LS-182AP manual, "Set Gain", byte 10)
 _RESERVED_CL = RegisterField("CL (reserved on this drive)", 1, 0, 0)
+# "servo rate divisor SR (1 - 0xFF)": 0 is in neither manual
 _SR = RegisterField("SR", 1, 1, MOST_DIVISOR)
 _DEADBAND = RegisterField("deadband compensation", 1, 0, 0xFF)
 _STEP_MULTIPLIER = RegisterField("step multiplier", 1, 1, 0xFF)
@@ -136,8 +138,7 @@ def decode_gains(profile: Profile, data: bytes) -> Gains:
     values = []
     at = 0
     for field in gain_fields(profile):
-        # "if only 13 data bytes are sent, version 4 will use a default value of zero for the deadband" (ibid., "Set
-        # Gain")
+        # "if ... only 13 data bytes are sent, version 4 will use a default value of zero" for the deadband (ibid.)
         present = field is not _STEP_MULTIPLIER or at < len(data)
         values.append(field.decode(data[at:]) if present else 1)
         at += field.width
@@ -152,11 +153,9 @@ def gain_fields(profile: Profile) -> tuple[RegisterField, ...]:
         _KI,
         _IL,
         _OL,
-        # odd and even values limit by opposite signs of the sense voltage, "setting CL to 0 effectively disables" it
-        # (ibid.)
+        # odd and even values limit by opposite signs of the sense voltage, 0 "effectively disables" it (ibid.)
         _CL if profile.current_limit else _RESERVED_CL,
-        # 0 opens the loop at the first count of error: the manual's least for motion is EL <> 0 (LS-182AP manual,
-        # step 3)
+        # 0 opens the loop at the first count: "minimal requirements are" EL <> 0 (LS-182AP manual, "Initializing")
         RegisterField("EL", 2, 0, profile.most_error_limit),
         _SR,
     )
@@ -349,8 +348,7 @@ class ServoRegisters(RegisterBook):
 
     def taken_over(self) -> None:
         """Another host has left the drive as it is: its gains may be those of the configuration."""
-        # Set Gain, Load Trajectory and I/O Control have no counterpart that reads: what the other host wrote is not
-        # seen
+        # no command reads what Set Gain, Load Trajectory and I/O Control of another host have written
         self.forget(TAKEN_OVER)
         if self.wanted_gains:
             self.assume(asdict(self.wanted_gains), f"{TAKEN_OVER}; this is what the configuration says")

@@ -163,6 +163,7 @@ class LdcnAxis(Moves):
         else:
             self.state.taken_over(status)
             self._book.taken_over()
+        # a closed loop proves that another host has done what the manual wants after a reset
         self._initialised = status.aux is not None and bool(status.aux & AuxFlag.SERVO_ON)
 
     @property
@@ -200,6 +201,7 @@ class LdcnAxis(Moves):
 
     def reading(self, items: frozenset[TelemetryItem]) -> Exchange[AxisReading]:
         """See `Readable`. The loss of the analog sensor shows only in its value."""
+        # not known counts as yes: only a value shows that the sensor is lost
         senses = self.profile.analog_target and self.state.known.absolute is not False
         prepared = self._readings.get((items, senses))
         if prepared is None:
@@ -233,8 +235,7 @@ class LdcnAxis(Moves):
     def exchanges(self, motion: CountsMotion) -> tuple[Exchange[Any], ...]:
         first: tuple[Exchange[Any], ...] = ()
         offset = self.state.offset_counts
-        # "the goal position should not differ from the current position by more than 0x7FFFFFFF" (PIC-SERVO manual,
-        # 5.2)
+        # the goal "should not differ from the current position by more" than 0x7FFFFFFF (PIC-SERVO manual, 5.2)
         if motion.target_counts is not None and abs(motion.target_counts - offset) > LARGEST_COUNT:
             first, offset = (commands.reset_position(self._node),), self.state.counts
         if self.state.known.closed and self._book.wanted_gains and not self._book.loaded:
@@ -252,9 +253,7 @@ class LdcnAxis(Moves):
             await self.stop(StopMode.OFF)
             return
         # it may have been reset unseen, and then "all gain parameters and limit values are set to zero"
-        if self._book.wanted_gains and not (
-            self.state.known.closed and self._book.loaded
-        ):  # it may have been reset unseen
+        if self._book.wanted_gains and not (self.state.known.closed and self._book.loaded):
             await self.set_gains(self._book.wanted_gains)
         if self.profile.pic_ae_diagnostics and self.state.known.pic_ae is not False:
             await self._check_without_power_driver()
@@ -312,6 +311,7 @@ class LdcnAxis(Moves):
         """Send Stop Motor, and take note of what became of power driver and loop."""
         try:
             await self._bus.execute(exchange, lane)
+        # cancelled or lost: it may have been executed, so nothing is believed of loop and power driver
         except BaseException:
             self.state.switched_unconfirmed(pic_ae=pic_ae)
             raise
@@ -349,11 +349,11 @@ class LdcnAxis(Moves):
         # a stop that holds would close the loop of a motor that was switched off
         if self.switched_off:
             mode = StopMode.OFF
-        # "the current command velocity and the goal velocity will be set to zero": in some firmware that is the
-        # register
+        # "the goal velocity will be set to 0" (manuals, "Stop Motor"): in some firmware that is the register
         self._book.forget("some firmware clears it with a stop", ("velocity",))
         off = mode is StopMode.OFF
         shows_nothing = self.state.loop_may_open and not self.switched_off
+        # counted before it is sent: a stop that holds, queued meanwhile, would close the loop behind it
         self._switching_off += off
         try:
             await self._stop_motor(STOP_CONTROLS[mode])
@@ -457,6 +457,7 @@ class LdcnAxis(Moves):
         with contextlib.suppress(OutcomeUnknown):
             await self._bus.execute(commands.reset_position(self._node))
         self.state.reading(await self._of.read(STATE_ITEMS))
+        # `reading` has not seen it begin anew
         if self.state.setting_back:
             self.state.setting_back = 0
             raise OutcomeUnknown(
@@ -487,8 +488,6 @@ class LdcnAxis(Moves):
         The manuals let a smooth stop use "the current acceleration rate" and do not say whether loading makes a rate
         current or only a start does; after a reset the difference is a motor that is never slowed down.
         """
-        # "causing the motor to decelerate to a stop at the current acceleration rate" (PIC-SERVO manual, 5.2, "Stop
-        # Motor")
         standing = Trajectory(velocity=0, acceleration=trajectory.acceleration, mode=ProfileMode.VELOCITY)
         await self._load(standing)
         await self._bus.execute(commands.start_motion(self._node))

@@ -116,6 +116,7 @@ def encode_trajectory(profile: Profile, trajectory: Trajectory) -> bytes:
     trapezoidal = trajectory.servo and trajectory.mode is ProfileMode.TRAPEZOIDAL
     if trajectory.relative and not (trapezoidal and profile.sc_extensions):
         raise NotSupported(f"{profile.title} has no relative moves, or this is no trapezoidal one")
+    # bit 6 "is ignored in trapezoidal profile mode" (LS-182AP manual)
     if trapezoidal and trajectory.reverse:
         raise NotSupported("a trapezoidal move takes its direction from the position, not from the reverse bit")
     if trajectory.servo and trajectory.pwm_or_target and not profile.analog_target:
@@ -233,6 +234,7 @@ def trajectory_of(motion: CountsMotion | AnalogMotion | PwmOutput, servo_divisor
         case PwmOutput():
             return Trajectory(
                 acceleration=acceleration,
+                # with an acceleration, although PWM mode has none: the smooth stop that ends it decelerates by it
                 pwm_or_target=round(abs(motion.duty) * MOST_PWM),
                 servo=False,
                 reverse=motion.duty < 0,
@@ -243,6 +245,7 @@ def trajectory_of(motion: CountsMotion | AnalogMotion | PwmOutput, servo_divisor
                 velocity=programmed_velocity(motion.velocity_counts_per_s, servo_divisor, profile),
                 acceleration=acceleration,
                 pwm_or_target=motion.target_counts,
+                # "The direction bit is calculated internally" (LS-182AP manual, "Absolute positioning mode")
                 mode=ProfileMode.VELOCITY,
             )
         case CountsMotion():
@@ -261,6 +264,7 @@ def _check_analog_target(target: int, profile: Profile) -> None:
     if not profile.analog_target:
         raise NotSupported(f"{profile.title} cannot move to an analog target")
     shift = SENSOR_BITS - profile.adc_bits
+    # rounded inwards on a converter that is coarser
     low, high = -(-SENSOR_LEAST >> shift), SENSOR_MOST >> shift
     if not low <= target <= high:
         nearest = low if target < low else high
@@ -339,6 +343,7 @@ def _profile_tick_s(servo_divisor: int, profile: Profile) -> float:
 
 def _programmed(what: str, unit: str, value: float, ceiling: float, factor: float, most_register: int) -> int:
     most = most_register / factor
+    # this comparison is false for what is not a number, too
     if not 0 <= value <= most:
         nearest = most if value > most else 0.0
         raise ValueOutOfRange(
@@ -347,6 +352,7 @@ def _programmed(what: str, unit: str, value: float, ceiling: float, factor: floa
             limit=nearest,
             nearest=nearest,
         )
+    # `round` would take the even one of two that are equally near
     register = math.floor(value * factor + 0.5)
     if register > ceiling * factor * (1 + ROUNDING):
         register -= 1
@@ -415,6 +421,7 @@ def encode_point(point: PathPoint, *, fast_path: bool) -> int:
             limit=most,
             nearest=most if point.counts > 0 else -most,
         )
+    # sign and magnitude, not two's complement: bit 0 is the sign
     word = abs(point.counts) * _SPEED_FRACTION // point.cycles
     if point.cycles == periods[0]:
         word |= LONG_PERIOD

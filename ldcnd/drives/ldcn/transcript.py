@@ -56,6 +56,7 @@ class LdcnTranscript:
         return ""
 
     def _request(self, data: bytes) -> str:
+        # any dialect will do: all have the address in the same place
         address = interpret_bytes(LS_182AP, data).address
         profile = self._learned.get(address) or self._profiles.get(address, LS_182AP)
         meaning = interpret_bytes(profile, data, bytes(self._buffered))
@@ -70,6 +71,7 @@ class LdcnTranscript:
             case ReadStatus():
                 items = command.items
             case HardReset():
+                # of all of them: the record does not show whom it has reached
                 self._defined.clear()
                 self._learned.clear()
         self._asked = (address, profile, items)

@@ -260,6 +260,7 @@ def _exchange(
 def _effect(command: CommandPacket) -> PacketEffect:
     if command.function is Function.REFERENCE:
         return PacketEffect.READS
+    # "set the operating mode to Normal Mode" ends what is under way (manual 4, setting 1)
     if (command.address, command.data) == (Register.OPERATING_MODE, OperatingMode.NORMAL):
         return PacketEffect.RELIEVES  # it leaves a mode and does nothing else
     return PacketEffect.CHANGES
@@ -360,9 +361,11 @@ def string_reference(
     )
     checksum = profile.unit.trace.string_checksum
     allowed = _VARIANTS if checksum is StringChecksum.AUTO else (checksum,)
+    # as if the count were one of words, whatever the profile says: a wrong unit is to be named, not to time out
     longest = PACKET_CHARACTERS + 4 * command.data + TRAILER_CHARACTERS
     expected = PACKET_CHARACTERS + 2 * byte_count
     if StringChecksum.TRAILER in allowed:
+        # for the time that it takes only: where it ends, its CR tells
         expected += TRAILER_CHARACTERS
     return Exchange(
         unit,

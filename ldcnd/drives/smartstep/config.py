@@ -50,6 +50,7 @@ class SmartStepLineConfig(Frozen):
     def _wires(self) -> Self:
         if self.wiring is Wiring.TWO_WIRE and not self.accept_two_wire:
             raise ValueError("wiring 2-wire is not described in the manual; set accept_two_wire = true to use it")
+        # each reply would be compared with what was sent, and be a collision
         if self.echo == "expect" and self.wiring is Wiring.FOUR_WIRE:
             raise ValueError("there is no echo on four wires")
         return self

@@ -75,11 +75,13 @@ class ParameterAudit:
     def read(self, place: int, value: int) -> bool:
         """Take the value in use of `PARAMETERS[place]`; return whether it has to be read again at once."""
         label = PARAMETERS[place].label
+        # it was switched off and on meanwhile: what this host has stored is in use now
         if value == self._stored.get(label):
             self._held[label] = value
         if value == self._held.setdefault(label, value):
             self._found.pop(label, None)
         elif self._found.get(label) != value:
+            # a late reply to another read passes for this one's only once
             if self._odd != (label, value):
                 self._odd = (label, value)
                 return True
@@ -221,8 +223,10 @@ class SmartStepAxis(PollsItself):
         speed_rpm = signed_word(words[SPEED_FEEDBACK.address])
         return AxisReading(
             position_counts=latest.position.signed,
+            # its deviation counter counts command units (manual 3, 8008H), which the electronic gear makes counts of
             following_error_counts=None,
             velocity_counts_per_s=speed_rpm * counts_per_s_per_rpm,
+            # whole r/min are shown: less than half of one reads 0
             velocity_resolution_counts_per_s=counts_per_s_per_rpm / 2,
             adc_counts=None,
             enabled=run_is_on(self.profile, input_levels(words[INPUT_SIGNALS.address])) and not stops,

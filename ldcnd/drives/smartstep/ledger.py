@@ -114,6 +114,7 @@ class EepromLedger:
 
     async def _replace(self, axis: str, counts: dict[str, int]) -> None:
         before = self._counts.get(axis, {})
+        # before it is on disk, so that a write of another axis meanwhile does not lose it
         self._counts[axis] = counts
         text = json.dumps(self._counts, indent=1, sort_keys=True)
         loop = asyncio.get_running_loop()
@@ -140,6 +141,7 @@ def _parse(text: str) -> dict[str, dict[str, int]]:
 def _counts(document: Mapping[str, object]) -> dict[str, int]:
     counts = {}
     for parameter, writes in document.items():
+        # `isinstance` would take true for 1
         if type(writes) is not int or writes < 0:
             raise ValueError(f"{parameter}: {writes!r} is not a number of writes")
         counts[parameter] = writes

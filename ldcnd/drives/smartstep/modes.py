@@ -99,6 +99,7 @@ async def enter(words: Words, mode: OperatingMode) -> None:
         try:
             await words.ask(set_operating_mode(words.unit, mode))
         except OutcomeUnknown:
+            # the reply was lost, not the setting
             if await words.mode() == mode:
                 return
         else:
@@ -150,6 +151,7 @@ async def leave(words: Words) -> None:
             while True:
                 try:
                     await enter(words, OperatingMode.NORMAL)
+                # a line that loses packets is no reason to leave it armed, `LEAVE_S` is
                 except (ReplyTimeout, OutcomeUnknown):
                     continue
                 except LdcndError as error:
@@ -191,6 +193,7 @@ async def clear_counter(words: Words, counter: Counter) -> ClearedCounter:
         await enter(words, counter.clear_mode)
         await execute_mode(words, counter.clear_mode)
         await _wait_until_done(words)
+    # on cancellation, too: nothing else ends a mode that was entered and not executed
     except BaseException:
         await leave(words)
         raise
@@ -232,6 +235,7 @@ async def _require_rest(words: Words, counter: Counter) -> None:
 async def _wait_until_done(words: Words) -> None:
     loop = asyncio.get_running_loop()
     give_up_at_s = loop.time() + CLEAR_S
+    # "when the clear process is completed the mode returns to Normal Mode" (manual 5 (2), 6 (2))
     while await words.mode() != OperatingMode.NORMAL:
         if loop.time() > give_up_at_s:
             raise OutcomeUnknown(

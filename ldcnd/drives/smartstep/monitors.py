@@ -373,6 +373,7 @@ def _high_of(seen: Iterable[int], low: int) -> int | None:
         highs.reverse()  # the counter went through zero
     elif len(highs) > 2 or highs[1] - highs[0] != 1:  # noqa: PLR2004 - two adjacent halves
         return None
+    # a low half near 0 goes with the higher one of them, one near FFFFH with the lower one
     return highs[1] if low < _HALF else highs[0]
 
 

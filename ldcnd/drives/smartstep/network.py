@@ -146,6 +146,7 @@ def smartstep_line(
         candidates = [number for number in answering if number not in avoid] or answering
         return commands.probe(candidates[0]) if candidates else None
 
+    # its time-out has waited for a reply to begin; one that has begun goes on within the gap between characters
     bus = Bus(settings, opener, Resync(flush=commands.FLUSH, quiet_s=SMARTSTEP.gap_s, settle_s=0.005, probe=probe))
     return bus, SmartStepNetwork(bus, specs, answering)
 
@@ -189,9 +190,11 @@ class SmartStepNetwork(Network):
                 continue
             self._answering.append(number)
             try:
+                # first: what follows reads words that may be zero
                 await self._check_wires(unit)
                 unit.wires_checked = True
                 remarks += await self._meet(unit)
+            # one unit must not keep the others of its line from being served
             except (ReplyTimeout, DriveFault) as error:
                 remarks.append(f"unit {number} (axis {unit.spec.name}): {error.message}")
         name = self._bus.settings.name
@@ -242,6 +245,7 @@ class SmartStepNetwork(Network):
         stored = unit_number(await words.read(PN000.eeprom_address))
         if stored != unit.spec.address:
             remarks.append(f"{who}: Pn000.2 makes it unit {stored} at its next power-on")
+        # which level means so is not in the manual (3, 8106H), so it is a remark and forbids nothing
         if FunctionSwitch.PARAMETERS_RULE not in function_switches(await words.read(Register.FUNCTION_SWITCHES)):
             remarks.append(f"{who}: its switches seem to overrule parameters (switch 6 is off)")
         return remarks
@@ -252,6 +256,7 @@ async def hears_itself(bus: Bus, unit: SmartStepAxis) -> bool:
 
     A non-zero word makes it answer itself with a data error, which stops by itself: Pn100 is never zero.
     """
+    # or the question that finds out would be refused
     unit.words.self_hearing = False
     await unit.words.read(PN100.ram_address)
     loop = asyncio.get_running_loop()

@@ -167,6 +167,7 @@ def _fields(packet: bytes) -> tuple[int, int, int, int] | None:
 DAMAGED = 0x7F
 """Stands for a character with wrong parity: it keeps its place and can belong to no packet."""
 
+# even parity: seven bits and this one, sent as eight, are on the wire what 7E1 makes of them
 _ENCODED = bytes((code & 0x7F) | ((code & 0x7F).bit_count() & 1) << 7 for code in range(256))
 _DECODED = bytes(code & 0x7F if code.bit_count() % 2 == 0 else DAMAGED for code in range(256))
 
@@ -197,6 +198,7 @@ def piece_bytes(data: bytes, longest: int) -> int | None:
         return len(data) if start < 0 else start
     end = data.find(END) + 1
     restart = data.find(START, 1)
+    # its CR was lost: what begins here is a packet of its own
     if restart > 0 and (end == 0 or restart < end):
         end = restart
     if end == 0:

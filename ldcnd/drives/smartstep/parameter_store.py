@@ -208,6 +208,7 @@ class UnitParameters(ParameterAccess):
                 return Written(before, written=False, remarks=_pending(parameter, before))
             await self._write_eeprom(parameter, before.stored, request.value)
         after = await self._read(parameter)
+        # an acknowledgement repeats what was sent, not what is held (manual 2.2, example 2)
         held = after.active if request.memory is Memory.RAM else after.stored
         if held != request.value:
             raise DriveFault(
@@ -251,6 +252,7 @@ class UnitParameters(ParameterAccess):
             held = await self._words.read_back(parameter.eeprom_address)
             if held == old:
                 await ledger.withdraw(self._axis, parameter.label)
+            # a third value was written, too: the comparison afterwards says that it is not the one that was meant
             return held != old
         return True
 
@@ -292,6 +294,7 @@ class UnitParameters(ParameterAccess):
         if parameter.number != PN000.number:
             return
         unit = unit_number(request.value)
+        # the other digits of Pn000 may be set without that
         if unit == unit_number(before.stored if request.memory is Memory.EEPROM else before.active):
             return
         if request.memory is Memory.RAM:
@@ -316,6 +319,7 @@ class UnitParameters(ParameterAccess):
         Raises:
             WrongState: the number is taken, configured or not; or it is 0 and the drive is not alone on its line.
         """
+        # "single-axle mode and transmission is always enabled" (manual 2.2 (6))
         if unit == 0 and self._others:
             reason = "a drive with unit number 0 never releases its transmitter, so it must be alone on its line"
         elif unit in self._others:

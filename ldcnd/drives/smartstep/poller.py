@@ -183,6 +183,7 @@ class UnitPoller(Poller[int | Refusal]):
         """
         queued_at_s, self.due_at_s = self.due_at_s, now_s + self._profile.unit.first_character_s + PUT_OFF_S
         if self._misses >= MISSES_BEFORE_BACKOFF or self._one_word_only:
+            # every drive has it, and it is never zero: 0099H without an alarm (manual 3)
             self._address = Register.PRESENT_ALARM
         else:
             if self._item is None:
@@ -200,6 +201,7 @@ class UnitPoller(Poller[int | Refusal]):
             self._back(timing.received_at_s)
             return
         self._misses = 0
+        # until `_heard`, which comes much sooner than this turn
         if self._one_word_only:
             self._next_turn(timing.received_at_s + LONGEST_BACKOFF_S)
             return
@@ -208,6 +210,7 @@ class UnitPoller(Poller[int | Refusal]):
         elif self._counter and isinstance(reply, int):
             self._take_half(self._counter, reply, timing)
         elif self._item and isinstance(reply, int):
+            # the history has a new entry, or one more is on its way
             if self._address == Register.PRESENT_ALARM and reply != self._words.get(self._address):
                 self._read_history(timing.received_at_s)
             self._words[self._address] = reply
@@ -233,8 +236,8 @@ class UnitPoller(Poller[int | Refusal]):
     def _next_turn(self, at_s: float) -> None:
         """Request the next turn; the line may take it before this returns."""
         self.due_at_s = at_s
-        if self._bus.is_open:
-            self._bus.add_poller(self)
+        # not added: it may have been replaced while its poll was on the wire, or its line lost while it waited
+        self._bus.move_poller(self)
 
     # -- items -------------------------------------------------------------------------------------------------------
 
@@ -281,6 +284,7 @@ class UnitPoller(Poller[int | Refusal]):
             del self._audited[0]  # this model lacks it
             return
         log.warning("item not there", unit=self.node, item=item.value, reason=str(refusal))
+        # without it there is neither state nor fault
         if item is not Basic.STATE:
             self._due_s[item] = NEVER_S
 
@@ -380,6 +384,7 @@ class UnitPoller(Poller[int | Refusal]):
             self._listeners.monitored(counter_value(item, value.signed, resolved=resolved), low_timing)
         else:
             self._position = value
+            # of the latest speed, which was read before: a later one that is not 0 revokes it, see `_tell`
             self._at_rest_since_position = self._words.get(SPEED_FEEDBACK.address) == 0
             self._tell(Basic.POSITION, low_timing)
 

@@ -204,7 +204,7 @@ class SmartStepProfile:
     framing: Framing = Framing.SEVEN_EVEN  # manual 2.1; soft parity for adapters that cannot make it
     wiring: Wiring = Wiring.FOUR_WIRE  # manual 1.1 has no other; on two wires a drive may take its replies for commands
     echo: Echo = Echo.NONE  # not in the manual: on four wires the host's receiver is on the other pair
-    gap_s: float = 0.06
+    gap_s: float = 0.06  # manual 2.1 gives no such time, nor the next one
     quiet_s: float = 0.005
     attempts: int = 3
     unit: SmartStepUnitConfig = field(default_factory=SmartStepUnitConfig)

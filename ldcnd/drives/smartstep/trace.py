@@ -241,14 +241,17 @@ class SmartStepTracer(Tracer):
         words = self._words
         for name, largest in request.full_scale.items():
             register = FULL_SCALE_REGISTERS[name]
+            # 0 would leave nothing to scale by
             value = min(max(1, math.ceil(largest)), 0xFFFF)
             before = await words.read(register)
             if before == value:
                 continue
+            # before it is set: if that reply is lost, the register is put back all the same
             originals[register] = before
             try:
                 await words.ask(write_trace_register(words.unit, register, value))
             except AddressRefused as refusal:
+                # refused, so it has what it had
                 del originals[register]
                 raise NotSupported(
                     f"axis {words.axis}: the drive does not let {register.name} ({register:04X}H) be set",
@@ -428,6 +431,7 @@ class ArmedSmartStep(ArmedTrace):
         Raises:
             DriveFault: it was ended from elsewhere.
         """
+        # those before the trigger may have been taken while it was waited for
         points = POINTS - self._setup.settings[TraceRegister.PTRGNO]
         needed_s = (points - 1) * self._setup.interval_s * (1 - CLOCK_ERROR)
         if ended_at_s - self._execution.sent_s < needed_s:
@@ -493,25 +497,23 @@ class ArmedSmartStep(ArmedTrace):
 
 async def put_back(words: Words, originals: Mapping[TraceRegister, int]) -> bool:
     """Set registers to what they were; bounded, whatever the line does. Return whether all of them are."""
-    for register, value in originals.items():
-        done = False
-        with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(LEAVE_S):
-                while not done:
-                    try:
-                        await words.ask(write_trace_register(words.unit, register, value))
-                        done = True
-                    except ReplyTimeout:
-                        continue
-                    except LdcndError as error:
-                        log.error(
-                            "register not put back", axis=words.axis, register=register.name, reason=error.message
-                        )
-                        return False
-        if not done:
-            log.error("register not put back in time", axis=words.axis, register=register.name, value=value)
-            return False
-    return True
+    return all([await _put_back_one(words, register, value) for register, value in originals.items()])
+
+
+async def _put_back_one(words: Words, register: TraceRegister, value: int) -> bool:
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(LEAVE_S):
+            while True:
+                try:
+                    await words.ask(write_trace_register(words.unit, register, value))
+                except ReplyTimeout:
+                    continue
+                except LdcndError as error:
+                    log.error("register not put back", axis=words.axis, register=register.name, reason=error.message)
+                    return False
+                return True
+    log.error("register not put back in time", axis=words.axis, register=register.name, value=value)
+    return False
 
 
 async def require_settings(words: Words, settings: Mapping[TraceRegister, int], lane: Lane) -> None:

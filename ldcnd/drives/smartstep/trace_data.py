@@ -214,6 +214,7 @@ def sampling_interval(period_s: float, cyclec_us: int) -> int:
         raise ValueOutOfRange(f"a sampling time unit of {cyclec_us} us is impossible", value=cyclec_us)
     unit_s = cyclec_us * 1e-6
     shortest_s, longest_s = SHORTEST_INTERVAL * unit_s, LONGEST_INTERVAL * unit_s
+    # what rounds to an interval that the drive has is meant by it
     if not SHORTEST_INTERVAL - 0.5 <= period_s / unit_s < LONGEST_INTERVAL + 0.5:
         raise ValueOutOfRange(
             f"a sampling period of {period_s} s is not {shortest_s} to {longest_s} s",

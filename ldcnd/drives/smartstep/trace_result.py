@@ -326,6 +326,7 @@ def trigger_problem(
         index: of the sample at which the trigger was detected.
         interval_s: between two samples.
     """
+    # one sample more, so that the edge has both of its sides
     first = max(0, index - math.ceil(TRIGGER_LATE_S / interval_s) - 1)
     near = [value for value in column[first : index + 2] if value is not None]
     if trigger.channel in SIGNALS:

@@ -72,6 +72,7 @@ class TraceUpload:
         try:
             return await self._agreed(chunk)
         except ByteCountRefused:
+            # the longest string is not documented, and a drive that refuses one says no other number
             halves = chunk.halves()
             if halves is None:
                 raise
@@ -92,6 +93,7 @@ class TraceUpload:
         )
 
     async def _read(self, chunk: Chunk) -> bytes:
+        # once it is known, a reply that fits another variant is damaged
         profile = self._profile.with_trace(string_checksum=self.string_checksum)
         exchange = string_reference(self._words.unit, chunk.address, chunk.byte_count, profile)
         for _ in range(ROUNDS - 1):
@@ -113,5 +115,6 @@ class TraceUpload:
         while loop.time() < at_the_latest_s:
             before = statistics.exchanges
             await asyncio.sleep(IDLE_PERIOD_S)
+            # idle now, and all the time since: a poll between two looks would not show otherwise
             if self._bus.is_idle and statistics.exchanges == before:
                 return

@@ -80,6 +80,7 @@ def check_values(values: Mapping[str, int]) -> tuple[tuple[str, ...], tuple[str,
         if parameter is None:
             wrong.append(f"{name}: the manual lists no such parameter")
             continue
+        # one may stand there by its number and by its name
         if parameter.label in seen:
             wrong.append(f"{name}: names the same parameter as {seen[parameter.label]}")
         seen[parameter.label] = name

@@ -127,6 +127,7 @@ class Words:
 
     def identified(self, type_word: int) -> None:
         """Take the driver type that was read: another one than before is another drive."""
+        # the first one after the line came up is believed: nothing tells drives of one type apart
         if self._type in (None, type_word):
             self._type = type_word
             self._proof.prove()
@@ -162,6 +163,7 @@ class Words:
                 return await self.read(address)
             except ReplyTimeout:
                 continue
+            # there is nobody to ask until it is open again, and the caller waits
             except BusDown:
                 break
         raise OutcomeUnknown(
@@ -176,6 +178,7 @@ class Words:
 
     async def _mode_of(self, refusal: Refusal) -> OperatingMode | int:
         """Return the mode in which a drive declined, as far as it matters for the reason."""
+        # a trace would make no difference: the mode need not be read
         if refusal.reason_in(OperatingMode.DATA_TRACE) is refusal.reason:
             return OperatingMode.NORMAL
         try:
