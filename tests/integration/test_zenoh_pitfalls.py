@@ -16,9 +16,10 @@ import pytest
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import load_config
 from ldcnd.contract.codec import decode
-from ldcnd.contract.commands import ErrorReply, ReportShadow, Why
+from ldcnd.contract.commands import ErrorReply
 from ldcnd.contract.errors import ErrorCode, ValueOutOfRange
 from ldcnd.contract.keys import Keys
+from ldcnd.contract.questions import ReportShadow, Why
 from ldcnd.contract.samples import StateSample
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.net.hand_over import Query
