@@ -109,12 +109,16 @@ class Job(Transaction):
             try:
                 self.condition()
             except LdcndError as error:
-                # at a repetition: the node may have executed the one before, although its reply was lost
-                self.fail(error if self.attempts_left == self.attempts else error.although(SENT_IN_VAIN))
+                self.refuse(error)
                 return False
         self.attempts_left -= 1  # what the condition forbids was no attempt
         self._doubted = False
         return True
+
+    @override
+    def refuse(self, error: LdcndError) -> None:
+        # before a repetition: the node may have executed the packet before, although its reply was lost
+        self.fail(error if self.attempts_left == self.attempts else error.although(SENT_IN_VAIN))
 
     def fail(self, error: LdcndError) -> None:
         """Give the caller the error, unless it has gone."""
@@ -329,7 +333,7 @@ class Bus:
         """Fail every command that still waits for this node; what is on the wire runs on. Stops are not touched."""
         for job in self._schedule.waiting(Lane.COMMAND):
             if job.exchange.node == node:
-                job.fail(error)
+                job.refuse(error)
 
     def waiting(self, lane: Lane) -> int:
         """Return how many exchanges wait in a lane; polls are scheduled, not queued."""

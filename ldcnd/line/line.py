@@ -87,6 +87,10 @@ class Transaction:
     def fail(self, error: LdcndError) -> None:
         """Give the caller the error, if there is one who waits."""
 
+    def refuse(self, error: LdcndError) -> None:
+        """Give the caller what forbids to send it, with what became of it before."""
+        self.fail(error)
+
     def completed(self, reply: bytes, timing: Timing) -> None:
         """Take the intact reply (empty when none was due); the next request is on the wire already."""
 

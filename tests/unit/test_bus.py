@@ -10,13 +10,14 @@ from ldcnd.contract.errors import (
     LdcndError,
     NotIdentified,
     NotSupported,
+    StopLatched,
     WrongState,
 )
 from ldcnd.line.exchange import Lane, PacketEffect
 from ldcnd.line.proof import only_while
 from ldcnd.line.schedule import LANE_LIMITS
 from tests.support import toy_family as toy
-from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running
+from tests.support.bus_rig import BYTE_S, SETTINGS, Rig, running, scripted
 from tests.support.toy_family import ToyPoller
 
 
@@ -182,6 +183,20 @@ async def test_nothing_is_sent_again_for_a_caller_that_has_gone():
         await rig.bus.execute(toy.exchange(2, node=2))
 
     assert rig.sent() == [1, 2]
+
+
+async def test_a_command_that_is_withdrawn_before_it_is_repeated_says_that_it_was_sent():
+    rig = Rig(scripted({1: [[]]}))
+
+    async with running(rig) as callers:
+        command = callers.create_task(outcome_of(rig.bus.execute(toy.exchange(1, node=1))), name="command")
+        while rig.bus.statistics.timeouts == 0:
+            await asyncio.sleep(0.001)
+        rig.bus.withdraw(1, StopLatched("a stop came"))
+
+    assert isinstance(command.result(), StopLatched)
+    assert "sent once" in str(command.result())
+    assert rig.sent() == [1]
 
 
 async def test_withdrawing_fails_the_nodes_waiting_commands_only():

@@ -6,7 +6,15 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.contract.commands import HomeMethod, PinMode
-from ldcnd.contract.errors import BadReply, DriveFault, OutcomeUnknown, PacketRejected, ReplyTimeout, WrongState
+from ldcnd.contract.errors import (
+    BadReply,
+    CommandAborted,
+    DriveFault,
+    OutcomeUnknown,
+    PacketRejected,
+    ReplyTimeout,
+    WrongState,
+)
 from ldcnd.drives.driver import AnalogMotion, AxisSpec, CountsMotion, Gains, HomeCapture, PwmOutput, StopMode
 from ldcnd.drives.ldcn.controls import HomingControl, LimitPins
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
@@ -269,6 +277,42 @@ async def test_only_the_switches_ahead_of_a_motion_are_armed(motion, armed):
     await drive.axis.load(motion)
 
     assert drive.module.loop.search.control == armed
+
+
+@pytest.mark.promise("stop-closes-no-loop")
+@pytest.mark.parametrize("mode", [StopMode.SMOOTH, StopMode.ABRUPT])
+@pytest.mark.parametrize(("model", "profile"), [("ls182ap", LS_182AP), ("picservo-v4", PIC_SERVO_V4)])
+async def test_no_stop_closes_a_loop_that_was_not_closed_because_that_was_refused(mode, model, profile):
+    drive = await powered(model=model, profile=profile)
+    await drive.axis.power(on=False)
+
+    def refused() -> None:
+        raise CommandAborted("a stop came before it began")
+
+    drive.bus.instead[CommandCode.STOP_MOTOR] = refused
+    with pytest.raises(CommandAborted):
+        await drive.axis.power(on=True)
+    used = await drive.axis.stop(mode)
+
+    assert used is StopMode.OFF
+    assert not drive.module.loop.servo_on
+
+
+async def test_a_loop_that_shows_that_it_was_closed_after_all_is_not_opened_by_a_stop():
+    drive = await powered()
+    await drive.axis.power(on=False)
+
+    def lost() -> None:
+        raise ReplyTimeout("the reply was lost")
+
+    drive.bus.after[CommandCode.STOP_MOTOR] = lost
+    with pytest.raises(ReplyTimeout):
+        await drive.axis.power(on=True)
+    await drive.bus.execute(drive.axis.reading(frozenset()))
+    used = await drive.axis.stop(StopMode.SMOOTH)
+
+    assert used is StopMode.SMOOTH
+    assert drive.module.loop.servo_on
 
 
 @pytest.mark.promise("stop-closes-no-loop")

@@ -55,6 +55,7 @@ class DriveState:
         known: what decides on the meaning of its status.
         homing_armed: a capture was armed and has not been seen to come.
         arming: packets that arm a capture are on their way: what a reading shows of it may be of before.
+        off_before: the motor was switched off, and nothing shows that what was to close its loop since has done so.
         loop_may_open: the loop is open on purpose (PWM mode), or will be once home is captured: then the position
             error flag, which every open loop shows, is no fault.
         motion_locked: the drive refuses motion since it homed on a limit switch.
@@ -79,7 +80,7 @@ class DriveState:
     def restarted(self) -> None:
         """The drive was reset or lost power: nothing that was sent before holds any more."""
         self.known = AFTER_RESET
-        self.homing_armed = self.arming = False
+        self.homing_armed = self.arming = self.off_before = False
         self.loop_may_open = False
         self.motion_locked = False
         self.guard = ""
@@ -101,6 +102,7 @@ class DriveState:
 
         What it would leave as it is known to be stays known: a motor that was off is off, whether it arrived or not.
         """
+        self.off_before = self.off_before or self.known.pic_ae is False
         known = pic_ae if self.known.pic_ae is pic_ae else None
         self.known = replace(self.known, pic_ae=known, nothing_latched=False, closed=False)
 
@@ -110,7 +112,7 @@ class DriveState:
         self.known = Knowledge(
             pic_ae=pic_ae, nothing_latched=False, latched=self.known.latched, closed=closed, seen=True, absolute=False
         )
-        self.loop_may_open = False
+        self.loop_may_open = self.off_before = False
 
     def clearing(self) -> None:
         """Clear Sticky Bits is on its way: a cause that was known may be gone before that is acknowledged."""
@@ -230,6 +232,7 @@ class DriveState:
         """Take from a status what it proves."""
         logosol = self._profile.pic_ae_diagnostics
         if servo_on(status):
+            self.off_before = False
             # PIC-SERVO closes its loop whatever the amplifier (manual, 5.2), a Logosol drive does not
             pic_ae = True if logosol else self.known.pic_ae
             self.known = replace(self.known, pic_ae=pic_ae, nothing_latched=False, latched=None, closed=True)

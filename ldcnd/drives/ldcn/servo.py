@@ -341,8 +341,11 @@ class LdcnAxis(Moves):
 
     @property
     def switched_off(self) -> bool:
-        """Whether its motor was switched off, or is being by a packet that is on its way."""
-        return self._switching_off > 0 or self.state.known.pic_ae is False
+        """Whether its motor was switched off, or is being by a packet that is on its way.
+
+        Also where it is not known whether it was switched on since, as when that was refused, or its reply was lost.
+        """
+        return self._switching_off > 0 or self.state.known.pic_ae is False or self.state.off_before
 
     async def stop(self, mode: StopMode) -> StopMode:
         """See `Moves`. Some firmware clears the velocity register, so it counts as unknown afterwards."""
