@@ -15,17 +15,17 @@ class AxisScale:
         counts_per_unit: negative where forward in axis units is backward in counts.
         modulo: length of one turn, in axis units; None for an axis without one.
         origin_counts: count of the drive at position 0. It means something only while the axis is referenced.
+        unit: of its positions.
     """
 
     units: AxisUnits = field(compare=False)
     counts_per_unit: float = 1.0
     modulo: float | None = None
     origin_counts: float = 0.0
+    unit: str = field(init=False)
 
-    @property
-    def unit(self) -> str:
-        """The unit of the axis's positions."""
-        return self.units.unit
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unit", self.units.unit)  # not a property: each poll publishes it twice
 
     @classmethod
     def of(cls, config: AxisConfig) -> "AxisScale":
