@@ -213,6 +213,34 @@ async def test_alarms_are_enumerations():
         assert (status.raw_value, severity.raw_value) == (9, 3)
 
 
+async def test_an_axis_that_moves_has_no_message_but_an_error_as_nicos_takes_one_with_it_for_one_that_has_arrived():
+    async with records() as (running, made):
+        said, done = made.variables["T:x-MsgTxt"], made.variables["T:x.DMOV"]
+
+        async def look_until_it_rests() -> set[tuple[int, str]]:
+            seen = {(done.value, said.value)}
+            while (await running.client.state("x")).moving is not Moving.NO:
+                await asyncio.sleep(0.01)
+                seen.add((done.value, said.value))
+            await shows(made, "T:x.DMOV", 1)
+            return seen
+
+        homing = asyncio.create_task(put(made, "T:x.HOMF", 1))
+        await shows(made, "T:x.DMOV", 0)
+        seen = await look_until_it_rests()
+        await homing
+        moving = asyncio.create_task(put(made, "T:x", 90.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await running.client.stop()
+        await running.until("x", lambda state: state.stop_latched)
+        seen |= await look_until_it_rests()
+        with suppress(CommandAborted, StopLatched):
+            await moving
+        await shows(made, "T:x-MsgTxt", "stop latched")
+
+        assert {message for is_done, message in seen if not is_done} == {""}
+
+
 async def test_errors_are_shown_and_cleared_as_nicos_does():
     async with records() as (running, made):
         moving = asyncio.create_task(put(made, "T:x", 50.0))

@@ -123,7 +123,8 @@ class AxisLink:
                     if self._state is not None:
                         self._condition = assess(self._state, self._faults, age_s=math.inf)
                         self._state = None
-                    self._update("value", problem=self._condition.troubles[0].text)
+                    for module in (axis, *self.values()):
+                        self._announce(Update(module, "value", problem=self._condition.troubles[0].text))
                     self._show_status()
                 else:
                     self.take(sample)
