@@ -234,12 +234,12 @@ class AxisLink:
 
     async def clear_errors(self) -> None:
         """Clear the latch and faults; nothing moves."""
-        await (await self.control.taken()).reset()
+        await self.control.prepare(lambda axis: axis.reset())
 
     async def enable(self, *, on: bool) -> bool:
         """Close or open the position loop."""
         if on:
-            await (await self.control.taken()).power(on=True)
+            await self.control.prepare(lambda axis: axis.power(on=True))
         else:
             await self.control.power_off()
         return on
