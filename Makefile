@@ -85,7 +85,18 @@ test-edges: .venv-edges/ready
 
 .venv-edges/ready: .venv/ready
 	$(PYTHON) -m venv .venv-edges
-	.venv/bin/uv pip install --quiet --python .venv-edges/bin/python -c constraints.txt -e '.[edges]'
+	.venv/bin/uv pip install --quiet --python .venv-edges/bin/python -c constraints.txt -e '.[edges]' pip setuptools toml==0.10.2
+	-$(MAKE) --no-print-directory .venv-edges/nicos
+	@touch $@
+
+# NICOS (GPL) is used from its sources: its setup needs what it does not ask for, and a wheel of it is on no path of Python.
+# Without it its tests are skipped
+NICOS := nicos-3.12.2
+.venv-edges/nicos:
+	.venv-edges/bin/python -m pip download --quiet --no-deps --no-build-isolation --dest .venv-edges $(subst -,==,$(NICOS))
+	tar -xzf .venv-edges/$(NICOS).tar.gz -C .venv-edges
+	echo $(CURDIR)/.venv-edges/$(NICOS) > $$(.venv-edges/bin/python -c 'import site; print(site.getsitepackages()[0])')/nicos.pth
+	rm .venv-edges/$(NICOS).tar.gz
 	@touch $@
 
 # what needs no wall clock, on every interpreter of PYTHONS that is there

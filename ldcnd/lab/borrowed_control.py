@@ -51,6 +51,7 @@ class BorrowedControl:
         self._holder = NO_HOLDER
         self._wanted = asyncio.Event()
         self._changed = asyncio.Event()
+        self._preparing = asyncio.Lock()
         self._used_s = 0.0  # when control was needed last, in loop time
 
     async def run(self) -> None:
@@ -70,11 +71,27 @@ class BorrowedControl:
                     raise asyncio.CancelledError from error
 
     async def taken(self) -> Axis:
-        """Return the axis, under control.
+        """Return the axis, under control, once all that was prepared before has taken effect.
 
         Raises:
             LeaseRequired: another program controls it, or the daemon does not answer.
         """
+        async with self._preparing:
+            return await self._take()
+
+    async def prepare(self, done: Callable[[Axis], Awaitable[object]]) -> None:
+        """Do to the axis what motions need, before any that is commanded later: queries may overtake one another.
+
+        Args:
+            done: does it, with the axis under control.
+
+        Raises:
+            LdcndError: it was refused, or control could not be had.
+        """
+        async with self._preparing:
+            await done(await self._take())
+
+    async def _take(self) -> Axis:
         self._used_s = asyncio.get_running_loop().time()
         if self._axis is None:
             self._changed.clear()

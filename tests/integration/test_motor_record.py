@@ -7,6 +7,7 @@ from itertools import pairwise
 import pytest
 from caproto import AccessRights, AlarmSeverity, ChannelType
 
+from ldcnd.client.axis import Axis
 from ldcnd.contract.errors import CommandAborted, LdcndError, PositionLimit, StopLatched, WrongState
 from ldcnd.contract.samples import Moving
 from tests.support.epics_records import monitored, put, records, shows
@@ -211,6 +212,55 @@ async def test_alarms_are_enumerations():
         await shows(made, "T:x.STAT", "COMM")
 
         assert (status.raw_value, severity.raw_value) == (9, 3)
+
+
+async def test_puts_that_do_not_wait_take_effect_in_their_order(monkeypatch):
+    power = Axis.power
+
+    async def late(axis, *, on):
+        await asyncio.sleep(0.1)  # a query may overtake another one
+        return await power(axis, on=on)
+
+    monkeypatch.setattr(Axis, "power", late)
+    async with records(power=False) as (running, made):
+        await running.client.stop("x")
+        await running.until("x", lambda state: state.stop_latched)
+        puts = (("T:x-ErrRst", 1), ("T:x.CNEN", "Enable"), ("T:x.HOMF", 1))
+        async with asyncio.TaskGroup() as group:
+            for name, value in puts:
+                group.create_task(put(made, name, value))
+                await asyncio.sleep(0)
+
+        assert (await running.client.state("x")).enabled
+        assert made.variables["T:x:message"].value == ""
+
+
+async def test_an_axis_that_moves_has_no_message_but_an_error_as_nicos_takes_one_with_it_for_one_that_has_arrived():
+    async with records() as (running, made):
+        said, done = made.variables["T:x-MsgTxt"], made.variables["T:x.DMOV"]
+
+        async def look_until_it_rests() -> set[tuple[int, str]]:
+            seen = {(done.value, said.value)}
+            while (await running.client.state("x")).moving is not Moving.NO:
+                await asyncio.sleep(0.01)
+                seen.add((done.value, said.value))
+            await shows(made, "T:x.DMOV", 1)
+            return seen
+
+        homing = asyncio.create_task(put(made, "T:x.HOMF", 1))
+        await shows(made, "T:x.DMOV", 0)
+        seen = await look_until_it_rests()
+        await homing
+        moving = asyncio.create_task(put(made, "T:x", 90.0))
+        await running.until("x", lambda state: state.moving is Moving.YES)
+        await running.client.stop()
+        await running.until("x", lambda state: state.stop_latched)
+        seen |= await look_until_it_rests()
+        with suppress(CommandAborted, StopLatched):
+            await moving
+        await shows(made, "T:x-MsgTxt", "stop latched")
+
+        assert {message for is_done, message in seen if not is_done} == {""}
 
 
 async def test_errors_are_shown_and_cleared_as_nicos_does():

@@ -112,7 +112,10 @@ async def test_a_daemon_that_says_nothing_is_an_error():
         async with asyncio.timeout(3):
             while "its position is old: nothing newer came" not in {update.problem for update in updates}:
                 await asyncio.sleep(0.1)
+        problems = {update.module: update.problem for update in updates if update.parameter == "value"}
 
+        assert set(problems) == {"x", "x_velocity", "x_adc"}
+        assert all(problems.values()), problems
         assert link.status()[0] == StatusCode.ERROR
 
 

@@ -361,14 +361,14 @@ class MovedRecord(MotorRecord):
 
     async def _put_cnen(self, asked: Value) -> Put:
         if asked == "Enable":
-            await (await self.control.taken()).power(on=True)
-            return Put()
-        await self.control.power_off()
+            await self.control.prepare(lambda axis: axis.power(on=True))
+        else:
+            await self.control.power_off()
         return Put()
 
     async def _put_reset(self, asked: Value) -> Put:
         if asked:
-            await (await self.control.taken()).reset()
+            await self.control.prepare(lambda axis: axis.reset())
         return Put(0)
 
     async def _put_velo(self, asked: Value) -> Put:

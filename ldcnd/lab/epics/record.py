@@ -273,9 +273,8 @@ class MotorRecord:
         if isinstance(position, Number):
             position.deadband = 0.0
         await self.grow_old()
-        for field in (self["VAL"], self["DIFF"], self.beside(":velocity")):
-            if field is not None:
-                await field.show(field.value, SILENT)
+        for field in (self["VAL"], self["DIFF"]):
+            await field.show(field.value, SILENT)
 
     # -- what the axis says ------------------------------------------------------------------------------------------
 
@@ -383,13 +382,25 @@ class MotorRecord:
         self.moving = Moving.UNKNOWN
         await self._take_alarm(SILENT)
         self.condition = assess(self.state, self._faults, age_s=math.inf)
+        for name in (":velocity", ":adc", *(f":{monitor}" for monitor in self.info.monitors)):
+            field = self.beside(name)
+            if field is not None:
+                await field.show(field.value, SILENT)
         await self._show_condition()
         await self.show_motion()
 
     async def _show_condition(self) -> None:
-        """Show all that is to be said of the axis; a message is what is wrong with it, not who controls it."""
+        """Show all that is to be said of the axis."""
         await self.show_beside(":condition", ", ".join(self.condition.notes))
-        await self.show_beside("-MsgTxt", ", ".join(trouble.short for trouble in self.condition.troubles))
+
+    async def _show_message(self) -> None:
+        """Show what is wrong with the axis, not who controls it; while it moves, only what is an error.
+
+        NICOS takes an axis with a message, and no more than a MINOR alarm, for one that has arrived.
+        """
+        silent = not self.stands() and self.condition.alarm < Severity.MAJOR
+        troubles = () if silent else self.condition.troubles
+        await self.show_beside("-MsgTxt", ", ".join(trouble.short for trouble in troubles))
 
     def stands(self) -> bool:
         """Tell whether the axis has done what was put: one of which that is not known has not arrived."""
@@ -398,6 +409,7 @@ class MotorRecord:
     async def show_motion(self) -> None:
         """Show whether the axis moves."""
         stands, state = self.stands(), self.state
+        await self._show_message()
         await self["MOVN"].show(int(not stands))
         await self["MIP"].show(0 if stands else MIP_MOVE)
         await self["MSTA"].show(

@@ -123,7 +123,8 @@ class AxisLink:
                     if self._state is not None:
                         self._condition = assess(self._state, self._faults, age_s=math.inf)
                         self._state = None
-                    self._update("value", problem=self._condition.troubles[0].text)
+                    for module in (axis, *self.values()):
+                        self._announce(Update(module, "value", problem=self._condition.troubles[0].text))
                     self._show_status()
                 else:
                     self.take(sample)
@@ -233,12 +234,12 @@ class AxisLink:
 
     async def clear_errors(self) -> None:
         """Clear the latch and faults; nothing moves."""
-        await (await self.control.taken()).reset()
+        await self.control.prepare(lambda axis: axis.reset())
 
     async def enable(self, *, on: bool) -> bool:
         """Close or open the position loop."""
         if on:
-            await (await self.control.taken()).power(on=True)
+            await self.control.prepare(lambda axis: axis.power(on=True))
         else:
             await self.control.power_off()
         return on

@@ -36,7 +36,7 @@ from ldcnd.contract.errors import (
     ValueOutOfRange,
 )
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.lab.secop.link import AxisLink, Update, described_by, linked
+from ldcnd.lab.secop.link import AxisLink, StatusCode, Update, described_by, linked
 from ldcnd.listen_address import ListenAddress
 
 ResultT = TypeVar("ResultT")
@@ -235,6 +235,10 @@ class SecNodeServer(Server):  # type: ignore[misc]
             self.errors[update.module] = update.error
         problem = CommunicationFailedError(update.problem) if update.problem else None
         module.announceUpdate(update.parameter, update.value, problem, update.at_s)
+        if isinstance(module, ValueModule):
+            status = (StatusCode.ERROR, update.problem) if update.problem else (StatusCode.IDLE, "")
+            if status != module.status:
+                module.announceUpdate("status", status)
 
     def wait(self, work: Coroutine[object, object, ResultT]) -> ResultT:
         """Do something on the rig's loop, and wait for it on the thread of a client.
