@@ -2,22 +2,21 @@
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import replace
 
 from ldcnd.axis import guards
 from ldcnd.axis.axis import NO_COMMAND_HELPS, AxisService
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.procedures.group import GroupMoveRequest, Meeting, Rendezvous, plans_on_line
-from ldcnd.axis.procedures.path import PathShareRequest, SharedPath
+from ldcnd.axis.procedures.group import GroupMoveRequest
+from ldcnd.axis.procedures.path import PathShareRequest
 from ldcnd.contract.catalogue import AXIS_COMMANDS, verbs_for
 from ldcnd.contract.codec import remedy_steps
-from ldcnd.contract.commands import AxisCommand, Capability, Command, CommandReply, Effect, MoveAbsolute
+from ldcnd.contract.commands import AxisCommand, Capability, Command, CommandReply, Effect
 from ldcnd.contract.errors import (
     InternalError,
     LdcndError,
     LeaseHeld,
-    MalformedRequest,
     NotSupported,
     WrongState,
 )
@@ -27,8 +26,6 @@ from ldcnd.contract.keys import RIG_ITSELF
 from ldcnd.contract.leases import GuestSentAway, Holder, HolderList, ListHolders, Release, Renew, SendGuestAway
 from ldcnd.contract.questions import Cause, Hindered, Preview, ReportShadow, Why, WhyReply
 from ldcnd.contract.rig_commands import (
-    AxisShare,
-    GroupMoves,
     IoReply,
     LinePath,
     MoveTogether,
@@ -36,7 +33,6 @@ from ldcnd.contract.rig_commands import (
     OverrideInterlock,
     PathReply,
     PreviewTogether,
-    PreviewTogetherReply,
     ReadWireLog,
     Rehearsal,
     RehearsalReply,
@@ -51,6 +47,7 @@ from ldcnd.contract.rig_commands import (
     WalkPath,
     WireLogReply,
 )
+from ldcnd.daemon.group_moves import move_together, preview_together, shares_of, walk_path
 from ldcnd.daemon.interlocks import Interlocks
 from ldcnd.daemon.leases import Authority, LeaseWatch, apply_policy
 from ldcnd.daemon.ledger import EventLog, Ledger, status_of
@@ -74,8 +71,6 @@ LINE_OVERHEAD_BYTES = 3
 """Quotation marks and comma in JSON."""
 
 
-Execute = Callable[[str, AxisCommand[CommandReply]], Awaitable[CommandReply]]
-"""Carries out a command of an axis, after all checks of the daemon."""
 ExecuteFor = Callable[[str, AxisCommand[CommandReply], str | None], Awaitable[CommandReply]]
 """The same for a login."""
 Admit = Callable[[str, str | None], None]
@@ -343,7 +338,7 @@ class RigCommands:
         else:
             straight, deviation = command.path is LinePath.LINEAR, command.max_deviation
             reply = await move_together(
-                self._rig, _shares(command), execute, straight=straight, max_deviation=deviation
+                self._rig, shares_of(command), execute, straight=straight, max_deviation=deviation
             )
         share = self._ledger.get(reply.replies[0].command_id).command
         # the ledger decides which request was the first: of two that come at once it knows neither before
@@ -371,128 +366,6 @@ class RigCommands:
             following_error=arrival.following_error if arrival else None,
             settled=arrival.settled if arrival else None,
         )
-
-
-async def move_together(
-    rig: OwnedRig,
-    moves: Mapping[str, MoveAbsolute],
-    execute: Execute,
-    *,
-    straight: bool = False,
-    max_deviation: float | None = None,
-) -> MoveTogetherReply:
-    """Start absolute moves of several axes together; returns once every drive has proven that it started.
-
-    Args:
-        rig: the daemon's.
-        moves: by axis name; exactly the members of one configured group.
-        execute: how a single command is carried out.
-        straight: they keep to a straight line.
-        max_deviation: the line is refused if they would leave it by more, in axis units.
-
-    Raises:
-        UnknownAxis: there is no such axis.
-        NotSupported: the axes are on different lines, or are no group.
-        RequestRefused: a member cannot move, or they would leave the line; nothing was started.
-        BusError: the line failed; `OutcomeUnknown` when a drive may have started, then all were commanded to stop.
-    """
-    line = _line_of(rig, moves)
-    meeting = Meeting(line.network, frozenset(moves), straight=straight, max_deviation=max_deviation)
-
-    requests = {name: GroupMoveRequest.of(move, meeting) for name, move in moves.items()}
-    return meeting.reply(await _all_of(requests, meeting, execute))
-
-
-async def walk_path(rig: OwnedRig, command: WalkPath, execute: Execute) -> PathReply:
-    """Walk axes along a polyline; returns once every drive walks.
-
-    Raises:
-        MalformedRequest: an axis is named twice, or the axes have differently many corners.
-        UnknownAxis, NotSupported, RequestRefused, BusError: as `move_together`.
-    """
-    via = {move.axis: move.via for move in command.moves}
-    if len({len(corners) for corners in via.values()}) > 1 or len(via) < len(command.moves):
-        raise MalformedRequest("a path names each axis once, with equally many corners", remedy="see `via`")
-    line = _line_of(rig, via)
-    path = SharedPath(line.network, line.bus, frozenset(via), command.speed, command.max_deviation)
-    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis", "via"})) for move in command.moves}
-
-    requests = {name: PathShareRequest.of(move, via[name], path) for name, move in moves.items()}
-    return path.reply(await _all_of(requests, path, execute))
-
-
-async def _all_of(
-    requests: Mapping[str, AxisCommand[CommandReply]], rendezvous: Rendezvous, execute: Execute
-) -> tuple[CommandReply, ...]:
-    """Have each axis carry out its part; returns once all have started, and raises why none did."""
-
-    async def take_part(name: str, request: AxisCommand[CommandReply]) -> CommandReply | LdcndError:
-        try:
-            return await execute(name, request)
-        except LdcndError as error:
-            # refused before its turn it never meets the others, who would wait for it in vain
-            rendezvous.fail(error)
-            return error
-
-    async with asyncio.TaskGroup() as group:
-        tasks = [
-            group.create_task(take_part(name, request), name=f"{request.verb} {name}")
-            for name, request in requests.items()
-        ]
-    replies = []
-    for task in tasks:
-        result = task.result()
-        if isinstance(result, LdcndError):
-            raise rendezvous.failure or result
-        replies.append(result)
-    return tuple(replies)
-
-
-def preview_together(rig: OwnedRig, request: PreviewTogether) -> PreviewTogetherReply:
-    """Plan moves of a group without sending anything.
-
-    Raises:
-        UnknownAxis, NotSupported, RequestRefused: as `move_together`, but for what is in the way only now.
-    """
-    moves = _shares(request)
-    _line_of(rig, moves)
-    axes = {name: rig.axes[name].planned(move) for name, move in moves.items()}
-    plans, deviation = {name: plan for name, (_, plan) in axes.items()}, None
-    if request.path is LinePath.LINEAR:
-        plans, deviation = plans_on_line(axes, request.max_deviation)
-    shares = tuple(
-        AxisShare(
-            axis=name,
-            position=axes[name][0].shown(plan.position) or 0.0,
-            velocity=plan.velocity,
-            acceleration=plan.acceleration,
-            duration_s=plan.duration_s or 0.0,
-        )
-        for name, plan in plans.items()
-    )
-    longest_s = max(share.duration_s for share in shares)
-    return PreviewTogetherReply(shares=shares, duration_s=longest_s, deviation=deviation)
-
-
-def _shares(command: GroupMoves) -> dict[str, MoveAbsolute]:
-    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis"})) for move in command.moves}
-    if len(moves) < len(command.moves):
-        raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
-    return moves
-
-
-def _line_of(rig: OwnedRig, names: Iterable[str]) -> BusService:
-    """Return the line that all these axes are on.
-
-    Raises:
-        UnknownAxis, NotSupported: as `move_together`.
-    """
-    wanted = list(names)
-    lines = {bus for bus in rig.buses for name in wanted if rig.axes[name] in bus.axes}
-    if len(lines) != 1:
-        raise NotSupported(f"axes {', '.join(wanted)} are not on one line, so they cannot start together")
-    (line,) = lines
-    return line
 
 
 def concerned(rig: OwnedRig, request: Rehearse) -> tuple[str, ...]:

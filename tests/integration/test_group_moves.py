@@ -20,7 +20,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.rig_commands import AxisMove, LinePath, MoveTogether, PreviewTogether
 from ldcnd.contract.samples import AxisState, LinkState
-from ldcnd.daemon.rig_commands import move_together
+from ldcnd.daemon.group_moves import move_together
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain

@@ -16,7 +16,7 @@ from tests.mutants.covering import ROOT, Covering, record
 SUBJECTS = (
     "ldcnd/axis/*.py", "ldcnd/axis/procedures/*.py",
     *(f"ldcnd/daemon/{name}.py" for name in (
-        "dispatch", "interlocks", "leases", "ledger", "line", "modules", "rig", "rig_commands",
+        "dispatch", "group_moves", "interlocks", "leases", "ledger", "line", "modules", "rig", "rig_commands",
     )),
     *(f"ldcnd/line/{name}.py" for name in (
         "bus", "exchange", "line", "proof", "schedule", "settings",
