@@ -232,6 +232,13 @@ class UnrulyLine(RuleBasedStateMachine):
     def babble(self, count: int) -> None:
         self.opener.line.say(b"\xf0" * count)
 
+    @rule(seed=st.integers(0, 2**16))
+    def distrust(self, seed: int) -> None:
+        # what reads something that cannot be stops its axis
+        self.bus.distrust()
+        self._call(random.Random(seed * 1000 + len(self.exchanges)), Lane.STOP)
+        self.runner.run(asyncio.sleep(0))
+
     @rule(node=st.integers(1, NODES))
     def poll(self, node: int) -> None:
         if self.bus.is_open and len(self.pollers) < 9:
