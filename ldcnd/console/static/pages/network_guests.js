@@ -21,6 +21,6 @@ export function Guests({ rig, bus }) {
   );
   return html`<h3>Ports</h3>
     <${Table} label=${`Ports of ${rig.name} on ${bus.name}`}
-      head=${["Port", "Program since", "Controls", "#Packets/s", "#Refused", ""]} rows=${rows} />
+      head=${["Port", "Program since", "Controls", "#Packets/s", "#Refused", "Commands"]} rows=${rows} />
     <p class="quiet">A program that is sent away loses its terminal or connection; axes that it moves do what their configuration says for the loss of a client.</p>`;
 }
