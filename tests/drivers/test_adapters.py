@@ -80,6 +80,7 @@ def test_an_adapter_hands_over_when_its_chip_does(holding, held, last_byte_s, du
 
 
 @pytest.mark.parametrize("velocity", [1.5, 40.0])
+@pytest.mark.sweep(2)
 async def test_a_move_that_nobody_could_see_is_halted_however_slow_it_is(velocity):
     async with plugged() as line:
         await moving(line, "x", 95.0, velocity)
@@ -209,6 +210,7 @@ async def test_nothing_that_is_not_known_is_published_as_good_while_the_adapter_
 # -- disturbed -------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 async def test_breaks_and_noise_make_no_value_and_the_line_is_back_in_step():
     async with plugged() as line:
         await moving(line, "x", 90.0, 5.0)

@@ -109,6 +109,7 @@ def test_every_status_says_what_our_own_decoder_says(name: str, tmp_path: Path):
 
 @needs_tshark
 @pytest.mark.real_time
+@pytest.mark.long
 def test_requests_and_replies_are_paired_and_damage_is_shown(tmp_path: Path):
     packets = dissected(kept("corrupted_line").records, tmp_path)
 

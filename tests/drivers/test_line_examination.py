@@ -67,6 +67,7 @@ async def test_latency_of_an_adapter_is_measured_and_proposed(holding, least_ms,
     assert found["errors"].verdict is Verdict.FINE
 
 
+@pytest.mark.long
 async def test_what_a_slow_adapter_costs_is_told_in_polls_a_second():
     chain = await addressed_chain()
 

@@ -171,6 +171,7 @@ async def test_a_scan_says_from_which_end_the_chain_is_numbered(names, said, ver
 
 
 @pytest.mark.parametrize("addressed", [1, 2])
+@pytest.mark.sweep(2)
 async def test_nothing_is_reset_while_a_drive_moves_or_may(addressed):
     chain = build_chain(ChainSpec((ModuleSpec("ls-182ap"), ModuleSpec("ls-182ap", plant=LONG))))
     for number, module in enumerate(chain.modules[:addressed], start=1):

@@ -2,6 +2,7 @@
 
 from contextlib import suppress
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -44,6 +45,7 @@ streams = st.binary(max_size=24) | nearly_frames()
 
 
 @given(profiles, streams)
+@pytest.mark.long
 def test_any_bytes_are_a_command_or_a_bad_reply(profile, data):
     for decode in (decode_command, interpret_bytes):
         with suppress(BadReply):

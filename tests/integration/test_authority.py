@@ -91,6 +91,7 @@ async def test_stop_and_halt_never_need_a_lease():
 
 @pytest.mark.promise("loss-of-control")
 @pytest.mark.parametrize("lease_s", [SHORTEST_LEASE_S, 0.3, 1.0])
+@pytest.mark.sweep(2)
 async def test_an_axis_halts_when_its_client_disappears(lease_s):
     async with running_rig(leased()) as rig:
         await rig.until("x", lambda state: state.link == "up")
@@ -246,6 +247,7 @@ async def test_the_events_tell_who_has_stopped_what():
 
 
 @pytest.mark.parametrize("payload", [b"", b"\xff\xff", b"[1]", b'{"client": 7}', b'{"client": "ann", "axis": "y"}'])
+@pytest.mark.sweep(2)
 async def test_a_stop_that_does_not_say_who_it_is_from_is_carried_out_and_told_all_the_same(payload):
     async with running_rig() as rig:
         await powered(rig)

@@ -184,6 +184,7 @@ def test_a_trigger_of_an_item_that_is_not_measured_any_more_says_which():
             adc.trigger().wait(60)
 
 
+@pytest.mark.long
 def test_a_relative_grid_ends_where_it_began(lab: Laboratory):
     with lab.powered("x", "y") as (x, y):
         began = (lab.truth("x"), lab.truth("y"))
@@ -612,6 +613,7 @@ def test_a_scan_into_a_limit_fails_and_leaves_the_axis_at_rest(lab: Laboratory):
     assert lab.documents.data("x") == pytest.approx([95, 100], abs=IN_POSITION)
 
 
+@pytest.mark.long
 def test_a_stop_from_elsewhere_ends_the_run_as_failed(lab: Laboratory):
     def stop_at_the_third(name, document):
         if document["seq_num"] == 3:

@@ -255,6 +255,7 @@ def test_the_command_line_waits_for_as_long_as_what_it_waits_behind_takes(monkey
         assert here.wait(position_of(here.rig)) == pytest.approx(2.0, abs=0.0011)
 
 
+@pytest.mark.long
 def test_the_command_line_says_why_what_it_waited_for_did_not_begin(monkeypatch):
     with virtual_rig(monkeypatch) as here:
         here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))

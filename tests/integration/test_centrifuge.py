@@ -274,6 +274,7 @@ def test_the_sequence_that_shuts_the_door_does_not_let_a_broken_wire_tell_it_tha
     assert not run(program())
 
 
+@pytest.mark.long
 def test_the_sequence_that_shuts_the_door_shuts_it_where_no_wire_breaks():
     async def program():
         async with simulated_rig(CENTRIFUGE) as rig:
@@ -363,6 +364,7 @@ def test_of_a_spin_and_an_unlocking_at_one_instant_at_most_one_passes():
     assert operated(race)
 
 
+@pytest.mark.long
 def test_a_client_that_dies_in_a_spin_leaves_a_rotor_that_comes_to_rest_behind_its_locked_door():
     async def dies(machine):
         await machine.spin()
@@ -475,6 +477,7 @@ def test_a_halt_that_is_waited_for_returns_when_a_rotor_that_nothing_drives_stan
     assert (at_rest["moving"], abs(at_rest["velocity"]) < 0.5) == ("no", True)
 
 
+@pytest.mark.long
 def test_an_override_is_shown_by_list_and_why_with_its_rule_its_client_and_its_end(monkeypatch):
     with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
         machine.wait(asyncio.sleep(1))

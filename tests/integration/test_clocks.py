@@ -34,6 +34,7 @@ async def test_125000_baud_works(dialect):
 
 
 @pytest.mark.parametrize(("mhz", "baud"), [(10.0, 62_500), (16.0, 100_000)])
+@pytest.mark.sweep(2)
 async def test_a_drive_with_another_clock_moves_at_the_speed_that_was_asked_for(mhz, baud):
     async with clocked(V4, mhz, baud) as rig:
         await rig.send(MoveVelocity(velocity=5.0))

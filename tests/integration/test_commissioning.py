@@ -601,6 +601,7 @@ async def test_a_search_goes_as_the_preview_has_said_whatever_the_daemon_was_sta
         assert velocities == [pytest.approx(0.5, rel=0.01)] * 2
 
 
+@pytest.mark.long
 async def test_a_distance_too_short_for_the_velocity_is_asked_for_again(tmp_path):
     distances = iter(["0", "0.5", "4"])
     text = rig_text().replace("velocity = 40, acceleration = 400", "velocity = 15, acceleration = 150")
@@ -708,6 +709,7 @@ async def test_speed_is_raised_until_the_drive_does_not_follow(tmp_path):
         assert kept.result.series
 
 
+@pytest.mark.long
 async def test_an_axis_that_follows_up_to_its_limits_keeps_them(tmp_path):
     text = rig_text().replace("velocity = 40, acceleration = 400", "velocity = 15, acceleration = 150")
     async with commissioning_rig(tmp_path, {"how far may": "4"}, text=text) as rig:
@@ -736,6 +738,7 @@ async def test_leaving_in_the_middle_and_resuming(tmp_path):
         assert not (await rig.running.client.state(AXIS)).command
 
 
+@pytest.mark.long
 async def test_a_changed_configuration_and_another_drive_open_steps_again(tmp_path):
     async with commissioning_rig(tmp_path, {"how many": "2", "what falls": "none", "a remark": ""}) as rig:
         checklist = await rig.checklist()
@@ -811,6 +814,7 @@ async def test_a_configuration_that_was_changed_while_a_change_was_looked_at_kee
         assert axis.counts_per_unit == pytest.approx(500, rel=0.01)
 
 
+@pytest.mark.long
 async def test_the_report_is_well_formed_and_has_the_numbers(tmp_path):
     script = {"how many": "3", "what falls": "none", "a remark": "<b>spring</b> & \x1b[2J"}
     async with commissioning_rig(tmp_path, script) as rig:

@@ -60,6 +60,7 @@ async def test_control_lasts_in_a_page_that_says_nothing(console):
         assert (await page.post(f"{X}/power", {"on": True})).status == 200
 
 
+@pytest.mark.long
 async def test_a_move_that_still_waits_when_its_page_goes_does_not_run_on(console):
     async with open_page(console.app, console.browser) as page:
         await running_at(console, page, 1.0)

@@ -69,6 +69,7 @@ async def test_a_wrong_cookie_is_a_stranger_s(console, cookie):
     "origin",
     ["", "null", "http://evil.example", "https://127.0.0.1:8470", "http://127.0.0.1:8471", f"{ORIGIN}.evil.example"],
 )
+@pytest.mark.sweep(2)
 async def test_a_command_from_another_origin_is_refused(console, origin):
     for path in (POWER, "/api/stop", "/api/link"):
         answer = await console.browser.forging(origin=origin).post(path, ON)
@@ -109,6 +110,7 @@ async def test_a_name_that_is_not_the_console_s_is_refused(console, host):
 
 
 @pytest.mark.parametrize("host", ["localhost:8470", "[::1]:8470", "LOCALHOST:9000", "127.0.0.1:9000"])
+@pytest.mark.sweep(2)
 async def test_a_tunnel_may_come_through_any_port_of_this_machine(console, host):
     """`ssh -L 9000:127.0.0.1:8470` changes the port that the browser sees."""
     origin = f"http://{host}"

@@ -86,6 +86,7 @@ async def test_the_record_has_the_fields_that_clients_use():
 
 
 @pytest.mark.record("JOGF", "1 jogs at JVEL and with JAR, 0 ends that")
+@pytest.mark.long
 async def test_a_jog_runs_until_it_is_released():
     async with records() as (running, made):
         await put(made, "T:x.JVEL", 5.0)
@@ -334,6 +335,7 @@ async def test_a_stop_right_after_a_put_leaves_the_axis_at_rest():
 
 
 @pytest.mark.record("SET", "with Set a put to VAL says where the motor is, and does not move it")
+@pytest.mark.long
 async def test_tweaks_homing_and_set_mode():
     async with records() as (running, made):
         await put(made, "T:x.TWV", 0.5)

@@ -106,6 +106,7 @@ async def test_a_daemon_that_was_started_anew_is_told():
         assert (events.restarts, events.lost) == (1, 0)
 
 
+@pytest.mark.long
 async def test_a_list_of_events_fits_into_one_reply_and_all_of_them_are_fetched_by_pages():
     async with running_rig() as rig:
         ids = await commands(rig, 100)

@@ -64,6 +64,7 @@ async def test_a_stop_of_a_tripped_drive_leaves_the_fault_its_name(dialect, cond
 
 
 @latched
+@pytest.mark.sweep(2)
 async def test_power_off_of_a_tripped_drive_leaves_the_fault_its_name(condition):
     async with dialect_rig(LS_182AP) as rig:
         await trip(rig, condition)
@@ -103,6 +104,7 @@ async def test_a_position_that_was_lost_stays_lost_after_a_stop():
 
 
 @latched
+@pytest.mark.sweep(2)
 async def test_a_second_without_the_cable_leaves_the_fault_its_name(condition):
     async with dialect_rig(LS_182AP) as rig:
         await trip(rig, condition)
@@ -160,6 +162,7 @@ async def test_one_reset_is_enough_for_a_tripped_drive_that_was_stopped_and_take
 
 
 @pytest.mark.parametrize("dialect", [LS_173AP, LS_182AP], ids=lambda dialect: dialect.name)
+@pytest.mark.sweep(2)
 async def test_power_clears_no_fault_that_a_drive_hides_when_it_is_taken_over(dialect):
     async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
         await stopped_after(rig, FaultCondition.STALLED)

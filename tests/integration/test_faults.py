@@ -158,6 +158,7 @@ async def test_a_jam_ends_in_a_position_error(dialect):
 
 
 @named(LOGOSOL)
+@pytest.mark.sweep(2)
 async def test_a_sensor_lost_in_an_analog_move_is_named(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
@@ -176,6 +177,7 @@ async def test_a_sensor_lost_in_an_analog_move_is_named(dialect):
 
 
 @named(LOGOSOL)
+@pytest.mark.sweep(2)
 async def test_a_sensor_lost_in_any_other_move_disturbs_nothing(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()
@@ -190,6 +192,7 @@ async def test_a_sensor_lost_in_any_other_move_disturbs_nothing(dialect):
 
 
 @named(LOGOSOL)
+@pytest.mark.sweep(2)
 async def test_an_encoder_that_was_lost_takes_the_reference_with_it_until_the_axis_is_homed(dialect):
     async with dialect_rig(dialect, PLANT.model_copy(update={"index_width_counts": 40})) as rig:
         await rig.power_on()
@@ -332,6 +335,7 @@ async def test_a_counter_that_wraps_is_a_warning(dialect):
 
 
 @named(DIALECTS)
+@pytest.mark.sweep(2)
 async def test_a_late_servo_cycle_is_a_warning_that_reset_clears(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()

@@ -84,6 +84,7 @@ async def test_a_motion_with_other_gains_does_not_go_on_from_one_under_way():
 
 
 @pytest.mark.parametrize("what", ["stop", "power lost"])
+@pytest.mark.sweep(2)
 async def test_the_gains_of_the_position_are_back_after_a_fault_and_a_restart(what):
     async with running_machine(machine(axis=AXIS)) as rig:
         await rig.client.command("rotor", Power(on=True))

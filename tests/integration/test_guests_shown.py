@@ -36,6 +36,7 @@ async def shown(rig) -> GuestHealth:
     return found
 
 
+@pytest.mark.long
 async def test_everyone_sees_who_is_there_what_it_controls_how_much_it_asks_and_what_was_refused(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
         assert await shown(rig) == GuestHealth(port="old", since=None, axes=(), packets_hz=0, refused=0)

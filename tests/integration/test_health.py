@@ -30,6 +30,7 @@ async def bus_health(rig) -> BusHealth:
     return decode_received(BusHealth, answer.payload, answer.encoding)
 
 
+@pytest.mark.long
 async def test_reports_are_published_once_a_second_and_numbered():
     async with running_rig() as rig:
         taken = []
@@ -106,6 +107,7 @@ async def daemon_health(rig) -> DaemonHealth:
     return decode_received(DaemonHealth, answer.payload, answer.encoding)
 
 
+@pytest.mark.long
 async def test_a_loop_that_is_held_up_says_for_how_long_and_what_it_left_out():
     loop = asyncio.get_running_loop()
     async with running_rig() as rig:

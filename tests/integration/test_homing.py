@@ -172,6 +172,7 @@ async def test_the_loop_can_be_opened_at_home(dialect):
 
 
 @named((V2, V3, LS_182AP, LS_182AP_22))
+@pytest.mark.sweep(2)
 async def test_an_axis_that_stands_on_its_switch_moves_off_it_first(dialect):
     async with dialect_rig(dialect, start_counts=-20_500.0) as rig:
         await rig.power_on()
@@ -246,6 +247,7 @@ async def test_a_search_that_the_index_pulse_can_slip_through_is_refused_with_th
 
 
 @pytest.mark.parametrize("index_at_counts", [700, 701, 702, 703, 704])
+@pytest.mark.sweep(2)
 async def test_at_the_nearest_velocity_no_index_pulse_is_missed(index_at_counts):
     narrow = PLANT.model_copy(update={"index_width_counts": 1, "index_at_counts": index_at_counts})
     async with dialect_rig(LS_182AP, narrow) as rig:
@@ -293,6 +295,7 @@ async def test_a_search_ends_at_its_distance():
 
 
 @named((V1, LS_182AP))
+@pytest.mark.sweep(2)
 async def test_a_search_ends_at_its_time_out(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()

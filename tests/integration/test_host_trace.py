@@ -201,6 +201,7 @@ async def test_who_stops_waiting_ends_his_own_trace_and_no_other(replaced):
         (TakeTrace(channels=("position",), interval_s=0.0001), "a poll takes up to"),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_impossible_request_is_refused_with_the_reason(request_, reason):
     async with running_rig() as rig:
         await ready(rig)
@@ -220,6 +221,7 @@ async def test_axis_says_what_can_be_traced():
     assert {"trace", "trace_abort"} <= set(axes["x"].capabilities)
 
 
+@pytest.mark.long
 async def test_every_ldcn_and_nmc_drive_of_the_rig_is_traced_faster_than_it_is_polled():
     async with running_rig() as rig:
         rates_hz = {}
@@ -254,6 +256,7 @@ async def test_a_lost_line_ends_the_trace_at_once_and_the_next_one_works():
     assert len(again.offsets_ns) == 20
 
 
+@pytest.mark.long
 async def test_a_stop_on_the_traced_line_waits_for_the_poll_on_the_wire_only():
     async with running_rig() as rig:
         await ready(rig)

@@ -111,6 +111,7 @@ AXIS_RULES = [
 
 
 @pytest.mark.parametrize(("requirement", "why"), AXIS_RULES)
+@pytest.mark.sweep(2)
 async def test_a_motion_requires_another_axis_to_be_so(requirement, why):
     rule = {"name": "clear", "of": "rotor", "requires": [{"axis": "table", **requirement}]}
     async with running_machine(machine(rule)) as rig:
@@ -320,6 +321,7 @@ async def test_a_reset_does_not_drop_a_load_that_its_loop_holds():
 
 @pytest.mark.promise("interlock-never-a-stop")
 @pytest.mark.parametrize("command", [Halt(), Stop()])
+@pytest.mark.sweep(2)
 async def test_what_takes_energy_out_is_asked_no_interlock(command):
     rules = [
         {"name": f"n{at}", "of": axis, "kind": ["position", "velocity", "home", "power_on", "power_off"]}
@@ -469,6 +471,7 @@ async def test_a_machine_that_is_taken_over_with_its_door_open_is_brought_to_res
 @pytest.mark.promise("outputs-by-command")
 @pytest.mark.parametrize("lost", [1, 2])
 @pytest.mark.parametrize("end", ["stop", "force"])
+@pytest.mark.sweep(2)
 async def test_an_output_whose_packet_was_lost_is_not_written_again_after_what_forbids_it(lost, end, monkeypatch):
     def request(self, data, at_s):
         if data[1:2] == b"\x03" and data[2] & 0x0F == CommandCode.SET_GAIN and left:

@@ -59,6 +59,7 @@ async def test_a_jog_runs_while_it_is_renewed_and_ends_when_it_is_not(dialect, v
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_a_jog_that_is_halted_ends_at_once(dialect):
     async with ready(dialect) as rig:
         await rig.send(Jog(velocity=5.0))
@@ -100,6 +101,7 @@ async def test_a_renewal_may_change_the_velocity_and_turn_round(dialect):
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_a_jog_ends_at_the_software_limit_and_is_over_then(dialect):
     async with ready(dialect, limits=LIMITS) as rig:
         jog = await rig.send(Jog(velocity=20.0, hold_s=HOLD_S))
@@ -200,6 +202,7 @@ async def test_another_client_cannot_renew_under_a_lease_that_it_has_not():
 
 @pytest.mark.promise("jog-ends-in-drive")
 @pytest.mark.parametrize("dialect", [SC, V4], ids=lambda dialect: dialect.name)
+@pytest.mark.sweep(2)
 async def test_a_lost_line_ends_a_jog_within_the_goal_of_the_drive(dialect):
     async with ready(dialect, jog_reach_s=1.0) as rig:
         jog = await rig.send(Jog(velocity=5.0, hold_s=HOLD_S))

@@ -129,6 +129,7 @@ async def test_a_reference_outlives_many_restarts(tmp_path):
         assert (await position_of(rig)).value == pytest.approx(40.0, abs=0.01)
 
 
+@pytest.mark.long
 async def test_a_homed_axis_has_its_mark_from_its_homing(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -208,6 +209,7 @@ async def test_a_motion_is_written_once_however_long_it_takes(tmp_path, monkeypa
     ]
 
 
+@pytest.mark.long
 async def test_one_reading_that_proves_a_reference_is_enough(tmp_path, monkeypatch):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -241,6 +243,7 @@ async def between(chain: Chain, config: RigConfig, tamper: Any, **how: Any) -> t
         return state.referenced, await refusals(rig)
 
 
+@pytest.mark.long
 async def test_a_drive_that_lost_power_has_no_reference(tmp_path):
     def cut(_drive: object) -> None:
         now_s = asyncio.get_running_loop().time()
@@ -252,6 +255,7 @@ async def test_a_drive_that_lost_power_has_no_reference(tmp_path):
     assert await between(chain, keeping(tmp_path), cut) == (False, ["not kept: its line was reset"])
 
 
+@pytest.mark.long
 async def test_a_drive_that_lost_power_by_itself_has_no_reference(tmp_path):
     def cut(module: Any) -> None:
         now_s = asyncio.get_running_loop().time()
@@ -262,6 +266,7 @@ async def test_a_drive_that_lost_power_by_itself_has_no_reference(tmp_path):
     assert await between(chain, keeping(tmp_path), cut) == (False, ["not kept: its drive had lost power"])
 
 
+@pytest.mark.long
 async def test_a_reference_that_is_lost_under_a_daemon_is_off_the_disk_before_it_ends(tmp_path):
     chain = chain_of()
     async with rig_on(chain, keeping(tmp_path)) as rig:
@@ -276,6 +281,7 @@ async def test_a_reference_that_is_lost_under_a_daemon_is_off_the_disk_before_it
 
 
 @pytest.mark.promise("kept-reference")
+@pytest.mark.long
 async def test_a_drive_that_was_reset_and_addressed_by_another_program_has_no_reference(tmp_path):
     """Address, identity and rate are what they were, and even the counter is near where it was."""
 
@@ -309,6 +315,7 @@ async def test_what_another_program_did_meanwhile_costs_the_reference(tmp_path, 
     assert why in said[0]
 
 
+@pytest.mark.long
 async def test_an_axis_that_was_pushed_has_no_reference(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -364,6 +371,7 @@ async def tar(what: str, folder: Path) -> None:
     await asyncio.to_thread(subprocess.run, command, cwd=folder, check=True)
 
 
+@pytest.mark.long
 async def test_a_backup_that_is_put_back_brings_no_old_origin(tmp_path):
     """The axis stands where it stood, on the same mark, and has another position 0 by now."""
     chain, config = chain_of(), keeping(tmp_path)
@@ -382,6 +390,7 @@ async def test_a_backup_that_is_put_back_brings_no_old_origin(tmp_path):
     assert "a copy that was put there" in said[0]
 
 
+@pytest.mark.long
 async def test_a_refused_reference_is_seen_where_an_operator_looks_and_stays_refused(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -414,6 +423,7 @@ async def test_a_refused_reference_is_seen_where_an_operator_looks_and_stays_ref
 
 
 @pytest.mark.promise("kept-reference")
+@pytest.mark.long
 async def test_a_crash_right_behind_a_new_origin_never_brings_back_the_old_one(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -426,6 +436,7 @@ async def test_a_crash_right_behind_a_new_origin_never_brings_back_the_old_one(t
     assert (state.referenced, said) == (False, [])
 
 
+@pytest.mark.long
 async def test_a_crash_in_mid_homing_leaves_no_reference(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:
@@ -453,6 +464,7 @@ async def test_a_counter_is_not_set_back_before_the_reference_is_off_the_disk(tm
 # -- disks ------------------------
 
 
+@pytest.mark.long
 async def test_a_full_disk_costs_the_reference_and_nothing_else(tmp_path, monkeypatch):
     def full(path: Path, text: str) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -470,6 +482,7 @@ async def test_a_full_disk_costs_the_reference_and_nothing_else(tmp_path, monkey
     assert not (tmp_path / "references").exists()
 
 
+@pytest.mark.long
 async def test_a_reference_that_cannot_be_removed_from_the_disk_is_made_void_in_the_drive(tmp_path, monkeypatch):
     def read_only(path: Path, *_text: str) -> None:
         raise OSError(errno.EROFS, os.strerror(errno.EROFS))
@@ -536,6 +549,7 @@ def _never(loop: asyncio.AbstractEventLoop, *_work: object) -> asyncio.Future[No
 # -- faults ------------------------
 
 
+@pytest.mark.long
 async def test_faults_outlive_the_daemon(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     async with rig_on(chain, config) as rig:

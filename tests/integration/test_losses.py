@@ -135,6 +135,7 @@ async def test_the_end_of_the_daemon_brings_each_axis_to_rest_as_configured(poli
 
 
 @pytest.mark.parametrize("kind", list(Rehearsal))
+@pytest.mark.sweep(2)
 async def test_a_rehearsed_loss_does_what_the_policy_says(kind):
     async with running_rig() as rig:
         await jogging(rig)

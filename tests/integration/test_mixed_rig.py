@@ -64,6 +64,7 @@ def two_drives() -> list[SimulatedUnit]:
     return units
 
 
+@pytest.mark.long
 async def test_a_smartstep_publishes_the_same_shapes_as_the_other_family(tmp_path):
     async with mixed_rig(tmp_path, two_drives()) as rig:
         state = await rig.until("feed", lambda state: state.moving is Moving.YES)
@@ -83,6 +84,7 @@ async def test_a_smartstep_publishes_the_same_shapes_as_the_other_family(tmp_pat
     assert (at_rest.state, at_rest.moving) == (AxisState.DISABLED, Moving.NO)
 
 
+@pytest.mark.long
 async def test_monitors_are_published_below_the_axis(tmp_path):
     async with mixed_rig(tmp_path, two_drives()) as rig:
         await asyncio.sleep(12.0)
@@ -125,6 +127,7 @@ async def test_an_alarm_is_shown_and_goes_with_the_reset_input(tmp_path):
         Reset(),
     ],
 )
+@pytest.mark.sweep(2)
 async def test_motion_enable_and_reset_are_refused_and_not_offered(tmp_path, command):
     async with mixed_rig(tmp_path, two_drives()) as rig:
         await rig.until("feed", lambda state: state.enabled)
@@ -226,6 +229,7 @@ async def test_an_alarm_that_a_drive_enters_in_its_history_is_an_event(tmp_path)
     assert alarm.reason == "A.51: Overspeed: new in the alarm history of the drive"
 
 
+@pytest.mark.long
 async def test_a_stop_on_the_other_line_is_not_delayed(tmp_path):
     async def longest_stop_s(*, busy: bool) -> float:
         async with mixed_rig(tmp_path, two_drives()) as rig:

@@ -286,6 +286,7 @@ async def test_a_duty_may_be_replaced_while_it_runs():
 
 @named((V4, LS_182AP))
 @pytest.mark.parametrize(("duration_s", "unplugged_s"), [(4.0, 0.5), (0.5, 1.5)])
+@pytest.mark.sweep(2)
 async def test_a_duty_does_not_survive_the_loss_of_the_line(dialect, duration_s, unplugged_s):
     async with dialect_rig(dialect, pwm=PWM, acceleration=2000) as rig:
         await rig.power_on()

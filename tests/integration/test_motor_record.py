@@ -280,6 +280,7 @@ async def test_errors_are_shown_and_cleared_as_nicos_does():
 
 
 @pytest.mark.parametrize("unit", ["degrees", "counts of it", "\u03bcm", "°"])
+@pytest.mark.sweep(2)
 async def test_a_unit_of_any_length_can_be_read(unit: str):
     config = two_axes()
     (bus,) = config.bus

@@ -214,6 +214,7 @@ async def test_whatever_ends_one_axis_of_a_path_ends_all(what: Callable[[ChainRi
 
 
 @pytest.mark.parametrize("after_s", [0.31, 0.5, 0.97])
+@pytest.mark.sweep(2)
 async def test_a_move_that_aborts_a_path_begins_where_its_axis_has_come_to_rest(after_s):
     chain = sc_chain()
     async with two_sc(chain) as rig:
@@ -267,6 +268,7 @@ async def test_if_the_daemon_dies_the_axes_stand_at_the_end_of_their_buffers():
 
 @pytest.mark.promise("path-checked-whole")
 @pytest.mark.parametrize("by_force", [False, True])
+@pytest.mark.sweep(2)
 async def test_a_path_whose_sender_has_lost_one_axis_is_fed_no_further(by_force):
     chain = sc_chain()
     async with two_sc(chain, leased=True) as rig:

@@ -74,6 +74,7 @@ async def stays_at_first_target(rig: RunningRig) -> None:
     assert position.value == pytest.approx(FIRST_TARGET, abs=0.05)
 
 
+@pytest.mark.long
 async def test_a_buffered_move_that_has_become_too_late_is_refused():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         waiting = buffered(rig, held, not_after=now_ns() + 500_000_000)
@@ -82,6 +83,7 @@ async def test_a_buffered_move_that_has_become_too_late_is_refused():
 
 
 @pytest.mark.promise("permission-at-motion")
+@pytest.mark.long
 async def test_a_buffered_move_of_a_lease_that_was_released_is_refused():
     async with running_rig(config()) as rig:
         async with moving_to_first_target(rig) as held:
@@ -92,6 +94,7 @@ async def test_a_buffered_move_of_a_lease_that_was_released_is_refused():
             await stays_at_first_target(rig)
 
 
+@pytest.mark.long
 async def test_a_buffered_move_of_a_lease_that_was_taken_by_force_is_refused():
     async with running_rig(config()) as rig:
         async with moving_to_first_target(rig) as held:
@@ -102,6 +105,7 @@ async def test_a_buffered_move_of_a_lease_that_was_taken_by_force_is_refused():
                 await stays_at_first_target(rig)
 
 
+@pytest.mark.long
 async def test_a_buffered_move_of_a_client_that_died_is_refused_although_its_axis_runs_to_its_target():
     async with running_rig(config()) as rig:
         await rig.until("x", lambda state: state.link == "up")
@@ -115,6 +119,7 @@ async def test_a_buffered_move_of_a_client_that_died_is_refused_although_its_axi
         await stays_at_first_target(rig)
 
 
+@pytest.mark.long
 async def test_a_buffered_move_is_refused_once_another_daemon_serves_the_rig():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         waiting = buffered(rig, held)
@@ -138,6 +143,7 @@ async def test_a_buffered_move_without_a_lease_is_refused_once_its_axis_is_held(
             await stays_at_first_target(rig)
 
 
+@pytest.mark.long
 async def test_a_buffered_move_goes_on_under_a_lease_that_its_holder_has_widened():
     async with running_rig(config()) as rig, moving_to_first_target(rig) as held:
         waiting = buffered(rig, held)
@@ -305,6 +311,7 @@ def busy_line_before(rig: RunningRig, monkeypatch, call: str) -> asyncio.Event:
 
 @pytest.mark.promise("permission-at-motion")
 @pytest.mark.parametrize("call", ["load", "start"])
+@pytest.mark.sweep(2)
 async def test_a_packet_that_waits_for_the_line_is_not_sent_once_its_lease_has_ended(call, monkeypatch):
     async with running_rig(config(LossPolicy.RUN_TO_TARGET)) as rig:
         await rig.until("x", lambda state: state.link == "up")

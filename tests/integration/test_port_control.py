@@ -79,6 +79,7 @@ async def test_a_program_enables_moves_and_finds_its_counts(tmp_path):
         assert holders == {"rotor": "old", "table": None}
 
 
+@pytest.mark.long
 async def test_the_registers_of_the_drive_are_those_that_the_program_has_loaded(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
         await program.begin()
@@ -301,6 +302,7 @@ async def test_a_zero_that_the_program_sets_is_its_own_counter_and_the_position_
         assert shaft(rig) == pytest.approx(2000, abs=8)
 
 
+@pytest.mark.long
 async def test_a_search_for_the_index_is_the_homing_of_everybody(tmp_path):
     async with guest(tmp_path, "control") as (rig, program):
         await program.begin()
@@ -325,6 +327,7 @@ async def test_a_search_for_the_index_is_the_homing_of_everybody(tmp_path):
         assert (shaft(rig) - plant.index_at_counts) % plant.counts_per_rev == pytest.approx(0, abs=10)
 
 
+@pytest.mark.long
 async def test_a_search_that_is_armed_in_mid_motion_shows_what_a_drive_shows(tmp_path):
     """As the driver of a centrifuge does it: servo and amplifier in two packets, and armed once the rotor turns."""
     async with guest(tmp_path, "control") as (rig, program):

@@ -198,6 +198,7 @@ async def test_whatever_a_guest_sends_the_line_is_not_rearranged_and_nothing_mov
         assert not rig.daemon.rig.axes["rotor"].tracker.status.enabled
 
 
+@pytest.mark.long
 async def test_replies_have_the_form_that_they_have_on_the_bare_line(tmp_path):
     loop = asyncio.get_running_loop()
     bare = build_chain(ChainSpec((ModuleSpec("pic-servo-sc"), ModuleSpec("pic-servo-sc"), ModuleSpec("pic-io"))))
@@ -223,6 +224,7 @@ async def test_replies_have_the_form_that_they_have_on_the_bare_line(tmp_path):
             assert len(reply) // 2 == len(expected), packet
 
 
+@pytest.mark.long
 async def test_a_port_that_cannot_be_made_is_an_event_and_is_served_once_it_can_be(tmp_path):
     folder = tmp_path / "run"
     async with running_machine(with_port(folder / "port")) as rig:

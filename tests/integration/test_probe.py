@@ -87,6 +87,7 @@ async def test_what_cannot_be_latched_is_refused():
 
 
 @pytest.mark.parametrize("dialect", [V4, SC, LS_182AP], ids=lambda dialect: dialect.name)
+@pytest.mark.sweep(2)
 async def test_a_probe_ends_at_the_input_when_the_host_is_dead(dialect):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()

@@ -56,6 +56,7 @@ async def test_each_topic_becomes_a_table_whose_columns_are_its_values(tmp_path)
     assert rows(folder, "tele.x.event")[-1]["event.status"] == CommandStatus.DONE
 
 
+@pytest.mark.long
 async def test_a_topic_is_columns_of_the_same_length(tmp_path):
     await record_a_move(tmp_path / "run.mcap")
     tables = ldcnd.recording(tmp_path / "run.mcap")
@@ -84,6 +85,7 @@ async def test_of_a_damaged_recording_the_rest_is_exported_and_it_says_so(tmp_pa
     assert len(rest.damages) == 1
 
 
+@pytest.mark.long
 async def test_tables_are_never_overwritten(tmp_path):
     path, folder = tmp_path / "run.mcap", tmp_path / "tables"
     await record_a_move(path)

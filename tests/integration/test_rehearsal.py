@@ -73,6 +73,7 @@ async def test_a_blocking_program_fails_where_its_machine_does(ldcnd_rig):
         await ldcnd_rig.run_blocking(slow_scan, [1, -1, 2])
 
 
+@pytest.mark.long
 async def test_a_jam_ends_the_program_where_it_is(ldcnd_rig):
     ldcnd_rig.faults.jam("x", at=7.5)
     with pytest.raises(ldcnd.LdcndError, match="move_absolute"):

@@ -193,6 +193,7 @@ async def test_a_whole_chain_that_lost_power_comes_back():
     assert [module.address for module in chain.modules] == [1, 2, 3, 4]
 
 
+@pytest.mark.long
 async def test_a_module_that_is_no_axis_comes_back_too():
     chain = chain_of("ls182ap", "ls182ap", "picservo-v4", "picservo-v4", "picio")
     async with rig_on(chain, simulated_config(module=[{"address": 5, "model": "pic-io"}])) as rig:
@@ -208,6 +209,7 @@ async def test_a_module_that_is_no_axis_comes_back_too():
     assert [drive(chain, address).loop.servo_on for address in (1, 2, 3, 4)] == [True] * 4
 
 
+@pytest.mark.long
 async def test_a_stop_works_while_a_drive_is_dark():
     chain = chain_of()
     async with rig_on(chain, simulated_config()) as rig:

@@ -64,6 +64,7 @@ async def test_what_is_published_of_drives_that_move_stop_fail_and_fall_silent(e
     assert min(found.values()) > 10
 
 
+@pytest.mark.long
 async def test_what_is_published_of_smartsteps():
     taken: list[Publication] = []
     async with running_rig(load_config(SIMULATED.with_name("mixed.toml"))) as rig:

@@ -169,6 +169,7 @@ async def test_the_target_is_where_the_axis_was_sent_last_by_any_program_or_came
         assert (abs(place - 9) < 0.05) == (ending == "end")
 
 
+@pytest.mark.long
 async def test_no_target_of_a_daemon_with_another_unit_is_shown_as_one_in_the_unit_that_is_described():
     broker, updates = MemoryBroker(), []
     document = two_axes().model_dump(mode="json", exclude_unset=True)

@@ -73,6 +73,7 @@ def test_a_whole_cycle_runs_and_is_recorded():
     assert [each.client for each in holders] == [None]
 
 
+@pytest.mark.long
 def test_a_step_that_fails_ends_the_sequence_and_halts_what_moves():
     spin = SequenceStep(
         do="move_velocity",

@@ -55,6 +55,7 @@ async def moved(rig: RunningRig, axis: str, distance: float) -> CommandEvent:
 
 
 @pytest.mark.parametrize("axis", DISTANCES)
+@pytest.mark.sweep(2)
 async def test_a_move_is_done_within_its_window_and_says_where(axis):
     async with running_rig() as rig:
         await powered(rig, axis)

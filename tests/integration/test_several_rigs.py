@@ -119,6 +119,7 @@ def test_what_a_remedy_names_is_typed_with_the_options_that_led_to_its_rig(two_r
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 def test_a_stop_that_reaches_no_daemon_says_that_nothing_was_stopped():
     ran = subprocess.run(  # noqa: S603
         (sys.executable, "-m", "ldcnd", "stop", "-e", f"tcp/127.0.0.1:{free_port()}"),

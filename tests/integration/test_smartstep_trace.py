@@ -162,6 +162,7 @@ async def test_unknown_layout_leaves_words_undecoded():
     assert trace.header.channels[0].unit == ""
 
 
+@pytest.mark.long
 async def test_values_that_cannot_be_make_the_layout_uncertain():
     async with trace_rig(assumed={"word_layout": TraceWordLayout.LSB_IO_SHIFT}) as under_test:
         under_test.pulses(-8_000.0)
@@ -223,6 +224,7 @@ async def test_second_unit_keeps_its_rate_while_a_trace_uploads():
     assert sum(busy) <= 5 * 2.0 + max(quiet) - 2.0 + piece_s
 
 
+@pytest.mark.long
 async def test_stop_on_another_bus_is_not_delayed_by_an_upload():
     async def stop_times_s(rig, number):
         loop = asyncio.get_running_loop()

@@ -61,6 +61,7 @@ async def test_motions_that_begin_have_their_share_of_the_velocity_and_say_so(di
 
 
 @pytest.mark.parametrize(("dialect", "goes_on_at"), [(SC, 2.0), (V4, 8.0), (LS_182AP, 8.0)], ids=str)
+@pytest.mark.sweep(2)
 async def test_a_move_under_way_changes_its_speed_where_the_drive_takes_it_and_ends_at_its_goal(dialect, goes_on_at):
     async with dialect_rig(dialect) as rig:
         await rig.power_on()

@@ -218,6 +218,7 @@ async def test_a_line_that_was_lost_with_a_drive_is_not_reset_while_another_move
 
 @pytest.mark.promise("rejoin-resets-nothing")
 @pytest.mark.parametrize("stopped", [False, True])
+@pytest.mark.sweep(2)
 async def test_a_drive_that_a_restarted_one_keeps_from_hearing_is_not_reset(stopped):
     chain = chain_of()
     loop = asyncio.get_running_loop()

@@ -10,6 +10,7 @@ from tests.bench.trace_upload import AS_A_RULE_BYTES, MEMORIES, READINGS, SHARE,
 from tests.support.trace_rig import MIXED
 
 
+@pytest.mark.long
 def test_on_an_idle_line_the_longest_strings_take_nearly_all_of_the_time():
     assert SHARE <= share_of_limit(LONGEST_STRING_BYTES) < 1.0
 

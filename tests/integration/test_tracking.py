@@ -129,6 +129,7 @@ async def test_a_set_point_keeps_to_reference_and_software_limits():
             await rig.send(Track(position=0.1))
 
 
+@pytest.mark.long
 async def test_a_set_point_without_a_reply_is_not_sent_again_and_the_stream_goes_on():
     no_replies = FaultPlan((LineFault(FaultKind.REPLY_LOST, from_s=10.0, until_s=10.05),))
     async with dialect_rig(V4, faults=no_replies, tracking=TRACKING) as rig:

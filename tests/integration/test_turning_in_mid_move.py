@@ -198,6 +198,7 @@ async def test_no_row_of_motions_that_follow_each_other_leaves_the_limits(dialec
 
 
 @dialects
+@pytest.mark.sweep(2)
 async def test_a_jog_that_is_held_keeps_to_limits_that_a_reload_has_narrowed(dialect: Dialect):
     async with dialect_rig(dialect, WIDE, limits=LIMITS) as rig:
         await rig.power_on()

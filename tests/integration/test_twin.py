@@ -232,6 +232,7 @@ async def ram_written():
         return await seen(rig, program)
 
 
+@pytest.mark.long
 def test_a_write_to_ram_is_no_write_to_eeprom_and_what_is_not_counted_is_unknown():
     report = run(ram_written())
     assert report.eeprom_writes is None

@@ -175,6 +175,7 @@ def test_group_of_the_daemon_may_keep_the_processor_awake(machine: Machine):
     assert re.search(r"71-ldcnd.rules:\d+ MODE 0660", report)
 
 
+@pytest.mark.long
 def test_rules_are_understood_whole(machine: Machine):
     report = tried(machine, FTDI, PORT)
 

@@ -25,6 +25,7 @@ async def _ready(rig):
         await (await rotor.home()).done()
 
 
+@pytest.mark.long
 def test_programs_send_numbers_with_units():
     async def program():
         async with simulated_rig(CENTRIFUGE) as rig:

@@ -69,6 +69,7 @@ async def bare(head: bytes) -> str:
     return b"".join(piece for _, piece in chain.advance(5.0)).decode().rstrip("\r")
 
 
+@pytest.mark.long
 async def test_reads_are_answered_with_the_same_bytes_as_on_the_bare_line(tmp_path):
     async with units_guest(tmp_path, "read") as (_, program, _feed):
         for head in READS:

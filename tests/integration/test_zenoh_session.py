@@ -303,6 +303,7 @@ async def test_a_session_leaves_no_thread_behind(endpoint: str) -> None:
     assert during - before
 
 
+@pytest.mark.long
 async def test_the_interpreter_exits_when_the_program_fails_inside_a_session(endpoint: str) -> None:
     async with program(DAEMON, endpoint) as daemon, asyncio.timeout(5):
         assert await daemon.wait() == 7

@@ -228,6 +228,7 @@ def test_a_query_of_an_instant_answers_with_bounds_and_refuses_what_is_none():
     run(program())
 
 
+@pytest.mark.long
 def test_a_program_asks_where_axes_were_and_what_is_not_known_is_not_guessed():
     async def program() -> None:
         async with simulated_rig(Path("config/simulated.toml"), seed=1) as rig:

@@ -42,6 +42,7 @@ def play(chain, requests, gap_s=0.02):
 
 @settings(max_examples=60, deadline=None)
 @given(noise=st.binary(min_size=1, max_size=200))
+@pytest.mark.long
 def test_any_bytes_are_survived(noise):
     chain = chain_of_all()
 
@@ -70,6 +71,7 @@ def test_any_commands_with_any_data_are_answered_with_right_checksums(requests):
 
 @settings(max_examples=30, deadline=None)
 @given(requests=st.lists(packets, max_size=10), seed=st.integers(0, 1000))
+@pytest.mark.long
 def test_same_seed_and_same_commands_give_the_same_bytes_at_the_same_instants(requests, seed):
     faults = tuple(LineFault(kind, 0.1, longest_s=0.02) for kind in FaultKind if kind is not FaultKind.UNPLUGGED)
     options = {"seed": seed, "faults": FaultPlan(faults, seed)}

@@ -320,6 +320,7 @@ NUMBERS = {axis_list: "60.000", axis_watch: "60.0000", top: "60.000", python_rep
 
 @pytest.mark.parametrize("face", NUMBERS, ids=lambda face: face.__name__)
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+@pytest.mark.sweep(2)
 def test_a_number_that_does_not_say_where_the_axis_is_stands_in_brackets_with_words(case, face):
     told, digits = face(known(case)), NUMBERS[face]
     is_known = case.place is Place.KNOWN or not wanted(case, face)

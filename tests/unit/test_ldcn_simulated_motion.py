@@ -16,6 +16,7 @@ SERVOS = ["ls182ap", "ls173ap", "picservo-v1", "picservo-v2", "picservo-v3", "pi
 
 @pytest.mark.parametrize("name", SERVOS)
 @pytest.mark.parametrize("gains", [UTILITY_GAINS, SOFT_GAINS], ids=["utility", "soft"])
+@pytest.mark.sweep(2)
 def test_move_ends_within_one_count(name, gains):
     axis = SimulatedAxis(name, gains=gains)
 

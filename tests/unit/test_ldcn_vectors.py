@@ -243,6 +243,7 @@ def built_for_servo(profile, address, command, decoded):  # noqa: PLR0911, PLR09
 
 
 @rows("command", ok=True)
+@pytest.mark.sweep(2)
 def test_a_correct_frame_is_decoded_and_framed_again(row):
     frame = bytes.fromhex(row["hex"])
 
@@ -256,6 +257,7 @@ def test_a_correct_frame_is_decoded_and_framed_again(row):
 
 
 @rows("command", ok=True)
+@pytest.mark.sweep(2)
 def test_a_correct_frame_is_built_byte_by_byte(row):
     exchange = built(row, expected(row))
 

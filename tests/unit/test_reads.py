@@ -116,6 +116,7 @@ async def test_a_client_has_so_many_unanswered_reads_and_others_have_theirs(who:
     assert (desk.intake.load().waiting, desk.intake.load().lost) == (bound + 1, 10)
 
 
+@pytest.mark.long
 async def test_all_clients_together_have_so_many_unanswered_reads() -> None:
     desk = Desk(Library())
 

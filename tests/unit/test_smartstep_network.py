@@ -264,6 +264,7 @@ async def test_monitors_come_at_their_rates():
     }
 
 
+@pytest.mark.long
 async def test_polling_for_long_leaves_nothing_behind_in_the_queue():
     heard = Heard()
     async with smartstep_line([simulated(1)]) as line:

@@ -240,6 +240,7 @@ async def taken(line, **request):
 
 
 @pytest.mark.parametrize("lost", [("request",), ("reply",), ("request", "reply", "request")])
+@pytest.mark.sweep(2)
 async def test_a_lost_execute_starts_the_trace_within_seconds(lost):
     unit = losing_once(1, b"W112001", *lost)
     async with smartstep_line([unit]) as line:
@@ -299,6 +300,7 @@ async def test_a_trace_that_was_ended_from_elsewhere_is_no_trace():
             await armed.record(ignore)
 
 
+@pytest.mark.long
 async def test_a_triggered_trace_that_was_ended_from_elsewhere_shows_no_trigger():
     unit = running(pulses=0.0)
     async with smartstep_line([unit], profile=TRIGGERED) as line:

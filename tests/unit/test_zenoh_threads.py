@@ -58,6 +58,7 @@ asyncio.run(main())
 
 
 @pytest.mark.real_time
+@pytest.mark.long
 async def test_a_daemon_starts_enough_sending_threads():
     """While one closes the link of a client that takes nothing, the others send."""
     program = await asyncio.create_subprocess_exec(
