@@ -6,6 +6,7 @@ A configuration, a state directory and a recording go to `tests/kept/VERSION`; e
 
 import argparse
 import asyncio
+import os
 import shutil
 import tomllib
 from pathlib import Path
@@ -54,7 +55,8 @@ def main() -> None:
     """Write the files of this version."""
     argparse.ArgumentParser(description=__doc__).parse_args()
     version = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
-    place = ROOT / "tests" / "kept" / version
+    os.chdir(ROOT)
+    place = Path("tests", "kept", version)  # no path of the machine on which it was written gets into the recording
     place.mkdir(parents=True, exist_ok=True)
     for name in FILES:
         shutil.rmtree(place / name, ignore_errors=True)
