@@ -36,7 +36,7 @@ HALT_TIME_S = 3.0
 def _name() -> str:
     try:
         person = getpass.getuser()
-    except (KeyError, OSError):  # of a process whose user has no account
+    except (ImportError, KeyError, OSError):  # of a process whose user has no account, or of a system that has none
         return "ldcnd"
     return f"{person} (ldcnd)"[:LONGEST_NAME]
 

@@ -43,7 +43,11 @@ async def test_a_recorded_axis_is_drawn_with_its_commands_and_without_what_nobod
     assert position.unit == "mm"
     assert max(value for value in position.values if not math.isnan(value)) == pytest.approx(5.0, abs=0.1)
     assert any(map(math.isnan, position.values))
-    assert [event.verb for event in history.events if event.status is CommandStatus.DONE] == ["power", "move_absolute"]
+    assert [event.verb for event in history.events if event.status is CommandStatus.DONE] == [
+        "power",
+        "move_absolute",
+        "link_back",
+    ]
     assert drawn.exit_code == 0, drawn.output
     assert picture.read_bytes().startswith(b"\x89PNG")
 

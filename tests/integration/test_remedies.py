@@ -306,7 +306,7 @@ def test_every_remedy_that_names_a_command_is_run_or_takes_hands():
 
 def remedies() -> set[str]:
     """Return what each remedy of the package that names commands says, as it is typed."""
-    words = {"Remedy": Remedy, "step": step, "EEPROM_LIFE": EEPROM_LIFE, "again": ""}
+    words = {"Remedy": Remedy, "step": step, "remedy_step": step, "EEPROM_LIFE": EEPROM_LIFE, "again": ""}
     words["remedy"] = step("set_outputs", limit1="input", limit2="input")
     found = set()
     for file in Path(ldcnd.__file__).parent.rglob("*.py"):
