@@ -228,7 +228,7 @@ class AxisCommands:
                 self._tracker.status.command is not None
                 and self._tracker.status.command.completion is Completion.PROCEDURE
             )
-        # before `RequestRefused`, which they are, too: whoever has overtaken the step sees to the drive
+        # before `RequestRefused`, which they are, too: the command that has overtaken the step sees to the drive
         except (StopLatched, CommandAborted):
             raise
         except (RequestRefused, DriveFault) as error:

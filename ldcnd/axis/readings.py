@@ -293,7 +293,7 @@ class AxisReadings:
                 self._queue.wake()
         if self._stops.inherited:
             self._stops.watch_inherited(reading, timing.sent_at_s)
-        # whoever waits for the end reads the position next: it must be that of the end
+        # a client that waits for the end reads the position next: it must be that of the end
         if self._over:
             asked |= END_ITEMS
         self._telemetry.publish(tracker.status, reading, asked, t, t_error_ns)

@@ -144,7 +144,7 @@ class TraceRecorder:
             **dict(granted.shape),
         )
         trace = self._current = _Trace(armed, header)
-        # before the header of this one, so that nobody takes samples of the last for its own
+        # before the header of this one, so that no client takes samples of the last for its own
         self._publisher.withdraw_trace_chunks(self._axis)
         self._publish(trace, header)
         self._armed.put_nowait(trace)

@@ -189,7 +189,7 @@ def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
         # nothing but a reset leads out of error_stop, and what is not known to rest or to move changes nothing
         if status.state is AxisState.ERROR_STOP or (rests is None and status.state is not AxisState.DISABLED):
             return status
-        # without a command of this daemon: somebody else's motion, or one of before
+        # without a command of this daemon: the motion of another program, or one of before
         state = AxisState.STANDSTILL if rests else AxisState.DISCRETE_MOTION
         return status if status.state is state else replace(status, state=state)
     match command.completion:
@@ -262,7 +262,7 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
         return _with_faults(status, (fault,), event.now_ns)  # what is before it is known by now, or answers again
     if not was_up and not event.another:
         return status
-    # a counter that nobody watches may have been set, so what it shows later is no place
+    # a counter that is not read may have been set, so what it shows later is no place
     status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=NOTHING_SEEN)
     status = _with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again

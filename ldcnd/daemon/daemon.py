@@ -368,9 +368,7 @@ class GuardedGroup(asyncio.TaskGroup):
         self, coro: Coroutine[Any, Any, Any], **kwargs: Any
     ) -> "asyncio.Task[Any]":
         task = super().create_task(self._guarded(coro), **kwargs)
-        task.add_done_callback(
-            lambda _: coro.close()
-        )  # of a task that is cancelled before it begins nothing is awaited
+        task.add_done_callback(lambda _: coro.close())  # of one that is cancelled before it begins nothing is awaited
         return task
 
 

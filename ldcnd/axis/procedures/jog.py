@@ -93,7 +93,7 @@ class Holds:
 
     def begin(self, command_id: str, request: Jog, now_s: float) -> Hold:
         """Remember a jog from its command on, also while that waits."""
-        # whoever ended without being told is cleared away here
+        # a holder that ended without being told is cleared away here
         self._holds = {name: hold for name, hold in self._holds.items() if not hold.over and hold.until_s > now_s}
         hold = self._holds[command_id] = Hold(self._axis, command_id, request, now_s)
         return hold
