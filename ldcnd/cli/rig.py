@@ -62,9 +62,9 @@ def stop_rig(target: Target, axis: str | None) -> None:
             codes.add(UNREACHABLE if isinstance(reply, SessionError) else FAILED)
             show_error(reply, f"{whose}{NOT_STOPPED}")
             continue
-        target.show(reply, f"{whose}stop latched, confirmed by {', '.join(reply.confirmed) or 'none'}", rig=rig)
-        if reply.warning:
-            show_lines(f"{whose}{reply.warning}", err=True)
+        target.show(reply, *([f"{whose}{reply.outcome}"] if reply.outcome else []), rig=rig)
+        for remark in filter(None, (reply.unreached, reply.warning)):
+            show_lines(f"{whose}{remark}", err=True)
         if reply.shortfall:
             codes.add(FAILED)
             show_lines(f"{whose}{reply.shortfall}", err=True)
@@ -79,7 +79,8 @@ def stop(target: Target, axis: str | None) -> None:
     """Stop AXIS, or every axis, and latch: nothing moves again before `ldcnd reset`.
 
     Without --rig it stops on every rig that this endpoint reaches, and names them. It needs no lease and works in any
-    state. It is no emergency stop. The exit code is 0 only when all drives have confirmed it.
+    state. It is no emergency stop. The exit code is 0 only when all drives that take
+    a stop have confirmed it, and the others (SmartStep) stood when they were read last.
     """
     stop_rig(target, axis)
 

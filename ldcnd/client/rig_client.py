@@ -323,12 +323,14 @@ class RigClient:
             return self._one(answers, StopReply)
         # the drives confirm it to the daemon that has the line: whichever of them says so, it is so
         axes = tuple(dict.fromkeys(name for reply in replies for name in reply.axes))
-        confirmed, unstoppable, kept = (
+        confirmed, unstoppable, standing, kept = (
             {name for reply in replies for name in getattr(reply, what)}
-            for what in ("confirmed", "unstoppable", "kept")
+            for what in ("confirmed", "unstoppable", "standing", "kept")
         )
         warning = next((reply.warning for reply in replies if reply.warning), "")
-        return StopReply.of(axes, confirmed=confirmed, unstoppable=unstoppable, kept=kept, warning=warning)
+        return StopReply.of(
+            axes, confirmed=confirmed, unstoppable=unstoppable, standing=standing, kept=kept, warning=warning
+        )
 
     async def position(self, axis: str) -> PositionSample | None:
         """Return the axis's last position, or None when there is none yet."""

@@ -283,13 +283,20 @@ class StopReply(Frozen):
     """The axes whose drives acknowledged the stop."""
     unstoppable: tuple[str, ...] = ()
     """The axes that no stop reaches over their line, and that no latch holds: what moves them goes on."""
+    standing: tuple[str, ...] = ()
+    """Those of them that stood when their drive was read last."""
     kept: tuple[str, ...] = ()
     """The axes whose latch is on the disk of the daemon: it outlasts a restart. The others lose it when the daemon
     ends: none is kept without a `state_dir`."""
     warning: str = ""
     """That the latches cannot be written to the `state_dir`, and why, for a person; empty where they are."""
     shortfall: str = ""
-    """What may move on, and what to do, for a person; empty when every drive has confirmed the stop."""
+    """What may move on, and what to do, for a person; empty when every drive that takes a stop has confirmed it and
+    all others stood when they were read last."""
+    outcome: str = ""
+    """That the stop is latched, and which drives have confirmed it, for a person; empty where no axis has a latch."""
+    unreached: str = ""
+    """That axes stand although no stop reaches them, and which, for a person; empty where there is none."""
 
     @classmethod
     def of(
@@ -298,6 +305,7 @@ class StopReply(Frozen):
         *,
         confirmed: Collection[str],
         unstoppable: Collection[str],
+        standing: Collection[str],
         kept: Collection[str],
         warning: str = "",
     ) -> Self:
@@ -305,17 +313,21 @@ class StopReply(Frozen):
         pending = [name for name in axes if name not in confirmed and name not in unstoppable]
         out_of_reach = tuple(name for name in axes if name in unstoppable)
         said = [f"NOT confirmed: {', '.join(pending)}; the latch holds, look at the machine"] if pending else []
-        if out_of_reach:
-            said.append(
-                f"NOT stopped: {', '.join(out_of_reach)}; the drive takes no stop over its line and has no latch"
-            )
+        at_rest = tuple(name for name in out_of_reach if name in standing)
+        done = tuple(name for name in axes if name in confirmed)
+        going = [name for name in out_of_reach if name not in standing]
+        if going:
+            said.append(f"NOT stopped: {', '.join(going)}; the drive takes no stop over its line and has no latch")
         return cls(
             axes=axes,
-            confirmed=tuple(name for name in axes if name in confirmed),
+            confirmed=done,
             unstoppable=out_of_reach,
+            standing=at_rest,
             kept=tuple(name for name in axes if name in kept),
             warning=warning,
             shortfall=f"{'. '.join(said)}. Use the machine's emergency stop." if said else "",
+            outcome=f"stop latched, confirmed by {', '.join(done) or 'none'}" if len(out_of_reach) < len(axes) else "",
+            unreached=f"No stop reaches {', '.join(at_rest)}: no motion at the last reading." if at_rest else "",
         )
 
 

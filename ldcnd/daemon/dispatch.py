@@ -46,6 +46,7 @@ from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.keys import RIG_ITSELF, CommandAddress, Keys
 from ldcnd.contract.leases import Acquire
+from ldcnd.contract.samples import Moving
 from ldcnd.daemon.interlocks import Interlocks
 from ldcnd.daemon.leases import Authority, LeaseWatch
 from ldcnd.daemon.ledger import EventLog, Ledger, LedgerEntry, status_of
@@ -249,9 +250,12 @@ class Requests:
         confirmed = await self._stop_once(names, query)
         kept = tuple(each for each in names if self._rig.axes[each].stops.latch_is_kept)
         unstoppable = tuple(each for each in names if not self._rig.axes[each].stops.possible)
+        standing = tuple(each for each in unstoppable if self._rig.axes[each].tracker.status.moving is Moving.NO)
         trouble = self._rig.not_kept.get(LATCHES)
         warning = f"The latch is not on the disk ({trouble}): it is lost when the daemon ends." if trouble else ""
-        return StopReply.of(names, confirmed=confirmed, unstoppable=unstoppable, kept=kept, warning=warning)
+        return StopReply.of(
+            names, confirmed=confirmed, unstoppable=unstoppable, standing=standing, kept=kept, warning=warning
+        )
 
     async def _stop_once(self, names: tuple[str, ...], query: Query) -> tuple[str, ...]:
         """Stop axes and return those that confirmed it; in a flood of stops, join one that is under way.

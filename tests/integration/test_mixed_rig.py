@@ -248,9 +248,10 @@ async def test_a_stop_on_the_other_line_is_not_delayed(tmp_path):
     assert await longest_stop_s(busy=True) <= await longest_stop_s(busy=False) + 1e-3
 
 
-async def test_a_rig_wide_stop_says_which_drive_it_could_not_stop(tmp_path):
+async def test_a_stop_says_which_drive_that_turns_it_could_not_stop_and_which_stands(tmp_path):
     async with mixed_rig(tmp_path, two_drives()) as rig:
-        await rig.until("feed", lambda state: state.enabled)
+        await rig.until("feed", lambda state: state.moving is Moving.YES)
+        await rig.until("spool", lambda state: state.moving is Moving.NO)
         reply = await rig.client.stop()
         state = await rig.client.state("feed")
 
@@ -258,9 +259,9 @@ async def test_a_rig_wide_stop_says_which_drive_it_could_not_stop(tmp_path):
     assert set(reply.axes) == {"x", "feed", "spool"}
     assert reply.unstoppable == ("feed", "spool")
     assert reply.shortfall == (
-        "NOT stopped: feed, spool; the drive takes no stop over its line and has no latch."
-        " Use the machine's emergency stop."
+        "NOT stopped: feed; the drive takes no stop over its line and has no latch. Use the machine's emergency stop."
     )
+    assert (reply.standing, reply.unreached) == (("spool",), "No stop reaches spool: no motion at the last reading.")
     assert isinstance(state, StateSample)
     assert not state.stop_latched
 

@@ -11,7 +11,7 @@ from textual.coordinate import Coordinate
 from textual.widgets import DataTable, Footer, Static
 
 from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.commands import Halt, Reset, StopReply
+from ldcnd.contract.commands import Halt, Reset
 from ldcnd.contract.condition import Severity
 from ldcnd.contract.errors import LdcndError
 from ldcnd.lab.top.columns import AXIS_TITLES, BUS_TITLES, NARROW, axis_cells, headline, line_rows, narrow_cells
@@ -96,7 +96,9 @@ class TopScreen(App[None]):
     async def _stop_all(self) -> None:
         self._say("stopping all axes ...")
         try:
-            answer = _stopped(await self._client.stop(client=NAME))
+            reply = await self._client.stop(client=NAME)
+            said = (reply.shortfall.removesuffix("."), reply.outcome, reply.unreached.removesuffix("."), reply.warning)
+            answer = ". ".join(filter(None, said))
         except LdcndError as error:
             answer = f"STOP NOT CONFIRMED: {error.message}. Use the machine's emergency stop."
         self._say(answer)
@@ -138,9 +140,3 @@ def _fill(table: "DataTable[Text]", rows: Sequence[tuple[tuple[str, ...], Severi
             before = table.get_cell_at(place)
             if (before.plain, before.style) != (text.plain, text.style):
                 table.update_cell_at(place, text, update_width=True)
-
-
-def _stopped(reply: StopReply) -> str:
-    """Return what became of a stop."""
-    stopped = f"stop latched, confirmed by {', '.join(reply.confirmed) or 'none'}"
-    return ". ".join(part for part in (reply.shortfall.removesuffix("."), stopped, reply.warning) if part)

@@ -71,11 +71,9 @@ function isNews({ answered }) {
 
 function outcome(rig, reply) {
   if (!reply.axes) return { level: "bad", text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.` };
-  const warning = reply.warning ? ` ${reply.warning}` : "";
-  const confirmed = reply.confirmed.length ? `confirmed by ${reply.confirmed.join(", ")}` : "confirmed by no drive";
-  const told = reply.unstoppable.length < reply.axes.length ? { answered: rig } : {}; // without a latch no state tells of it
-  if (!reply.shortfall) return { ...told, level: warning && "warn", text: `${rig}: stop latched; ${confirmed}.${warning}` };
-  return { ...told, level: "bad", text: `${rig}: ${reply.shortfall} Stop latched; ${confirmed}.${warning}` };
+  const text = [reply.shortfall, sentence(reply.outcome), reply.unreached, reply.warning].filter(Boolean).join(" ");
+  const told = reply.outcome ? { answered: rig } : {}; // without a latch no state tells of it
+  return { ...told, level: reply.shortfall ? "bad" : reply.warning && "warn", text: `${rig}: ${text}` };
 }
 
 /** The stops that are latched now, as the axes say it: by this page, another one, or any other program. */
