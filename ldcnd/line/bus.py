@@ -120,6 +120,10 @@ class Job(Transaction):
         # before a repetition: the node may have executed the packet before, although its reply was lost
         self.fail(error if self.attempts_left == self.attempts else error.although(SENT_IN_VAIN))
 
+    @override
+    def give_up(self) -> None:
+        self.attempts_left = 0
+
     def fail(self, error: LdcndError) -> None:
         """Give the caller the error, unless it has gone."""
         if not self.future.done():
@@ -334,6 +338,15 @@ class Bus:
         for job in self._schedule.waiting(Lane.COMMAND):
             if job.exchange.node == node:
                 job.refuse(error)
+
+    def outrank(self, stop: Exchange[Any]) -> None:
+        """Never send a stop again, nor at all where it waits: one that takes more out follows, and must come last."""
+        error = ReplyTimeout("another stop outranks it, so it is not sent any more")
+        for job in self._schedule.waiting(Lane.STOP):
+            if job.exchange is stop:
+                job.refuse(error)
+        if self._line and (sent := self._line.on_wire) and sent.exchange is stop:
+            sent.give_up()
 
     def waiting(self, lane: Lane) -> int:
         """Return how many exchanges wait in a lane; polls are scheduled, not queued."""

@@ -98,6 +98,9 @@ class Transaction:
         """Note that no reply is valid any more; return whether to send the exchange again."""
         return False
 
+    def give_up(self) -> None:
+        """Send it no more."""
+
     def rejected(self) -> bool:
         """Note that the node did not execute the packet; return whether to send it again."""
         return False
@@ -271,6 +274,11 @@ class Line(Receiver):
         self.undelivered: deque[tuple[Transaction, bytes, Timing]] = deque()
         self._coalesce_s, self._deliver_by_s = settings.coalesce_s, NEVER_S
         transport.attach(self)
+
+    @property
+    def on_wire(self) -> Transaction | None:
+        """What was sent last, as long as its reply is waited for."""
+        return self._transaction
 
     def on_time(self, now_s: float) -> bool:
         """Tell whether the line acts on time: the time of its next action is always set, and is not past."""

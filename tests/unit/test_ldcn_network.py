@@ -555,6 +555,28 @@ async def test_an_sc_that_has_kept_its_power_is_not_reset_although_it_answers_at
         assert chain.modules[1].loop.servo_on
 
 
+@pytest.mark.promise("stop-closes-no-loop")
+@pytest.mark.parametrize("mode", [StopMode.SMOOTH, StopMode.ABRUPT])
+async def test_a_stop_that_is_sent_again_on_a_line_out_of_step_never_follows_the_packet_that_switches_the_motor_off(
+    mode,
+):
+    chain = chain_of("ls182ap", "picservo-v4")
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+        axis = line.network.axes["a1"]
+        await axis.power(on=True)
+        before = len(line.sent())
+        line.bus.distrust()
+        async with asyncio.TaskGroup() as both:
+            both.create_task(axis.stop(mode), name="stop")
+            both.create_task(axis.stop(StopMode.OFF), name="off")
+        stops = [packet.data[0] for packet in line.sent(before) if packet.command is CommandCode.STOP_MOTOR]
+
+    off = next(place for place, control in enumerate(stops) if control & StopControl.MOTOR_OFF)
+    assert not [control for control in stops[off:] if control & StopControl.AMP_ENABLE]
+    assert not chain.modules[0].loop.servo_on
+
+
 async def test_stops_that_are_not_acknowledged_never_close_the_loop_of_a_drive_that_was_reset():
     chain = chain_of("ls182ap", "picservo-v4")
     async with bare_network(chain, PAIR) as line:

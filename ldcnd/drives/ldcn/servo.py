@@ -21,6 +21,7 @@ from ldcnd.contract.catalogue import verbs_for
 from ldcnd.contract.commands import Capability, HomeMethod, PinMode, Verb
 from ldcnd.contract.errors import (
     BadReply,
+    BusError,
     DriveFault,
     NotSupported,
     OutcomeUnknown,
@@ -358,10 +359,19 @@ class LdcnAxis(Moves):
         shows_nothing = self.state.loop_may_open and not self.switched_off
         # counted before it is sent: a stop that holds, queued meanwhile, would close the loop behind it
         self._switching_off += off
+        if off:
+            for bits, holding in self._stops.items():
+                if not bits & _MOTOR_OFF:  # nor may one of before that is not answered be sent again behind it
+                    self._bus.outrank(holding)
         try:
             await self._stop_motor(STOP_CONTROLS[mode])
-            if shows_nothing:  # with its loop open no reading tells whether it has heard it: see `Exchange.unseen`
+            # with its loop open no reading tells whether it has heard it: see `Exchange.unseen`
+            if shows_nothing and (off or not self.switched_off):
                 await self._stop_motor(STOP_CONTROLS[mode])
+        except BusError:
+            if off or not self.switched_off:
+                raise
+            return await self.stop(StopMode.OFF)  # what has outranked it is what has to arrive
         finally:
             self._switching_off -= off
         await self._homing.disarm()
