@@ -7,14 +7,26 @@ from typing import Final
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import AxisStatus
 from ldcnd.contract.history import AxisInstant
-from ldcnd.contract.instants import Coordinates, Reading, count_until, instant_of, instants_of, longest_gap_ns, packed
+from ldcnd.contract.instants import (
+    Coordinates,
+    Course,
+    Past,
+    Reading,
+    count_until,
+    course,
+    instant_of,
+    instants_of,
+    longest_gap_ns,
+    packed,
+)
 from ldcnd.drives.driver import AxisReading
 
 HISTORY_S: Final = 600.0
 """Time for which readings are kept at the rate of the polls, seconds."""
 MOST_READINGS: Final = 60_000
 """Readings that are kept of an axis at most, 38 bytes each: 2.3 MB, 600 s of 100 polls a second."""
-
+MOST_COURSES: Final = 8192
+"""Changes of what it does that are kept of an axis at most."""
 LONGEST_ERROR_NS: Final = 0xFFFF_FFFF
 
 _RECORD = struct.Struct("<qIqddH")
@@ -40,6 +52,8 @@ class ReadingRing:
         self._levels: tuple[bool | None, ...] = ()
         self._origin = 0.0
         self._packed = 0
+        self._stretch = 0
+        self._courses = [Course(0, altered=False, winding=False)]
 
     def take(self, reading: AxisReading, status: AxisStatus, t: int, t_error_ns: int) -> None:
         """Keep a reading; in every poll, so what seldom changes is compared and not computed."""
@@ -52,9 +66,17 @@ class ReadingRing:
         )
         if status is not self._status or levels != self._levels:
             self._status, self._levels = status, levels
-            self._origin, self._packed = status.scale.origin_counts, packed(levels, status.quality)
+            self._origin = status.scale.origin_counts
+            self._packed = packed(
+                levels,
+                status.quality,
+                referenced=status.referenced,
+                lost=status.reference_lost,
+                stretch=self._stretch,
+            )
         if t <= self._last_ns:
             self._count = 0  # the clock was set back: which instants these were is not known
+            self._courses = [Course(t, altered=True, winding=False)]
         self._last_ns = t
         _RECORD.pack_into(
             self._ring,
@@ -70,19 +92,37 @@ class ReadingRing:
 
     def forget(self) -> None:
         """Conclude nothing across now: the drive was out of reach, or its counter was set."""
-        self._count = 0
+        self._stretch += 1
+        self._status = None
 
-    def at(self, t: int, scale: AxisScale) -> AxisInstant:
-        """Return what the readings prove of an instant, UTC in ns since 1970."""
-        return instant_of(self, t, self._gap_ns, Coordinates(scale.unit, scale.counts_per_unit))
+    def alter(self, t: int, status: AxisStatus, *, approaches: bool) -> None:
+        """Keep what the axis does from an instant on, UTC in ns since 1970; see `course`."""
+        if len(self._courses) >= MOST_COURSES:
+            del self._courses[: MOST_COURSES // 2]
+        verb = status.command.verb if status.command else None
+        self._courses.append(course(max(t, self._courses[-1].t), status.state, verb, approaches=approaches))
 
-    def between(self, t: int, until: int, scale: AxisScale) -> Iterator[AxisInstant]:
+    def at(self, t: int, scale: AxisScale, fastest: float | None) -> AxisInstant:
+        """Return what is proven of an instant.
+
+        Args:
+            t: the instant, UTC in ns since 1970.
+            scale: of the axis.
+            fastest: its limit of velocity in units a second, None without one.
+        """
+        return instant_of(self._past(scale, fastest), t)
+
+    def between(self, t: int, until: int, scale: AxisScale, fastest: float | None) -> Iterator[AxisInstant]:
         """Yield the same of the first instant of a range, of each reading in it, and of its last instant."""
-        return instants_of(self, t, until, self._gap_ns, Coordinates(scale.unit, scale.counts_per_unit))
+        return instants_of(self._past(scale, fastest), t, until)
 
     def count(self, t: int, until: int) -> int:
         """Return how many readings lie in a range."""
         return count_until(self, until) - count_until(self, t)
+
+    def _past(self, scale: AxisScale, fastest: float | None) -> Past:
+        coordinates = Coordinates.of(scale.unit, scale.counts_per_unit, fastest)
+        return Past(self, self._courses, self._gap_ns, coordinates)
 
     def __len__(self) -> int:
         return min(self._count, self._most)

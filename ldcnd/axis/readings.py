@@ -5,7 +5,7 @@ is reported, and what is not understood any more is stopped.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from ldcnd.axis.clock import Clock
@@ -24,6 +24,7 @@ from ldcnd.axis.turns import CommandQueue
 from ldcnd.contract import events
 from ldcnd.contract.errors import BadReply, BusError, PacketRejected
 from ldcnd.contract.events import ALARM_HISTORY, UNSETTLED, CommandStatus
+from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.rig_commands import FrozenPosition
 from ldcnd.contract.samples import LinkState, TelemetryItem
 from ldcnd.drives.axis_config import AxisConfig
@@ -150,6 +151,7 @@ class AxisReadings:
         self.history = _ring(motion.config)
         self._over: tuple[CommandEnd, Arrival] | None = None
         motion.tracker.watch(self._watch, "last_end")
+        motion.tracker.watch(self._watch_course, "command", "state", "speed_share")
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Take rates and scale of another configuration."""
@@ -247,6 +249,14 @@ class AxisReadings:
             referenced=self._tracker.status.referenced,
         )
 
+    def at(self, t: int) -> AxisInstant:
+        """Return where the axis was at an instant, UTC in ns since 1970."""
+        return self.history.at(t, self._tracker.status.scale, self._motion.config.limits.velocity)
+
+    def between(self, t: int, until: int) -> Iterator[AxisInstant]:
+        """Yield the same of the first instant of a range, of each reading in it, and of its last instant."""
+        return self.history.between(t, until, self._tracker.status.scale, self._motion.config.limits.velocity)
+
     # -- what the line says ------------------------------------------------------------------------------------------
 
     def explain_loss(self) -> None:
@@ -303,6 +313,9 @@ class AxisReadings:
             self._report_end()
             self._ask_in_time(timing.sent_at_s)
             self._motion.reference.woken.set()
+
+    def _watch_course(self, _before: AxisStatus, after: AxisStatus) -> None:
+        self.history.alter(self._clock.now_ns(), after, approaches=self._motion.config.approach is not None)
 
     def _watch(self, _before: AxisStatus, after: AxisStatus) -> None:
         """Report a command that is over; one that a reading has ended is reported behind the reading."""

@@ -67,4 +67,5 @@ def _show(target: Target, axis: str, found: AxisInstant, info: AxisInfo, *, name
         f" from {place.lower:.{digits}f} to {place.upper:.{digits}f}",
         f"  at {speed.value:.4g} {found.unit}/s, from {speed.lower:.4g} to {speed.upper:.4g}",
         *([f"  its data are {found.quality.value}"] if found.quality is not Quality.GOOD else []),
+        *([] if found.referenced else ["  no place of the machine: the axis had no reference"]),
     )

@@ -36,7 +36,9 @@ class AxisInstant(Frozen):
     unit: str
     """The axis unit."""
     quality: Quality
-    """How much it is worth; bad where nothing is known."""
+    """How much it is worth; bad where nothing is known, uncertain where the place that the axis had was lost."""
+    referenced: bool = False
+    """Whether the position was a place: the axis had a reference."""
     position: Within | None = None
     """Position in axis units, counted through all turns; null where it is not known."""
     velocity: Within | None = None

@@ -152,8 +152,8 @@ class Describing:
 
     def _instants(self, axes: Mapping[str, AxisService], t: int, until: int, encoding: Encoding) -> Iterator[_Part]:
         for key, axis in axes.items():
-            history, scale = axis.readings.history, axis.tracker.status.scale
-            found: Iterable[AxisInstant] = [history.at(t, scale)] if t == until else history.between(t, until, scale)
+            past = axis.readings
+            found: Iterable[AxisInstant] = [past.at(t)] if t == until else past.between(t, until)
             for instant in found:
                 payload, name = encode(instant, encoding)
                 yield Answer(key, payload, name, instant.t), DESCRIPTION_WORK

@@ -114,7 +114,7 @@ def _judge(rig: SimulatedRig, seen: tuple[str, str, int, float, float]) -> Judge
     name, kind, t, place, speed = seen
     axis = rig.daemon.rig.axes[name]
     found, per_unit = (
-        axis.readings.history.at(t, axis.tracker.status.scale),
+        axis.readings.at(t),
         abs(axis.tracker.status.scale.counts_per_unit),
     )
     at, speeds = found.position, found.velocity
@@ -272,6 +272,69 @@ def test_a_query_of_a_range_answers_its_ends_and_every_reading_and_refuses_too_m
             for none in ("[now(-1s)..now(-2s)]", "[now(-2s)..]", "[]", "now(-2s)..now(-1s)"):
                 (refused,) = await session.query("ldcn/sim/tele/x/at", parameters={"_time": none})
                 assert refused.is_error, none
+
+    run(program())
+
+
+async def _shuttle(rig: SimulatedRig, rng: random.Random, moves: int) -> list[tuple[int, float, float]]:
+    """Let an axis go to and fro, and turn it round on its way; return where its shaft was."""
+    seen: list[tuple[int, float, float]] = []
+
+    async def look() -> None:
+        while True:
+            seen.append(await _look(rig, "x"))
+            await asyncio.sleep(0.01)
+
+    async with rig.client.control("x", client="day") as x:
+        await x.power(on=True)
+        await asyncio.sleep(3)
+        looking = asyncio.create_task(look())
+        for _ in range(moves):
+            await x.move_relative(rng.uniform(-10, 10))
+            await asyncio.sleep(rng.uniform(0.05, 0.6))
+            await (await x.move_relative(rng.uniform(-10, 10), buffer_mode="aborting")).done()
+            for distance in (0.5, -0.5):
+                await (await x.move_relative(distance)).done()
+        await asyncio.sleep(3)
+        looking.cancel()
+    return seen
+
+
+@pytest.mark.parametrize("hz", [1, 2, 5])
+def test_the_bounds_of_an_axis_that_is_read_too_seldom_hold_motions_between_two_readings(hz: float):
+    async def program() -> None:
+        config = with_rate(load_config(Path("config/simulated.toml")), hz)
+        async with simulated_rig(config, seed=hz) as rig:
+            seen = await _shuttle(rig, random.Random(hz), 6)
+            await asyncio.sleep(4 / hz)
+            judged = [_judge(rig, ("x", "move", *each)) for each in seen]
+            known = [each for each in judged if each]
+            print(f"{hz} Hz: {len(known)} of {len(judged)} known")
+            print(statistics.fmean(e.inside for e in known), statistics.fmean(e.speed_inside for e in known), "Hz:")
+            assert len(known) > 0.9 * len(judged)
+            assert statistics.fmean(each.inside and each.speed_inside for each in known) >= 0.999
+
+    run(program())
+
+
+def test_where_an_axis_was_before_it_was_lost_stays_known_and_a_lost_place_is_not_good():
+    async def program() -> None:
+        async with simulated_rig(Path("config/simulated.toml"), seed=1) as rig:
+            async with rig.client.control("x", client="day") as x:
+                await x.power(on=True)
+                await x.set_position(5.0)
+                await (await x.move_absolute(7.0)).done()
+                await asyncio.sleep(1)
+                t = BEGINS_NS + round((rig.now_s - 0.5) * 1e9)
+                before = await x.at(t)
+                assert (before.quality, before.referenced) == ("good", True)
+                rig.faults.power_loss("x", for_s=1.0)
+                status = rig.daemon.rig.axes["x"].tracker
+                await rig.until(lambda: status.status.reference_lost and status.status.link is LinkState.UP)
+                await asyncio.sleep(3)
+                assert await x.at(t) == before
+                since = await x.at(BEGINS_NS + round((rig.now_s - 1) * 1e9))
+                assert (since.quality, since.referenced) == ("uncertain", False)
 
     run(program())
 

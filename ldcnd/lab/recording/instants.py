@@ -11,13 +11,32 @@ from mcap.records import Attachment, Channel, Message
 from ldcnd.contract.errors import ConfigError, UnknownAxis
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.history import AxisInstant
-from ldcnd.contract.instants import Coordinates, Reading, instant_of, instants_of, longest_gap_ns, packed
+from ldcnd.contract.instants import (
+    Coordinates,
+    Course,
+    Past,
+    Reading,
+    course,
+    instant_of,
+    instants_of,
+    longest_gap_ns,
+    packed,
+)
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.plan import RigBudget
-from ldcnd.contract.samples import InputLevels, InputsSample, PositionSample, TelemetryItem, VelocitySample
+from ldcnd.contract.samples import (
+    InputLevels,
+    InputsSample,
+    LinkState,
+    PositionSample,
+    StateSample,
+    TelemetryItem,
+    VelocitySample,
+)
 from ldcnd.lab.recording.messages import axis_of, model_of
 from ldcnd.lab.recording.reading import Recording
 
+_TOLD = PositionSample, InputsSample, StateSample, VelocitySample
 _UNKNOWN = (None,) * len(InputLevels.model_fields)
 
 
@@ -27,26 +46,30 @@ class RecordedReadings:
 
     Attributes:
         readings: as they were.
+        courses: what the axis was doing, by its recorded states.
         gap_ns: nothing is concluded where two of them are farther apart.
         info: the description of the axis.
     """
 
     readings: Sequence[Reading]
+    courses: Sequence[Course]
     gap_ns: int
     info: AxisInfo
 
     @property
-    def coordinates(self) -> Coordinates:
-        """How counts and positions belong together."""
-        return Coordinates(self.info.unit, _counts_per_unit(self.info))
+    def past(self) -> Past:
+        """What is kept of the axis."""
+        info = self.info
+        coordinates = Coordinates.of(info.unit, _counts_per_unit(info), info.limits.velocity)
+        return Past(self.readings, self.courses, self.gap_ns, coordinates)
 
     def at(self, t: int) -> AxisInstant:
         """Return what they prove of an instant, UTC in ns since 1970."""
-        return instant_of(self.readings, t, self.gap_ns, self.coordinates)
+        return instant_of(self.past, t)
 
     def between(self, t: int, until: int) -> Iterator[AxisInstant]:
         """Yield the same of the first instant of a range, of each reading in it, and of its last instant."""
-        return instants_of(self.readings, t, until, self.gap_ns, self.coordinates)
+        return instants_of(self.past, t, until)
 
 
 def recorded_readings(recording: Recording, axis: str) -> RecordedReadings:
@@ -59,9 +82,7 @@ def recorded_readings(recording: Recording, axis: str) -> RecordedReadings:
     axes: set[str] = set()
     models: dict[int, type[Frozen]] = {}
     told: dict[str, bytes] = {}
-    samples: list[PositionSample] = []
-    inputs: list[InputsSample] = []
-    speeds = {0.0}
+    samples: list[Frozen] = []
     for record in recording.records():
         if isinstance(record, Attachment):
             told[record.name] = record.data
@@ -69,16 +90,10 @@ def recorded_readings(recording: Recording, axis: str) -> RecordedReadings:
             name = axis_of(key := record.topic.removeprefix("/"))
             if name is not None:
                 axes.add(name)
-            if name == axis and (model := model_of(key)) in (PositionSample, InputsSample, VelocitySample):
+            if name == axis and (model := model_of(key)) in _TOLD:
                 models[record.id] = model
         elif isinstance(record, Message) and record.channel_id in models:
-            match models[record.channel_id].model_validate_json(record.data, extra="ignore"):
-                case PositionSample() as sample:
-                    samples.append(sample)
-                case InputsSample() as levels:
-                    inputs.append(levels)
-                case VelocitySample() as velocity:
-                    speeds.add(round(abs(velocity.counts_per_s), 3))
+            samples.append(models[record.channel_id].model_validate_json(record.data, extra="ignore"))
     if axis not in axes:
         known = ", ".join(sorted(axes)) or "none"
         raise UnknownAxis(f"{recording.path} has no axis {axis!r}; it has {known}", axis=axis, value=axis)
@@ -87,8 +102,12 @@ def recorded_readings(recording: Recording, axis: str) -> RecordedReadings:
         budget = RigBudget.model_validate_json(told["budget.json"], extra="ignore")
     except (KeyError, ValueError):
         raise ConfigError(f"{recording.path} has no description of axis {axis} that this version understands") from None
-    readings = _readings(samples, inputs, info, _resolution(speeds))
-    return RecordedReadings(readings, longest_gap_ns(_rate_hz(budget, axis, readings)), info)
+    places = [each for each in samples if isinstance(each, PositionSample)]
+    inputs = [each for each in samples if isinstance(each, InputsSample)]
+    states = sorted((each for each in samples if isinstance(each, StateSample)), key=lambda each: each.t)
+    speeds = {round(abs(each.counts_per_s), 3) for each in samples if isinstance(each, VelocitySample)}
+    readings = _readings(places, inputs, states, info, _resolution({0.0, *speeds}))
+    return RecordedReadings(readings, _courses(states, info), longest_gap_ns(_rate_hz(budget, axis, readings)), info)
 
 
 def _rate_hz(budget: RigBudget, axis: str, readings: Sequence[Reading]) -> float:
@@ -108,10 +127,15 @@ def _counts_per_unit(info: AxisInfo) -> float:
 
 
 def _readings(
-    samples: Sequence[PositionSample], inputs: Sequence[InputsSample], info: AxisInfo, resolution: float
+    samples: Sequence[PositionSample],
+    inputs: Sequence[InputsSample],
+    states: Sequence[StateSample],
+    info: AxisInfo,
+    resolution: float,
 ) -> list[Reading]:
     """Return recorded positions as what was read."""
     changes, per_unit, modulo = [each.t for each in inputs], _counts_per_unit(info), info.modulo or 0.0
+    told, stretch = [each.t for each in states], 0
     found: list[Reading] = []
     for sample in sorted(samples, key=lambda each: each.t):
         if found and sample.t == found[-1].t:
@@ -119,6 +143,24 @@ def _readings(
         shown = bisect_right(changes, sample.t)
         levels = tuple(getattr(inputs[shown - 1], name) for name in InputLevels.model_fields) if shown else _UNKNOWN
         origin = sample.counts - (sample.value + (sample.turns or 0) * modulo) * per_unit
-        rest = packed(levels, sample.quality)
+        state = states[number - 1] if (number := bisect_right(told, sample.t)) else None
+        if state and state.link is LinkState.DOWN:
+            stretch += 1
+        placed, lost = (state.referenced, state.reference_lost) if state else (False, False)
+        rest = packed(levels, sample.quality, referenced=placed, lost=lost, stretch=stretch)
         found.append(Reading(sample.t, sample.t_error_ns, sample.counts, resolution, origin, rest))
+    return found
+
+
+def _courses(states: Sequence[StateSample], info: AxisInfo) -> list[Course]:
+    """Return what the axis was doing, by its states in their order."""
+    found: list[Course] = []
+    latest = None
+    for each in states:
+        command = each.command
+        does = each.state, command and (command.verb, command.since), each.speed_override
+        if does != latest:
+            latest = does
+            verb = command.verb if command else None
+            found.append(course(each.t, each.state, verb, approaches=info.approach is not None))
     return found
