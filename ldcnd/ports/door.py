@@ -14,11 +14,12 @@ class Door(Protocol):
         take: called with what it has sent, and the rate at which it sends; None for the rate that its modules have.
             Returns whether all of it could be taken: a program that sends more than its line carries is read from
             again after `FLOOD_PAUSE_S`.
-        closed: called when it has gone.
+        closed: called when it has gone, with what it had sent and was not taken yet, and its rate: nothing begins by
+            that any more, and a stop in it is a stop.
     """
 
     take: Callable[[bytes, int | None], bool]
-    closed: Callable[[], None]
+    closed: Callable[[bytes, int | None], None]
 
     def write(self, data: bytes) -> None:
         """Send to the program; what it does not read is lost."""

@@ -149,7 +149,6 @@ class Guest(Presence):
 
     def send(self, data: bytes, baud: int | None) -> bool:
         """Take bytes of the guest, see `Door`; what its line would not carry in time is lost, and False is returned."""
-        self.chain.baud = baud or int(self.chain.modules[0].baud)
         if self.ended:
             return True
         if self._heard():
@@ -157,11 +156,22 @@ class Guest(Presence):
             self.chain.replug()
             for module in self._modules:
                 module.drop_half_packets()
-        now_s = self._loop.time()
+        now_s, self.chain.baud = self._loop.time(), self._rate(baud)
         room = MOST_UNSENT_BYTES - math.ceil(self.chain.leaving_s(now_s) * self.chain.baud / BITS_PER_BYTE)
         self.chain.write(now_s, data[: max(0, room)])
         self._advance()
         return len(data) <= room
+
+    @override
+    def leave(self, left: bytes, baud: int | None) -> None:
+        super().leave(left, baud)
+        if left:  # a stop is the last that a program sends
+            self.chain.baud = self._rate(baud)
+            self.chain.write(self._loop.time(), left[-MOST_UNSENT_BYTES:])
+            self._advance()
+
+    def _rate(self, baud: int | None) -> int:
+        return baud or int(self.chain.modules[0].baud)
 
     @override
     def close(self) -> None:

@@ -76,8 +76,9 @@ async def _serve_once(
             stack.callback(guest.close)
             stack.callback(host.show, port.name, None)
 
-            def closed() -> None:
+            def closed(left: bytes, baud: int | None) -> None:
                 if not guest.ended:
+                    guest.leave(left, baud)
                     group.create_task(guest.gone(), name=f"guest {port.name} gone")
 
             guest.receive, guest.hang_up, door.take, door.closed = door.write, door.leave, guest.send, closed

@@ -45,11 +45,15 @@ class Presence:
         """Nothing begins any more: its port ends."""
         self.ended = True
 
-    async def gone(self) -> None:
-        """The program has gone: what it has commanded and has not begun is dropped, and control ends."""
+    def leave(self, left: bytes, baud: int | None) -> None:  # noqa: ARG002 - only chains have a stop in it
+        """The program has gone: nothing begins any more by what it has sent; see `Door.closed`."""
         if self._visit:
             self._visit.ended = True
         self._visit = self.since_s = None
+
+    async def gone(self) -> None:
+        """The program has gone: what it has commanded and has not begun is dropped, and control ends."""
+        self.leave(b"", None)
         if self._control:
             await self._control.end()
 

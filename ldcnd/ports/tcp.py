@@ -1,6 +1,7 @@
 """The TCP address of a port: one program at a time, raw bytes or RFC 2217, as serial device servers have them."""
 
 import asyncio
+import select
 from collections.abc import Callable, Iterable
 from typing import cast
 
@@ -23,9 +24,10 @@ class GuestSocket:
 
     def __init__(self, *, rfc2217: bool) -> None:
         self.take: Callable[[bytes, int | None], bool] = lambda _data, _baud: True
-        self.closed: Callable[[], None] = lambda: None
+        self.closed: Callable[[bytes, int | None], None] = lambda _data, _baud: None
         self._rfc2217 = rfc2217
         self._inside: _Connection | None = None
+        self._left = b""
 
     async def listen(self, address: ListenAddress) -> asyncio.Server:
         """Listen there, and return the server; closing it does not disconnect the program."""
@@ -54,15 +56,19 @@ class GuestSocket:
 
     def received(self, connection: "_Connection", data: bytes) -> None:
         """Take what a program has sent."""
-        if connection is self._inside and data and not self.take(data, connection.baud):
+        if connection is not self._inside or not data:
+            return
+        if connection.hung_up():  # what it has sent last begins nothing
+            self._left = (self._left + data)[-MOST_UNREAD_BYTES:]
+        elif not self.take(data, connection.baud):
             connection.transport.pause_reading()
             asyncio.get_running_loop().call_later(FLOOD_PAUSE_S, connection.transport.resume_reading)
 
     def left(self, connection: "_Connection") -> None:
         """A connection has ended."""
         if connection is self._inside:
-            self._inside = None
-            self.closed()
+            self._inside, left, self._left = None, self._left, b""
+            self.closed(left, connection.baud)
 
 
 class _Connection(asyncio.Protocol):
@@ -76,6 +82,12 @@ class _Connection(asyncio.Protocol):
 
     def begin(self) -> None:
         """The program is let in."""
+
+    def hung_up(self) -> bool:
+        """Tell whether the program has closed its side, or has ended."""
+        poll = select.poll()
+        poll.register(self.transport.get_extra_info("socket"), select.POLLRDHUP)
+        return bool(poll.poll(0))
 
     def write(self, data: bytes) -> None:
         """Send to the program."""

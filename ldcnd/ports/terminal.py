@@ -11,6 +11,8 @@ from pathlib import Path
 from ldcnd.ports.door import FLOOD_PAUSE_S
 
 READ_BYTES = 4096
+MOST_LEFT_BYTES = 1 << 20
+"""More than a terminal keeps of what nobody reads."""
 LOOK_S = 0.02
 """How often a terminal that nobody has open is looked at, seconds."""
 
@@ -28,7 +30,7 @@ class GuestTerminal:
 
     def __init__(self, link: Path, mode: int, group: str | None) -> None:
         self.take: Callable[[bytes, int | None], bool] = lambda _data, _baud: True
-        self.closed: Callable[[], None] = lambda: None
+        self.closed: Callable[[bytes, int | None], None] = lambda _data, _baud: None
         self._mode, self._group = mode, group
         self._loop = asyncio.get_running_loop()
         self._later: asyncio.TimerHandle | None = None
@@ -64,6 +66,7 @@ class GuestTerminal:
 
     def _watch(self) -> None:
         self._baud: int | None = None
+        self._present = False  # a program, as far as was seen
         self._poll = select.poll()
         self._poll.register(self._master, select.POLLIN)
         self._look()
@@ -84,7 +87,7 @@ class GuestTerminal:
         self._drop()
         self._master, self.path = master, path
         self._watch()
-        self.closed()
+        self.closed(b"", None)
 
     def _let_be_set(self) -> None:
         """Leave something that the next program sets: CLOCAL, which says nothing of a terminal without a modem.
@@ -111,26 +114,45 @@ class GuestTerminal:
 
     def _look(self) -> None:
         """Read once somebody has it open: without, a master is always ready, and has hung up."""
-        if any(event & select.POLLHUP for _, event in self._poll.poll(0)):
+        if self._hung_up():
             self._later = self._loop.call_later(LOOK_S, self._look)
+            # also of a program that had it open between two looks
+            if (left := self._left()) or self._present:
+                self._gone(left)
         else:
-            self._later = None
+            self._later, self._present = None, True
             self._loop.add_reader(self._master, self._read)
 
     def _read(self) -> None:
-        from ldcnd.line.line_discipline import actual_baud  # noqa: PLC0415 - as above
-
-        try:
-            data = os.read(self._master, READ_BYTES)
-        except BlockingIOError:
-            return
-        except OSError:  # EIO: nobody has it open any more
+        if self._hung_up():  # before what is left: the next program must not begin what this one has sent
             self._loop.remove_reader(self._master)
-            self._let_be_set()
-            self.closed()
             self._look()
             return
+        with suppress(BlockingIOError, OSError):
+            data = os.read(self._master, READ_BYTES)
+            if not self.take(data, self._rate()):
+                self._loop.remove_reader(self._master)
+                self._later = self._loop.call_later(FLOOD_PAUSE_S, self._look)
+
+    def _hung_up(self) -> bool:
+        return any(event & select.POLLHUP for _, event in self._poll.poll(0))
+
+    def _left(self) -> bytes:
+        """Return what was sent by a program that has gone."""
+        left = b""
+        with suppress(OSError):  # EIO: that was all
+            while len(left) < MOST_LEFT_BYTES and (data := os.read(self._master, READ_BYTES)):
+                left += data
+        return left
+
+    def _gone(self, left: bytes) -> None:
+        self._present = False
+        baud = self._rate()
+        self._let_be_set()
+        self.closed(left, baud)
+
+    def _rate(self) -> int | None:
+        from ldcnd.line.line_discipline import actual_baud  # noqa: PLC0415 - as above
+
         self._baud = actual_baud(self._master) or self._baud
-        if not self.take(data, self._baud):
-            self._loop.remove_reader(self._master)
-            self._later = self._loop.call_later(FLOOD_PAUSE_S, self._look)
+        return self._baud

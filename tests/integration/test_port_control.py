@@ -1,6 +1,7 @@
 """An old program moves axes through its port: the simulated shaft decides, and everybody's rules hold for it too."""
 
 import asyncio
+from contextlib import suppress
 
 import pytest
 
@@ -521,3 +522,42 @@ async def test_a_program_that_begins_anew_after_a_fault_moves_the_axis_as_on_the
         assert shaft(rig) - before == pytest.approx(3000, abs=30)
         again.close()
         await asyncio.sleep(0.2)
+
+
+async def test_what_a_program_has_sent_before_it_went_never_moves_anything_for_the_next_one(tmp_path):
+    """It was open for so short a time that nobody saw it, as one that is killed right behind its write."""
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        program.close()
+        await asyncio.sleep(1.0)
+        before = shaft(rig)
+
+        for _ in range(3):
+            short = open_port(tmp_path / "port")
+            short.send_bytes(encode_packet(load(GO_NOW, counts=round(before + 5 * COUNTS))))
+            short.close()
+        await asyncio.sleep(0.1)
+        silent = open_port(tmp_path / "port")
+        await asyncio.sleep(1.0)
+        silent.close()
+
+        assert abs(shaft(rig) - before) <= 2
+
+
+@pytest.mark.parametrize("lived_s", [0.005, 0.03, 0.3])
+async def test_an_axis_rests_soon_however_much_a_program_has_sent_before_it_was_killed(tmp_path, lived_s):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        for number in range(400):
+            with suppress(BlockingIOError):
+                program.send_bytes(encode_packet(load(RUN_NOW, speed=3.0 + number % 7 / 10)))
+        await asyncio.sleep(lived_s)
+        program.close()
+        await asyncio.sleep(1.5)
+        before = shaft(rig)
+        await asyncio.sleep(3.0)
+
+        assert abs(shaft(rig) - before) <= 2
+        assert not (await rig.client.ask(ListHolders())).holders[0].client
