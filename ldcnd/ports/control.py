@@ -37,6 +37,7 @@ class GuestControl:
 
     def __init__(self, name: str, host: GuestHost, idle_s: float) -> None:
         self.axes: frozenset[str] = frozenset()
+        self._claimed: frozenset[str] = frozenset()  # what it controls again, if at all, after force has ended that
         self._name, self._host, self._idle_s = name, host, idle_s
         self._token: str | None = None
         self._changing = asyncio.Lock()
@@ -61,7 +62,7 @@ class GuestControl:
         async with self._changing:
             if visit.ended:  # a command may have waited for its axis to come to rest
                 raise LeaseExpired(f"{self._name} has gone before it began")
-            wanted = self.axes.union(axes)
+            wanted = self._claimed.union(axes)
             if self._token is None or wanted != self.axes:
                 await self._ask(Acquire(client=self._name, axes=tuple(sorted(wanted)), lease_s=LEASE_S))
             if self._token is None:
@@ -71,8 +72,9 @@ class GuestControl:
     async def end(self) -> None:
         """Give control back; an axis that still moves does what its policy for the loss of a client says."""
         async with self._changing:
+            self._claimed = self.axes = frozenset()
             if self._token is not None:
-                token, self._token, self.axes = self._token, None, frozenset()
+                token, self._token = self._token, None
                 with suppress(LdcndError):  # it was taken away meanwhile
                     await self._host.carry_out(RIG_ITSELF, Release(lease=token))
 
@@ -102,10 +104,11 @@ class GuestControl:
                 return
             try:
                 await self._ask(Renew(lease=self._token))
-            except LdcndError:  # taken by force: the next command of the guest asks for it anew
+            except LdcndError:  # taken by force: the next command of the guest asks anew, for all that it had
                 self._token, self.axes = None, frozenset()
 
     async def _ask(self, command: Command[Frozen]) -> None:
         reply = await self._host.carry_out(RIG_ITSELF, command)
         if isinstance(reply, LeaseReply):
-            self._token, self.axes = reply.lease, frozenset(reply.axes)
+            self._token, self._claimed = reply.lease, frozenset(reply.axes)
+            self.axes = self._claimed

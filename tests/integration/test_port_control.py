@@ -8,7 +8,7 @@ import pytest
 from ldcnd.contract.commands import MoveRelative, Power, SetPosition, Stop
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
-from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.leases import Acquire, ListHolders, Release
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, StatusItem, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
@@ -561,3 +561,24 @@ async def test_an_axis_rests_soon_however_much_a_program_has_sent_before_it_was_
 
         assert abs(shaft(rig) - before) <= 2
         assert not (await rig.client.ask(ListHolders())).holders[0].client
+
+
+async def test_force_on_one_axis_ends_control_of_all_until_it_is_given_back(tmp_path):
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        for address in (1, 2):
+            await program.send(Packet(address, STOP, b"\x05"))
+            await program.send(load(RUN_NOW, address=address))
+        await asyncio.sleep(1.0)
+        held = await rig.client.ask(Acquire(client="other", axes=("rotor",), lease_s=60.0, force=True))
+        await asyncio.sleep(4.0)
+        before = shaft(rig), shaft(rig, 2)
+        for _ in range(5):
+            await program.send(load(RUN_NOW, address=2))
+            await asyncio.sleep(0.2)
+        assert (shaft(rig), shaft(rig, 2)) == pytest.approx(before, abs=2)
+
+        await rig.client.ask(Release(lease=held.lease))
+        await program.send(load(RUN_NOW, address=2))
+        await asyncio.sleep(1.0)
+        assert shaft(rig, 2) > before[1] + COUNTS
