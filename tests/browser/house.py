@@ -194,10 +194,19 @@ class House:
         return f"{at.scheme}://{at.netloc}"
 
     @asynccontextmanager
-    async def desk(self, scheme: str = "dark", width: int = 1400, height: int = 900) -> AsyncIterator[Desk]:
-        """Let one more browser in, the first by the link; nothing that it asks for may lie elsewhere."""
+    async def desk(
+        self, scheme: str = "dark", width: int = 1400, height: int = 900, *, phone: bool = False
+    ) -> AsyncIterator[Desk]:
+        """Let one more browser in, the first by the link; nothing that it asks for may lie elsewhere.
+
+        The browser of a phone makes a page as wide as the widest of its content, and what is fixed to an edge with it.
+        """
         context = await self.browser.new_context(
-            color_scheme=scheme, viewport={"width": width, "height": height}, reduced_motion="reduce"
+            color_scheme=scheme,
+            viewport={"width": width, "height": height},
+            reduced_motion="reduce",
+            is_mobile=phone,
+            has_touch=phone,
         )
         context.set_default_timeout(PATIENCE_S * 1e3)
         try:

@@ -34,6 +34,8 @@ SHOW = """async ([axes, condition, lineUp]) => {
   changed();
 }"""
 """Put what the console process sends into the page, which takes no other condition and no report of the line."""
+REACH = """() => [innerWidth, document.documentElement.scrollWidth,
+  document.querySelector("button.stop").getBoundingClientRect().bottom]"""
 
 
 def payload(case: Case) -> dict[str, object]:
@@ -59,6 +61,18 @@ async def test_the_rig_page_says_every_condition_in_its_row(house, width):
                 await playwright.expect(row.locator(".homed")).to_have_text(payload(case)["mark"])
                 await playwright.expect(desk.page.get_by_text("Nothing needs attention")).to_have_count(0)
                 await playwright.expect(attention.get_by_role("link", name="sim · x")).not_to_have_count(0)
+
+
+@pytest.mark.parametrize("place", ["rig", "axis/sim/x"])
+async def test_on_a_phone_a_stop_is_within_reach_whatever_is_said_of_axes(house, place):
+    async with house.desk(width=390, height=780, phone=True) as desk:
+        await desk.open(place)
+        await playwright.expect(desk.page.locator("tr[data-axis=x], .big").first).to_be_visible()
+        for case in CASES:
+            await desk.page.evaluate(SHOW, [["x", "y"], payload(case), True])
+            width, wide, bottom = await desk.page.evaluate(REACH)
+            assert (width, wide) == (390, 390), case.name
+            assert bottom <= 780, case.name
 
 
 async def test_the_axis_page_says_every_condition_beside_its_large_number(house):
