@@ -290,7 +290,7 @@ _UNCOMMANDED = Trouble(
 )
 _PUSHED = Trouble(TroubleKind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command")
 _OVERRIDE_ZERO = Trouble(
-    TroubleKind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: nothing moves", "speed override 0 %"
+    TroubleKind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: no command moves it", "speed override 0 %"
 )
 _MISSED_POLLS = Trouble(TroubleKind.MISSED_POLLS, _NOTICE, "the drive missed its latest polls", "missed polls")
 _MODULE_SILENT = replace(_NO_ANSWER, text="the module does not answer; check its power and the line")
@@ -451,7 +451,7 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
             found.append(_PUSHED)
         elif state.has_reference:  # without: a drive that takes no motion over its line; others move it
             found.append(_UNCOMMANDED)
-    if not state.speed_override:
+    if not state.speed_override and state.has_reference:  # as above
         found.append(_OVERRIDE_ZERO)
     found += [_of_fault(entry, TroubleKind.WARNING, _NOTICE) for entry in entries if not entry.stops]
     if state.link is LinkState.DEGRADED:
@@ -484,7 +484,7 @@ def _overridden(health: AxisHealth | None) -> tuple[Trouble, ...]:
 
 def _slowed(state: KnownState) -> tuple[Trouble, ...]:
     """Return what is to be known and is not wrong."""
-    if not 0 < state.speed_override < FULL_SPEED:
+    if not (state.has_reference and 0 < state.speed_override < FULL_SPEED):
         return ()
     short = f"speed override {state.speed_override:g} %"
     return (Trouble(TroubleKind.SLOWED, _FINE, f"{short} of every velocity", short),)

@@ -250,7 +250,7 @@ async def test_a_speed_override_and_every_axis_that_was_lost_stand_on_top_of_eve
         await expect(desk.page.get_by_role("banner")).to_contain_text("You control sim · x, sim · y, sim · z, sim · c")
         await house.sim.rig.ask(SetSpeedOverride(percent=0))
         await desk.open("events")
-        await expect(desk.page.get_by_role("banner")).to_contain_text("speed override 0 %: nothing moves")
+        await expect(desk.page.get_by_role("banner")).to_contain_text("speed override 0 %: no command moves anything")
 
         taken = Acquire(client="ada", axes=("x", "y", "z", "c"), lease_s=60, force=True)
         lease = await house.sim.rig.ask(taken)

@@ -181,3 +181,11 @@ def test_an_axis_whose_daemon_has_only_begun_is_being_reached() -> None:
 
     assert condition.mark == "line is being opened"
     assert said(condition.troubles) == notice("its daemon has just begun to open its line")
+
+
+@pytest.mark.parametrize("override", [0.0, 30.0])
+def test_the_override_is_said_of_no_drive_that_others_move(override):
+    turning = state(speed_override=override, has_reference=False, moving=Moving.YES, command=None)
+
+    assert not [each for each in assess(turning).troubles if "override" in each.text]
+    assert [each for each in assess(state(speed_override=override)).troubles if "override" in each.text]

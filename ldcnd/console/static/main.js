@@ -61,7 +61,7 @@ function Summary() {
     <${Mark} level=${worst}>
       ${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : calm("Nothing needs attention")}<//>
     ${[...rigs.values()].filter((rig) => !rig.worth && slowed(rig)).map((rig) => html`<${Mark} level="warn"
-      >${rigs.size > 1 ? `${rig.name}: ` : ""}speed override ${number(overrideOf(rig), 0)} %${overrideOf(rig) === 0 ? ": nothing moves" : ""}<//> `)}
+      >${rigs.size > 1 ? `${rig.name}: ` : ""}speed override ${number(overrideOf(rig), 0)} %${overrideOf(rig) === 0 ? ": no command moves anything" : ""}<//> `)}
     ${mine.length > 0 && html` <span class="mine">You control ${namesOf(mine)}</span>`}
   </p>`;
 }
