@@ -172,6 +172,8 @@ class Meeting(Rendezvous):
     @override
     async def _start(self) -> None:
         try:
+            for member in self._members.values():
+                member.make_plan()  # anew: the speed override may be another by now
             if self._straight:
                 axes = {name: (member.motion, member.plan) for name, member in self._members.items()}
                 plans, self.deviation = plans_on_line(axes, self._max_deviation)
@@ -216,8 +218,7 @@ class GroupMember(Procedure):
         meeting, motion = self._request.rendezvous, self.motion
         try:
             self.permit.check_state()
-            position = motion.unwrapped(self._request.position, self._request.direction)
-            self.plan = motion.plan_to(position, self._request.velocity, self._request.acceleration)
+            self.make_plan()
             await meeting.join(motion.config.name, self)
         except LdcndError as error:
             meeting.fail(error)
@@ -225,6 +226,15 @@ class GroupMember(Procedure):
             raise
         motion.tracker.take(MotionStarted(motion.clock.now_s(), self.plan.motion.target_counts))
         return motion.reply(self.permit, self.plan)
+
+    def make_plan(self) -> None:
+        """Plan the move by limits and the speed override of now.
+
+        Raises:
+            RequestRefused: as `move_absolute`.
+        """
+        position = self.motion.unwrapped(self._request.position, self._request.direction)
+        self.plan = self.motion.plan_to(position, self._request.velocity, self._request.acceleration)
 
     def announce(self) -> None:
         """Say that the axis moves, before its drive does."""
