@@ -329,3 +329,39 @@ async def test_a_group_move_halts_what_a_member_does_if_it_says_so(module):
             await rig.client.wait_for_end(each.axis, each.command_id)
 
         assert [drive(chain, at).shaft.position_counts for at in (1, 2)] == pytest.approx([10_000, 10_000], abs=60)
+
+
+@pytest.mark.parametrize("after_ms", range(2, 40, 2))
+@pytest.mark.sweep(3)
+async def test_a_group_move_that_is_cut_short_leaves_no_axis_moving(after_ms):
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+        move = asyncio.create_task(together(rig, x=10.0, y=-10.0), name="move")
+        await asyncio.sleep(after_ms / 1000)
+        if not move.done():
+            move.cancel()
+            await asyncio.wait([move])
+            await asyncio.sleep(0.5)
+            stood = [drive(chain, at).shaft.position_counts for at in (1, 2)]
+            await asyncio.sleep(0.5)
+
+            assert [drive(chain, at).shaft.position_counts for at in (1, 2)] == pytest.approx(stood, abs=5)
+            for name in ("x", "y"):
+                await rig.until(name, lambda state: state.command is None)
+
+
+@pytest.mark.parametrize("after_ms", range(2, 20, 2))
+@pytest.mark.sweep(3)
+async def test_a_move_whose_caller_is_cut_short_ends_like_any_other(after_ms):
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x")
+        move = asyncio.create_task(rig.daemon.rig.axes["x"].execute(MoveAbsolute(position=5.0)), name="move")
+        await asyncio.sleep(after_ms / 1000)
+        move.cancel()
+        await asyncio.wait([move])
+        await asyncio.sleep(1.0)
+        state = await rig.until("x", lambda state: state.command is None)
+        assert state.state is AxisState.STANDSTILL
+        assert await rig.client.command("x", MoveAbsolute(position=1.0))

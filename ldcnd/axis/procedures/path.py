@@ -15,7 +15,7 @@ from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit, start_path
 from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
-from ldcnd.axis.procedures.group import Rendezvous
+from ldcnd.axis.procedures.group import CUT_SHORT, Rendezvous
 from ldcnd.axis.status import Completion
 from ldcnd.axis.unmoved import walking
 from ldcnd.contract.commands import CommandReply, MoveAbsolute
@@ -24,7 +24,6 @@ from ldcnd.contract.errors import (
     LdcndError,
     NotSupported,
     OutcomeUnknown,
-    ShuttingDown,
     ValueOutOfRange,
     WrongState,
 )
@@ -143,7 +142,7 @@ class SharedPath(Rendezvous):
                 await self.stop_all(error.message)
             self.fail(error)
         except asyncio.CancelledError:
-            self.fail(ShuttingDown("the daemon is stopping"))
+            self.fail(CUT_SHORT)
             raise
         else:
             self.begun_s = next(iter(members.values())).motion.clock.now_s()
@@ -309,9 +308,10 @@ class PathMember(Procedure):
             self._here = status.commanded_counts
             self.make_plan()
             await path.join(motion.config.name, self)
-        except LdcndError as error:
-            path.fail(error)
-            self._not_started(error)
+        except (LdcndError, asyncio.CancelledError) as error:
+            failure = error if isinstance(error, LdcndError) else CUT_SHORT
+            path.fail(failure)
+            self._not_started(failure)
             raise
         motion.tracker.take(MotionStarted(motion.clock.now_s()))
         self._wait(path.share_of(self).sent)
