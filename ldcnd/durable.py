@@ -15,6 +15,8 @@ from urllib.parse import quote
 
 KeptT = TypeVar("KeptT")
 BLOCK_BYTES = 4096
+DISK_TIME_S = 2.0
+"""A disk that takes longer than this counts as failed."""
 _WRITING: defaultdict[Path, Lock] = defaultdict(Lock)
 """Held by the thread that writes a draft."""
 if hasattr(os, "register_at_fork"):

@@ -457,6 +457,8 @@ class AxisService:
         self.telemetry.publish_state(self.tracker.take(SpeedOverridden(share)), self._clock.now_ns())
         if share <= 0:
             if not self.at_work or self.tracker.status.state is AxisState.DISABLED:
+                # what has yet to begin its motion must not do so once the override is raised
+                self.stops.overtake(None, "a speed override of 0 %")
                 return None
             await self.stops.bring_to_rest(StopMode.SMOOTH)
             return "halted"

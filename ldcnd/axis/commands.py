@@ -317,7 +317,8 @@ class AxisCommands:
         tracker = self._tracker
         return (
             self._driver.retargets
-            and not isinstance(request, Jog)
+            # a group starts from rest
+            and not isinstance(request, Jog | GroupMoveRequest | PathShareRequest)
             and not isinstance(self.procedure, PathMember)
             and not self.gains.switches(kind_of(request.verb))
             and request.buffer_mode is BufferMode.ABORTING
@@ -421,8 +422,8 @@ class AxisCommands:
         state: AxisState,
         completion: Completion = Completion.PROFILE,
     ) -> CommandReply:
-        await permit.load(plan.motion)
         self._moved = permit, plan.motion, self._tracker.status.speed_share
+        await permit.load(plan.motion)
         await self._motion.start(permit, state, completion, plan=plan)
         return self._motion.reply(permit, plan)
 
@@ -503,6 +504,8 @@ class AxisCommands:
 
     _PLANNED: ClassVar[Mapping[type, Callable[[Any, Any], MotionPlan]]] = {
         MoveAbsolute: _plan_absolute,
+        GroupMoveRequest: _plan_absolute,
+        PathShareRequest: _plan_absolute,
         MoveRelative: _plan_relative,
         MoveVelocity: lambda self, request: self._plan_velocity(request, in_motion=self.goes_on(request))[1],
         Jog: lambda self, request: self._motion.plan_at(request.velocity, request.acceleration),

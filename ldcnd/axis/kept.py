@@ -6,10 +6,8 @@ A reference is removed from the disk before anything may change it, and written 
 costs the reference, and a file never says more than was true when it was written.
 """
 
-import asyncio
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal, TypeVar
@@ -20,12 +18,11 @@ from ldcnd.contract.samples import PastFault
 from ldcnd.drives.driver import StopMode
 from ldcnd.durable import DamagedFile
 from ldcnd.log import get_logger
+from ldcnd.own_thread import OwnThread
 
 log = get_logger("kept")
 FORMAT = 1
 NS = 10**9
-DISK_TIME_S = 2.0
-"""A disk that takes longer than this counts as failed."""
 LATCHES = "latches.json"
 LATCH_ROOM_BYTES = 16 * 1024
 """Kept on the disk for latches that come once it is full: more than 30 axes in error_stop take."""
@@ -124,9 +121,9 @@ class KeptFiles:
     def __init__(self, directory: Path) -> None:
         self.troubles: dict[str, str] = {}
         self._directory = directory
-        self._worker = ThreadPoolExecutor(1, "kept files")
+        self._worker = OwnThread("kept files")
         self._latches = directory / LATCHES
-        self._latch_worker = ThreadPoolExecutor(1, "kept latches")
+        self._latch_worker = OwnThread("kept latches")
 
     def latches(self) -> dict[str, KeptLatch] | None:
         """Return the latches that are kept, by axis; None where there is no file of them, in a directory that is new.
@@ -237,11 +234,8 @@ class KeptFiles:
             raise
         self.troubles.pop(name, None)
 
-    async def _in_thread(self, work: Callable[[], ResultT], worker: ThreadPoolExecutor | None = None) -> ResultT:
-        future = asyncio.get_running_loop().run_in_executor(worker or self._worker, work)
-        async with asyncio.timeout(DISK_TIME_S):  # TimeoutError is an OSError
-            # a thread cannot be cancelled: the write goes on, and what comes later is written behind it
-            return await asyncio.shield(future)
+    async def _in_thread(self, work: Callable[[], ResultT], worker: OwnThread | None = None) -> ResultT:
+        return await (worker or self._worker).run(work, durable.DISK_TIME_S)  # TimeoutError is an OSError
 
 
 def in_words(error: Exception) -> str:
@@ -262,7 +256,7 @@ def _check_left_there(path: Path, on_disk: int) -> None:
     Raises:
         DamagedFile: it was put there later than it was written.
     """
-    if path.stat().st_ctime_ns - on_disk > DISK_TIME_S * NS:
+    if path.stat().st_ctime_ns - on_disk > durable.DISK_TIME_S * NS:
         raise DamagedFile(f"{path}: is a copy that was put there, and may be older than what it replaced")
 
 

@@ -521,8 +521,9 @@ class AxisMotion:
         self.begin(permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan)
         try:
             await permit.start()
-        except OutcomeUnknown as error:
-            unsure = Unsure(error.message, from_rest=not in_motion)  # the next readings tell
+        except (OutcomeUnknown, asyncio.CancelledError) as error:
+            why = error.message if isinstance(error, OutcomeUnknown) else "its start was cut short"
+            unsure = Unsure(why, from_rest=not in_motion)  # the next readings tell
             self.tracker.take(MotionStarted(self.clock.now_s(), unsure=unsure))
             raise
         except (BusError, RequestRefused) as error:  # refused when the turn of the packet came: it was not sent

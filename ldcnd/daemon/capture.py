@@ -28,6 +28,7 @@ from ldcnd.drives.known import FAMILIES
 from ldcnd.line.capture import Capture, CaptureHeader, capture_lines
 from ldcnd.line.flight_recorder import WireEntries, WireRecord
 from ldcnd.log import get_logger
+from ldcnd.own_thread import OwnThread
 from ldcnd.version import version
 
 log = get_logger("captures")
@@ -205,7 +206,8 @@ class CaptureWatch:
 
     async def run(self) -> None:
         """Watch until cancelled."""
-        clock = self._run.clock
+        clock, loop = self._run.clock, asyncio.get_running_loop()
+        writing = OwnThread("captures")
         while True:
             await asyncio.sleep(CHECK_PERIOD_S)
             for line in self._rig.buses:
@@ -221,7 +223,7 @@ class CaptureWatch:
                     # counted from here, however long the disk takes
                     self._last_s[name] = clock.now_s()
                     snapshot = snapshot_of(line, self._run)
-                    await asyncio.to_thread(self._write, snapshot, "; ".join(sorted(news)))
+                    await loop.run_in_executor(writing, self._write, snapshot, "; ".join(sorted(news)))
 
     def write_all(self, cause: str) -> None:
         """Write a capture of every line here and now; for a process that is about to die."""

@@ -9,7 +9,6 @@ This is no safety function: it is software on a common computer. See docs/how-to
 
 import asyncio
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from ldcnd.config.rig import HeartbeatConfig
@@ -20,6 +19,7 @@ from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.line.level import GpioLine, LevelFile, ModemLine, Output
 from ldcnd.log import get_logger
+from ldcnd.own_thread import OwnThread
 
 log = get_logger("heartbeat")
 
@@ -75,28 +75,23 @@ class Heartbeat:
     async def run(self) -> None:
         """Change the level until cancelled; an output that is gone is opened again once it is back."""
         loop = asyncio.get_running_loop()
-        # a thread of its own: reloads and captures that fill the loop's do not hold it
-        thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix="heartbeat")
-        try:
-            while True:
-                try:
-                    output = await loop.run_in_executor(thread, self._open_wire, self._config)
-                except (OSError, ConfigError) as error:
-                    self._tell(f"the output cannot be opened: {error}")
-                    await asyncio.sleep(REOPEN_S)
-                    continue
-                try:
-                    await self._change(output, thread)
-                except OSError as error:
-                    self._tell(f"the output is gone: {error}")
-                finally:
-                    output.close()
+        thread = OwnThread("heartbeat")  # a driver may hang in it
+        while True:
+            try:
+                output = await loop.run_in_executor(thread, self._open_wire, self._config)
+            except (OSError, ConfigError) as error:
+                self._tell(f"the output cannot be opened: {error}")
                 await asyncio.sleep(REOPEN_S)
-        finally:
-            # not waited for: a driver may hang in it
-            thread.shutdown(wait=False, cancel_futures=True)
+                continue
+            try:
+                await self._change(output, thread)
+            except OSError as error:
+                self._tell(f"the output is gone: {error}")
+            finally:
+                loop.run_in_executor(thread, output.close)
+            await asyncio.sleep(REOPEN_S)
 
-    async def _change(self, output: Output, thread: ThreadPoolExecutor) -> None:
+    async def _change(self, output: Output, thread: OwnThread) -> None:
         """Change the level every half period, in step with the loop's clock and one change at a time."""
         loop = asyncio.get_running_loop()
         while True:

@@ -10,6 +10,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 from pydantic import BaseModel, ValidationError
 
@@ -22,6 +23,7 @@ from ldcnd.daemon.daemon import Daemon
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.log import get_logger
+from ldcnd.own_thread import OwnThread
 
 log = get_logger("reload")
 
@@ -44,6 +46,7 @@ class Reloader:
         self._daemon = daemon
         self._load = load
         self._one_at_a_time = asyncio.Lock()
+        self._reading = OwnThread("configuration")
 
     async def reload(self) -> "ReloadPlan":
         """Take what can be taken.
@@ -92,8 +95,7 @@ class Reloader:
     async def _read(self) -> "tuple[ReloadPlan, RigBudget]":
         """Read and judge the file, beside the loop: lines go on meanwhile."""
         try:
-            async with asyncio.timeout(RELOAD_TIME_S):
-                return await asyncio.to_thread(self._prepare, self._daemon.config)
+            return await self._reading.run(partial(self._prepare, self._daemon.config), RELOAD_TIME_S)
         except TimeoutError:
             raise ConfigError(f"the configuration cannot be read within {RELOAD_TIME_S:g} s") from None
 

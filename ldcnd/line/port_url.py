@@ -10,6 +10,7 @@ from ldcnd.line.ports_here import port_matching
 from ldcnd.line.rfc2217_port import open_rfc2217_port
 from ldcnd.line.tcp_port import open_tcp_port
 from ldcnd.line.transport import Framing, Opener, Rs485Config, Transport
+from ldcnd.own_thread import OwnThread
 
 SOCKET, RFC2217, MATCHING = "socket://", "rfc2217://", "hwgrep://"
 KINDS = f"a device path, {SOCKET}host:port, {RFC2217}host:port or {MATCHING}PATTERN"
@@ -40,7 +41,7 @@ def port_opener(
             from ldcnd.line.serial_port import SerialSettings, open_serial_port  # noqa: PLC0415
 
             # a pattern is looked for in sysfs, which must not hold up the loop
-            path = await asyncio.to_thread(_device, port)
+            path = await asyncio.get_running_loop().run_in_executor(OwnThread("ports"), _device, port)
             return await open_serial_port(SerialSettings(path, baud, framing, working_baud=working_baud, rs485=rs485))
 
         return open_here

@@ -4,7 +4,7 @@ Reading: one `read` each time the descriptor is ready; an empty one or an error 
 a pseudo-terminal or a USB adapter has gone) ends the port. Writing: the bytes go to the descriptor at once; a request
 is far smaller than the driver's buffer, so one that does not fit whole means that the port is stuck. pyserial-asyncio
 0.6 needs three system calls for each read and keeps every write for the next turn of the loop; the measurement is in
-docs/explanation/timing.md. Draining and opening may block and happen in a worker.
+docs/explanation/timing.md. Draining and opening may hang and happen in threads of their own, one for each device.
 
 The direction of an RS-485 transmitter is the adapter's business, or the kernel's (`Rs485Config`); pyserial's
 `rs485_mode` is not used: after a driver has refused it, every later change of the rate fails too.
@@ -28,8 +28,12 @@ from ldcnd.line.line_discipline import PortFault, actual_baud, switch_direction
 from ldcnd.line.rates import STANDARD_BAUDS, makes, nearest
 from ldcnd.line.terminal_link import PSEUDO_TERMINALS, why_not_served
 from ldcnd.line.transport import Framing, Incoming, Receiver, Rs485Config, Transport
+from ldcnd.own_thread import OwnThread
 
 OPEN_TIME_S = 5.0
+REPLUG = "unplug the adapter and plug it in again"
+_OPENING: set[str] = set()
+"""Paths of which an opening has not returned: of a driver that hangs each attempt would keep one more thread."""
 DRAIN_TIME_S = 1.0
 """Enough for a full output buffer of 1 KiB at 9600 baud."""
 
@@ -87,8 +91,13 @@ async def open_serial_port(settings: SerialSettings) -> Transport:
     Raises:
         TransportLost: there is no such device, it may not be used, another program has it, or it is no serial port.
     """
-    loop = asyncio.get_running_loop()
-    opening = loop.run_in_executor(None, _open, settings)
+    if settings.path in _OPENING:
+        raise TransportLost(
+            f"{settings.path} cannot be opened: an earlier attempt has not returned; {REPLUG}", remedy=REPLUG
+        )
+    thread = OwnThread(f"open {settings.path}")
+    _OPENING.add(settings.path)
+    opening = asyncio.get_running_loop().run_in_executor(thread, _open, settings)
     try:
         async with asyncio.timeout(OPEN_TIME_S):
             # open(2) cannot be interrupted: should it end after all, `_close_unwanted` gives the port back
@@ -98,9 +107,7 @@ async def open_serial_port(settings: SerialSettings) -> Transport:
         raise TransportLost(message, value=settings.path, remedy=refused.remedy) from None
     except TimeoutError:
         opening.add_done_callback(_close_unwanted)
-        raise TransportLost(
-            f"{settings.path} did not open within {OPEN_TIME_S:g} s", remedy="unplug the adapter and plug it in again"
-        ) from None
+        raise TransportLost(f"{settings.path} did not open within {OPEN_TIME_S:g} s", remedy=REPLUG) from None
     except asyncio.CancelledError:
         opening.add_done_callback(_close_unwanted)
         raise
@@ -282,11 +289,9 @@ class SerialPort(Transport):
         await self._incoming.ended.wait()
 
     async def _drain(self) -> None:
-        loop = asyncio.get_running_loop()
         # `_end` drops what has not left by then
         with contextlib.suppress(TimeoutError, *PortFault):
-            async with asyncio.timeout(DRAIN_TIME_S):
-                await loop.run_in_executor(None, self._port.drain)
+            await OwnThread(f"drain {self._port.port}").run(self._port.drain, DRAIN_TIME_S)
 
     def _require_usable(self) -> None:
         if self._incoming.reason:
@@ -309,7 +314,14 @@ class SerialPort(Transport):
 
 
 def _open(settings: SerialSettings) -> _Serial:
-    """Open the port; blocks, so it runs in a worker."""
+    """Open the port; may hang, so it runs in a thread of its own."""
+    try:
+        return _opened(settings)
+    finally:
+        _OPENING.discard(settings.path)
+
+
+def _opened(settings: SerialSettings) -> _Serial:
     _require_served(settings.path)
     seven_even = settings.framing == "7e1" and not _is_pseudo_terminal(settings.path)
     port = _Serial(

@@ -9,7 +9,9 @@ from click.testing import CliRunner
 from ldcnd.cli.rig import group
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.errors import (
+    CommandAborted,
     CommandIdReused,
+    LdcndError,
     MalformedRequest,
     NotSupported,
     PositionLimit,
@@ -18,7 +20,7 @@ from ldcnd.contract.errors import (
     ValueOutOfRange,
     WrongState,
 )
-from ldcnd.contract.rig_commands import AxisMove, LinePath, MoveTogether, PreviewTogether
+from ldcnd.contract.rig_commands import AxisMove, LinePath, MoveTogether, PreviewTogether, SetSpeedOverride
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.group_moves import move_together
 from ldcnd.drives.ldcn.packet import CommandCode
@@ -115,7 +117,7 @@ async def test_axes_that_are_no_group_or_do_not_exist_are_refused():
 async def outcome(call):
     try:
         return await call
-    except StopLatched as error:
+    except LdcndError as error:
         return error
 
 
@@ -270,3 +272,96 @@ def test_a_group_of_one_is_refused_in_words():
     said = CliRunner().invoke(group, ["move", "x=5", "--connect", "tcp/127.0.0.1:1"])
     assert said.exit_code == 2
     assert "moves: takes at least 2, and 1 came" in said.output
+
+
+SHARES = tuple(AxisMove(axis=name, position=10.0) for name in ("x", "y"))
+
+
+@pytest.mark.promise("override-0")
+async def test_a_group_that_was_about_to_start_at_0_percent_does_not_start_once_that_is_raised():
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+
+        async with asyncio.TaskGroup() as group:
+            move = group.create_task(outcome(rig.client.ask(MoveTogether(moves=SHARES))), name="move")
+            await asyncio.sleep(0.003)
+            for percent in (0, 100):
+                await rig.client.ask(SetSpeedOverride(percent=percent))
+        await asyncio.sleep(2)
+
+        assert isinstance(move.result(), CommandAborted)
+        assert [drive(chain, address).loop.position for address in (1, 2)] == [0, 0]
+
+
+async def test_a_group_begins_at_the_speed_that_was_set_while_its_members_met():
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+        await rig.client.command("y", MoveAbsolute(position=10.0, velocity=10.0))
+        moves = tuple(move.model_copy(update={"position": 20.0, "buffer_mode": "buffered"}) for move in SHARES)
+
+        async with asyncio.TaskGroup() as group:
+            move = group.create_task(rig.client.ask(MoveTogether(moves=moves)), name="move")
+            await asyncio.sleep(0.3)
+            await rig.client.ask(SetSpeedOverride(percent=25))
+
+        full = [rig.daemon.rig.axes[name].config.velocity for name in ("x", "y")]
+        begun = [reply.velocity for reply in move.result().replies]
+        assert begun == pytest.approx([0.25 * each for each in full], rel=0.01)
+
+
+@pytest.mark.parametrize("module", ["ls182ap", "picservo-sc"])
+async def test_a_group_move_halts_what_a_member_does_if_it_says_so(module):
+    profile = {"ls182ap": "ls-182ap", "picservo-sc": "pic-servo-sc"}[module]
+    document = GANTRY.model_dump(mode="json", exclude_unset=True)
+    document["bus"][0]["axis"] = document["bus"][0]["axis"][:2]
+    for axis in document["bus"][0]["axis"]:
+        axis["model"] = profile
+    chain = build_chain(ChainSpec((ModuleSpec(module), ModuleSpec(module))))
+    async with rig_on(chain, type(GANTRY).model_validate(document)) as rig:
+        await powered(rig, "x", "y")
+        await rig.client.command("y", MoveAbsolute(position=-10.0))
+        await asyncio.sleep(0.2)
+        moves = tuple(move.model_copy(update={"buffer_mode": "aborting"}) for move in SHARES)
+        reply = await rig.client.ask(MoveTogether(moves=moves))
+        for each in reply.replies:
+            await rig.client.wait_for_end(each.axis, each.command_id)
+
+        assert [drive(chain, at).shaft.position_counts for at in (1, 2)] == pytest.approx([10_000, 10_000], abs=60)
+
+
+@pytest.mark.parametrize("after_ms", range(2, 40, 2))
+@pytest.mark.sweep(3)
+async def test_a_group_move_that_is_cut_short_leaves_no_axis_moving(after_ms):
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x", "y")
+        move = asyncio.create_task(together(rig, x=10.0, y=-10.0), name="move")
+        await asyncio.sleep(after_ms / 1000)
+        if not move.done():
+            move.cancel()
+            await asyncio.wait([move])
+            await asyncio.sleep(0.5)
+            stood = [drive(chain, at).shaft.position_counts for at in (1, 2)]
+            await asyncio.sleep(0.5)
+
+            assert [drive(chain, at).shaft.position_counts for at in (1, 2)] == pytest.approx(stood, abs=5)
+            for name in ("x", "y"):
+                await rig.until(name, lambda state: state.command is None)
+
+
+@pytest.mark.parametrize("after_ms", range(2, 20, 2))
+@pytest.mark.sweep(3)
+async def test_a_move_whose_caller_is_cut_short_ends_like_any_other(after_ms):
+    chain = chain_of()
+    async with rig_on(chain, GANTRY) as rig:
+        await powered(rig, "x")
+        move = asyncio.create_task(rig.daemon.rig.axes["x"].execute(MoveAbsolute(position=5.0)), name="move")
+        await asyncio.sleep(after_ms / 1000)
+        move.cancel()
+        await asyncio.wait([move])
+        await asyncio.sleep(1.0)
+        state = await rig.until("x", lambda state: state.command is None)
+        assert state.state is AxisState.STANDSTILL
+        assert await rig.client.command("x", MoveAbsolute(position=1.0))

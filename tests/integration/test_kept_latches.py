@@ -11,11 +11,11 @@ from structlog.testing import capture_logs
 
 from ldcnd import durable
 from ldcnd.axis import kept as kept_files
-from ldcnd.axis.kept import DISK_TIME_S
 from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, QuickStop, Reset
 from ldcnd.contract.errors import OutcomeUnknown, RequestRefused, WrongState
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.config import ModuleConfig
+from ldcnd.durable import DISK_TIME_S
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.power import FaultCondition
 from tests.integration.test_kept_references import chain_of, keeping

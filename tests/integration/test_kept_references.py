@@ -17,7 +17,6 @@ from typing import Any
 import pytest
 
 from ldcnd import durable
-from ldcnd.axis.kept import DISK_TIME_S
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveRelative, Power, Reset, SetPosition
 from ldcnd.contract.errors import LdcndError, NotReferenced, ReplyTimeout, RequestRefused, WrongState
@@ -26,6 +25,7 @@ from ldcnd.contract.samples import FaultSample, LinkState, PositionSample, State
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import PlainCommand, ResetPosition
 from ldcnd.drives.ldcn.servo import LdcnAxis
+from ldcnd.durable import DISK_TIME_S
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config

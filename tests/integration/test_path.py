@@ -10,6 +10,7 @@ import pytest
 
 from ldcnd.contract.commands import BufferMode, Direction, Halt, MoveAbsolute, MoveRelative, Power, Reset, Stop
 from ldcnd.contract.errors import (
+    CommandAborted,
     CommandExpired,
     CommandIdReused,
     NotSupported,
@@ -18,7 +19,7 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.leases import Acquire, Release
-from ldcnd.contract.rig_commands import AxisPath, PathReply, WalkPath
+from ldcnd.contract.rig_commands import AxisPath, PathReply, SetSpeedOverride, WalkPath
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.line.flight_recorder import WireEvent
@@ -436,3 +437,34 @@ async def test_a_path_begins_in_time_or_not_at_all_however_long_its_drives_are_f
             await asked
             assert began_s <= latest_s + 0.01
         assert began_s is not None or allowed_s < 2.0
+
+
+@pytest.mark.promise("override-0")
+async def test_a_path_that_was_being_fed_at_0_percent_does_not_begin_once_that_is_raised():
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+
+        async def interfere() -> None:
+            await asyncio.sleep(0.05)
+            for percent in (0, 100):
+                await rig.client.ask(SetSpeedOverride(percent=percent))
+
+        interfering = asyncio.create_task(interfere(), name="interfere")
+        with pytest.raises(CommandAborted):
+            await rig.client.ask(path())
+        await interfering
+        assert await rests(chain, 2.0)
+
+
+@pytest.mark.parametrize("mode", [BufferMode.BUFFERED, BufferMode.ABORTING])
+async def test_a_path_may_wait_for_the_motion_of_a_member_or_halt_it(mode):
+    chain = sc_chain()
+    async with two_sc(chain) as rig:
+        await rig.client.command("c", MoveAbsolute(position=5.0))
+        await asyncio.sleep(0.1)
+        request = path()
+        moves = tuple(move.model_copy(update={"buffer_mode": mode}) for move in request.moves)
+        reply = await rig.client.ask(request.model_copy(update={"moves": moves}))
+        for each in reply.replies:
+            await rig.client.wait_for_end(each.axis, each.command_id)
+        assert places(chain)[1] == pytest.approx((0.0, 0.0), abs=0.05)

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from ldcnd.contract.commands import Home, Jog, MoveAbsolute, MoveRelative, MoveVelocity, Power, SetPwm, Track
-from ldcnd.contract.errors import LeaseHeld, WrongState
+from ldcnd.contract.errors import CommandAborted, LdcndError, LeaseHeld, WrongState
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.questions import Preview
@@ -39,6 +39,13 @@ async def speed(rig):
     await asyncio.sleep(0.1)
     rig.drive.catch_up(loop.time())
     return (rig.position_mm - before) / 0.1
+
+
+async def refused(call):
+    """Return what a command was refused with."""
+    with pytest.raises(LdcndError) as caught:
+        await call
+    return caught.value
 
 
 @dialects
@@ -134,6 +141,23 @@ async def test_a_move_that_waits_is_not_begun_at_0_percent():
         await asyncio.sleep(0.2)
         await override(rig, 0)
         assert await rig.rig.refusal(waiting) is not None
+
+
+@pytest.mark.promise("override-0")
+@dialects
+async def test_a_motion_whose_packets_were_under_way_at_0_percent_does_not_begin_once_that_is_raised(dialect):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        async with asyncio.TaskGroup() as group:
+            move = group.create_task(refused(rig.send(MoveAbsolute(position=5.0))), name="move")
+            await asyncio.sleep(0.003)
+            await override(rig, 0)
+            await override(rig, 100)
+        await asyncio.sleep(1.0)
+        rig.drive.catch_up(asyncio.get_running_loop().time())
+
+        assert isinstance(move.result(), CommandAborted)
+        assert rig.position_mm == pytest.approx(0.0, abs=0.02)
 
 
 @pytest.mark.promise("override-0")

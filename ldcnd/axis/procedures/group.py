@@ -18,7 +18,7 @@ from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion
 from ldcnd.axis.straight import straight_line
 from ldcnd.contract.commands import CommandReply, MoveAbsolute
-from ldcnd.contract.errors import LdcndError, OutcomeUnknown, ShuttingDown, ValueOutOfRange, WrongState
+from ldcnd.contract.errors import LdcndError, OutcomeUnknown, ValueOutOfRange, WrongState
 from ldcnd.contract.rig_commands import MoveTogetherReply
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import AxisReading
@@ -26,6 +26,13 @@ from ldcnd.drives.network import Network
 
 MEETING_S = 2.0
 """Longest wait for the turns of all members, seconds; one that has not got it by then keeps the group from moving."""
+
+
+CUT_SHORT = OutcomeUnknown(
+    "the start of several axes was cut short, so all were commanded to stop",
+    remedy="read the axis states before anything else",
+)
+"""Of a start that was cancelled: for those who have announced a motion the readings tell."""
 
 
 class GroupMoveRequest(MoveAbsolute):
@@ -172,6 +179,8 @@ class Meeting(Rendezvous):
     @override
     async def _start(self) -> None:
         try:
+            for member in self._members.values():
+                member.make_plan()  # anew: the speed override may be another by now
             if self._straight:
                 axes = {name: (member.motion, member.plan) for name, member in self._members.items()}
                 plans, self.deviation = plans_on_line(axes, self._max_deviation)
@@ -183,7 +192,7 @@ class Meeting(Rendezvous):
         except LdcndError as error:
             self.fail(error)
         except asyncio.CancelledError:
-            self.fail(ShuttingDown("the daemon is stopping"))
+            self.fail(CUT_SHORT)
             raise
         else:
             if not self._started.done():
@@ -216,15 +225,24 @@ class GroupMember(Procedure):
         meeting, motion = self._request.rendezvous, self.motion
         try:
             self.permit.check_state()
-            position = motion.unwrapped(self._request.position, self._request.direction)
-            self.plan = motion.plan_to(position, self._request.velocity, self._request.acceleration)
+            self.make_plan()
             await meeting.join(motion.config.name, self)
-        except LdcndError as error:
-            meeting.fail(error)
-            self._not_started(error)
+        except (LdcndError, asyncio.CancelledError) as error:
+            failure = error if isinstance(error, LdcndError) else CUT_SHORT
+            meeting.fail(failure)
+            self._not_started(failure)
             raise
         motion.tracker.take(MotionStarted(motion.clock.now_s(), self.plan.motion.target_counts))
         return motion.reply(self.permit, self.plan)
+
+    def make_plan(self) -> None:
+        """Plan the move by limits and the speed override of now.
+
+        Raises:
+            RequestRefused: as `move_absolute`.
+        """
+        position = self.motion.unwrapped(self._request.position, self._request.direction)
+        self.plan = self.motion.plan_to(position, self._request.velocity, self._request.acceleration)
 
     def announce(self) -> None:
         """Say that the axis moves, before its drive does."""

@@ -15,7 +15,7 @@ from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit, start_path
 from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
-from ldcnd.axis.procedures.group import Rendezvous
+from ldcnd.axis.procedures.group import CUT_SHORT, Rendezvous
 from ldcnd.axis.status import Completion
 from ldcnd.axis.unmoved import walking
 from ldcnd.contract.commands import CommandReply, MoveAbsolute
@@ -24,7 +24,6 @@ from ldcnd.contract.errors import (
     LdcndError,
     NotSupported,
     OutcomeUnknown,
-    ShuttingDown,
     ValueOutOfRange,
     WrongState,
 )
@@ -122,6 +121,8 @@ class SharedPath(Rendezvous):
         fed = False
         try:
             members = {name: share.member for name, share in self._shares.items()}
+            for member in members.values():
+                member.make_plan()  # anew: the speed override may be another by now
             plan = self.plan = self._planned({name: member.on_path() for name, member in members.items()})
             self._check_line(members)
             for member in members.values():
@@ -141,7 +142,7 @@ class SharedPath(Rendezvous):
                 await self.stop_all(error.message)
             self.fail(error)
         except asyncio.CancelledError:
-            self.fail(ShuttingDown("the daemon is stopping"))
+            self.fail(CUT_SHORT)
             raise
         else:
             self.begun_s = next(iter(members.values())).motion.clock.now_s()
@@ -305,25 +306,30 @@ class PathMember(Procedure):
                     remedy="restart the drive",
                 )
             self._here = status.commanded_counts
-            self._corners = self._planned_corners(status.commanded_counts)
+            self.make_plan()
             await path.join(motion.config.name, self)
-        except LdcndError as error:
-            path.fail(error)
-            self._not_started(error)
+        except (LdcndError, asyncio.CancelledError) as error:
+            failure = error if isinstance(error, LdcndError) else CUT_SHORT
+            path.fail(failure)
+            self._not_started(failure)
             raise
         motion.tracker.take(MotionStarted(motion.clock.now_s()))
         self._wait(path.share_of(self).sent)
         return motion.reply(self.permit, self.plan, duration_s=path.plan.duration_s if path.plan else None)
 
-    def _planned_corners(self, here_counts: int) -> tuple[float, ...]:
-        """Plan the move to each corner from the one before; return where the path turns, in counts of the drive."""
+    def make_plan(self) -> None:
+        """Plan the move to each corner from the one before, by limits and the speed override of now.
+
+        Raises:
+            RequestRefused: as `move_absolute`.
+        """
         motion, request = self.motion, self._request
-        corners = [here_counts]
+        corners = [self._here]
         for position in (*request.via, request.position):
             corner = motion.unwrapped(position, request.direction, from_counts=corners[-1])
             self.plan = motion.plan_to(corner, request.velocity, request.acceleration)
             corners.append(self.plan.motion.target_counts or 0)
-        return tuple(map(float, corners))
+        self._corners = tuple(map(float, corners))  # where the path turns, in counts of the drive
 
     def on_path(self) -> PathAxis:
         """Return the share of this axis."""

@@ -6,7 +6,7 @@ Position As Home".
 """
 
 import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 
 from ldcnd.contract.errors import (
     BusError,
@@ -107,26 +107,11 @@ class Groups:
             before[name] = self._counts(name, await self._ready(name))
             await self._drives[name].load(motion)
         still_wanted()
-        sent = False
-        try:
-            await self._start_motion(group)
-            sent = True
-            stuck = [name for name, motion in motions.items() if not await self._started(name, motion, before[name])]
-        except LdcndError as error:  # also a stop of one member that came between
-            if isinstance(error, RequestRefused) and not sent:
-                raise  # refused when its turn on the line came
-            await self._stop_all(group)
-            raise OutcomeUnknown(
-                f"group of {', '.join(sorted(names))}: {error.message}; not all axes are known to have started, so all"
-                " were commanded to stop",
-                remedy="read the axis states before anything else",
-            ) from error
-        if stuck:
-            await self._stop_all(group)
-            raise OutcomeUnknown(
-                f"group of {', '.join(sorted(names))}: {', '.join(stuck)} did not start, so all were commanded to stop",
-                remedy="read the axis states before anything else",
-            )
+
+        async def stuck() -> list[str]:
+            return [name for name, motion in motions.items() if not await self._started(name, motion, before[name])]
+
+        await self._start_proven(f"group of {', '.join(sorted(names))}", group, self._start_motion(group), stuck)
 
     async def start_path(self, names: frozenset[str], still_wanted: Callable[[], None]) -> None:
         """See `Network.start_path`.
@@ -137,32 +122,11 @@ class Groups:
         group = self.group_of(names)
         await self._prove()
         still_wanted()
-        profile = self._drives[min(names)].profile
-        sent = False
-        try:
-            if group.leader is None:
-                await self._bus.execute(
-                    commands.start_path(commands.LeaderlessGroup(group.address, profile, self._rate.cycle_s))
-                )
-            else:
-                await self._bus.execute(commands.start_path(Node(group.address, profile)), once=True)
-            sent = True
-            stuck = [name for name in sorted(names) if not (await self._drives[name].path_status()).running]
-        except LdcndError as error:
-            if isinstance(error, RequestRefused) and not sent:
-                raise
-            await self._stop_all(group)
-            raise OutcomeUnknown(
-                f"path of {', '.join(sorted(names))}: {error.message}; not all axes are known to have started, so all"
-                " were told to stop",
-                remedy="read the axis states before anything else",
-            ) from error
-        if stuck:
-            await self._stop_all(group)
-            raise OutcomeUnknown(
-                f"path of {', '.join(sorted(names))}: {', '.join(stuck)} did not start, so all were told to stop",
-                remedy="read the axis states before anything else",
-            )
+
+        async def stuck() -> list[str]:
+            return [name for name in sorted(names) if not (await self._drives[name].path_status()).running]
+
+        await self._start_proven(f"path of {', '.join(sorted(names))}", group, self._start_walking(group), stuck)
 
     async def snapshot(self, still_free: Callable[[], None]) -> Instant:
         """See `Network.snapshot`: Save Current Position as Home freezes, the home registers tell.
@@ -252,6 +216,42 @@ class Groups:
             raise WrongState(f"axis {name} moves already, so the group was not started", axis=name)
         return status
 
+    async def _start_proven(
+        self, what: str, group: Group, start: Awaitable[object], stuck: Callable[[], Awaitable[list[str]]]
+    ) -> None:
+        """Send the packet that starts a group, and have all stopped unless every drive proves that it has started.
+
+        Args:
+            what: it is, in words.
+            group: which.
+            start: sends the packet.
+            stuck: returns who has not started.
+
+        Raises:
+            OutcomeUnknown: that was not proven.
+            RequestRefused: when the turn of the packet came it was not sent.
+        """
+        sent = False
+        try:
+            await start
+            sent = True
+            if not (late := await stuck()):
+                return
+            why = f"{', '.join(late)} did not start"
+            cause = None
+        except asyncio.CancelledError:  # nobody waits for the outcome any more, and the packet may be out
+            await self._stop_all(group)
+            raise
+        except LdcndError as error:  # also a stop of one member that came between
+            if isinstance(error, RequestRefused) and not sent:
+                raise
+            why = f"{error.message}; not all axes are known to have started"
+            cause = error
+        await self._stop_all(group)
+        raise OutcomeUnknown(
+            f"{what}: {why}, so all were commanded to stop", remedy="read the axis states before anything else"
+        ) from cause
+
     async def _start_motion(self, group: Group) -> None:
         """Start Motion, once; a leader's reply proves that the packet was understood, and its loss proves nothing."""
         if group.leader is None:
@@ -262,6 +262,15 @@ class Groups:
         leader = self._drives[group.leader]
         # a leader that has received it damaged speaks for itself only: the others may have started
         await self._bus.execute(commands.start_motion(Node(group.address, leader.profile)), once=True)
+
+    async def _start_walking(self, group: Group) -> None:
+        """Start Path, once."""
+        profile = self._drives[min(group.members)].profile
+        if group.leader is None:
+            node = commands.LeaderlessGroup(group.address, profile, self._rate.cycle_s)
+            await self._bus.execute(commands.start_path(node))
+        else:
+            await self._bus.execute(commands.start_path(Node(group.address, profile)), once=True)
 
     async def _started(self, name: str, motion: CountsMotion, came_from: int) -> bool:
         """Tell from the drive's status whether it has set out, or has arrived already."""

@@ -5,16 +5,16 @@ crash in between makes the count too high, never too low.
 Source: manual 2.2, note on EEPROM.
 """
 
-import asyncio
 import json
 import os
 from collections.abc import Mapping
-from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 
 from ldcnd import durable
 from ldcnd.contract.errors import ConfigError, EepromBudgetSpent, Remedy, step
 from ldcnd.log import get_logger
+from ldcnd.own_thread import OwnThread
 
 log = get_logger("eeprom")
 
@@ -39,7 +39,7 @@ class EepromLedger:
         self._path = path
         self._damaged = path.with_name(f"{path.name}.damaged")
         """Where a damaged one was put when the first count was restarted; it stands for those that were not."""
-        self._worker = ThreadPoolExecutor(1, "eeprom ledger")  # one: the file is replaced in the order of the counts
+        self._worker = OwnThread("eeprom ledger")  # one: the file is replaced in the order of the counts
         self._counts: dict[str, dict[str, int]] = {}
         self._lost = f"a damaged one is kept as {self._damaged}" if os.path.lexists(self._damaged) else ""
         try:
@@ -117,13 +117,12 @@ class EepromLedger:
         # before it is on disk, so that a write of another axis meanwhile does not lose it
         self._counts[axis] = counts
         text = json.dumps(self._counts, indent=1, sort_keys=True)
-        loop = asyncio.get_running_loop()
         try:
-            await loop.run_in_executor(self._worker, self._write, text)
-        except OSError as error:
+            await self._worker.run(partial(self._write, text), durable.DISK_TIME_S)
+        except OSError as error:  # also a TimeoutError, after which the disk may have a higher count
             self._counts[axis] = before
             raise ConfigError(
-                f"{self._path}: the EEPROM ledger cannot be written: {error.strerror}",
+                f"{self._path}: the EEPROM ledger cannot be written: {error.strerror or 'the disk does not answer'}",
                 axis=axis,
                 remedy="make state_dir writable",
             ) from error
