@@ -28,11 +28,12 @@ MEETING_S = 2.0
 """Longest wait for the turns of all members, seconds; one that has not got it by then keeps the group from moving."""
 
 
-CUT_SHORT = OutcomeUnknown(
-    "the start of several axes was cut short, so all were commanded to stop",
-    remedy="read the axis states before anything else",
-)
-"""Of a start that was cancelled: for those who have announced a motion the readings tell."""
+def cut_short() -> OutcomeUnknown:
+    """Return the end of a start that was cancelled: for those who have announced a motion the readings tell."""
+    return OutcomeUnknown(
+        "the start of several axes was cut short, so all were commanded to stop",
+        remedy="read the axis states before anything else",
+    )
 
 
 class GroupMoveRequest(MoveAbsolute):
@@ -192,7 +193,7 @@ class Meeting(Rendezvous):
         except LdcndError as error:
             self.fail(error)
         except asyncio.CancelledError:
-            self.fail(CUT_SHORT)
+            self.fail(cut_short())
             raise
         else:
             if not self._started.done():
@@ -228,7 +229,7 @@ class GroupMember(Procedure):
             self.make_plan()
             await meeting.join(motion.config.name, self)
         except (LdcndError, asyncio.CancelledError) as error:
-            failure = error if isinstance(error, LdcndError) else CUT_SHORT
+            failure = error if isinstance(error, LdcndError) else cut_short()
             meeting.fail(failure)
             self._not_started(failure)
             raise

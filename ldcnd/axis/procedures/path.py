@@ -15,7 +15,7 @@ from ldcnd.axis.motion import AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit, start_path
 from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
-from ldcnd.axis.procedures.group import CUT_SHORT, Rendezvous
+from ldcnd.axis.procedures.group import Rendezvous, cut_short
 from ldcnd.axis.status import Completion
 from ldcnd.axis.unmoved import walking
 from ldcnd.contract.commands import CommandReply, MoveAbsolute
@@ -142,7 +142,7 @@ class SharedPath(Rendezvous):
                 await self.stop_all(error.message)
             self.fail(error)
         except asyncio.CancelledError:
-            self.fail(CUT_SHORT)
+            self.fail(cut_short())
             raise
         else:
             self.begun_s = next(iter(members.values())).motion.clock.now_s()
@@ -309,7 +309,7 @@ class PathMember(Procedure):
             self.make_plan()
             await path.join(motion.config.name, self)
         except (LdcndError, asyncio.CancelledError) as error:
-            failure = error if isinstance(error, LdcndError) else CUT_SHORT
+            failure = error if isinstance(error, LdcndError) else cut_short()
             path.fail(failure)
             self._not_started(failure)
             raise
