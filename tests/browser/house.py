@@ -80,6 +80,11 @@ class DaemonUnderTest:
         """Stop the process where it is, so that it falls silent, or let it go on."""
         self._process.send_signal(signal.SIGSTOP if on else signal.SIGCONT)
 
+    async def kill(self) -> None:
+        """Let it end without a word."""
+        self._process.kill()
+        await self.end()
+
     async def end(self) -> None:
         """Return when it has ended."""
         await self._running.aclose()

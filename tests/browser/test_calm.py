@@ -171,8 +171,11 @@ async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_t
             await house.alpha.rig.stop("x")
             await playwright.expect(story).to_contain_text("move absolute, stopped at")
             await playwright.expect(desk.panel("Now")).to_contain_text("move absolute, stopped at")
-
+            async with house.desk() as another:  # it was not there when that happened
+                await another.open("axis/alpha/x")
+                await playwright.expect(another.panel("Now")).to_contain_text("move absolute, stopped at")
             await desk.button("Reset").click()
+
             await house.alpha.until("x", lambda state: not state.stop_latched)
             await desk.panel("Move").get_by_label("Position mm").fill("70")
             await desk.button("Move").click()
@@ -187,6 +190,15 @@ async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_t
             )
             await house.alpha.start()
             await playwright.expect(story).not_to_contain_text("x moves to")
+            await playwright.expect(desk.panel("Now")).to_contain_text("move absolute, halted")
+
+            await desk.button("Take control").click()
+            await desk.button("Enable").click()
+            await desk.button("+10 mm").click()
+            await playwright.expect(desk.panel("Now")).to_contain_text("move relative, ends in")
+            await house.alpha.kill()
+            await house.alpha.start()
+            await playwright.expect(desk.panel("Now")).to_contain_text("move relative: not known how it ended")
     finally:
         with suppress(ProcessLookupError):  # it has ended already
             house.alpha.pause(on=False)

@@ -33,7 +33,7 @@ export function NowPanel({ axis }) {
       ["encoder", html`${number(position?.counts, 0)} <span class="unit">count</span>`],
       ["A/D input", adc ? html`${number(adc.volts, 3)} <span class="unit">V</span> (${adc.counts})` : "none"],
       ["command", state?.command ? `${words(state.command.verb)}, ${remaining(state.command, axis.rig.nowNs())}` : "none"],
-      ["last motion", axis.ended() ? html`<${EndOfMotion} axis=${axis} event=${axis.ended()} />` : "none yet"],
+      ["last motion", html`<${LastMotion} axis=${axis} />`],
     ]} />
     <h3>Status</h3>
     <${StatusLamps} state=${state} live=${live} silent=${axis.rig.worth} />
@@ -41,6 +41,12 @@ export function NowPanel({ axis }) {
     <${Monitors} axis=${axis} />
     <${Signals} axis=${axis} />
   <//>`;
+}
+
+function LastMotion({ axis }) {
+  const unseen = axis.endedUnseen();
+  if (unseen) return html`${words(unseen.verb)}: <${Mark} level="warn">not known how it ended<//>, the daemon was started again`;
+  return axis.ended() ? html`<${EndOfMotion} axis=${axis} event=${axis.ended()} />` : "none known";
 }
 
 function remaining(command, nowNs) {

@@ -6,9 +6,8 @@ import { TextField } from "../parts/number_field.js";
 import { save } from "../parts/chart_view.js";
 import { dateAndClock, words } from "../parts/format.js";
 import { faultPage, Mark } from "../parts/state.js";
-import { ask, rigPath } from "../session/api.js";
 import { COMMAND_STATUSES } from "../session/contract.js";
-import { changed, useRigs } from "../session/rigs.js";
+import { learnEvents, useRigs } from "../session/rigs.js";
 
 const ASKED = 500;
 const MOST_SHOWN = 300;
@@ -23,7 +22,7 @@ export function EventsPage() {
     .map((rig) => rig.name)
     .join();
   useEffect(() => {
-    for (const rig of all) if (rig.connected) earlier(rig).catch(setRefusal);
+    for (const rig of all) if (rig.connected) learnEvents(rig, ASKED).catch(setRefusal);
   }, [connected]);
 
   const set = (name) => (value) => setOnly((last) => ({ ...last, [name]: value ?? "" }));
@@ -94,13 +93,6 @@ function matches({ rig, event }, { axis, status, text }) {
     .join(" ")
     .toLowerCase()
     .includes(text.toLowerCase());
-}
-
-/** Ask for what happened before this page was there. */
-async function earlier(rig) {
-  const { events } = await ask(`${rigPath(rig.name)}/rig/events`, { count: ASKED });
-  for (const event of events) rig.happened(event);
-  changed();
 }
 
 function csvOf(found) {

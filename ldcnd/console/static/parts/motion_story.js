@@ -31,6 +31,7 @@ function restOf(axis, event) {
   if (event.t < (axis.unitChange?.since ?? 0)) return null; // it was in another unit
   if (event.position != null) return event.position;
   const after = axis.rig.events.slice(axis.rig.events.indexOf(event) + 1).filter((each) => each.axis === axis.name);
+  if (after.some(({ verb }) => verb === "set_position")) return null; // what came behind it is in other coordinates
   const ending = after.find((each) => each.position != null);
   if (ending) return axis.rig.mayMove(ending.verb) ? null : ending.position;
   // where it ended before a restart of the daemon or the loss of its reference is not known any more

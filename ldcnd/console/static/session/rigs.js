@@ -1,7 +1,7 @@
 /** What is known of every rig: descriptions by GET, latest values by the feed, and how old they are. */
 
 import { useEffect, useState } from "../html.js";
-import { read } from "./api.js";
+import { ask, read, rigPath } from "./api.js";
 import { feed } from "./feed.js";
 
 const DESCRIBED_EACH_MS = 5_000;
@@ -186,6 +186,13 @@ export class Axis {
       event.axis === this.name && FINAL.has(event.status) &&
       (commandId ? event.command_id === commandId : this.rig.mayMove(event.verb) && event.status !== "refused");
     return this.rig.events.findLast(mine) ?? null;
+  }
+
+  /** Whether a motion began behind the last end that is known, and is not under way: how it ended nobody has seen. */
+  endedUnseen() {
+    const began = this.rig.events.findLast((event) => event.axis === this.name && this.rig.mayMove(event.verb) && event.status !== "refused");
+    const open = began && !this.ended(began.command_id) && began.command_id !== this.state?.command?.command_id;
+    return open && began.t < (this.rig.daemon?.started ?? 0) ? began : null;
   }
 
   /** Seconds from the end of a command's profile to its own end; null where the profile has none, or was not seen. */
@@ -493,4 +500,11 @@ function joined(rig, { connected, problem }) {
   const came = connected && !rig.connected;
   Object.assign(rig, { connected, problem });
   if (came) describe(); // another run of the daemon may have other axes
+}
+
+/** Ask a rig for its latest events: of what happened before this page was there, or while it slept. */
+export async function learnEvents(rig, count) {
+  const { events } = await ask(`${rigPath(rig.name)}/rig/events`, { count });
+  for (const event of events) rig.happened(event);
+  changed();
 }
