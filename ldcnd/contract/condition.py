@@ -358,8 +358,8 @@ def assess(
 ) -> Condition:
     """Return the condition of an axis.
 
-    Of an axis that does not answer nothing else is said but a stop that it has not confirmed: what was known of it may
-    be over. How its last command ended is an event, not a state: it is given only where it explains an error stop, or
+    Of an axis that does not answer nothing else is said but a stop: what was known of its drive may be over, and a latch
+    is its daemon's. How its last command ended is an event, not a state: it is given only where it explains an error stop, or
     where an interlock ended it.
 
     Args:
@@ -381,7 +381,8 @@ def assess(
     gone = _unreachable(state, faults, silence=silence, line_up=line_up is not False)
     pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
     if gone:
-        silent = _unanswered(last, (*pending, gone), gone.short)
+        latched = (_LATCHED,) if state.stop_latched and not state.stop_pending and not silence else ()
+        silent = _unanswered(last, (*pending, gone, *latched), gone.short)
         return replace(silent, holder=holder, control=control, moves=state.state.is_motion)
     place, mark = _place(state, faults, is_old=_is_old(state, age_s, health))
     troubles = (*pending, *_found(state, faults, health, place), *_overridden(health), *_slowed(state))

@@ -78,7 +78,7 @@ def test_a_line_that_is_not_up_is_wrong_and_says_why_where_that_is_known():
 
 
 def test_of_a_drive_that_does_not_answer_nothing_else_is_said():
-    gone = state(link=LinkState.DOWN, state=AxisState.ERROR_STOP, stop_latched=True)
+    gone = state(link=LinkState.DOWN, state=AxisState.ERROR_STOP)
 
     assert said(troubles_of(gone, None, health(0.0))) == wrong("the drive does not answer")
     assert said(troubles_of(gone, faults(entry("link_lost")), health(0.0))) == wrong("remedy of link_lost")
@@ -189,3 +189,11 @@ def test_the_override_is_said_of_no_drive_that_others_move(override):
 
     assert not [each for each in assess(turning).troubles if "override" in each.text]
     assert [each for each in assess(state(speed_override=override)).troubles if "override" in each.text]
+
+
+def test_a_latch_is_said_of_an_axis_that_does_not_answer_too():
+    lost = assess(state(link=LinkState.DOWN, stop_latched=True))
+    silent = assess(state(link=LinkState.DOWN, stop_latched=True), silence="nothing was heard")
+
+    assert "stop latched" in [each.short for each in lost.troubles]
+    assert "stop latched" not in [each.short for each in silent.troubles]
