@@ -205,7 +205,7 @@ def accept(  # noqa: PLR0917 - click passes them by name
     This is no emergency stop; have one within reach. Exits with 1 when an assumption is refuted.
     """
     if list_only:
-        _list()
+        _list(family)
         return
     if port is None:
         raise click.UsageError("name the port that the drives are on")
@@ -231,10 +231,12 @@ def _refutes(finding: Finding) -> bool:
     return finding.verdict is Verdict.WRONG or (finding.verdict is Verdict.LOOK and finding.verifies is not None)
 
 
-def _list() -> None:
-    for name, family in BENCHES.items():
-        for each in family.assumptions():
-            print(json.dumps({"family": name, **each}))
+def _list(family: str) -> None:
+    found = BENCHES[family].assumptions()
+    if not found:
+        click.echo(f"a trial confirms nothing that this manual leaves open; see `ldcnd doctor {family}`", err=True)
+    for each in found:
+        print(json.dumps({"family": family, **each}))
 
 
 def _numbers(units: str) -> tuple[int, ...]:
