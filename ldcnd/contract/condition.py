@@ -358,8 +358,8 @@ def assess(
 ) -> Condition:
     """Return the condition of an axis.
 
-    Of an axis that does not answer nothing else is said but a stop: what was known of its drive may be over, and a latch
-    is its daemon's. How its last command ended is an event, not a state: it is given only where it explains an error
+    Of an axis that does not answer nothing else is said but a stop: what was known of its drive may be over, and a
+    latch is its daemon's. How its last command ended is an event, not a state: it is given only where it explains an error
     stop, or where an interlock ended it.
 
     Args:
