@@ -359,8 +359,8 @@ def assess(
     """Return the condition of an axis.
 
     Of an axis that does not answer nothing else is said but a stop: what was known of its drive may be over, and a
-    latch is its daemon's. How its last command ended is an event, not a state: it is given only where it explains an error
-    stop, or where an interlock ended it.
+    latch is its daemon's. How its last command ended is an event, not a state: it is given only where it explains an
+    error stop, or where an interlock ended it.
 
     Args:
         state: its last state; None before the first.
