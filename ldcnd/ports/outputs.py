@@ -41,10 +41,10 @@ class GuestOutputs:
         """
         match command:
             case SetDirection(inputs):
-                if foreign := ALL_LINES & ~inputs & ~sum(self._lines):
+                self._inputs = inputs
+                if foreign := ALL_LINES & ~inputs & ~sum(self._lines):  # the named ones of the packet are outputs
                     lines = ", ".join(str(line) for line in range(1, 13) if foreign & 1 << line - 1)
                     raise NotSupported(f"the configuration names no output at line {lines}")
-                self._inputs = inputs
                 return self._drive()
             case SetOutput(levels):
                 self._levels = levels

@@ -1,5 +1,9 @@
 """A guest's own chain: what arranges is answered as on the bare line, what could concern a drive is handed on."""
 
+import pytest
+
+from ldcnd.contract.errors import NotSupported
+from ldcnd.contract.rig_commands import SetIo
 from ldcnd.drives.ldcn.packet import (
     CommandCode,
     Packet,
@@ -9,9 +13,12 @@ from ldcnd.drives.ldcn.packet import (
     encode_packet,
     encode_status,
 )
+from ldcnd.drives.ldcn.pic_io import SetDirection, SetOutput
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.received import ReceivedCommand
+from ldcnd.drives.line_config import OutputConfig
 from ldcnd.ports.guest_module import GuestModule, PendingReply
+from ldcnd.ports.outputs import GuestOutputs
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.quirks import ModuleSettings
 
@@ -99,3 +106,12 @@ def test_a_reading_that_comes_late_answers_no_later_request() -> None:
     program.send_bytes(ask, read=False)
 
     assert program.send_bytes(ask) == "0909"
+
+
+def test_named_outputs_of_a_direction_packet_are_outputs_though_it_makes_others_outputs_too():
+    outputs = GuestOutputs("cabinet", {"lamp": OutputConfig(line=10)}, lambda _: {"lamp": False})
+
+    with pytest.raises(NotSupported, match="line 12"):
+        outputs.meaning(SetDirection(0xFFF & ~0xA00))
+
+    assert outputs.meaning(SetOutput(0xA00)) == SetIo(module="cabinet", high=("lamp",))
