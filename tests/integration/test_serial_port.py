@@ -5,7 +5,6 @@ import select
 import termios
 import tty
 from collections.abc import AsyncIterator, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -53,6 +52,15 @@ async def port(far: FarSide) -> AsyncIterator[Transport]:
     opened = await open_serial_port(SerialSettings(far.path, 115_200))
     yield opened
     await opened.close()
+
+
+async def opened_at_last(settings: SerialSettings) -> Transport:
+    """Open a port as soon as an attempt of before has returned."""
+    while True:
+        try:
+            return await open_serial_port(settings)
+        except TransportLost:
+            await asyncio.sleep(0.01)
 
 
 def descriptors() -> int:
@@ -185,16 +193,52 @@ async def test_a_lost_port_keeps_no_descriptor():
 
 
 async def test_an_opening_that_is_cancelled_keeps_no_descriptor(far: FarSide):
-    loop = asyncio.get_running_loop()
-    loop.set_default_executor(ThreadPoolExecutor(1))  # one worker: what was cancelled ends before the next opening
-    await loop.run_in_executor(None, int)
+    settings = SerialSettings(far.path, 115_200, exclusive=False)
+    await (await open_serial_port(settings)).close()  # what the loop and threads keep is there now
     before = descriptors()
 
     async with asyncio.TaskGroup() as group:
-        opening = group.create_task(open_serial_port(SerialSettings(far.path, 115_200)), name="opening")
+        opening = group.create_task(open_serial_port(settings), name="opening")
         await asyncio.sleep(0)
         opening.cancel()
-    port = await open_serial_port(SerialSettings(far.path, 115_200, exclusive=False))
+    async with asyncio.timeout(10):
+        port = await opened_at_last(settings)
+    await port.close()
+
+    assert descriptors() == before
+
+
+async def test_a_lost_port_keeps_no_descriptor():
+    await asyncio.get_running_loop().run_in_executor(None, int)
+    before = descriptors()
+
+    for _ in range(5):
+        far = FarSide()
+        port = await open_serial_port(SerialSettings(far.path, 115_200))
+        receiver = RecordingReceiver()
+        port.attach(receiver)
+        far.close()
+        await receiver.wait_lost()
+        await port.close()
+
+    assert descriptors() == before
+
+
+async def test_an_opening_that_is_cancelled_keeps_no_descriptor(far: FarSide):
+    settings = SerialSettings(far.path, 115_200, exclusive=False)
+    await (await open_serial_port(settings)).close()  # what the loop and threads keep is there now
+    before = descriptors()
+
+    async with asyncio.TaskGroup() as group:
+        opening = group.create_task(open_serial_port(settings), name="opening")
+        await asyncio.sleep(0)
+        opening.cancel()
+    port = None
+    async with asyncio.timeout(10):
+        while port is None:
+            with suppress(TransportLost):  # the first attempt has not returned yet
+                port = await open_serial_port(settings)
+            await asyncio.sleep(0.01)
     await port.close()
 
     assert descriptors() == before
