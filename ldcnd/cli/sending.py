@@ -22,12 +22,12 @@ from ldcnd.cli.typed import Finite, Quantity, WholeNumber, axis_of, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, Verb
-from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError, UnknownAxis, step
+from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, step
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.frozen import Frozen, attribute_docstrings
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.questions import PreviewReply
-from ldcnd.contract.samples import LinkState, Moving, PositionSample, Sample, StateSample, TelemetryItem
+from ldcnd.contract.samples import PositionSample, Sample, StateSample, TelemetryItem
 from ldcnd.contract.units import DIMENSIONS
 
 HALT_TIME_S = 3.0
@@ -181,24 +181,10 @@ class Sender:
             reply = await self.command(client, axis, command)
             if wait:
                 await client.wait_for_end(axis, reply.command_id)
-                await _at_rest(client, axis)
+                await client.wait_for_rest(axis, None)  # its load may turn one whose loop is open
         except LdcndError as error:
             return error
         return reply
-
-
-async def _at_rest(client: RigClient, axis: str) -> None:
-    """Return once an axis stands: one whose loop is open may be turned by its load after its command has ended.
-
-    Raises:
-        OutcomeUnknown: the drive stopped answering.
-    """
-    async with client.samples(axis, TelemetryItem.STATE) as states:
-        sample: Sample | None = await client.state(axis)
-        while isinstance(sample, StateSample) and sample.moving is not Moving.NO:
-            if sample.link is LinkState.DOWN:
-                raise OutcomeUnknown(f"axis {axis}: the drive does not answer any more", axis=axis)
-            _, sample = await anext(states)
 
 
 @asynccontextmanager

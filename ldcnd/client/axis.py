@@ -10,18 +10,19 @@ from typing import Any, TypeVar
 from ldcnd.client.lease import Control
 from ldcnd.client.motion import Jogging, Motion, Position, Sent, State, set_point
 from ldcnd.client.notebook import table
+from ldcnd.client.rest import REST_S, until_at_rest
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import Trace, armed_trace, fetch_trace, wait_for_trace
 from ldcnd.client.verbs import AxisVerbs
 from ldcnd.contract.codec import decode_received, valid
 from ldcnd.contract.commands import AxisCommand, BufferMode, Command, CommandReply, Halt, Jog, StopReply
 from ldcnd.contract.condition import assess
-from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, SessionError, UnknownAxis, WrongState
+from ldcnd.contract.errors import LdcndError, LeaseExpired, MalformedRequest, SessionError, UnknownAxis
 from ldcnd.contract.events import FINAL, CommandOutcome, ReadOutcome
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.number_text import NotANumber
-from ldcnd.contract.samples import Moving, PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
 from ldcnd.contract.traces import TakeTrace, TraceTrigger
 from ldcnd.contract.units import DIMENSIONS, read_quantity
 from ldcnd.net.session import Publication, SampleKind
@@ -391,8 +392,6 @@ async def made(client: RigClient, axis: str, command: type[CommandT], fields: Ma
     return valid(command, **fields)
 
 
-REST_S = 5.0
-"""Longest time that an axis takes to come to rest, or to be heard of, seconds."""
 CHECK_PERIOD_S = 0.05
 
 
@@ -414,19 +413,12 @@ async def seen(axis: Axis) -> Axis:
             return axis
 
 
-async def at_rest(axis: Axis) -> None:
-    """Wait until an axis stands.
+async def at_rest(axis: Axis, within_s: float | None = REST_S) -> StateSample:
+    """Wait until an axis stands, and return its state then; without `within_s` as long as anything comes from it.
 
     Raises:
-        WrongState: it does not come to rest.
+        LeaseExpired: control was lost.
+        OutcomeUnknown: the drive does not answer, or nothing comes from it any more.
+        WrongState: it does not come to rest in time.
     """
-    try:
-        async with asyncio.timeout(REST_S):
-            while axis.state.moving is not Moving.NO:
-                await axis.news(CHECK_PERIOD_S)
-    except TimeoutError:
-        raise WrongState(
-            f"axis {axis.name} does not come to rest within {REST_S:g} s",
-            axis=axis.name,
-            remedy="look for a load that moves it, then give the command again",
-        ) from None
+    return await until_at_rest(axis.name, lambda: axis.state.sample, lambda: axis.news(None), within_s)

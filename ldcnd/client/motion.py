@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 from ldcnd.client.notebook import table
+from ldcnd.client.rest import PATIENCE_S, drive_silent, nothing_received
 from ldcnd.client.rig_client import CHECK_PERIOD_S
 from ldcnd.contract.commands import CommandReply, Jog
 from ldcnd.contract.condition import Condition, assess
@@ -15,9 +16,6 @@ from ldcnd.contract.samples import AxisState, LinkState, Moving, PositionSample,
 
 if TYPE_CHECKING:
     from ldcnd.client.axis import Axis
-
-PATIENCE_S = 10.0
-"""Time without samples after which the outcome of a motion is unknown, seconds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,10 +234,7 @@ class Motion:
         while True:
             while self._under_way():
                 if not await self._axis.news(PATIENCE_S):
-                    raise OutcomeUnknown(
-                        f"axis {self._axis.name}: nothing was received from it for {PATIENCE_S:g} s",
-                        axis=self._axis.name,
-                    )
+                    raise nothing_received(self._axis.name)
             try:
                 outcome = await self._axis.outcome(self.command_id)
             except UnknownCommand:
@@ -263,7 +258,7 @@ class Motion:
     def _under_way(self) -> bool:
         state = self._axis.state.sample
         if state.link is LinkState.DOWN:
-            raise OutcomeUnknown(f"axis {self._axis.name}: the drive does not answer any more", axis=self._axis.name)
+            raise drive_silent(self._axis.name)
         return state.command is not None and state.command.command_id == self.command_id
 
     def _repr_html_(self) -> str:

@@ -8,6 +8,7 @@ from difflib import get_close_matches
 from typing import TypeVar
 
 from ldcnd.client.own_samples import Origin
+from ldcnd.client.rest import REST_S, drive_silent, until_at_rest
 from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Effect, Stop, StopReply
 from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownAxis, UnknownCommand
@@ -406,7 +407,7 @@ class RigClient:
                 waits = False
                 if isinstance(sample, StateSample):
                     if sample.link is LinkState.DOWN:
-                        raise OutcomeUnknown(f"axis {axis}: the drive does not answer any more", axis=axis)
+                        raise drive_silent(axis)
                     if sample.command is None or sample.command.command_id != command_id:
                         waits = await self._waits(command_id)
                         if not waits:
@@ -414,6 +415,23 @@ class RigClient:
                 with suppress(TimeoutError):
                     async with asyncio.timeout(CHECK_PERIOD_S if waits else None):
                         _, sample = await anext(states)
+
+    async def wait_for_rest(self, axis: str, within_s: float | None = REST_S) -> StateSample:
+        """Wait until an axis stands, and return its state then; see `until_at_rest`.
+
+        Raises:
+            OutcomeUnknown: the drive does not answer, or nothing comes from the axis any more.
+            WrongState: it does not come to rest in time.
+        """
+        async with self.samples(axis) as samples:
+            last = await self.state(axis)
+
+            async def news() -> None:
+                nonlocal last
+                _, sample = await anext(samples)
+                last = sample if isinstance(sample, StateSample) else last
+
+            return await until_at_rest(axis, lambda: last, news, within_s)
 
     async def _waits(self, command_id: str) -> bool:
         """Tell whether a command waits for another one: no state names it yet."""

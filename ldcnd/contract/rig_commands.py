@@ -22,6 +22,10 @@ class AxisMove(MoveAbsolute):
     axis: str
     """The axis."""
 
+    def absolute(self) -> MoveAbsolute:
+        """Return the move as a command to its axis."""
+        return MoveAbsolute(**{name: value for name, value in self if name in MoveAbsolute.model_fields})
+
 
 class LinePath(StrEnum):
     """The way that the axes of a group take between them."""

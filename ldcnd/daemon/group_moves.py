@@ -66,7 +66,7 @@ async def walk_path(rig: OwnedRig, command: WalkPath, execute: Execute) -> PathR
         raise MalformedRequest("a path names each axis once, with equally many corners", remedy="see `via`")
     line = _line_of(rig, via)
     path = SharedPath(line.network, line.bus, frozenset(via), command.speed, command.max_deviation)
-    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis", "via"})) for move in command.moves}
+    moves = {move.axis: move.absolute() for move in command.moves}
 
     requests = {name: PathShareRequest.of(move, via[name], path) for name, move in moves.items()}
     return path.reply(await _all_of(requests, path, execute))
@@ -131,7 +131,7 @@ def shares_of(command: GroupMoves) -> dict[str, MoveAbsolute]:
     Raises:
         MalformedRequest: an axis is named twice.
     """
-    moves = {move.axis: MoveAbsolute(**move.model_dump(exclude={"axis"})) for move in command.moves}
+    moves = {move.axis: move.absolute() for move in command.moves}
     if len(moves) < len(command.moves):
         raise MalformedRequest("a group move names each axis once", remedy="send one move for each axis")
     return moves

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 
-from ldcnd.client.axis import Axis
+from ldcnd.client.axis import Axis, at_rest
 from ldcnd.client.motion import Motion
 from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import AXIS_COMMANDS
@@ -146,8 +146,7 @@ class SequenceRun:
                 if step.until:
                     await self._come(step, seen)
                 for axis in step.standstill:
-                    while self._axes[axis].state.sample.moving is not Moving.NO:
-                        await self._axes[axis].news(None)
+                    await at_rest(self._axes[axis], None)
         except TimeoutError:
             words = [f"{name} is {'not known' if each is None else str(each).lower()}" for name, each in seen.items()]
             words += [f"{axis} moves: {self._axes[axis].state.sample.moving.value}" for axis in step.standstill]

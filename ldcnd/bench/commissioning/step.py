@@ -9,9 +9,10 @@ from typing import ClassVar
 
 from ldcnd.bench.commissioning.record import CommissioningRecord, Result, StepState
 from ldcnd.bench.person import Person
-from ldcnd.client.axis import REST_S, Axis, at_rest
+from ldcnd.client.axis import Axis, at_rest
 from ldcnd.client.kept_gains import open_loop
 from ldcnd.client.motion import Motion, State
+from ldcnd.client.rest import REST_S
 from ldcnd.client.rig import Rig
 from ldcnd.contract.codec import rebuild_error
 from ldcnd.contract.commands import Verb

@@ -18,13 +18,14 @@ from ldcnd.contract.errors import (
     CommandAborted,
     DriveFault,
     LdcndError,
+    OutcomeUnknown,
     RequestRefused,
     SessionError,
     StopLatched,
     UnknownAxis,
 )
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import LinkState, Moving, PositionSample, Quality
+from ldcnd.contract.samples import LinkState, PositionSample, Quality
 from ldcnd.lab.bluesky.flight import Flight, Fly
 from ldcnd.lab.bluesky.followers import Followers, ValueCallback
 from ldcnd.lab.bluesky.setting import Setting
@@ -510,11 +511,11 @@ class PlanAxis(ReadableAxis):
     async def _rest(self, *, is_news: bool = False) -> None:
         """Wait until the axis stands, as far as the daemon knows it; after a stop that is news, in a later state."""
         known = self._axis.state.sample
-        async with within(PATIENCE_S, f"axis {self._info.axis}: it did not come to rest within {PATIENCE_S:g} s"):
+        async with within(PATIENCE_S, f"axis {self._info.axis}: nothing was received from it for {PATIENCE_S:g} s"):
             while is_news and self._axis.state.sample is known:
                 await self._axis.news(None)
-            while self._axis.state.moving is not Moving.NO and self._axis.state.link is not LinkState.DOWN:
-                await self._axis.news(None)
+        with suppress(OutcomeUnknown):  # as far as the daemon knows: it tells by itself that a drive is silent
+            await at_rest(self._axis)
 
     async def _check(self, target: float, velocity: float | None) -> None:
         reply = await self._axis.preview(position=target, velocity=velocity, acceleration=self.acceleration.value)

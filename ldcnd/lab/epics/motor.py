@@ -12,6 +12,7 @@ from caproto import AlarmSeverity, AlarmStatus
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion, Sent
+from ldcnd.client.rest import REST_S, until_at_rest
 from ldcnd.contract.commands import BufferMode, Verb
 from ldcnd.contract.errors import (
     CommandAborted,
@@ -31,8 +32,6 @@ MOTIONS = frozenset({".VAL", ".RLV", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", 
 REFUSED = RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM)
 SHOWN_S = 2.0
 """Longest wait for a position and a state that say what a put has set, in seconds."""
-REST_S = 10.0
-"""Longest wait for the standstill after a motion that was ended early, in seconds."""
 
 
 class MovedRecord(MotorRecord):
@@ -132,6 +131,11 @@ class MovedRecord(MotorRecord):
         await super().take(sample, item)
         self._changed.set()
 
+    async def _news(self) -> None:
+        """Wait until a sample is shown."""
+        self._changed.clear()
+        await self._changed.wait()
+
     def target(self, state: StateSample) -> float:
         """Return where the axis was sent, by any program, or is to be sent, or else where it is."""
         return super().target(state) if self._wanted is None else self._wanted
@@ -208,8 +212,7 @@ class MovedRecord(MotorRecord):
         with suppress(TimeoutError):
             async with asyncio.timeout(SHOWN_S):
                 while self._measured <= position_t or (self.state and self.state.t < state_t):
-                    self._changed.clear()
-                    await self._changed.wait()
+                    await self._news()
 
     async def _put_tweak(self, asked: Value, sign: int) -> Put:
         return await self._put_step(sign * float(self["TWV"].value)) if asked else Put(0)
@@ -469,11 +472,8 @@ class MovedRecord(MotorRecord):
 
     async def _rest(self) -> None:
         """Wait until the axis stands, but not for ever: DMOV says when it does."""
-        with suppress(TimeoutError):
-            async with asyncio.timeout(REST_S):
-                while self.moving is not Moving.NO:
-                    self._changed.clear()
-                    await self._changed.wait()
+        with suppress(LdcndError):
+            await until_at_rest(self.info.axis, lambda: self.state, self._news, REST_S)
 
     async def halt(self) -> None:
         """Halt; where this gateway has no control a stop is the only thing that is not refused, and it latches."""

@@ -104,14 +104,12 @@ class MotorRecord:
         defaults: its velocity and acceleration, in units a second and a second squared, when a client names no others;
             None while they are not known.
         condition: how it is.
-        moving: whether it moves.
         state: as it was published last; None when that was of a daemon that described it differently.
     """
 
     def __init__(self, info: AxisInfo, defaults: Defaults | None) -> None:
         self.info = info
         self.condition = assess(None)
-        self.moving = Moving.UNKNOWN
         self.state: StateSample | None = None
         self.defaults = defaults
         self._alarm = SILENT
@@ -337,7 +335,7 @@ class MotorRecord:
         await self["RVAL"].show(int(self["RRBV"].value) + steps * (-1 if self.info.direction == "reverse" else 1))
 
     async def _take_state(self, sample: StateSample) -> None:
-        self.moving, self.state = sample.moving, sample
+        self.state = sample
         self.condition = assess(sample, self._faults)
         await self.show_alarm()
         await self._show_condition()
@@ -379,7 +377,7 @@ class MotorRecord:
 
     async def grow_old(self) -> None:
         """Show that nothing newer is known of the axis: its drive, its line or its daemon is silent."""
-        self.moving = Moving.UNKNOWN
+        self.state = self.state and self.state.model_copy(update={"moving": Moving.UNKNOWN})
         await self._take_alarm(SILENT)
         self.condition = assess(self.state, self._faults, age_s=math.inf)
         for name in (":velocity", ":adc", *(f":{monitor}" for monitor in self.info.monitors)):
@@ -401,6 +399,11 @@ class MotorRecord:
         silent = not self.stands() and self.condition.alarm < Severity.MAJOR
         troubles = () if silent else self.condition.troubles
         await self.show_beside("-MsgTxt", ", ".join(trouble.short for trouble in troubles))
+
+    @property
+    def moving(self) -> Moving:
+        """Whether the axis moves; unknown as long as nothing is heard of it."""
+        return self.state.moving if self.state else Moving.UNKNOWN
 
     def stands(self) -> bool:
         """Tell whether the axis has done what was put: one of which that is not known has not arrived."""

@@ -1,0 +1,56 @@
+"""Whether an axis stands, as its states tell: one rule and one time-out for all who wait for it."""
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+from ldcnd.contract.errors import OutcomeUnknown, WrongState
+from ldcnd.contract.samples import LinkState, Moving, StateSample
+
+REST_S = 10.0
+"""Longest time that an axis takes to come to rest, or to be heard of, seconds."""
+PATIENCE_S = 10.0
+"""Time without samples after which nothing is known of an axis any more, seconds."""
+
+
+async def until_at_rest(
+    axis: str, state: Callable[[], StateSample | None], news: Callable[[], Awaitable[object]], within_s: float | None
+) -> StateSample:
+    """Wait until an axis stands, and return the state that says so: one that is out of sight does not stand.
+
+    Args:
+        axis: its name.
+        state: returns the last one.
+        news: returns once something has come from the axis.
+        within_s: longest wait, in seconds; without one as long as anything comes from it.
+
+    Raises:
+        OutcomeUnknown: the drive does not answer, or nothing comes any more.
+        WrongState: it does not come to rest in time.
+    """
+    try:
+        async with asyncio.timeout(within_s):
+            while (last := state()) is None or last.moving is not Moving.NO:
+                if last and last.link is LinkState.DOWN:
+                    raise drive_silent(axis)
+                try:
+                    async with asyncio.timeout(PATIENCE_S):
+                        await news()
+                except TimeoutError:
+                    raise nothing_received(axis) from None
+    except TimeoutError:
+        raise WrongState(
+            f"axis {axis} does not come to rest within {within_s:g} s",
+            axis=axis,
+            remedy="look for a load that moves it, then give the command again",
+        ) from None
+    return last
+
+
+def drive_silent(axis: str) -> OutcomeUnknown:
+    """Return the error for an axis whose drive has stopped answering."""
+    return OutcomeUnknown(f"axis {axis}: the drive does not answer any more", axis=axis)
+
+
+def nothing_received(axis: str) -> OutcomeUnknown:
+    """Return the error for an axis of which nothing has come for too long."""
+    return OutcomeUnknown(f"axis {axis}: nothing was received from it for {PATIENCE_S:g} s", axis=axis)
