@@ -8,11 +8,12 @@ import pytest
 from ldcnd.contract.commands import HomeMethod
 from ldcnd.contract.errors import BusError, NetworkMismatch, NotSupported, ReplyTimeout, StopLatched
 from ldcnd.drives.driver import CountsMotion, HomeCapture, StopMode
-from ldcnd.drives.ldcn.addressing import Expected, Identity, differences
+from ldcnd.drives.ldcn.addressing import WAITING_ADDRESSES, Expected, Identity, differences
 from ldcnd.drives.ldcn.adoption import Found
 from ldcnd.drives.ldcn.commands import Node, read_status
 from ldcnd.drives.ldcn.config import LineSpec, ModuleConfig
 from ldcnd.drives.ldcn.controls import StopControl
+from ldcnd.drives.ldcn.gathering import Gathering
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.drives.ldcn.profiles import LS_182AP, PIC_SERVO_SC, PIC_SERVO_V4
 from ldcnd.drives.ldcn.registers import actual_baud
@@ -424,6 +425,28 @@ async def test_after_a_search_for_newcomers_all_are_at_the_working_rate_also_whe
         assert line.bus.baud == 115_200
         assert chain.modules[0].baud == pytest.approx(actual_baud(0x0A), rel=1e-4)
         assert await line.bus.execute(read_status(Node(1, LS_182AP), StatusItem.AUX))
+
+
+async def test_a_drive_at_a_waiting_address_is_not_forgotten_when_a_late_reply_passes_for_its_own(monkeypatch):
+    chain, answers, late = chain_of("ls182ap", "picservo-v4"), Gathering._answers, [2]
+
+    async def answered(gathering: Gathering, address: int) -> bool:
+        if address in late:
+            late.remove(address)
+            return True
+        return await answers(gathering, address)
+
+    monkeypatch.setattr(Gathering, "_answers", answered)
+    async with bare_network(chain, PAIR) as line:
+        await line.network.bring_up()
+        await restart(chain, line, 2)
+        await line.network.rejoin(lambda _: None)
+        assert chain.modules[1].address == WAITING_ADDRESSES[0]
+        with contextlib.suppress(ReplyTimeout):
+            await line.bus.execute(read_status(Node(2, PIC_SERVO_V4), StatusItem.AUX))
+
+        assert await line.network.rejoin(lambda _: None) == {"a2"}
+        assert chain.modules[1].address == 2
 
 
 async def test_a_line_is_not_taken_down_again_and_again_for_a_drive_that_stays_dark():

@@ -151,7 +151,9 @@ class Gathering:
         else:
             stock = await self._take_stock(heard)
         if not stock.silent:
-            self.problem, self._taken, self._waiting = "", 0, []
+            self.problem = ""
+            if not stock.waiting:  # one that waits has a place: a late reply may have passed for its answer from there
+                self._taken, self._waiting = 0, []
         return frozenset(each.address for at, each in enumerate(self.places) if at not in stock.silent)
 
     async def left_behind(self) -> frozenset[int]:
