@@ -351,8 +351,9 @@ def test_velocity_and_acceleration_are_moved_by_plans_and_configured(lab: Labora
 def test_a_move_that_takes_too_long_is_halted_and_fails(lab: Laboratory):
     with lab.powered("x") as (x,):
         x.set(0).wait(60)
-        with pytest.raises(FailedStatus):
+        with pytest.raises(FailedStatus) as failed:
             lab.engine(bps.abs_set(x, 50, timeout=1.0, wait=True))
+        assert isinstance(failed.value.__cause__, CommandAborted)
 
         assert 5 < lab.truth("x") < 30
         assert stands(lab, "x")
