@@ -10,7 +10,7 @@ from click.testing import CliRunner
 import ldcnd
 from ldcnd.cli.main import cli
 from ldcnd.contract.commands import MoveAbsolute, Power
-from ldcnd.contract.errors import ConfigError, UnknownAxis
+from ldcnd.contract.errors import ConfigError, MalformedRequest, UnknownAxis
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState
 from ldcnd.lab.recording.tables import export_tables
@@ -122,7 +122,17 @@ async def test_a_recording_answers_where_an_axis_was_as_its_daemon_did(tmp_path)
     assert told.at("x", began - 10**12).reason
     with pytest.raises(UnknownAxis):
         told.at("nobody", began)
+    for no_instant in (-3, 1.5, 2**70, "nonsense"):
+        with pytest.raises(MalformedRequest):
+            told.at("x", no_instant)
+    with pytest.raises(MalformedRequest):
+        told.between("x", began + 1, began)
     args = ["axis", "at", "x", str(began), "--recording", str(path)]
     shown = CliRunner().invoke(cli, [*args, "--to", str(began + 10**9), "--json"])
     assert [json.loads(line)["t"] for line in shown.stdout.splitlines()] == [each.t for each in ranged]
     assert CliRunner().invoke(cli, args).stdout.startswith(f"x: {told.at('x', began).position.value:.3f} mm, from ")
+
+
+def test_a_recording_that_is_not_there_is_an_error_of_the_configuration(tmp_path):
+    with pytest.raises(ConfigError, match=r"nope\.mcap"):
+        _ = ldcnd.recording(tmp_path / "nope.mcap").topics
