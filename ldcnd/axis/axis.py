@@ -53,7 +53,14 @@ from ldcnd.contract.commands import (
     Verb,
     kind_of,
 )
-from ldcnd.contract.errors import InterlockViolated, LdcndError, NotSupported, OutcomeUnknown, WrongState
+from ldcnd.contract.errors import (
+    CommandAborted,
+    InterlockViolated,
+    LdcndError,
+    NotSupported,
+    OutcomeUnknown,
+    WrongState,
+)
 from ldcnd.contract.events import REFERENCE, CommandStatus
 from ldcnd.contract.questions import Preview, PreviewReply, ReportShadow, ShadowReply
 from ldcnd.contract.samples import AxisState, LinkState, Moving
@@ -136,6 +143,8 @@ class AxisService:
         self.traces = TraceRecorder(config.name, self._tracer(driver), publisher, clock)
         self._successors = asyncio.Lock()
         self._last_in_turn = ""  # the last move that came to wait for its turn
+        self._newest_aborting = 0  # those before it wait in vain
+        self._beginning = 0  # motions on their way to the drive
 
     def _tracer(self, driver: Drive) -> Tracer:
         """Return the drive's own recorder, or the host's."""
@@ -251,13 +260,16 @@ class AxisService:
                 await self._ask_to_open_loop(permit)
             return await self._take_energy_out(permit, command, mode)
         self._check_takes(command.verb)
-        if not self._queue.free:
-            permit.ask()
-            return await self._queue.wait(permit, command)
+        self._beginning += command.effect is Effect.MOTION
         try:
+            if not self._queue.free:
+                permit.ask()
+                return await self._queue.wait(permit, command)
             async with self._queue.at_work:
                 return await self._obey(permit, command)
         finally:
+            self._beginning -= command.effect is Effect.MOTION
+            self._queue.changed.set()
             if self._commands.procedure is not None:
                 self._queue.wake()  # for the steps of what has begun
 
@@ -398,21 +410,11 @@ class AxisService:
         """
         # behind others that wait it follows the last of these
         ahead = self._last_in_turn if self._successors.locked() else self._active_id
-        patience_s = math.inf
-        if move.buffer_mode is BufferMode.ABORTING and self.tracker.status.command:
-            permit.ask_to_move()
-            self._commands.check(move)
-            if self._commands.retargets(move):
-                by_s = self._clock.now_s() + LATENCY_S
-                await self._motion.read()  # the latest reading may be as old as the rates let it be
-                # again, because the reading has taken its time
-                permit.ask_to_move()
-                if self._commands.goes_on(move) and self._clock.now_s() < by_s:
-                    permit.by_s = by_s
-                    self.stops.overtake(permit, permit.verb)
-                    return await execute()
-            await self.stops.bring_to_rest(StopMode.SMOOTH, by=permit)
-            patience_s = HALTS_WITHIN_S
+        aborting, patience_s = move.buffer_mode is BufferMode.ABORTING, math.inf
+        if aborting and self.tracker.status.command:
+            self._check_follows(permit, move)
+            self._newest_aborting = permit.number
+            self._queue.changed.set()
         elif move.buffer_mode is BufferMode.BUFFERED and ahead is not None:
             permit.ask()
             if (
@@ -424,20 +426,56 @@ class AxisService:
             waits(ahead)
         self._last_in_turn = permit.command_id
         async with self._successors:  # those who wait are served in the order in which they came
+            while self._beginning:  # what was sent before it begins first
+                await self._news(math.inf)
+                self._ask_in_turn(permit)
+            if aborting and self.tracker.status.command:
+                self._ask_in_turn(permit)
+                self._check_follows(permit, move)
+                if self._commands.retargets(move):
+                    by_s = self._clock.now_s() + LATENCY_S
+                    await self._motion.read()  # the latest reading may be as old as the rates let it be
+                    # again, because the reading has taken its time
+                    self._ask_in_turn(permit)
+                    permit.ask_to_move()
+                    if self._commands.goes_on(move) and self._clock.now_s() < by_s:
+                        permit.by_s = by_s
+                        self.stops.overtake(permit, permit.verb)
+                        return await execute()
+                await self.stops.bring_to_rest(StopMode.SMOOTH, by=permit)
+                patience_s = HALTS_WITHIN_S
             deadline_s = self._clock.now_s() + patience_s
             while self.tracker.status.command:
-                # no await between this look and the wait, so that no change is missed
-                self._queue.changed.clear()
-                try:
-                    async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
-                        await self._queue.changed.wait()
-                except TimeoutError:
+                self._ask_in_turn(permit)
+                if not await self._news(deadline_s):
                     # said once: from here on its sender waits for no reply
                     deadline_s = math.inf
                     waits(self._active_id or permit.command_id)
-                permit.ask()
-            permit.ask()
+            self._ask_in_turn(permit)
             return await execute()
+
+    async def _news(self, deadline_s: float) -> bool:
+        """Wait for a change that a move which waits for its turn has to look at; tell whether it came in time."""
+        # no await between the look before and the wait, so that no change is missed
+        self._queue.changed.clear()
+        try:
+            async with asyncio.timeout_at(None if math.isinf(deadline_s) else deadline_s):
+                await self._queue.changed.wait()
+        except TimeoutError:
+            return False
+        return True
+
+    def _ask_in_turn(self, permit: Permit) -> None:
+        """Raise when a move must not wait for its turn any more."""
+        permit.ask()
+        if permit.number < self._newest_aborting:
+            name = self.config.name
+            raise CommandAborted(f"axis {name}: {permit.verb} was overtaken by a later motion", axis=name)
+
+    def _check_follows(self, permit: Permit, move: Move) -> None:
+        """Refuse an aborting move that would be refused once the axis stands, before anything is halted for it."""
+        permit.ask_to_move()
+        self._commands.check(move)
 
     @property
     def _active_id(self) -> str | None:

@@ -1,4 +1,4 @@
-"""The last readings of an axis, in memory that is taken once, when the daemon starts; see contract/instants.py."""
+"""The last readings of an axis, in memory that is taken when the daemon starts; see contract/instants.py."""
 
 import struct
 from collections.abc import Iterator
@@ -10,6 +10,7 @@ from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.instants import (
     Coordinates,
     Course,
+    Gap,
     Past,
     Reading,
     count_until,
@@ -27,6 +28,8 @@ MOST_READINGS: Final = 60_000
 """Readings that are kept of an axis at most, 38 bytes each: 2.3 MB, 600 s of 100 polls a second."""
 MOST_COURSES: Final = 8192
 """Changes of what it does that are kept of an axis at most."""
+MOST_RATES: Final = 256
+"""Changes of the rate of its polls that are kept of an axis at most."""
 LONGEST_ERROR_NS: Final = 0xFFFF_FFFF
 
 _RECORD = struct.Struct("<qIqddH")
@@ -39,12 +42,17 @@ class ReadingRing:
     Args:
         rate_hz: how often its position is polled; extra readings shorten the time that the ring spans.
         counts_per_unit: by which they are counted.
+
+    Attributes:
+        rate_hz: as polled now.
+        counts_per_unit: as given.
     """
 
     def __init__(self, rate_hz: float, counts_per_unit: float) -> None:
-        self.made_for = rate_hz, counts_per_unit
-        self._most = min(MOST_READINGS, max(8, int(HISTORY_S * rate_hz)))
-        self._gap_ns = longest_gap_ns(rate_hz)
+        self.rate_hz = rate_hz
+        self.counts_per_unit = counts_per_unit
+        self._most = _most_at(rate_hz)
+        self._gaps = [Gap(0, longest_gap_ns(rate_hz))]
         self._ring = bytearray(self._most * _RECORD.size)
         self._count = 0
         self._last_ns = 0
@@ -54,6 +62,18 @@ class ReadingRing:
         self._packed = 0
         self._stretch = 0
         self._courses = [Course(0, altered=False, winding=False)]
+
+    def repoll(self, rate_hz: float, t: int) -> None:
+        """Keep what there is, and take readings at another rate from an instant on, UTC in ns since 1970."""
+        self.rate_hz = rate_hz
+        self._gaps.append(Gap(max(t, self._gaps[-1].t), longest_gap_ns(rate_hz)))
+        del self._gaps[:-MOST_RATES]
+        most = max(_most_at(rate_hz), len(self))
+        if most != self._most:
+            size, oldest = _RECORD.size, max(0, self._count - self._most) % self._most * _RECORD.size
+            kept = (self._ring[oldest:] + self._ring[:oldest])[: len(self) * size]
+            self._count, self._most = len(self), most
+            self._ring = kept + bytearray(most * size - len(kept))
 
     def take(self, reading: AxisReading, status: AxisStatus, t: int, t_error_ns: int) -> None:
         """Keep a reading; in every poll, so what seldom changes is compared and not computed."""
@@ -122,7 +142,7 @@ class ReadingRing:
 
     def _past(self, scale: AxisScale, fastest: float | None) -> Past:
         coordinates = Coordinates.of(scale.unit, scale.counts_per_unit, fastest)
-        return Past(self, self._courses, self._gap_ns, coordinates)
+        return Past(self, self._courses, self._gaps, coordinates)
 
     def __len__(self) -> int:
         return min(self._count, self._most)
@@ -130,3 +150,7 @@ class ReadingRing:
     def __getitem__(self, number: int) -> Reading:
         place = (max(0, self._count - self._most) + number) % self._most
         return Reading._make(_RECORD.unpack_from(self._ring, place * _RECORD.size))
+
+
+def _most_at(rate_hz: float) -> int:
+    return min(MOST_READINGS, max(8, int(HISTORY_S * rate_hz)))

@@ -90,7 +90,7 @@ class Permit:
         self.by_s = math.inf
         self._gate = gate
         self._right = right
-        self._epoch = gate.epoch
+        self._number = gate.next_number()
         self._begun = False
         self._kind = InterlockKind(kind_of(verb))
         self._counts_per_s = 0.0  # of what it has last loaded, or is about to
@@ -109,12 +109,18 @@ class Permit:
         """
         if self._gate.closed:
             raise self._gate.ending()
-        if self._epoch != self._gate.epoch:
+        if self.is_void:
             raise self._gate.overtaken(self.verb)
 
-    def renew(self) -> None:
-        """Go on after a stop that this command has requested itself."""
-        self._epoch = self._gate.epoch
+    @property
+    def is_void(self) -> bool:
+        """Whether the command was overtaken, or the daemon ends."""
+        return self._gate.closed or self._number < self._gate.valid_from
+
+    @property
+    def number(self) -> int:
+        """How many commands of the axis were admitted before."""
+        return self._number
 
     def ask(self) -> None:
         """Raise when the command must not be carried out any more.
@@ -312,7 +318,7 @@ class Gate:
         expect: takes each motion that is about to be loaded.
         violations: yields which interlocks forbid a kind of motion at a speed in units a second, or a change of power.
         counts_per_s: how fast the latest motion may have the drive turn.
-        epoch: number of stops so far; a permit of an earlier epoch is void.
+        valid_from: the number of the first permit that is not void.
         closed: the daemon ends; no permit holds.
     """
 
@@ -322,7 +328,8 @@ class Gate:
         self.expect = expect
         self.violations: Violations = _no_interlocks
         self.counts_per_s = 0.0
-        self.epoch = 0
+        self.valid_from = 0
+        self._made = 0
         self._cause = ""
         self.closed = False
 
@@ -330,12 +337,15 @@ class Gate:
         """Return the permit of a command, valid until the next stop."""
         return Permit(self, command_id, verb, right)
 
+    def next_number(self) -> int:
+        """Return the number of a permit that is made now."""
+        self._made += 1
+        return self._made - 1
+
     def overtake(self, by: Permit | None, cause: str) -> None:
-        """Make all permits void, except the caller's; the refusals of the others name the cause."""
-        self.epoch += 1
+        """Make all permits void that there are, or that are older than the caller's; their refusals name the cause."""
+        self.valid_from = max(self.valid_from, self._made if by is None else by.number)
         self._cause = cause
-        if by is not None:
-            by.renew()
 
     def close(self) -> None:
         """Make all permits void permanently."""

@@ -155,9 +155,11 @@ class AxisReadings:
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Take rates and scale of another configuration."""
-        ring = _ring(config)
-        if ring.made_for != self.history.made_for:
-            self.history = ring
+        rate_hz = config.rates.position
+        if config.signed_counts_per_unit != self.history.counts_per_unit:
+            self.history = _ring(config)
+        elif rate_hz != self.history.rate_hz:
+            self.history.repoll(rate_hz, self._clock.now_ns())
 
     @property
     def seen(self) -> bool:

@@ -122,7 +122,7 @@ class AxisStops:
         Args:
             mode: how.
             verb: the command, for the events.
-            by: permit of the command that goes on afterwards; all others are void.
+            by: permit of the command that goes on afterwards; those of all before it are void.
             command_id: of the command that asks for it; the next one of the daemon when missing.
         """
         if not self.possible:
@@ -143,7 +143,7 @@ class AxisStops:
             self._publish()
 
     def overtake(self, by: Permit | None, cause: str) -> StopLatched | CommandAborted:
-        """Make all queued commands and permits void, except the caller's; return the refusal, which names the cause."""
+        """Make void what waits or moves, all or what is older than the caller; return the refusal, with the cause."""
         self._gate.overtake(by, cause)
         overtaken = self._gate.overtaken("a queued command")
         self._queue.refuse(overtaken)

@@ -88,6 +88,7 @@ class AxisTelemetry:
                     "value": velocity / scale.counts_per_unit,
                     "unit": f"{scale.unit}/s",
                     "counts_per_s": velocity,
+                    "resolution": reading.velocity_resolution_counts_per_s / abs(scale.counts_per_unit),
                 }
             )
         adc, full_scale = reading.adc_counts, self._adc_full_scale

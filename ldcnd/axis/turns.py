@@ -88,10 +88,12 @@ class CommandQueue:
         return self._waiting.popleft() if self._waiting else None
 
     def refuse(self, error: LdcndError) -> None:
-        """Refuse all commands that wait, and have the moves that wait for their turn look whether they still may."""
+        """Refuse the commands that wait in vain, and have the moves that wait for their turn look whether they may."""
         self.changed.set()
-        while waiting := self.take():
-            waiting.refuse(error)
+        for waiting in tuple(self._waiting):
+            if waiting.permit.is_void:
+                self._waiting.remove(waiting)
+                waiting.refuse(error)
 
     def wake(self) -> None:
         """Wake the task of the axis to check for work."""

@@ -46,12 +46,16 @@ def _recorded(path: Path, axis: str, said: str) -> tuple[list[AxisInstant], Axis
     require("mcap")
     from ldcnd.lab.recording.instants import recorded_readings  # noqa: PLC0415 - needs an optional package
     from ldcnd.lab.recording.reading import Recording  # noqa: PLC0415
+    from ldcnd.lab.recording.recorder import following  # noqa: PLC0415
 
     file = Recording(path)
     t, until = time_of(said, time.time_ns())
     with a_failure():
         recorded = recorded_readings(file, axis)
     tell_damages(path, file.damages)
+    later = following(path) if recorded.ends_before(until) else None
+    if later:
+        click.echo(f"{path} ends before that; the recording goes on in {later}", err=True)
     return [recorded.at(t)] if t == until else list(recorded.between(t, until)), recorded.info
 
 

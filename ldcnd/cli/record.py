@@ -116,7 +116,10 @@ def dated(pattern: Path, start: datetime) -> Path:
 async def _record(client: RigClient, service: Serving, out: Path, rotate_bytes: int) -> None:
     from ldcnd.lab.recording.recorder import KEPT_SAMPLES, LINGER_S, Recorder  # noqa: PLC0415 - needs an optional package
 
-    recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes, client.descriptions)
+    def tell(path: Path) -> None:
+        click.echo(f"the daemon was restarted with another configuration: recording goes on in {path}", err=True)
+
+    recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes, client.descriptions, tell)
     on_end(recorder.end)
     try:
         with recorder:

@@ -82,6 +82,14 @@ class BlockingJogging(Facade[motion.Jogging]):
 class BlockingAxis(Facade[asynchronous.Axis]):
     """An axis that a program controls or watches; a method for each verb, as `ldcnd.Axis` has."""
 
+    def __init__(self, loop: LoopThread, wrapped: asynchronous.Axis, close: Callable[[], None]) -> None:
+        super().__init__(loop, wrapped)
+        self._close = close
+
+    def close(self) -> None:
+        """Give up control, or watch no more, as at the end of a context: with all axes of it; once is enough."""
+        self._close()
+
     # made by `python -m tools client`: begin
     power = _waiting(asynchronous.Axis.power)
     move_absolute = _moving(asynchronous.Axis.move_absolute)
@@ -170,9 +178,10 @@ class BlockingAxis(Facade[asynchronous.Axis]):
 class BlockingRig(Facade[rig.Rig]):
     """A rig that a program uses; made by `connect`, and by `ldcnd.open`."""
 
-    def __init__(self, loop: LoopThread, wrapped: rig.Rig, close: Callable[[], None]) -> None:
+    def __init__(self, loop: LoopThread, wrapped: rig.Rig, close: Callable[[], None], opened: ExitStack) -> None:
         super().__init__(loop, wrapped)
         self._close = close
+        self._opened = opened
 
     def close(self) -> None:
         """Leave the rig, which gives up control over its axes; once is enough."""
@@ -258,7 +267,7 @@ class BlockingRig(Facade[rig.Rig]):
     ) -> "Opened[BlockingAxis] | Opened[tuple[BlockingAxis, ...]]":
         """Control axes until the context ends, or until `close` after `open`; see `ldcnd.Rig.control`."""
         held = self._axes(self._wrapped.controlled(axes, client, lease_s, force=force))
-        return Opened(_only(held)) if len(axes) == 1 else Opened(held)
+        return Opened(_only(held), self._opened) if len(axes) == 1 else Opened(held, self._opened)
 
     @overload
     def watch(self, axis: str, /) -> "Opened[BlockingAxis]": ...
@@ -269,7 +278,7 @@ class BlockingRig(Facade[rig.Rig]):
     def watch(self, *axes: str) -> "Opened[BlockingAxis] | Opened[tuple[BlockingAxis, ...]]":
         """Watch axes until the context ends, or until `close` after `open`; see `ldcnd.Rig.watch`."""
         watched = self._axes(self._wrapped.watched(axes))
-        return Opened(_only(watched)) if len(axes) == 1 else Opened(watched)
+        return Opened(_only(watched), self._opened) if len(axes) == 1 else Opened(watched, self._opened)
 
     def events(self, axis: str | None = None, *, history: bool = False) -> "BlockingStream[CommandEvent]":
         """Follow what happens to commands: `for event in rig.events()`; see `ldcnd.Rig.events`."""
@@ -283,8 +292,9 @@ class BlockingRig(Facade[rig.Rig]):
     def _axes(
         self, context: AbstractAsyncContextManager[tuple[asynchronous.Axis, ...]]
     ) -> Iterator[tuple[BlockingAxis, ...]]:
-        with self._loop.inside(context) as axes:
-            yield tuple(BlockingAxis(self._loop, axis) for axis in axes)
+        with ExitStack() as entered:
+            axes = entered.enter_context(self._loop.inside(context))
+            yield tuple(BlockingAxis(self._loop, axis, entered.close) for axis in axes)
 
     def _repr_html_(self) -> str:
         """Return the axes as a table, for notebooks."""
@@ -318,8 +328,9 @@ class Opened(AbstractContextManager[ResultT, None]):
     What is still open when the program ends is closed then.
     """
 
-    def __init__(self, context: AbstractContextManager[ResultT]) -> None:
+    def __init__(self, context: AbstractContextManager[ResultT], within: ExitStack | None = None) -> None:
         self._context = context
+        self._within = within  # what was opened and is not closed is closed with it
         self._entered = ExitStack()
 
     def __enter__(self) -> ResultT:
@@ -333,6 +344,9 @@ class Opened(AbstractContextManager[ResultT, None]):
     def open(self) -> ResultT:
         """Begin; the caller closes it."""
         value = self.__enter__()
+        if self._within:
+            self._within.callback(self.close)
+            return value
         lent = LENT.get()  # the loop of a rehearsal ends long before the interpreter does
         if lent:
             lent.close_later(self.close)
@@ -365,7 +379,8 @@ def _rig(endpoint: str | None, name: str | None, config: Path | str | None, wait
     connected = rig.connect(endpoint, rig=name, config=config, wait_s=wait_s)
     with ExitStack() as entered:
         loop = entered.enter_context(loop_thread())
-        yield BlockingRig(loop, entered.enter_context(loop.inside(connected)), entered.close)
+        there = entered.enter_context(loop.inside(connected))
+        yield BlockingRig(loop, there, entered.close, entered.enter_context(ExitStack()))
 
 
 @contextmanager

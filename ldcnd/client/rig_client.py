@@ -114,6 +114,7 @@ class RigClient:
         self.session = session
         self.keys = Keys(rig)
         self._instance: str | None = None
+        self._meeting = asyncio.Lock()
         self._origin = Origin(self.daemon)
 
     async def read(self, key: str, model: type[ModelT]) -> list[ModelT]:
@@ -268,11 +269,14 @@ class RigClient:
         Raises:
             SessionError: none answers.
         """
-        if self._instance is None:
-            try:
-                self._instance = (await self.daemon()).instance
-            except OutcomeUnknown as error:  # of a question: the command itself is not on its way
-                raise SessionError(f"{what}: the daemon of rig {self.rig} does not answer; nothing was sent") from error
+        async with self._meeting:  # commands that wait for it go on in their order
+            if self._instance is None:
+                try:
+                    self._instance = (await self.daemon()).instance
+                except OutcomeUnknown as error:  # of a question: the command itself is not on its way
+                    raise SessionError(
+                        f"{what}: the daemon of rig {self.rig} does not answer; nothing was sent"
+                    ) from error
 
     async def ask(self, command: Command[ReplyT], axis: str = RIG_ITSELF, timeout_s: float | None = None) -> ReplyT:
         """Send what is no command of an axis: to the rig as a whole, or a question about an axis.

@@ -85,6 +85,15 @@ class Course(NamedTuple):
     """Whether it accelerates and brakes more than once: homing, paths and what else is not `ONE_PROFILE`."""
 
 
+class Gap(NamedTuple):
+    """The longest time between two readings about which anything is concluded, from an instant on."""
+
+    t: int
+    """The instant, UTC in ns since 1970."""
+    longest_ns: int
+    """So long."""
+
+
 class Readings(Protocol):
     """Readings of an axis, each later than the one before."""
 
@@ -115,8 +124,8 @@ class Past(NamedTuple):
     """Each later than the one before."""
     courses: Sequence[Course]
     """Likewise; before the first of them nothing is known of what it did."""
-    gap_ns: int
-    """Nothing is concluded where two readings are farther apart."""
+    gaps: Sequence[Gap]
+    """Nothing is concluded where two readings are farther apart; each later than the one before, one at least."""
     coordinates: Coordinates
     """Of the axis."""
 
@@ -159,7 +168,7 @@ def longest_gap_ns(rate_hz: float) -> int:
 
 def instant_of(past: Past, t: int) -> AxisInstant:
     """Return what is proven of an instant, UTC in ns since 1970."""
-    readings, courses, gap_ns, coordinates = past
+    readings, courses, gaps, coordinates = past
     place = count_until(readings, t) - 1
     if not 1 <= place < len(readings) - 2:
         return _unknown(t, coordinates, "no readings around this instant")
@@ -172,7 +181,7 @@ def instant_of(past: Past, t: int) -> AxisInstant:
     before, after = readings[earlier], readings[later]
     around = before, start, end, after
     longest_ns = max(two.t - one.t for one, two in pairwise(around))
-    if longest_ns > gap_ns:
+    if longest_ns > max(_longest_ns(gaps, before.t), _longest_ns(gaps, after.t)):
         return _unknown(t, coordinates, "readings are missing around this instant")
     if _quality(start) is Quality.BAD or _quality(end) is Quality.BAD:
         return _unknown(t, coordinates, "the drive did not answer then")
@@ -208,6 +217,10 @@ def count_until(readings: Readings, t: int) -> int:
         middle = (low + high) // 2
         low, high = (middle + 1, high) if readings[middle].t <= t else (low, middle)
     return low
+
+
+def _longest_ns(gaps: Sequence[Gap], t: int) -> int:
+    return gaps[max(0, bisect_right(gaps, t, key=attrgetter("t")) - 1)].longest_ns
 
 
 def _apart(readings: Readings, place: int, step: int, apart_ns: int) -> int:

@@ -115,6 +115,8 @@ class VelocitySample(Sample):
     """The axis unit, a second."""
     counts_per_s: float
     """Velocity in encoder counts a second; the drive reports whole counts per servo tick."""
+    resolution: float | None = None
+    """The smallest velocity that the drive can report, in axis units a second; null from a daemon of before."""
 
 
 class AdcSample(Sample):

@@ -1,5 +1,7 @@
 """Recordings and traces in Arrow's own library: Parquet files with types, and columns that it takes as they are."""
 
+import asyncio
+
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
@@ -32,6 +34,27 @@ async def test_tables_are_parquet_files_with_types(tmp_path):
     assert [str(table.schema.field(name).type) for name in ("t_ns", "enabled", "state")] == ["int64", "bool", "string"]
     assert [str(positions.schema.field(name).type) for name in ("value", "counts")] == ["double", "int64"]
     assert pa.table(expected).num_rows == table.num_rows
+
+
+async def test_columns_without_values_have_the_types_of_what_is_published(tmp_path):
+    path = tmp_path / "run.mcap"
+    async with recorded_rig(path) as recorded:
+        await recorded.rig.until("x", lambda state: state.state is AxisState.DISABLED)
+        await recorded.rig.client.command("x", Power(on=True))
+        await asyncio.sleep(1.0)
+
+    export_tables(path, tmp_path / "tables", parquet=True)
+
+    kinds = [
+        {
+            field.name: str(field.type)
+            for field in parquet.read_schema(tmp_path / "tables" / f"ldcn.sim.{topic}.parquet")
+        }
+        for topic in ("tele.x.position", "tele.y.position", "tele.x.velocity", "tele.x.state")
+    ]
+    assert (kinds[0]["turns"], kinds[0]["following_error"], kinds[0]["counts"]) == ("int64", "double", "int64")
+    assert kinds[0] == kinds[1]
+    assert (kinds[3]["last_error"], kinds[3]["target"], kinds[3]["referenced"]) == ("string", "double", "bool")
 
 
 def test_a_trace_is_a_table_of_columns_with_titles():

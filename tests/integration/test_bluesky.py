@@ -351,8 +351,9 @@ def test_velocity_and_acceleration_are_moved_by_plans_and_configured(lab: Labora
 def test_a_move_that_takes_too_long_is_halted_and_fails(lab: Laboratory):
     with lab.powered("x") as (x,):
         x.set(0).wait(60)
-        with pytest.raises(FailedStatus):
+        with pytest.raises(FailedStatus) as failed:
             lab.engine(bps.abs_set(x, 50, timeout=1.0, wait=True))
+        assert isinstance(failed.value.__cause__, CommandAborted)
 
         assert 5 < lab.truth("x") < 30
         assert stands(lab, "x")
@@ -378,6 +379,25 @@ def test_a_second_set_sends_a_moving_axis_elsewhere(lab: Laboratory):
         assert lab.documents.exit_status == "success"
         assert lab.documents.data("x") == pytest.approx([3], abs=IN_POSITION)
         assert lab.truth("x") == pytest.approx(3, abs=IN_POSITION)
+
+
+@pytest.mark.parametrize("pace_s", [0.0, 0.001, 0.005, 0.02])
+@pytest.mark.parametrize("goals", [(7, 2), (7, 7.5, 2), (7, 1, 6, 3, 9, 2)])
+def test_of_sets_right_behind_each_other_the_newest_wins(lab: Laboratory, goals, pace_s: float):
+    def plan():
+        for goal in goals:
+            yield from bps.abs_set(x, goal, group="moves")
+            yield from bps.sleep(pace_s)
+        yield from bps.wait("moves")
+
+    with lab.powered("x") as (x,):
+        x.set(0).wait(60)
+        lab.engine(plan())
+        sets = [x.set(goal) for goal in goals]
+        for each in sets:
+            each.wait(60)
+
+        assert lab.truth("x") == pytest.approx(2, abs=IN_POSITION)
 
 
 def test_an_adaptive_scan_of_a_signal_ends(lab: Laboratory):

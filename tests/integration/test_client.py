@@ -16,7 +16,7 @@ import pytest
 
 import ldcnd
 from ldcnd.client import blocking
-from ldcnd.client.axis import Axis
+from ldcnd.client.axis import Axis, at_rest
 from ldcnd.client.loop_thread import loop_thread
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
@@ -301,6 +301,29 @@ async def test_the_first_program_runs(tmp_path: Path):
 
 
 @pytest.mark.real_time
+@pytest.mark.parametrize("closing", ["x.close(); x.close(); rig.close()", "rig.close(); x.close(); rig.close()", ""])
+async def test_what_a_notebook_opens_ends_with_its_close_or_with_that_of_its_rig(closing):
+    program = f"""
+        import ldcnd
+
+        rig = ldcnd.open()
+        x = rig.control("x", client="notebook").open()
+        x.power(on=True)
+        x.move_absolute(40, velocity=2)
+        {closing}
+        print("closed")
+    """
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        printed = await run_program(inspect.cleandoc(program), endpoint)
+        async with ldcnd.connect(endpoint) as rig, rig.watch("x") as x:
+            await at_rest(x)
+            assert not x.state.sample.holder
+            assert x.position.value < 20
+
+    assert printed == ["closed"]
+
+
+@pytest.mark.real_time
 def test_what_cannot_be_opened_is_an_error_and_leaves_no_thread():
     with pytest.raises(SessionError), blocking.connect(free_endpoint()):
         pass
@@ -401,9 +424,10 @@ async def test_a_program_waits_for_a_daemon_that_starts_and_may_leave_it_open():
 
 async def run_program(text: str, endpoint: str) -> list[str]:
     process = await asyncio.create_subprocess_exec(
-        sys.executable, "-c", text, stdout=-1, env={**os.environ, "LDCND_CONNECT": endpoint}
+        sys.executable, "-c", text, stdout=-1, stderr=-1, env={**os.environ, "LDCND_CONNECT": endpoint}
     )
     async with asyncio.timeout(45):
-        printed, _ = await process.communicate()
-    assert process.returncode == 0
+        printed, said = await process.communicate()
+    assert process.returncode == 0, said
+    assert b"Traceback" not in said
     return printed.decode().splitlines()

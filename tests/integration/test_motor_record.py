@@ -319,3 +319,16 @@ async def test_a_text_may_carry_a_unit_and_the_velocity_is_in_that_of_people():
 
         assert values(made, "VAL", "RBV") == (5.0, pytest.approx(5.0, abs=0.02))
         assert metadata.units == b"m/min"
+
+
+@pytest.mark.record("VAL", "of values that are put right behind each other the newest is where the motor goes")
+@pytest.mark.parametrize("pace_s", [0.0, 0.005, 0.02])
+async def test_of_puts_right_behind_each_other_the_newest_wins(pace_s: float):
+    async with records() as (_, made):
+        async with asyncio.TaskGroup() as group:
+            for goal in (7.0, 7.5, -3.0, 2.0):
+                group.create_task(put(made, "T:x", goal), name=f"to {goal}")
+                await asyncio.sleep(pace_s)
+
+        assert values(made, "VAL", "DMOV") == (2.0, 1)
+        assert made.variables["T:x.RBV"].value == pytest.approx(2, abs=0.02)

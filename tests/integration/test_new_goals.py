@@ -4,11 +4,12 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import MoveAbsolute, MoveRelative, MoveVelocity
-from ldcnd.contract.errors import WrongState
+from ldcnd.contract.commands import BufferMode, MoveAbsolute, MoveRelative, MoveVelocity
+from ldcnd.contract.errors import RequestRefused, WrongState
+from ldcnd.contract.samples import Moving
 from ldcnd.drives.ldcn.packet import CommandCode, PacketReader
 from ldcnd.line.flight_recorder import WireEvent
-from tests.support.dialect_rig import SC, V4, DialectRig, dialect_rig
+from tests.support.dialect_rig import AXIS, LS_182AP, SC, V4, DialectRig, dialect_rig
 
 
 def stops(rig: DialectRig) -> int:
@@ -88,3 +89,64 @@ async def test_the_switch_ahead_stops_an_sc_that_turns_round_too_late():
 
         assert state.last_error is not None
         assert "forward limit switch" in state.last_error
+
+
+@pytest.mark.parametrize("dialect", [SC, LS_182AP], ids=lambda each: each.name)
+@pytest.mark.parametrize("pace_s", [0.0, 0.001, 0.005, 0.02, 0.3])
+@pytest.mark.parametrize(
+    ("first", "goals"),
+    [(BufferMode.REFUSE, (7.0, 2.0)), (BufferMode.ABORTING, (7.0, 2.0)), (BufferMode.ABORTING, (7.0, 7.5, -3, 9, 2.0))],
+)
+@pytest.mark.sweep(4)
+async def test_the_newest_of_several_goals_wins_at_whatever_pace_they_come(dialect, pace_s, first, goals):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        async with asyncio.TaskGroup() as group:
+            for number, goal in enumerate(goals):
+                move = MoveAbsolute(position=goal, buffer_mode=BufferMode.ABORTING if number else first)
+                sent = group.create_task(refused_or_id(rig, move), name=f"to {goal}")
+                await asyncio.sleep(pace_s)
+
+        assert await sent
+        await rig.rig.client.wait_for_end(AXIS, sent.result())
+        await rig.until(lambda state: state.moving is Moving.NO)
+        assert rig.position_mm == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize("dialect", [SC, LS_182AP], ids=lambda each: each.name)
+@pytest.mark.parametrize("pace_s", [0.0, 0.005])
+async def test_the_newest_of_several_goals_wins_in_mid_move(dialect, pace_s):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=7.0))
+        await asyncio.sleep(0.3)
+        async with asyncio.TaskGroup() as group:
+            for goal in (7.5, 6.0, 2.0):
+                move = MoveAbsolute(position=goal, buffer_mode=BufferMode.ABORTING)
+                sent = group.create_task(refused_or_id(rig, move), name=f"to {goal}")
+                await asyncio.sleep(pace_s)
+
+        assert await sent
+        await rig.rig.client.wait_for_end(AXIS, sent.result())
+        assert rig.position_mm == pytest.approx(2.0, abs=0.05)
+
+
+async def test_a_goal_beyond_the_limits_disturbs_none_that_was_sent_just_before_it():
+    async with dialect_rig(LS_182AP, limits={"position_max": 10}) as rig:
+        await rig.power_on()
+        async with asyncio.TaskGroup() as group:
+            sent = group.create_task(refused_or_id(rig, MoveAbsolute(position=3.0)), name="good")
+            await asyncio.sleep(0)
+            far = MoveAbsolute(position=11, buffer_mode=BufferMode.ABORTING)
+            beyond = group.create_task(refused_or_id(rig, far), name="beyond the limits")
+
+        assert beyond.result() is None
+        await rig.rig.client.wait_for_end(AXIS, sent.result())
+        assert rig.position_mm == pytest.approx(3.0, abs=0.05)
+
+
+async def refused_or_id(rig: DialectRig, move: MoveAbsolute) -> str | None:
+    try:
+        return (await rig.send(move)).command_id
+    except RequestRefused:
+        return None

@@ -3,21 +3,24 @@
 import asyncio
 import json
 import resource
+import shutil
 import signal
 import sys
 from asyncio.subprocess import PIPE
 
 import msgpack
 import pytest
+from click.testing import CliRunner
 from mcap.reader import make_reader
 
+from ldcnd.cli.main import cli
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.commands import MoveAbsolute, Power, Verb
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.events import CommandEvent, CommandStatus
 from ldcnd.contract.health import DaemonHealth
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, LinkState, PositionSample, Quality
 from ldcnd.lab.recording.mcap_file import FACTS
 from ldcnd.lab.recording.recorder import FLUSH_PERIOD_S, Recorder
 from ldcnd.lab.recording.recovery import recover
@@ -319,3 +322,41 @@ def test_a_recording_never_overwrites_what_a_cut_left_of_another(tmp_path):
 
     assert "ldcnd record recover" in str(refused.value.remedy)
     assert left.read_bytes() == b"precious"
+
+
+async def test_a_daemon_that_is_configured_anew_is_said_to_go_on_in_the_next_file(tmp_path):
+    path, said = tmp_path / "run.mcap", []
+    described = [{"configuration": b"one"}, {"configuration": b"two"}]
+
+    async def describe():
+        return described[-1]
+
+    with Recorder(path, described[0], lambda: 1, LARGE, describe, said.append) as recorder:
+        value = PositionSample(
+            t=1, t_error_ns=0, seq=0, quality=Quality.GOOD, value=1.5, unit="mm", counts=1500, following_error=None
+        )
+        recorder.take(
+            Publication("ldcn/sim/tele/x/position", *encode(value, Encoding.JSON), SampleKind.PUT, 1, source="other")
+        )
+        async with asyncio.TaskGroup() as group:
+            group.create_task(recorder.run(lambda: 0), name="recorder")
+            while not recorder.messages:
+                await asyncio.sleep(0.1)
+            recorder.end()
+
+    assert said == [tmp_path / "run-2.mcap"]
+    assert recorder.summary.endswith(f"2 files, the last of which is {tmp_path / 'run-2.mcap'}")
+
+
+async def test_what_is_asked_of_a_later_instant_names_the_file_in_which_the_recording_goes_on(tmp_path):
+    path = tmp_path / "run.mcap"
+    async with recorded_rig(path) as recorded:
+        await recorded.rig.until("x", lambda state: state.link is LinkState.UP)
+        await asyncio.sleep(2.0)
+    args = ["axis", "at", "x", str(EPOCH_NS + 10**12), "--recording", str(path)]
+    alone = CliRunner().invoke(cli, args)
+    shutil.copy(path, tmp_path / "run-2.mcap")
+    followed = CliRunner().invoke(cli, args)
+
+    assert "run-2.mcap" not in alone.stderr
+    assert f"goes on in {tmp_path / 'run-2.mcap'}" in followed.stderr

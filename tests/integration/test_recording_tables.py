@@ -9,13 +9,14 @@ from click.testing import CliRunner
 
 import ldcnd
 from ldcnd.cli.main import cli
+from ldcnd.config.plan import plan_rig
 from ldcnd.contract.commands import MoveAbsolute, Power
-from ldcnd.contract.errors import ConfigError, UnknownAxis
+from ldcnd.contract.errors import ConfigError, MalformedRequest, UnknownAxis
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState
 from ldcnd.lab.recording.tables import export_tables
 from tests.support.recordings import recorded_rig
-from tests.support.rig import EPOCH_NS
+from tests.support.rig import EPOCH_NS, two_axes
 
 
 async def record_a_move(path):
@@ -122,7 +123,45 @@ async def test_a_recording_answers_where_an_axis_was_as_its_daemon_did(tmp_path)
     assert told.at("x", began - 10**12).reason
     with pytest.raises(UnknownAxis):
         told.at("nobody", began)
+    for no_instant in (-3, 1.5, 2**70, "nonsense"):
+        with pytest.raises(MalformedRequest):
+            told.at("x", no_instant)
+    with pytest.raises(MalformedRequest):
+        told.between("x", began + 1, began)
     args = ["axis", "at", "x", str(began), "--recording", str(path)]
     shown = CliRunner().invoke(cli, [*args, "--to", str(began + 10**9), "--json"])
     assert [json.loads(line)["t"] for line in shown.stdout.splitlines()] == [each.t for each in ranged]
     assert CliRunner().invoke(cli, args).stdout.startswith(f"x: {told.at('x', began).position.value:.3f} mm, from ")
+
+
+def test_a_recording_that_is_not_there_is_an_error_of_the_configuration(tmp_path):
+    with pytest.raises(ConfigError, match=r"nope\.mcap"):
+        _ = ldcnd.recording(tmp_path / "nope.mcap").topics
+
+
+async def test_what_was_read_before_a_change_of_the_rates_is_kept_and_a_recording_knows_it_too(tmp_path):
+    path = tmp_path / "run.mcap"
+    config = two_axes()
+    async with recorded_rig(path, config) as recorded:
+        rig = recorded.rig
+        await rig.until("x", lambda state: state.state is AxisState.DISABLED)
+        asked = {}
+        for rate_hz in (None, 5.0, 50.0, 1.0):
+            if rate_hz is not None:
+                rates = [axis.rates.model_copy(update={"position": rate_hz}) for axis in config.bus[0].axis]
+                axes = [axis.model_copy(update={"rates": r}) for axis, r in zip(config.bus[0].axis, rates, strict=True)]
+                changed = config.model_copy(update={"bus": (config.bus[0].model_copy(update={"axis": tuple(axes)}),)})
+                rig.daemon.reconfigure(changed, plan_rig(changed))
+            await asyncio.sleep(8.0)
+            t = EPOCH_NS + round(asyncio.get_running_loop().time() * 1e9)
+            asked[t] = None
+            await asyncio.sleep(8.0)
+        for t in asked:
+            asked[t] = (await rig.client.at(t, "x"))["x"]
+
+    told = ldcnd.recording(path)
+
+    for t, by_daemon in asked.items():
+        assert by_daemon.reason is None
+        assert told.at("x", t).position == by_daemon.position
+        assert told.at("x", t).velocity.upper == pytest.approx(by_daemon.velocity.upper, rel=1e-9)

@@ -53,6 +53,18 @@ async def test_a_target_is_reached_and_busy_is_shown_before_the_reply():
         assert (await running.client.state("x")).target == pytest.approx(3)
 
 
+@pytest.mark.parametrize("pace_s", [0.0, 0.005, 0.02])
+async def test_of_targets_right_behind_each_other_the_newest_wins(pace_s: float):
+    async with linked_x() as (running, link, _):
+        async with asyncio.TaskGroup() as group:
+            for goal in (7.0, 7.5, -3.0, 2.0):
+                group.create_task(link.go(goal), name=f"to {goal}")
+                await asyncio.sleep(pace_s)
+        await becomes(link, StatusCode.IDLE)
+
+        assert (await running.client.position("x")).value == pytest.approx(2, abs=0.02)
+
+
 async def test_a_new_target_sends_a_moving_axis_elsewhere_and_a_stop_halts_it():
     async with linked_x() as (running, link, _):
         await link.go(50.0)

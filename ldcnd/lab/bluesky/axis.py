@@ -20,7 +20,6 @@ from ldcnd.contract.errors import (
     LdcndError,
     OutcomeUnknown,
     RequestRefused,
-    SessionError,
     StopLatched,
     UnknownAxis,
 )
@@ -468,7 +467,7 @@ class PlanAxis(ReadableAxis):
                     await asyncio.shield(self._newest)
         except TimeoutError:
             await at_rest(self._axis)  # what a plan does next may move another axis into its way
-            raise SessionError(
+            raise CommandAborted(
                 f"axis {self._info.axis}: it did not reach {target:g} {self._info.unit} within {within_s:g} s and was"
                 " halted",
                 axis=self._info.axis,

@@ -2,7 +2,7 @@
 
 import statistics
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -14,6 +14,7 @@ from ldcnd.contract.history import AxisInstant
 from ldcnd.contract.instants import (
     Coordinates,
     Course,
+    Gap,
     Past,
     Reading,
     course,
@@ -36,6 +37,10 @@ from ldcnd.contract.samples import (
 from ldcnd.lab.recording.messages import axis_of, model_of
 from ldcnd.lab.recording.reading import Recording
 
+NEIGHBOURS = 5
+"""Readings before and behind one by which it is told how often they come there."""
+SLOWED = 1.5
+"""So many times longer than planned they are apart where the rate was lowered; late or lost polls are not."""
 _TOLD = PositionSample, InputsSample, StateSample, VelocitySample
 _UNKNOWN = (None,) * len(InputLevels.model_fields)
 
@@ -47,13 +52,13 @@ class RecordedReadings:
     Attributes:
         readings: as they were.
         courses: what the axis was doing, by its recorded states.
-        gap_ns: nothing is concluded where two of them are farther apart.
+        gaps: nothing is concluded where two of them are farther apart.
         info: the description of the axis.
     """
 
     readings: Sequence[Reading]
     courses: Sequence[Course]
-    gap_ns: int
+    gaps: Sequence[Gap]
     info: AxisInfo
 
     @property
@@ -61,7 +66,11 @@ class RecordedReadings:
         """What is kept of the axis."""
         info = self.info
         coordinates = Coordinates.of(info.unit, _counts_per_unit(info), info.limits.velocity)
-        return Past(self.readings, self.courses, self.gap_ns, coordinates)
+        return Past(self.readings, self.courses, self.gaps, coordinates)
+
+    def ends_before(self, t: int) -> bool:
+        """Tell whether an instant is later than all that was recorded."""
+        return not self.readings or self.readings[-1].t < t
 
     def at(self, t: int) -> AxisInstant:
         """Return what they prove of an instant, UTC in ns since 1970."""
@@ -105,9 +114,9 @@ def recorded_readings(recording: Recording, axis: str) -> RecordedReadings:
     places = [each for each in samples if isinstance(each, PositionSample)]
     inputs = [each for each in samples if isinstance(each, InputsSample)]
     states = sorted((each for each in samples if isinstance(each, StateSample)), key=lambda each: each.t)
-    speeds = {round(abs(each.counts_per_s), 3) for each in samples if isinstance(each, VelocitySample)}
-    readings = _readings(places, inputs, states, info, _resolution({0.0, *speeds}))
-    return RecordedReadings(readings, _courses(states, info), longest_gap_ns(_rate_hz(budget, axis, readings)), info)
+    speeds = sorted((each for each in samples if isinstance(each, VelocitySample)), key=lambda each: each.t)
+    readings = _readings(places, inputs, states, info, _resolutions(speeds, info))
+    return RecordedReadings(readings, _courses(states, info), _gaps(readings, _rate_hz(budget, axis, readings)), info)
 
 
 def _rate_hz(budget: RigBudget, axis: str, readings: Sequence[Reading]) -> float:
@@ -117,9 +126,32 @@ def _rate_hz(budget: RigBudget, axis: str, readings: Sequence[Reading]) -> float
     return min(planned) if planned else 1e9 / statistics.median([b.t - a.t for a, b in pairwise(readings)] or [1e9])
 
 
-def _resolution(speeds: set[float]) -> float:
-    """Return the least difference of two speeds that a drive has reported: all are multiples of its resolution."""
-    return min((faster - slower for slower, faster in pairwise(sorted(speeds))), default=0.0)
+def _gaps(readings: Sequence[Reading], rate_hz: float) -> list[Gap]:
+    """Return what is a gap: by the planned rate, or where they come less often, as after a reload, by their own."""
+    planned_ns = longest_gap_ns(rate_hz)
+    found = [Gap(0, planned_ns)]
+    apart_ns = [later.t - earlier.t for earlier, later in pairwise(readings)]
+    for number, reading in enumerate(readings):
+        near = apart_ns[max(0, number - NEIGHBOURS) : number + NEIGHBOURS]
+        longest_ns = longest_gap_ns(1e9 / statistics.median(near)) if len(near) >= NEIGHBOURS else 0
+        gap_ns = planned_ns if longest_ns < planned_ns * SLOWED else longest_ns
+        if gap_ns != found[-1].longest_ns:
+            found.append(Gap(reading.t, gap_ns))
+    return found
+
+
+def _resolutions(speeds: Sequence[VelocitySample], info: AxisInfo) -> Callable[[int], float]:
+    """Return what tells the velocity resolution of the drive at an instant, in counts a second.
+
+    A daemon of before did not publish it: all velocities are multiples of it, so it is their least difference.
+    """
+    told = [(each.t, each.resolution * abs(_counts_per_unit(info))) for each in speeds if each.resolution is not None]
+    if not told:
+        known = sorted({0.0, *(round(abs(each.counts_per_s), 3) for each in speeds)})
+        least = min((faster - slower for slower, faster in pairwise(known)), default=0.0)
+        told = [(0, least)]
+    times = [t for t, _ in told]
+    return lambda t: told[max(0, bisect_right(times, t) - 1)][1]
 
 
 def _counts_per_unit(info: AxisInfo) -> float:
@@ -131,7 +163,7 @@ def _readings(
     inputs: Sequence[InputsSample],
     states: Sequence[StateSample],
     info: AxisInfo,
-    resolution: float,
+    resolution_at: Callable[[int], float],
 ) -> list[Reading]:
     """Return recorded positions as what was read."""
     changes, per_unit, modulo = [each.t for each in inputs], _counts_per_unit(info), info.modulo or 0.0
@@ -148,7 +180,7 @@ def _readings(
             stretch += 1
         placed, lost = (state.referenced, state.reference_lost) if state else (False, False)
         rest = packed(levels, sample.quality, referenced=placed, lost=lost, stretch=stretch)
-        found.append(Reading(sample.t, sample.t_error_ns, sample.counts, resolution, origin, rest))
+        found.append(Reading(sample.t, sample.t_error_ns, sample.counts, resolution_at(sample.t), origin, rest))
     return found
 
 

@@ -63,10 +63,14 @@ class Recording:
         """Yield what can be read, in order: a bad chunk is passed over, a bad record outside of chunks is the end.
 
         Raises:
-            ConfigError: the file is no recording.
+            ConfigError: the file is no recording, or cannot be opened.
         """
         self.damages.clear()
-        with self.path.open("rb") as source:
+        try:
+            source = self.path.open("rb")
+        except OSError as error:
+            raise ConfigError(f"{self.path}: {error.strerror}", value=str(self.path)) from error
+        with source:
             records = StreamReader(source, emit_chunks=True).records
             at = 0
             while True:

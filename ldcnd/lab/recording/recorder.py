@@ -37,6 +37,7 @@ class Recorder:
         describe: returns them as they are now.
         now_ns: the wall clock, UTC in ns since 1970.
         rotate_bytes: size of a file at which the next one follows, after at most `FLUSH_PERIOD_S`.
+        on_other_configuration: called with the next file when one begins because the daemon is configured anew.
 
     Attributes:
         messages: how many values were recorded.
@@ -56,6 +57,7 @@ class Recorder:
         now_ns: Callable[[], int],
         rotate_bytes: int,
         describe: Callable[[], Awaitable[Mapping[str, bytes]]] | None = None,
+        on_other_configuration: Callable[[Path], object] = lambda _: None,
     ) -> None:
         self.messages = 0
         self.not_understood = 0
@@ -66,6 +68,7 @@ class Recorder:
         self._now_ns = now_ns
         self._rotate_bytes = rotate_bytes
         self._describe = describe
+        self._on_other_configuration = on_other_configuration
         self._source = ""  # the session of the daemon that the descriptions are of
         self._undescribed: deque[Publication] = deque(maxlen=KEPT_SAMPLES)
         self._stirred = asyncio.Event()
@@ -81,6 +84,11 @@ class Recorder:
         self._file.complete(self._facts())
 
     @property
+    def path(self) -> Path:
+        """The file that is written now."""
+        return numbered(self._path, self._files)
+
+    @property
     def summary(self) -> str:
         """The samples recorded and lost, in one sentence for a person."""
         missing = self.losses.missing.total()
@@ -91,6 +99,8 @@ class Recorder:
             parts.append(f"{self.not_understood} not understood")
         if self.losses.restarts:
             parts.append(f"{self.losses.restarts} topics began again after a restart of the daemon")
+        if self._files > 1:
+            parts.append(f"{self._files} files, the last of which is {self.path}")
         return "; ".join(parts)
 
     def end(self) -> None:
@@ -158,6 +168,7 @@ class Recorder:
             self._source, self._descriptions = source, descriptions
             if changed:
                 self._begin_next()
+                self._on_other_configuration(self.path)
             for sample in waiting:
                 self.take(sample)
 
@@ -172,7 +183,7 @@ class Recorder:
 
     def _open(self) -> McapFile:
         number = self._files + 1
-        file = McapFile(self._path if number == 1 else self._path.with_stem(f"{self._path.stem}-{number}"))
+        file = McapFile(numbered(self._path, number))
         self._files = number
         with file.discard_bare():
             for name, document in self._descriptions.items():
@@ -183,6 +194,19 @@ class Recorder:
         """Return the facts of the recording until now, for a file."""
         counts = {"messages": self.messages, "too_slow": self.too_slow, "not_understood": self.not_understood}
         return {name: str(count) for name, count in counts.items()} | self.losses.facts()
+
+
+def numbered(path: Path, number: int) -> Path:
+    """Return a file of a recording: the first has no number."""
+    return path if number == 1 else path.with_stem(f"{path.stem}-{number}")
+
+
+def following(path: Path) -> Path | None:
+    """Return the file that goes on where one of a recording ends, if it is beside it."""
+    stem, dash, number = path.stem.rpartition("-")
+    is_numbered = bool(dash) and number.isdecimal() and path.with_stem(stem).exists()
+    found = numbered(path.with_stem(stem), int(number) + 1) if is_numbered else numbered(path, 2)
+    return next((each for each in (found, found.with_name(f"{found.name}.part")) if each.exists()), None)
 
 
 def _is_another(descriptions: Mapping[str, bytes], before: Mapping[str, bytes]) -> bool:

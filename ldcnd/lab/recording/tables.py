@@ -2,17 +2,22 @@
 
 import csv
 import json
+import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
+from types import UnionType
+from typing import Annotated, Literal, Union, get_args, get_origin
 
 from mcap.records import Channel, Message
+from pydantic import BaseModel
 
 from ldcnd.contract.errors import ConfigError
-from ldcnd.contract.history import AxisInstant
+from ldcnd.contract.history import AxisInstant, time_of
 from ldcnd.lab.recording.instants import RecordedReadings, recorded_readings
+from ldcnd.lab.recording.messages import model_of
 from ldcnd.lab.recording.reading import Damage, Recording
 
 T_NS = "t_ns"
@@ -98,19 +103,23 @@ class RecordedTables:
         """Return where an axis was at an instant, UTC in ns since 1970, with the bounds that a daemon gives.
 
         Raises:
+            MalformedRequest: it is no instant.
             ConfigError: the file is no recording, or has no description of the axis.
             UnknownAxis: it has no such axis.
         """
-        return self._of(axis).at(t)
+        first, _ = time_of(str(t), time.time_ns())
+        return self._of(axis).at(first)
 
     def between(self, axis: str, t: int, until: int) -> list[AxisInstant]:
         """Return the same of the first instant of a range, of each reading in it, and of its last instant.
 
         Raises:
+            MalformedRequest: it is no range.
             ConfigError: the file is no recording, or has no description of the axis.
             UnknownAxis: it has no such axis.
         """
-        return list(self._of(axis).between(t, until))
+        first, last = time_of(f"[{t}..{until}]", time.time_ns())
+        return list(self._of(axis).between(first, last))
 
     def _of(self, axis: str) -> RecordedReadings:
         if axis not in self._readings:
@@ -146,7 +155,7 @@ def export_tables(path: Path, folder: Path, *, parquet: bool = False) -> Exporte
             kinds.setdefault(name, set()).add(type(cell))
     folder.mkdir(parents=True, exist_ok=True)
     kind, suffix = (_ParquetTable, "parquet") if parquet else (_CsvTable, "csv")
-    tables = {topic: kind(_file_of(topic, folder, suffix), columns[topic]) for topic in columns}
+    tables = {topic: kind(_file_of(topic, folder, suffix), columns[topic], topic) for topic in columns}
     rows = 0
     for topic, message, cells in _rows(recording):
         tables[topic].add(_row(message, cells))
@@ -159,8 +168,9 @@ def export_tables(path: Path, folder: Path, *, parquet: bool = False) -> Exporte
 class _Table:
     """One file, and the rows that are not in it yet."""
 
-    def __init__(self, path: Path, columns: Mapping[str, set[type]]) -> None:
+    def __init__(self, path: Path, columns: Mapping[str, set[type]], topic: str) -> None:
         self.path = path
+        self.topic = topic
         self._columns = columns
         self._rows: list[dict[str, Cell]] = []
 
@@ -180,8 +190,8 @@ class _Table:
 
 
 class _CsvTable(_Table):
-    def __init__(self, path: Path, columns: Mapping[str, set[type]]) -> None:
-        super().__init__(path, columns)
+    def __init__(self, path: Path, columns: Mapping[str, set[type]], topic: str) -> None:
+        super().__init__(path, columns, topic)
         with path.open("x", encoding="utf-8") as stream:
             csv.writer(stream, lineterminator="\n").writerow(columns)
 
@@ -191,16 +201,17 @@ class _CsvTable(_Table):
 
 
 class _ParquetTable(_Table):
-    """A file whose columns are numbers where all of their cells are, and texts otherwise."""
+    """A file whose columns have the types of what is published, and of their cells where this version knows none."""
 
-    def __init__(self, path: Path, columns: Mapping[str, set[type]]) -> None:
+    def __init__(self, path: Path, columns: Mapping[str, set[type]], topic: str) -> None:
         import pyarrow as pa  # noqa: PLC0415 - an optional package, and large
         from pyarrow.parquet import ParquetWriter  # noqa: PLC0415
 
-        super().__init__(path, columns)
+        super().__init__(path, columns, topic)
         kinds = {bool: pa.bool_(), int: pa.int64(), float: pa.float64()}
         self._table = pa.table
-        self._types = {name: _one_kind(found) for name, found in columns.items()}
+        known = column_kinds(model_of(topic.removeprefix("/")))
+        self._types = {name: known.get(_numberless(name)) or _one_kind(found) for name, found in columns.items()}
         self._schema = pa.schema([(name, kinds.get(kind, pa.string())) for name, kind in self._types.items()])
         self._writer = ParquetWriter(path, self._schema)
 
@@ -215,6 +226,40 @@ class _ParquetTable(_Table):
         """Write the rows there are, and what a reader needs."""
         super().end()
         self._writer.close()
+
+
+@cache
+def column_kinds(model: type[BaseModel] | None) -> Mapping[str, type]:
+    """Return the types of the columns of what is published, by names without the numbers of lists."""
+    found: dict[str, type] = {}
+    for name, field in model.model_fields.items() if model else ():
+        for column, kinds in _kinds(name, field.annotation).items():
+            found[column] = _one_kind(kinds)
+    return found
+
+
+def _kinds(name: str, annotation: object) -> dict[str, set[type]]:
+    """Return the types of the columns that a field becomes; a text stands for what has several, and for lists."""
+    origin, inner = get_origin(annotation), get_args(annotation)
+    if origin is Literal:
+        return {name: {type(each) for each in inner}}
+    if origin is Annotated:
+        return _kinds(name, inner[0])
+    found: dict[str, set[type]] = {}
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        found = {f"{name}.{column}": {kind} for column, kind in column_kinds(annotation).items()}
+        return found | {name: {str}}
+    if inner:
+        for each in inner:
+            for column, kinds in _kinds(name, each).items():
+                found.setdefault(column, set()).update(kinds)
+        return found if origin in (Union, UnionType) else found | {name: {str}}
+    plain = (kind for kind in (bool, int, float, str) if isinstance(annotation, type) and issubclass(annotation, kind))
+    return {name: {kind}} if (kind := next(plain, None)) else {}
+
+
+def _numberless(column: str) -> str:
+    return ".".join(part for part in column.split(".") if not part.isdecimal())
 
 
 def _one_kind(found: set[type]) -> type:

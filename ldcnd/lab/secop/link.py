@@ -13,7 +13,7 @@ from ldcnd.client.motion import Motion, Sent, set_point
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import BufferMode
 from ldcnd.contract.condition import Alarm, Condition, assess
-from ldcnd.contract.errors import LdcndError, WrongState
+from ldcnd.contract.errors import CommandAborted, LdcndError, WrongState
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import (
     AdcSample,
@@ -89,6 +89,7 @@ class AxisLink:
         self._sent: Sent | None = None
         self._target: object = None  # as it is shown
         self._pending = 0
+        self._goals = 0  # targets that clients have sent it to so far
         self._on_the_way = 0  # commands of motions that have no reply yet
         self._velocity = 0.0
         self._motions: set[asyncio.Task[None]] = set()
@@ -218,10 +219,16 @@ class AxisLink:
     # -- what is done to it ------------------------------------------------------------------------------------------
 
     async def go(self, target: float) -> float:
-        """Send the axis to a target; returns once the drive has acknowledged it."""
-        await self._begin(
-            lambda axis: axis.move_absolute(target, buffer_mode=BufferMode.ABORTING, velocity=self.speed), target
-        )
+        """Send the axis to a target; returns once the drive has acknowledged it, or has another one that came later."""
+        self._goals += 1
+        own = self._goals
+        try:
+            await self._begin(
+                lambda axis: axis.move_absolute(target, buffer_mode=BufferMode.ABORTING, velocity=self.speed), target
+            )
+        except CommandAborted:
+            if own == self._goals:
+                raise
         return target
 
     async def home(self) -> None:
