@@ -177,6 +177,7 @@ class Campaign:
         def kill(before: Play, at: int, zero_s: float) -> NoReturn:
             act, now_s = acts[at], asyncio.get_running_loop().time()
             judge.daemon = None
+            judge.out_of_reach.append((now_s, now_s + act.for_s))
 
             async def next_life() -> None:
                 again = replace(before, rig=Rig(self.machine.settings, judge, MemoryBroker()), clients={}, leases={})
