@@ -408,6 +408,9 @@ class AxisService:
             CommandAborted: a halt, or a later aborting move, came first.
             LdcndError: as the move itself, and as `Permit.ask_to_move`: also what has changed while it waited.
         """
+        # now, not at its turn: a stop that is latched may be reset while it waits
+        permit.ask()
+        guards.require(guards.TO_MOVE, self.tracker)
         # behind others that wait it follows the last of these
         ahead = self._last_in_turn if self._successors.locked() else self._active_id
         aborting, patience_s = move.buffer_mode is BufferMode.ABORTING, math.inf
@@ -416,7 +419,6 @@ class AxisService:
             self._newest_aborting = permit.number
             self._queue.changed.set()
         elif move.buffer_mode is BufferMode.BUFFERED and ahead is not None:
-            permit.ask()
             if (
                 self.tracker.status.command
                 and self.tracker.status.command.verb is not Verb.HOME

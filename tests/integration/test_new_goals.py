@@ -4,8 +4,8 @@ import asyncio
 
 import pytest
 
-from ldcnd.contract.commands import BufferMode, MoveAbsolute, MoveRelative, MoveVelocity
-from ldcnd.contract.errors import RequestRefused, WrongState
+from ldcnd.contract.commands import BufferMode, MoveAbsolute, MoveRelative, MoveVelocity, Reset
+from ldcnd.contract.errors import RequestRefused, StopLatched, WrongState
 from ldcnd.contract.samples import Moving
 from ldcnd.drives.ldcn.packet import CommandCode, PacketReader
 from ldcnd.line.flight_recorder import WireEvent
@@ -150,3 +150,26 @@ async def refused_or_id(rig: DialectRig, move: MoveAbsolute) -> str | None:
         return (await rig.send(move)).command_id
     except RequestRefused:
         return None
+
+
+@pytest.mark.promise("stop-in-any-state")
+@pytest.mark.parametrize("dialect", [SC, LS_182AP])
+@pytest.mark.parametrize("mode", ["buffered", "aborting"])
+async def test_a_move_that_comes_while_a_stop_is_latched_does_not_wait_for_its_reset(dialect, mode):
+    async with dialect_rig(dialect) as rig:
+        await rig.power_on()
+        await rig.send(MoveAbsolute(position=30.0, velocity=20.0))
+        await asyncio.sleep(0.5)
+        await rig.rig.client.stop(AXIS)
+        with pytest.raises(StopLatched):  # it decelerates yet
+            await rig.send(MoveRelative(distance=5.0, buffer_mode=mode))
+        while True:
+            try:
+                await rig.send(Reset())
+                break
+            except RequestRefused:
+                await asyncio.sleep(0.005)
+        before = rig.position_mm
+        await asyncio.sleep(2.0)
+
+        assert rig.position_mm == pytest.approx(before, abs=0.05)
