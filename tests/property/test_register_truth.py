@@ -240,6 +240,11 @@ def test_no_lost_reply_makes_an_axis_exceed_its_limits_or_changes_another_output
     live_through(seeds)
 
 
+def test_outputs_that_switch_together_do_so_where_a_late_reply_stands_for_their_lost_packet():
+    """The soak's find: Synch Output was lost, and the reply to the packet before it passed for its acknowledgement."""
+    live_through(range(4533, 4534))
+
+
 @pytest.mark.soak
 @pytest.mark.timeout(3600 * 6)
 @pytest.mark.parametrize("batch", range(20))

@@ -300,10 +300,9 @@ def test_what_a_pic_io_does_not_have_is_refused(command):
 
 
 def test_only_the_common_moment_of_a_group_is_not_sent_again():
-    node = IoNode(1)
-
-    assert send_io_command(node, SetOutput(1)).repeatable
-    assert not send_io_command(node, SynchOutput()).repeatable
+    assert send_io_command(IoNode(1), SetOutput(1)).repeatable
+    assert send_io_command(IoNode(1), SynchOutput()).repeatable
+    assert not send_io_command(IoNode(0x81), SynchOutput()).repeatable
 
 
 # -- PIC-STEP ---------------------------------------------------------------------------------------------------------

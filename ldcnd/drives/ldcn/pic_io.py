@@ -24,6 +24,8 @@ from ldcnd.line.exchange import Exchange, PacketEffect
 LINES = 12
 ALL_LINES = (1 << LINES) - 1
 MOST_PWM = 0xFF
+LOWEST_GROUP = 0x80
+"""Addresses from here are of groups."""
 TIMER_HZ = 5_000_000
 """The timer at prescale 1, with a 20 MHz crystal."""
 COUNTER_LINE = 10
@@ -296,13 +298,15 @@ class IoNode(Destination[IoStatus]):
 
 
 def send_io_command(to: IoNode, command: IoCommand) -> Exchange[IoStatus]:
-    """Return the exchange of a command; all but `SynchOutput` to a group may be repeated.
+    """Return the exchange of a command; all but `SynchInput`, and `SynchOutput` to a group, may be repeated.
 
     Raises:
         ValueOutOfRange: see `encode_io_command`.
     """
-    # a second one would start servos of the group once more, or capture a later instant
-    repeatable = not isinstance(command, SynchOutput | SynchInput)
+    # a second one would start servos of the group once more, or capture a later instant; a module alone only sets once
+    # more what it was set to
+    started = isinstance(command, SynchOutput) and to.address >= LOWEST_GROUP
+    repeatable = not (started or isinstance(command, SynchInput))
     exchange = to.exchange(encode_io_command(to.address, command), None, repeatable=repeatable)
     # what its lines read is not what it was told: an output shows the level of its pin, and a direction nothing
     return replace(exchange, unseen=True)
