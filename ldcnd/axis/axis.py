@@ -14,7 +14,15 @@ from typing import Literal
 from ldcnd.axis import guards
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.commands import AxisCommands
-from ldcnd.axis.events import ControlChanged, LoopSeen, PlaceKnown, PlaceUnknown, ReferenceRefused, SpeedOverridden
+from ldcnd.axis.events import (
+    ControlChanged,
+    LimitsSet,
+    LoopSeen,
+    PlaceKnown,
+    PlaceUnknown,
+    ReferenceRefused,
+    SpeedOverridden,
+)
 from ldcnd.axis.faults import REFERENCE_REFUSED
 from ldcnd.axis.host_tracer import HostTracer, host_channels
 from ldcnd.axis.kept import KeptFiles
@@ -30,7 +38,7 @@ from ldcnd.axis.readings import AxisReadings, OnEnded, ReadingOutOfTurn
 from ldcnd.axis.recorder import TraceRecorder
 from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.scale import AxisScale
-from ldcnd.axis.status import AxisStatus
+from ldcnd.axis.status import AxisStatus, SoftLimits
 from ldcnd.axis.stopping import AxisStops, stop_mode_of
 from ldcnd.axis.telemetry import AxisTelemetry, Note
 from ldcnd.axis.tracker import AxisTracker
@@ -124,7 +132,7 @@ class AxisService:
         self._note = note
         self._moves = moves = driver if isinstance(driver, Moves) else Unmoved(driver)
         proof = bus.proofs.expect(driver.spec.address, f"axis {config.name}", config.name)
-        status = AxisStatus(config.name, AxisScale.of(config), commanded=Verb.STOP in driver.capabilities)
+        status = AxisStatus(config.name, AxisScale.of(config), Verb.STOP in driver.capabilities, SoftLimits.of(config))
         self.tracker = AxisTracker(status, proof)
         self.telemetry = AxisTelemetry(publisher, config.name, driver, adc_volts=config.adc_volts)
         self._plausibility = plausibility = PlausibilityGate(config)
@@ -182,6 +190,7 @@ class AxisService:
     def reconfigure(self, config: AxisConfig) -> None:
         """Take other limits and speeds, for commands that come from now on; what moves is not touched."""
         self.config = config
+        self.tracker.take(LimitsSet(SoftLimits.of(config)))
         self._motion.reconfigure(config)
         self._plausibility.reconfigure(config)
         self.readings.reconfigure(config)

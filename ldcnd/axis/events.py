@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ldcnd.axis.course import Pace
 from ldcnd.axis.scale import AxisScale
-from ldcnd.axis.status import ActiveCommand, Unsure
+from ldcnd.axis.status import ActiveCommand, SoftLimits, Unsure
 from ldcnd.contract.samples import PastFault
 from ldcnd.drives.driver import AxisReading, Fault, StopMode
 
@@ -24,6 +24,13 @@ class ReadingTaken:
     reading: AxisReading
     sent_at_s: float
     now_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class LimitsSet:
+    """The axis has other software limits."""
+
+    limits: SoftLimits
 
 
 @dataclass(frozen=True, slots=True)
@@ -276,6 +283,7 @@ class ResetDone:
 
 AxisEvent = (
     ReadingTaken
+    | LimitsSet
     | LookTaken
     | LoopSeen
     | PollMissed

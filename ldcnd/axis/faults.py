@@ -58,6 +58,12 @@ DRIVE_CHANGED = Fault(
     "the drive is not as this daemon has left it; the events say what differs: undo it, or take it over",
     stops=False,
 )
+OUTSIDE_LIMITS = Fault(
+    "outside_limits",
+    "the axis is outside its software limits, where no command has sent it; move it back to a position inside, and find"
+    " out what moved it there",
+    stops=False,
+)
 OF_DAEMON = (
     DRIVE_CHANGED,
     DRIVE_RESET,
@@ -66,6 +72,7 @@ OF_DAEMON = (
     JUMPED,
     NOT_IDENTIFIED,
     NOT_SETTLED,
+    OUTSIDE_LIMITS,
     READINGS_CONTRADICT,
     REFERENCE_REFUSED,
     REPLIES_UNUSABLE,

@@ -13,11 +13,12 @@ from typing import Any
 
 from ldcnd.axis.course import Braking, Pace, Way
 from ldcnd.axis.faults import READINGS_CONTRADICT, REPLIES_UNUSABLE
-from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling
+from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling, window_counts
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Quality, StateSample
+from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Fault, StopMode
 from ldcnd.line.exchange import Timing
 
@@ -38,6 +39,36 @@ class Completion(Enum):
     """The profile has ended and nothing moves."""
     PROCEDURE = "procedure"
     """The procedure that follows it says so."""
+
+
+@dataclass(frozen=True, slots=True)
+class SoftLimits:
+    """The software limits of a position, as readings are judged by them.
+
+    Attributes:
+        low: lowest position, in axis units; minus infinity without one.
+        high: highest position; infinity without one.
+        window_counts: how far beyond them an axis may stand that was sent to one, in counts.
+    """
+
+    low: float = -math.inf
+    high: float = math.inf
+    window_counts: float = 0.0
+
+    @classmethod
+    def of(cls, config: AxisConfig) -> "SoftLimits":
+        """Return those that an axis is configured with."""
+        low, high = config.limits.position_min, config.limits.position_max
+        return cls(-math.inf if low is None else low, math.inf if high is None else high, window_counts(config))
+
+    def span(self, scale: AxisScale) -> tuple[float, float]:
+        """Return the lowest and the highest count of a drive that they allow."""
+        ends = (edge * scale.counts_per_unit + scale.origin_counts for edge in (self.low, self.high))
+        low, high = sorted(ends)
+        return low - self.window_counts, high + self.window_counts
+
+
+UNLIMITED = SoftLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +160,8 @@ class AxisStatus:
         scale: its coordinates.
         commanded: this daemon commands its drive. Others send one that is only observed: it has no command, no target
             and no reference here, and its drive alone says how it is.
+        limits: its software limits.
+        span: counts of its drive that these allow; it means something only while the axis is referenced.
         state: PLCopen state.
         enabled: its position loop is closed.
         referenced: its place is known.
@@ -172,6 +205,8 @@ class AxisStatus:
     name: str
     scale: AxisScale
     commanded: bool = True
+    limits: SoftLimits = UNLIMITED
+    span: tuple[float, float] = (-math.inf, math.inf)
     state: AxisState = AxisState.DISABLED
     enabled: bool = False
     referenced: bool = False

@@ -20,6 +20,7 @@ from ldcnd.axis.events import (
     DriveLost,
     FaultFound,
     LatchRecalled,
+    LimitsSet,
     LookTaken,
     LoopSeen,
     LoopSwitched,
@@ -48,6 +49,7 @@ from ldcnd.axis.faults import (
     LOOP_OPENED,
     NOT_IDENTIFIED,
     NOT_SETTLED,
+    OUTSIDE_LIMITS,
     READINGS_CONTRADICT,
     REFERENCE_REFUSED,
     REPLIES_UNUSABLE,
@@ -87,6 +89,10 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     faults = (*reading.faults, *status.own) if status.own else reading.faults
     if reading.altered and DRIVE_CHANGED not in faults:
         faults = (*faults, DRIVE_CHANGED)
+    low, high = status.span
+    # under a command it is on its way back, or that command says where it ends
+    if not low <= reading.position_counts <= high and status.referenced and status.command is None:
+        faults = (*faults, OUTSIDE_LIMITS)
     # any reading ends both rows: the drive answers, and its reply can be used
     if status.misses or status.in_vain or status.link is not LinkState.UP:
         status = replace(status, misses=0, in_vain=0, link=LinkState.UP)
@@ -302,7 +308,20 @@ def _refuse_reference(status: AxisStatus, event: ReferenceRefused) -> AxisStatus
 def _know_place(status: AxisStatus, event: PlaceKnown) -> AxisStatus:
     own = tuple(fault for fault in status.own if fault.code != REFERENCE_REFUSED.code)
     target = None if event.resting else status.target
-    return replace(status, scale=event.scale, referenced=True, reference_lost=False, refused="", own=own, target=target)
+    return replace(
+        status,
+        scale=event.scale,
+        span=status.limits.span(event.scale),
+        referenced=True,
+        reference_lost=False,
+        refused="",
+        own=own,
+        target=target,
+    )
+
+
+def _set_limits(status: AxisStatus, event: LimitsSet) -> AxisStatus:
+    return _with(status, limits=event.limits, span=event.limits.span(status.scale))
 
 
 def _unknow_place(status: AxisStatus, _event: PlaceUnknown) -> AxisStatus:
@@ -467,6 +486,7 @@ def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
 STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType(
     {
         ReadingTaken: take_reading,
+        LimitsSet: _set_limits,
         LookTaken: _take_look,
         LoopSeen: _see_loop,
         PollMissed: _miss,
