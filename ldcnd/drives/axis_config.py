@@ -315,6 +315,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
         # made once here, so that what is wrong with them is said of the file
         _ = self.unit_table, self.g_velocity
+        self._check_home()
         self._check_gain_sets()
         self._check_tracking()
         return self
@@ -339,6 +340,19 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
     def switch_active(self) -> Literal["high", "low"]:
         """Level of a limit switch input while the switch is actuated."""
         return self.home.switch_active if self.home else "high"
+
+    def _check_home(self) -> None:
+        """Refuse speeds with which every search would be refused."""
+        if self.home is None:
+            return
+        if self.home.velocity == 0:
+            raise ValueError("home.velocity is 0: its sign is the way of the search")
+        for name, velocity in (
+            ("velocity", abs(self.home.velocity)),
+            ("find_velocity", self.home.find_velocity or 0.0),
+        ):
+            if self.limits.velocity is not None and velocity > self.limits.velocity:
+                raise ValueError(f"home.{name} {velocity:g} is above limits.velocity {self.limits.velocity:g}")
 
     def _check_gain_sets(self) -> None:
         """Refuse sets that `gains` do not stand for, and names of sets that there are not."""

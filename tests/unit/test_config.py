@@ -76,6 +76,17 @@ def test_a_reversed_axis_counts_backwards(tmp_path):
             ["bus[0].axis[0]", "position_min 5"],
         ),
         (("acceleration = 100", "acceleration = 100\nlimits = { velocity = 1 }"), ["velocity 10.0", "1.0"]),
+        (
+            ("acceleration = 100", 'acceleration = 100\nhome = { method = "index", velocity = 0 }'),
+            ["home.velocity is 0"],
+        ),
+        (
+            (
+                "acceleration = 100",
+                'acceleration = 100\nlimits = { velocity = 20 }\nhome = { method = "index", velocity = -30 }',
+            ),
+            ["home.velocity 30", "limits.velocity 20"],
+        ),
     ],
 )
 def test_a_wrong_value_names_file_key_value_and_what_is_allowed(tmp_path, change, words):
