@@ -468,6 +468,7 @@ class AxisCommands:
     async def _set_position(self, permit: Permit, request: SetPosition) -> CommandReply:
         motion = self._motion
         permit.check_state()
+        guards.check_origin(self._tracker, motion.config.farthest, request.position)
         here = await motion.read()  # one reading alone may be wrong
         # before the axis gets another origin: a crash between the two must not leave the old one
         await motion.reference.forget()

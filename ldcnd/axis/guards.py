@@ -4,6 +4,7 @@ Each refusal says what, which limit, and what to do. The table also answers `why
 command.
 """
 
+import math
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 
@@ -21,6 +22,7 @@ from ldcnd.contract.errors import (
     PositionLimit,
     Remedy,
     StopLatched,
+    ValueOutOfRange,
     VelocityLimit,
     WrongState,
     step,
@@ -111,6 +113,20 @@ def check_referenced(axis: AxisTracker) -> None:
             f"axis {axis.name} is not homed: its position is not known{kept}",
             axis=axis.name,
             remedy=Remedy("{} or {}", step("home"), step("set_position", "set_position")),
+        )
+
+
+def check_origin(axis: AxisTracker, farthest: float, position: float) -> None:
+    """Refuse to call a place by a number at which single counts could not be told apart any more."""
+    if abs(position) > farthest:
+        nearest = math.copysign(farthest, position)
+        raise ValueOutOfRange(
+            f"axis {axis.name}: position {position:.12g} {axis.status.unit} is beyond {nearest:.12g}"
+            f" {axis.status.unit}: it could not be told to a count",
+            axis=axis.name,
+            value=position,
+            limit=nearest,
+            nearest=nearest,
         )
 
 

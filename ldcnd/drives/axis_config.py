@@ -17,6 +17,8 @@ from ldcnd.drives.toml import DeviceIdentity, Name
 
 LEAST_TURN_COUNTS = 4
 """Of a rotary axis: one count must be no larger than the way to the other side."""
+MOST_ORIGIN_COUNTS = 2**40
+"""No place is called by a number farther off than this: a double still tells single counts well apart there."""
 
 
 QUANTITIES: Mapping[str, Dimension] = {
@@ -337,6 +339,11 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
         return -counts_per_unit if self.direction == "reverse" else counts_per_unit
 
     @property
+    def farthest(self) -> float:
+        """The farthest position that anything may be given as its own, in axis units."""
+        return MOST_ORIGIN_COUNTS / abs(self.signed_counts_per_unit)
+
+    @property
     def switch_active(self) -> Literal["high", "low"]:
         """Level of a limit switch input while the switch is actuated."""
         return self.home.switch_active if self.home else "high"
@@ -353,6 +360,8 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
         ):
             if self.limits.velocity is not None and velocity > self.limits.velocity:
                 raise ValueError(f"home.{name} {velocity:g} is above limits.velocity {self.limits.velocity:g}")
+        if abs(self.home.position) > (most := self.farthest):
+            raise ValueError(f"home.position {self.home.position:g} is beyond {most:g}")
 
     def _check_gain_sets(self) -> None:
         """Refuse sets that `gains` do not stand for, and names of sets that there are not."""

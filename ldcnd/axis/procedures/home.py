@@ -106,6 +106,7 @@ class HomeSequence(Procedure):
         motion, tracker = self._motion, self._motion.tracker
         self.permit.check_state()
         search = self._search
+        guards.check_origin(tracker, motion.config.farthest, search.position)
         plan = motion.plan_at(search.velocity, self._acceleration)
         if search.method is HomeMethod.INDEX:
             check_index_is_seen(motion, plan, search.index_width)
