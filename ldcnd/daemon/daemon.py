@@ -5,8 +5,6 @@ import contextlib
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from typing import Any
 
-from typing_extensions import override
-
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.latches import LatchKeeper
@@ -31,6 +29,7 @@ from ldcnd.daemon.modules import Situation
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.daemon.rig_commands import AnswerReload
 from ldcnd.line.capture import Capture
+from ldcnd.line.tasks import GuardedGroup
 from ldcnd.log import LogLimit, get_logger
 from ldcnd.net.hand_over import Load
 from ldcnd.net.publisher import Publisher
@@ -162,7 +161,8 @@ class Daemon:
             try:
                 await self._declare_stops(declared, requests)
                 serving += [
-                    group.create_task(bus.run(), name=f"line {bus.bus.settings.name}") for bus in self.rig.buses
+                    group.create_task(bus.run(self._guarded), name=f"line {bus.bus.settings.name}")
+                    for bus in self.rig.buses
                 ]
                 await self._declare(declared, requests)
                 serving.append(group.create_task(self._watch_axes(), name="liveliness"))
@@ -349,27 +349,6 @@ class Daemon:
             axes=tuple(self.rig.axes),
             buses=tuple(bus.bus.settings.name for bus in self.rig.buses),
         )
-
-
-class GuardedGroup(asyncio.TaskGroup):
-    """Tasks of which one that fails does not cancel the others."""
-
-    def __init__(self, guarded: Callable[[Coroutine[Any, Any, Any]], Coroutine[Any, Any, None]]) -> None:
-        """Begin without tasks.
-
-        Args:
-            guarded: does the work of a task; sees to what it raises.
-        """
-        super().__init__()
-        self._guarded = guarded
-
-    @override
-    def create_task(  # type: ignore[override] # its stub names what differs between versions of Python
-        self, coro: Coroutine[Any, Any, Any], **kwargs: Any
-    ) -> "asyncio.Task[Any]":
-        task = super().create_task(self._guarded(coro), **kwargs)
-        task.add_done_callback(lambda _: coro.close())  # of one that is cancelled before it begins nothing is awaited
-        return task
 
 
 async def _served(guest: Callable[[], Awaitable[None]]) -> None:

@@ -21,6 +21,7 @@ from ldcnd.drives.network import BringUpReport, Network
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Poller, Priority
 from ldcnd.line.flight_recorder import WireEvent
+from ldcnd.line.tasks import Guarded, GuardedGroup, each
 from ldcnd.log import get_logger
 
 log = get_logger("bus")
@@ -85,10 +86,15 @@ class BusService:
         for axis in axes:
             axis.stops.wanted = self._stop_wanted
 
-    async def run(self) -> None:
-        """Serve the line until cancelled."""
+    async def run(self, guarded: Guarded) -> None:
+        """Serve the line until cancelled.
+
+        Args:
+            guarded: does the work of each of its tasks. One that fails does not close the line, by which axes are to
+                come to rest.
+        """
         name = self.bus.settings.name
-        async with asyncio.TaskGroup() as group:
+        async with GuardedGroup(guarded) as group:
             group.create_task(self.bus.run(), name=f"bus {name}")
             group.create_task(self._supervise(), name=f"bring up {name}")
             if self._stop_probe_hz:
@@ -234,9 +240,7 @@ class BusService:
         waiting = [axis for axis in self.axes if axis.tracker.status.stop_pending or axis.tracker.status.off_again]
         if not waiting:
             return
-        async with asyncio.TaskGroup() as stops:
-            for axis in waiting:
-                stops.create_task(axis.send_pending_stop(), name=f"pending stop {axis.config.name}")
+        await each({f"pending stop {axis.config.name}": axis.send_pending_stop() for axis in waiting})
 
     async def _pause(self, pause_s: float) -> None:
         """Wait before the next attempt to bring the line up; a stop that comes meanwhile is tried at once."""

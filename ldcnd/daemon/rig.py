@@ -1,15 +1,15 @@
 """The rig as a whole: every line, every axis and every I/O module by name, and the commands that concern them all."""
 
-import asyncio
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from types import MappingProxyType
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from ldcnd.config.ports import GuestView
 from ldcnd.contract.errors import LdcndError, UnknownAxis, ValueOutOfRange
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.modules import ModuleService
 from ldcnd.drives.driver import StopMode
+from ldcnd.line.tasks import each
 
 PartT = TypeVar("PartT")
 
@@ -97,13 +97,11 @@ class OwnedRig:
         one packet first.
         """
         chosen = [self.axes[name] for name in names]
-        async with asyncio.TaskGroup() as group:
-            for bus in self.buses:
-                # closed loops only: a stop that holds would close the open ones of its group
-                closed = frozenset(
-                    axis.config.name for axis in bus.axes if axis in chosen and axis.tracker.status.enabled
-                )
-                if len(closed) > 1:
-                    group.create_task(bus.stop_together(mode, closed), name=f"stop line {bus.bus.settings.name}")
-            stops = {name: group.create_task(self.axes[name].stops.stop(mode), name=f"stop {name}") for name in names}
-        return tuple(name for name, stop in stops.items() if stop.result())
+        together = dict[str, Coroutine[Any, Any, None]]()
+        for bus in self.buses:
+            # closed loops only: a stop that holds would close the open ones of its group
+            closed = frozenset(axis.config.name for axis in bus.axes if axis in chosen and axis.tracker.status.enabled)
+            if len(closed) > 1:
+                together[f"stop line {bus.bus.settings.name}"] = bus.stop_together(mode, closed)
+        confirmed = await each({**together, **{name: self.axes[name].stops.stop(mode) for name in names}})
+        return tuple(name for name in names if confirmed[name])

@@ -1,15 +1,18 @@
 """However control over an axis is lost, what moves does what `loss.client` says; on the jumping clock."""
 
 import asyncio
+import contextlib
 
 import pytest
 
+from ldcnd.axis.recorder import TraceRecorder
+from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.stopping import AxisStops
 from ldcnd.client.events import latest_events
 from ldcnd.client.lease import control
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import BufferMode, MoveAbsolute, MoveVelocity, Power
-from ldcnd.contract.errors import LeaseExpired, LeaseHeld, LeaseRequired, SessionError
+from ldcnd.contract.errors import LdcndError, LeaseExpired, LeaseHeld, LeaseRequired, SessionError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.leases import Acquire, LeaseReply
 from ldcnd.contract.rig_commands import Rehearsal, Rehearse
@@ -17,6 +20,7 @@ from ldcnd.contract.samples import AxisState, Moving
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.health import HealthWatch
 from ldcnd.daemon.leases import LeaseWatch
+from ldcnd.daemon.line import BusService
 from ldcnd.drives.axis_config import LossConfig, LossPolicy
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive
@@ -187,7 +191,7 @@ async def test_a_client_that_freezes_in_mid_motion_has_its_axis_do_what_the_poli
 
 
 @pytest.mark.promise("error-ends-in-order")
-@pytest.mark.parametrize("part", ["health", "leases", "liveliness"])
+@pytest.mark.parametrize("part", ["health", "leases", "liveliness", "reference", "traces", "bring up"])
 async def test_an_internal_error_brings_axes_to_rest_before_it_ends_the_daemon(monkeypatch, part):
     broken = asyncio.Event()
     chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
@@ -200,6 +204,9 @@ async def test_an_internal_error_brings_axes_to_rest_before_it_ends_the_daemon(m
         "health": [(HealthWatch, "run")],
         "leases": [(LeaseWatch, "run")],
         "liveliness": [(Daemon, "_watch_axes")],
+        "reference": [(ReferenceKeeper, "run")],
+        "traces": [(TraceRecorder, "run")],
+        "bring up": [(BusService, "_scan_for_lost_drives")],
     }[part]:
         monkeypatch.setattr(owner, method, fails)
 
@@ -240,6 +247,30 @@ async def test_an_internal_error_while_one_axis_is_brought_to_rest_leaves_no_oth
     await asyncio.sleep(1.0)
 
     assert drive(chain, 2).loop.trajectory.at_rest
+
+
+async def test_an_internal_error_in_the_stop_of_one_axis_leaves_no_other_one_running(monkeypatch):
+    chain = build_chain(ChainSpec(tuple(map(ModuleSpec, ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")))))
+    stop = AxisStops.stop
+
+    async def fails(stops: AxisStops, *args: object) -> bool:
+        if stops is rig.daemon.rig.axes["x"].stops:
+            raise ZeroDivisionError
+        return await stop(stops, *args)
+
+    async with running_rig(load_config(SIMULATED), {"line0": chain}) as rig:
+        await rig.until("y", lambda state: state.link == "up")
+        await rig.client.command("y", Power(on=True))
+        await rig.client.command("y", MoveVelocity(velocity=5.0))
+        await asyncio.sleep(0.5)
+        monkeypatch.setattr(AxisStops, "stop", fails)
+        with contextlib.suppress(LdcndError):
+            await rig.client.stop()
+        await asyncio.sleep(1.0)
+        at_rest = drive(chain, 2).loop.trajectory.at_rest
+        monkeypatch.undo()
+
+    assert at_rest
 
 
 async def test_a_network_that_takes_no_token_for_a_while_stops_no_axis(monkeypatch):
