@@ -18,13 +18,13 @@ from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error
 from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, halted
 from ldcnd.cli.typed import Finite, Quantity, axis_of, in_units, number_of
-from ldcnd.client.lease import control
+from ldcnd.client.lease import acquire, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import CommandReply, MoveVelocity, Power, Reset
 from ldcnd.contract.errors import LdcndError, LeaseExpired, SessionError, UnknownAxis, WrongState
 from ldcnd.contract.events import ReadOutcome
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.leases import Acquire, HolderList, ListHolders
+from ldcnd.contract.leases import HolderList, ListHolders
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.rig_commands import (
     AxisMove,
@@ -237,7 +237,7 @@ async def _lose_client(client: RigClient, axis: str, request: MoveVelocity, leas
             axis=axis,
             remedy="run it outside",
         )
-    lease = await client.ask(Acquire(client="drill", axes=(axis,), lease_s=lease_s))
+    lease = (await acquire(client, "drill", (axis,), lease_s)).lease
     began_s = asyncio.get_running_loop().time()
     await client.command(axis, Power(on=True, lease=lease.lease))
     await client.command(axis, request.model_copy(update={"lease": lease.lease}))

@@ -30,12 +30,34 @@ def inherited_lease() -> str | None:
 
 
 def program_name(name: str) -> str:
-    """Return the name under which this process takes control: the same program elsewhere is another client.
+    """Return the name under which this process takes control: people see which one it is of several.
 
-    A client that acquires again replaces its own lease without force. So two processes of one name would take an axis
-    from each other in mid-motion, unasked.
+    A name gives no right: a lease belongs to the session that has its token.
     """
     return f"{name}, process {os.getpid()} on {socket.gethostname()}"[:LONGEST_NAME]
+
+
+async def acquire(
+    client: RigClient, name: str, axes: tuple[str, ...], lease_s: float, *, force: bool = False
+) -> "Control":
+    """Acquire control; leases on these axes that this program has here under the same name are replaced.
+
+    So is the lease that the program was started with, where it covers one of them.
+
+    Raises:
+        LeaseHeld: the lease of another client covers one of the axes, or one of this client's that was acquired
+            elsewhere or before it was started.
+    """
+    own = [token for token, held in client.held.items() if held.client == name]
+    if client.lease:
+        own.append(client.lease)
+    request = valid(Acquire, client=name, axes=axes, lease_s=lease_s, force=force, replaces=tuple(own))
+    lease = await client.ask(request)
+    for token in own:
+        if token in client.held and not set(lease.axes).isdisjoint(client.held[token].axes):
+            del client.held[token]
+    client.held[lease.lease] = lease
+    return Control(client, lease)
 
 
 class Control:
@@ -87,6 +109,7 @@ class Control:
 
     def _ended(self, error: LeaseExpired | LeaseUnknown) -> LeaseExpired:
         """Keep why control was lost: a daemon that does not know the lease which it gave is another one."""
+        self._client.held.pop(self.lease.lease, None)
         if isinstance(error, LeaseUnknown):
             error = LeaseExpired("the daemon was restarted, and control ended with it", remedy=ACQUIRE_AGAIN)
         self.lost = error
@@ -137,8 +160,10 @@ class Control:
         """
         if self.inherited:
             return
-        with contextlib.suppress(LeaseExpired, LeaseUnknown, OutcomeUnknown, SessionError):
-            await self._client.ask(Release(lease=self.lease.lease, leave_running=leave_running))
+        with contextlib.suppress(OutcomeUnknown, SessionError):  # then it is still the one to be replaced
+            with contextlib.suppress(LeaseExpired, LeaseUnknown):
+                await self._client.ask(Release(lease=self.lease.lease, leave_running=leave_running))
+            self._client.held.pop(self.lease.lease, None)
 
 
 async def take_control(client: RigClient, name: str, axes: tuple[str, ...], lease_s: float, *, force: bool) -> Control:
@@ -152,7 +177,7 @@ async def take_control(client: RigClient, name: str, axes: tuple[str, ...], leas
         lease = await client.ask(Renew(lease=client.lease))
         if set(axes) <= set(lease.axes):
             return Control(client, lease, inherited=True)
-    return Control(client, await client.ask(valid(Acquire, client=name, axes=axes, lease_s=lease_s, force=force)))
+    return await acquire(client, name, axes, lease_s, force=force)
 
 
 @contextlib.asynccontextmanager

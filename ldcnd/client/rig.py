@@ -165,7 +165,7 @@ class Rig:
         context raises `LeaseExpired`: clean up in `finally`. An exception that leaves the context halts the axes whose
         motions have not ended. At its other ends these do what their `loss.client` says, and the warning
         `UnfinishedMotion` names them. Inside `ldcnd lease hold -- PROGRAM` the program shares the control that is held
-        for it.
+        for it. Control that this `Rig` has already under the same name is replaced; what moves goes on.
 
         Args:
             axes: what to control; a group stands for its members.
@@ -174,7 +174,7 @@ class Rig:
             force: take control away from its holder.
 
         Raises:
-            LeaseHeld: another program controls one of the axes.
+            LeaseHeld: another program controls one of the axes, or this one by another `Rig` or before it was started.
             UnknownAxis: there is no such axis.
         """
         held = self.controlled(axes, client, lease_s, force=force)

@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from difflib import get_close_matches
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from ldcnd.client.own_samples import Origin
 from ldcnd.client.rest import REST_S, drive_silent, until_at_rest
@@ -38,6 +38,9 @@ from ldcnd.net.session import (
     SampleKind,
     Session,
 )
+
+if TYPE_CHECKING:
+    from ldcnd.contract.leases import LeaseReply  # clients that only read need no model of leases
 
 ModelT = TypeVar("ModelT", bound=Frozen)
 ReplyT = TypeVar("ReplyT", bound=Frozen)
@@ -106,11 +109,13 @@ class RigClient:
         session: the session.
         keys: the keys of the rig.
         lease: under this one is sent what can be sent under a lease and names none; None without one.
+        held: leases that this program has acquired here and not given back, by token: who acquires again names them.
     """
 
     def __init__(self, session: Session, rig: str, lease: str | None = None) -> None:
         self.rig = rig
         self.lease = lease
+        self.held: dict[str, LeaseReply] = {}
         self.session = session
         self.keys = Keys(rig)
         self._instance: str | None = None

@@ -14,7 +14,7 @@ from functools import partial
 
 from pydantic import Field
 
-from ldcnd.client.lease import Control
+from ldcnd.client.lease import Control, acquire
 from ldcnd.client.motion import Jogging
 from ldcnd.client.rig_client import RigClient
 from ldcnd.console.rigs import Rigs
@@ -31,7 +31,7 @@ from ldcnd.contract.errors import (
     UnknownAxis,
 )
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.leases import ListHolders
 from ldcnd.contract.rig_commands import MoveTogether, MoveTogetherReply
 from ldcnd.contract.samples import Moving
 from ldcnd.log import get_logger
@@ -172,8 +172,7 @@ class PageControl:
         client = self._rigs.client(rig)
         if axis not in self._rigs.axes(rig):
             raise UnknownAxis(f"rig {rig} has no axis {axis[:64]!r}", axis=axis[:64], value=axis[:64])
-        request = Acquire(client=self.client, axes=(axis,), lease_s=LEASE_S, force=force)
-        control = Control(client, await client.ask(request))
+        control = await acquire(client, self.client, (axis,), LEASE_S, force=force)
         if self._gone:
             await control.release()
             raise _page_gone()
@@ -297,6 +296,8 @@ class PageControl:
             why = control.lost.message if control.lost else ""
             log.info("control lost", client=self.client, rig=rig, axis=axis, reason=why)
             taker = await self._holder(rig, axis)
+            if (rig, axis) in self._held:  # taken again meanwhile
+                taker = None
             self._tell(ToPage(lost=Lost(rig=rig, axis=axis, message=why, taken_by=taker)))
 
     async def _holder(self, rig: str, axis: str) -> str | None:
@@ -305,8 +306,7 @@ class PageControl:
             reply = await self._rigs.client(rig).ask(ListHolders())
         except LdcndError:
             return None
-        holder = next((each.client for each in reply.holders if each.axis == axis), None)
-        return None if holder == self.client else holder
+        return next((each.client for each in reply.holders if each.axis == axis), None)
 
 
 class Pages:

@@ -1,5 +1,7 @@
 """Control of axes: leases, and who holds them."""
 
+from typing import Annotated
+
 from pydantic import ConfigDict, Field
 
 from ldcnd.contract.commands import About, Command, Effect
@@ -36,6 +38,9 @@ class Acquire(Command[LeaseReply]):
     """Duration of the lease, in seconds; it must be renewed before its end."""
     force: bool = False
     """Take control from its present holder; that is logged."""
+    replaces: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
+    """Leases of the requester. Those that cover a wanted axis end, and what moves under them goes on under the new one.
+    A held lease that is not named is refused, also to the same client: a lease belongs to who has its token."""
 
 
 class LeaseRequest(Frozen):

@@ -61,6 +61,9 @@ log = get_logger("requests")
 
 Accept = Callable[[CommandReply], None]
 STOP = "@stop"
+TOKENS = ("lease", "leases", "replaces")
+"""Fields of requests that name leases."""
+QUOTED_TOKENS = tuple(f'"{name}"'.encode() for name in TOKENS)
 STOPS_AT_ONCE = 8
 """Maximum number of concurrent stops of the same axes; further ones join."""
 REPLY_S = 1.0
@@ -84,12 +87,10 @@ class Journal:
 
     def asked(self, axis: str, command: Command[Frozen], lease: str | None = None) -> None:
         """Note a command of an axis or of the rig; `lease` is the token that was given in return."""
-        token = lease or getattr(command, "lease", None)
-        if token is None:
-            payload = to_json(command, exclude_defaults=True)
-        else:
-            fields = command.model_dump(mode="json", exclude_defaults=True)
-            payload = json.dumps({**fields, "lease": fingerprint(token)}, separators=(",", ":")).encode()
+        payload = to_json(command, exclude_defaults=True)
+        if lease or any(name in payload for name in QUOTED_TOKENS):
+            fields = json.loads(payload) | ({"lease": lease} if lease else {})
+            payload = json.dumps(without_tokens(fields), separators=(",", ":"), ensure_ascii=False).encode()
         self._note(axis, f"{axis}/{command.verb} ".encode() + payload)
 
     def stopped(self, axis: str | None) -> None:
@@ -101,6 +102,15 @@ class Journal:
         now_s = asyncio.get_running_loop().time()
         for log in self._logs[axis]:
             log.add(now_s, WireEvent.COMMAND, line)
+
+
+def without_tokens(given: object, *, secret: bool = False) -> object:
+    """Return fields of a request with a fingerprint in the place of every lease, also in what is nested."""
+    if isinstance(given, dict):
+        return {name: without_tokens(value, secret=name in TOKENS) for name, value in given.items()}
+    if isinstance(given, list):
+        return [without_tokens(each, secret=secret) for each in given]
+    return fingerprint(given) if secret and isinstance(given, str) else given
 
 
 def fingerprint(token: str) -> str:

@@ -1,5 +1,7 @@
 """Leases: which client may move which axis, since when none may, and what happens when control is lost.
 
+A lease belongs to who has its token: two programs may have one name, which is for people and gives no right.
+
 A lease ends by the daemon's own clock. It is ended before any waiting command is examined, so that a command which
 was delivered late - because the daemon, the link or the client was frozen - finds no lease and is refused. Control over
 an axis ends in one place: however it ends - not renewed in time, taken by force, exchanged for a lease that covers
@@ -72,6 +74,21 @@ class Lease:
         return LeaseReply(lease=self.token, client=self.client, axes=tuple(sorted(self.axes)), lease_s=self.duration_s)
 
 
+@dataclass(frozen=True, slots=True)
+class Acquired:
+    """What became of a request for control.
+
+    Attributes:
+        lease: that was given.
+        own: leases of the requester that it replaces; what it has begun under them goes on.
+        taken: leases that were taken from others by force.
+    """
+
+    lease: Lease
+    own: tuple[Lease, ...]
+    taken: tuple[Lease, ...]
+
+
 def random_token() -> str:
     """Return what a new lease is known by."""
     return secrets.token_hex(8)
@@ -107,13 +124,28 @@ class Authority:
         return min((lease.ends_at_s for lease in self._leases.values()), default=float("inf"))
 
     def acquire(
-        self, client: str, axes: Iterable[str], duration_s: float, now_s: float, *, force: bool
-    ) -> tuple[Lease, list[Lease]]:
-        """Give a client control; return the lease and those that it displaced.
+        self,
+        client: str,
+        axes: Iterable[str],
+        duration_s: float,
+        now_s: float,
+        *,
+        force: bool,
+        replaces: Iterable[str] = (),
+    ) -> Acquired:
+        """Give a client control.
+
+        Args:
+            client: its name, for people.
+            axes: what it wants; none means all.
+            duration_s: of the lease.
+            now_s: the time.
+            force: take control from its holders.
+            replaces: the tokens of its own leases.
 
         Raises:
             UnknownAxis: there is no such axis.
-            LeaseHeld: another client holds one of the axes, and `force` was not requested.
+            LeaseHeld: one of the axes is held under a lease that is not the requester's, and `force` was not requested.
         """
         wanted = frozenset(axes) or self._axes
         if unknown := sorted(wanted - self._axes):
@@ -123,23 +155,31 @@ class Authority:
                 value=unknown[0],
             )
         self.expire(now_s)
+        tokens = {self._latest(token) for token in replaces}
         displaced = [lease for lease in self._leases.values() if lease.axes & wanted]
-        foreign = [lease for lease in displaced if lease.client != client]
-        if foreign and not force:
-            axis = min(foreign[0].axes & wanted)
+        own = tuple(lease for lease in displaced if lease.token in tokens)
+        taken = tuple(lease for lease in displaced if lease.token not in tokens)
+        if taken and not force:
+            axis = min(taken[0].axes & wanted)
             raise LeaseHeld(
-                f"axis {axis} is controlled by {foreign[0].client}",
+                f"axis {axis} is controlled by {taken[0].client}, for {taken[0].ends_at_s - now_s:.1f} s more unless"
+                " renewed",
                 axis=axis,
-                value=foreign[0].client,
-                remedy=Remedy("wait until it is released, or {}", step("acquire", "acquire it with force", force=True)),
+                value=taken[0].client,
+                remedy=Remedy(
+                    "wait until it is released or not renewed, {}, or share it by its token in LDCND_LEASE",
+                    step("acquire", "acquire it with force", force=True),
+                ),
             )
-        for old in displaced:
-            self._end(old, f"was taken by {client}" if old.client != client else "was replaced by its own client")
+        for old in own:
+            self._end(old, "was replaced by its own client")
+        for old in taken:
+            self._end(old, f"was taken by {client}")
         lease = Lease(self._next_token(), client, wanted, duration_s, now_s + duration_s)
         self._leases[lease.token] = lease
         # what its holder has begun, or has waiting, goes on under the new one
-        self._successors.update((old.token, lease.token) for old in displaced if old.client == client)
-        return lease, displaced
+        self._successors.update((old.token, lease.token) for old in own)
+        return Acquired(lease, own, taken)
 
     def renew(self, token: str, now_s: float) -> Lease:
         """Let a lease last for its duration from now on.
@@ -211,10 +251,7 @@ class Authority:
         if token is None:
             self._admit_without(axis, now_s)
             return
-        # each was made behind the one before it, so this comes to an end
-        while token in self._successors:
-            token = self._successors[token]
-        lease = self._leases.get(token)
+        lease = self._leases.get(self._latest(token))
         if lease is None or lease.ends_at_s <= now_s or axis not in lease.axes:
             raise LeaseExpired(
                 f"axis {axis}: the lease of this command has ended before its motion began",
@@ -222,6 +259,13 @@ class Authority:
                 value=token,
                 remedy=Remedy("{}", step("acquire", "acquire a new one")),
             )
+
+    def _latest(self, token: str) -> str:
+        """Return the lease by which its own holder has replaced one, the latest of several; itself without one."""
+        # each was made behind the one before it, so this comes to an end
+        while token in self._successors:
+            token = self._successors[token]
+        return token
 
     def _admit_without(self, axis: str, now_s: float) -> None:
         holder = self.holder(axis)
@@ -297,22 +341,27 @@ class LeaseWatch:
 
         Raises:
             UnknownAxis: there is no such axis.
-            LeaseHeld: another client holds one of the axes, and `force` was not requested.
+            LeaseHeld: one of the axes is held under a lease that is not the requester's, and `force` was not requested.
         """
         self.expire()
         wanted = self._rig.members(request.axes)
         try:
-            lease, displaced = self._authority.acquire(
-                request.client, wanted, request.lease_s, self._clock.now_s(), force=request.force
+            acquired = self._authority.acquire(
+                request.client,
+                wanted,
+                request.lease_s,
+                self._clock.now_s(),
+                force=request.force,
+                replaces=request.replaces,
             )
         except LeaseHeld as error:
             self._refused(request, error)
             raise
-        self._show(lease.axes.union(*(other.axes for other in displaced)))
-        for other in displaced:
-            if other.client == lease.client:
-                self._lost(other, other.axes - lease.axes, "its client took a lease that covers less", None)
-                continue
+        lease = acquired.lease
+        self._show(lease.axes.union(*(other.axes for other in acquired.own + acquired.taken)))
+        for other in acquired.own:
+            self._lost(other, other.axes - lease.axes, "its client took a lease that covers less", None)
+        for other in acquired.taken:
             log.warning("control taken over", axes=sorted(other.axes), from_client=other.client, by=lease.client)
             self._lost(other, other.axes, f"taken by force by {lease.client}", ErrorCode.LEASE_EXPIRED)
         log.info("control acquired", client=lease.client, axes=sorted(lease.axes))

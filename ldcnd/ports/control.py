@@ -64,7 +64,9 @@ class GuestControl:
                 raise LeaseExpired(f"{self._name} has gone before it began")
             wanted = self._claimed.union(axes)
             if self._token is None or wanted != self.axes:
-                await self._ask(Acquire(client=self._name, axes=tuple(sorted(wanted)), lease_s=LEASE_S))
+                own = () if self._token is None else (self._token,)
+                axes = tuple(sorted(wanted))
+                await self._ask(Acquire(client=self._name, axes=axes, lease_s=LEASE_S, replaces=own))
             if self._token is None:
                 raise AssertionError("a lease that was given has a name")
             return self._token

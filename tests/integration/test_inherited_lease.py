@@ -111,9 +111,9 @@ def test_outside_of_it_what_needs_control_is_refused(rig, tmp_path):
 
 
 def test_a_program_inside_lease_hold_uses_its_control_and_leaves_it_to_its_holder(rig, monkeypatch):
-    monkeypatch.setenv("LDCND_LEASE", held(rig, "x"))
     client = rig.rig.client
     client.lease = held(rig, "x")
+    monkeypatch.setenv("LDCND_LEASE", client.lease)
 
     async def program() -> None:
         robot = Rig(client, await client.daemon())

@@ -37,8 +37,10 @@ def config(policy: LossPolicy = LossPolicy.HALT) -> RigConfig:
     return rig.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),), "authority": "leased"})
 
 
-async def acquired(rig: RunningRig, client: str, *axes: str, force: bool = False) -> LeaseReply:
-    request = Acquire(client=client, axes=axes, lease_s=60.0, force=force)
+async def acquired(
+    rig: RunningRig, client: str, *axes: str, force: bool = False, replaces: tuple[str, ...] = ()
+) -> LeaseReply:
+    request = Acquire(client=client, axes=axes, lease_s=60.0, force=force, replaces=replaces)
     return await rig.client.ask(request)
 
 
@@ -70,15 +72,17 @@ async def test_an_axis_taken_by_force_in_mid_motion_comes_to_rest():
 
 async def test_who_exchanges_a_lease_for_one_that_covers_less_stops_the_rest():
     async with running_rig(config()) as rig:
-        await jogging(rig, await acquired(rig, "ann", *BOTH), "y")
-        await acquired(rig, "ann", "x")
+        held = await acquired(rig, "ann", *BOTH)
+        await jogging(rig, held, "y")
+        await acquired(rig, "ann", "x", replaces=(held.lease,))
         assert not await jogs_on(rig, "y")
 
 
 async def test_who_exchanges_a_lease_for_one_that_covers_more_keeps_moving():
     async with running_rig(config()) as rig:
-        await jogging(rig, await acquired(rig, "ann", "y"), "y")
-        await acquired(rig, "ann", *BOTH)
+        held = await acquired(rig, "ann", "y")
+        await jogging(rig, held, "y")
+        await acquired(rig, "ann", *BOTH, replaces=(held.lease,))
         assert await jogs_on(rig, "y")
 
 
@@ -152,7 +156,7 @@ async def test_a_loss_is_rehearsed_under_a_lease_that_covers_what_it_concerns(ki
                 await rig.client.ask(mine, timeout_s=30.0)
             assert await jogs_on(rig, "x")
             assert (await rig.client.state("x")).referenced
-            whole = await acquired(rig, "ann")
+            whole = await acquired(rig, "ann", replaces=(held.lease,))
             mine = Rehearse(kind=kind, axis="x", lease=whole.lease)
         await rig.client.ask(mine, timeout_s=30.0)
         assert not await jogs_on(rig, "x")

@@ -373,12 +373,14 @@ class Play:
             await asyncio.sleep(LEASE_S / 4)
 
     async def _acquire(self, act: Act) -> None:
-        request = Acquire(client=act.who, lease_s=LEASE_S, force=bool(act.for_s))
+        own = self.leases.get(act.who)
+        request = Acquire(client=act.who, lease_s=LEASE_S, force=bool(act.for_s), replaces=(own,) if own else ())
         reply = await self.clients[act.who].ask(request, timeout_s=0.2)
         now_s, leases = self.judge.now_s, self.judge.leases
         held = Held(act.who, now_s + LEASE_S)
+        before = leases.get(own) if own else None
         for token, other in leases.items():
-            if other.client == act.who:
+            if other is before:
                 leases[token] = held if other.until_s > now_s else other  # what it has replaced holds with it
             else:
                 other.until_s = min(other.until_s, now_s)

@@ -29,7 +29,7 @@ def test_an_open_rig_moves_for_all_until_somebody_takes_control():
 
 
 def test_a_lease_covers_what_it_names_and_says_who_sends(leased):
-    lease, _ = leased.acquire("ann", ["x"], 1.0, 0.0, force=False)
+    lease = leased.acquire("ann", ["x"], 1.0, 0.0, force=False).lease
 
     assert leased.admit("x", lease.token, None, 0.9) == "ann"
     with pytest.raises(LeaseHeld, match="does not cover axis y"):
@@ -37,7 +37,7 @@ def test_a_lease_covers_what_it_names_and_says_who_sends(leased):
 
 
 def test_a_lease_that_names_nothing_covers_the_rig(leased):
-    lease, _ = leased.acquire("ann", [], 1.0, 0.0, force=False)
+    lease = leased.acquire("ann", [], 1.0, 0.0, force=False).lease
 
     assert lease.axes == {"x", "y"}
 
@@ -45,7 +45,7 @@ def test_a_lease_that_names_nothing_covers_the_rig(leased):
 def test_the_next_end_is_the_earliest_one(leased):
     assert leased.next_end_s() == float("inf")
     leased.acquire("ann", ["x"], 5.0, 0.0, force=False)
-    sooner, _ = leased.acquire("ben", ["y"], 1.0, 0.0, force=False)
+    sooner = leased.acquire("ben", ["y"], 1.0, 0.0, force=False).lease
 
     assert leased.next_end_s() == 1.0
     leased.renew(sooner.token, 0.5)
@@ -55,7 +55,7 @@ def test_the_next_end_is_the_earliest_one(leased):
 
 
 def test_a_renewed_lease_lives_on_and_an_old_one_is_stale(leased):
-    lease, _ = leased.acquire("ann", ["x"], 1.0, 0.0, force=False)
+    lease = leased.acquire("ann", ["x"], 1.0, 0.0, force=False).lease
     leased.renew(lease.token, 0.8)
     leased.admit("x", lease.token, None, 1.7)
 
@@ -68,7 +68,7 @@ def test_a_renewed_lease_lives_on_and_an_old_one_is_stale(leased):
 
 
 def test_a_lease_has_ended_even_before_anybody_looked(leased):
-    lease, _ = leased.acquire("ann", ["x"], 1.0, 0.0, force=False)
+    lease = leased.acquire("ann", ["x"], 1.0, 0.0, force=False).lease
 
     with pytest.raises(LeaseExpired):
         leased.admit("x", lease.token, None, 1.0)
@@ -82,7 +82,7 @@ def test_a_made_up_lease_is_unknown(leased):
 
 
 def test_old_numbers_under_a_lease_are_refused(leased):
-    lease, _ = leased.acquire("ann", ["x"], 1.0, 0.0, force=False)
+    lease = leased.acquire("ann", ["x"], 1.0, 0.0, force=False).lease
     leased.admit("x", lease.token, 5, 0.1)
 
     for number in (5, 4, 0):
@@ -93,29 +93,29 @@ def test_old_numbers_under_a_lease_are_refused(leased):
 
 
 def test_control_is_taken_over_only_by_force(leased):
-    first, _ = leased.acquire("ann", ["x"], 1.0, 0.0, force=False)
+    first = leased.acquire("ann", ["x"], 1.0, 0.0, force=False).lease
     with pytest.raises(LeaseHeld, match="ann"):
         leased.acquire("bob", ["x", "y"], 1.0, 0.1, force=False)
     assert leased.holder("y") is None
 
-    second, displaced = leased.acquire("bob", ["x"], 1.0, 0.1, force=True)
+    second = leased.acquire("bob", ["x"], 1.0, 0.1, force=True)
 
-    assert displaced == [first]
-    assert leased.holder("x") == second
+    assert (second.own, second.taken) == ((), (first,))
+    assert leased.holder("x") == second.lease
     with pytest.raises(LeaseExpired):
         leased.admit("x", first.token, None, 0.2)
 
 
-def test_the_holder_may_acquire_again(leased):
-    first, _ = leased.acquire("ann", ["x"], 1.0, 0.0, force=False)
+def test_who_has_the_token_may_acquire_again(leased):
+    first = leased.acquire("ann", ["x"], 1.0, 0.0, force=False).lease
 
-    second, displaced = leased.acquire("ann", ["x"], 1.0, 0.5, force=False)
+    second = leased.acquire("ann", ["x"], 1.0, 0.5, force=False, replaces=[first.token])
 
-    assert (displaced, leased.holder("x")) == ([first], second)
+    assert (second.own, second.taken, leased.holder("x")) == ((first,), (), second.lease)
 
 
 def test_a_released_axis_is_free(leased):
-    lease, _ = leased.acquire("ann", ["x"], 1.0, 0.0, force=False)
+    lease = leased.acquire("ann", ["x"], 1.0, 0.0, force=False).lease
 
     leased.release(lease.token, 0.5)
 

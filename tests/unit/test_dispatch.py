@@ -1,6 +1,7 @@
 """Who may command an axis, how often, and what becomes of it: dispatcher, leases and requests, without a line."""
 
 import asyncio
+import contextlib
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -55,7 +56,7 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.events import CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.leases import Acquire, LeaseReply, ListHolders, Release, Renew
 from ldcnd.contract.questions import Preview, Why
-from ldcnd.contract.rig_commands import AxisMove, MoveTogether, Rehearsal, Rehearse
+from ldcnd.contract.rig_commands import AxisMove, MoveTogether, Rehearsal, Rehearse, SetSpeedOverride
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.dispatch import PENDING_REQUESTS, Dispatcher, Requests
 from ldcnd.daemon.leases import Authority
@@ -573,7 +574,7 @@ async def test_however_control_ends_what_moved_comes_to_rest(how):
         elif how == "forced":
             await rig.acquired("y", client="bob", force=True)
         elif how == "subset":
-            await rig.acquired("y")
+            await rig.acquired("y", replaces=(mine.lease,))
         else:
             await rig.send(Release(lease=mine.lease), "_")
         await asyncio.sleep(0.001)
@@ -592,7 +593,7 @@ async def test_a_renewed_or_wider_lease_keeps_what_moves_and_leave_running_lets_
         renewed = await rig.send(Renew(lease=mine.lease), "_")
         await asyncio.sleep(0.6)
         rig.dispatcher.leases.expire()
-        wider = await rig.acquired("both")
+        wider = await rig.acquired("both", replaces=(mine.lease,))
         await rig.send(Release(lease=wider.lease, leave_running=True), "_")
         await asyncio.sleep(0.001)
 
@@ -606,7 +607,7 @@ async def test_a_lease_that_is_exchanged_for_another_keeps_what_moves_and_one_th
     async with commanded() as rig:
         first = await rig.acquired("x")
         await moving(rig, first.lease)
-        await rig.acquired("x", client="ann" if mine else "bob", force=True)
+        await rig.acquired("x", force=True, replaces=(first.lease,) if mine else ())
         await asyncio.sleep(0.001)
 
         assert rig.x.drive.calls == ([] if mine else ["stop"])
@@ -745,6 +746,20 @@ async def test_a_stop_of_the_rig_latches_every_axis_and_enters_one_event_for_eac
         assert rig.answers[0]["confirmed"] == ["x"]
         assert rig.page() == [("x", "stop", "done"), ("y", "stop", "unknown")]
         assert rig.wire[-1] == b"@stop {}"
+
+
+async def test_no_reader_of_the_wire_log_can_command_with_what_it_contains():
+    async with commanded(required=True) as rig:
+        held = (await rig.acquired("both")).lease
+        again = (await rig.acquired("both", replaces=(held,))).lease
+        moves = tuple(AxisMove(axis=name, position=1.0, lease=held) for name in ("x", "y"))
+        for command in (MoveTogether(moves=moves), SetSpeedOverride(percent=50.0, leases=(held, again))):
+            with contextlib.suppress(LdcndError):
+                await rig.send(command, "_")
+        noted = b"".join(rig.wire)
+        assert all(verb in noted for verb in (b"_/acquire", b"replaces", b"_/move_together", b"_/set_speed_override"))
+        assert held.encode() not in noted
+        assert again.encode() not in noted
 
 
 async def test_commands_are_noted_on_the_wire_log_and_questions_are_not():
