@@ -16,6 +16,8 @@ from ldcnd.contract.fault_pages import codes
 from tests.support.pages import ROOT
 from tools.schemas import all_schemas
 
+pytestmark = pytest.mark.timeout(300)  # the first test of a worker builds wheel and sdist
+
 NOT_SOURCE = shutil.ignore_patterns(".git", ".venv*", "build", "dist", "state", "__pycache__", ".*_cache", ".hyp*")
 EPOCH = "1700000000"
 RUNTIME_EXTRAS = {"bench", "console", "fast", "foxglove", "journal", "lab", "ops", "plot", "tui"}
