@@ -293,6 +293,7 @@ BY_VERB: Mapping[Verb, Needs] = {
     Verb.MOVE_ABSOLUTE: Needs((*STILL, check_referenced), TO_MOVE),
     Verb.TRACK: Needs((*STILL, check_referenced), TO_MOVE),
     Verb.RESET: Needs((check_reachable, check_stop_confirmed, check_stands, check_not_forced)),
+    Verb.SET_OUTPUTS: Needs((check_reachable, check_not_latched)),  # what hangs on them may move, as on a module's
     Verb.SET_POSITION: Needs((check_reachable, check_stands, check_position_kept)),
     Verb.TRACE: Needs(at_packet=(check_reachable,)),
     Verb.TRACE_ABORT: Needs(),

@@ -71,12 +71,12 @@ TABLE = {
     "homing": BUSY,
     "tracking": BUSY | {"track": TAKEN},
     "pwm": BUSY | {"set_pwm": TAKEN},
-    "latched": row(motions=LATCHED, power_on=LATCHED),
-    "stopping, latched": row(motions=LATCHED, power_on=LATCHED, set_position=WRONG, reset=WRONG),
-    "stop pending": row(motions=LATCHED, power_on=LATCHED, reset=LATCHED),
+    "latched": row(motions=LATCHED, power_on=LATCHED, set_outputs=LATCHED),
+    "stopping, latched": row(motions=LATCHED, power_on=LATCHED, set_outputs=LATCHED, set_position=WRONG, reset=WRONG),
+    "stop pending": row(motions=LATCHED, power_on=LATCHED, set_outputs=LATCHED, reset=LATCHED),
     "error": row(motions=WRONG, power_on=WRONG),
     "error, moving": row(motions=WRONG, power_on=WRONG, reset=WRONG),
-    "error, latched": row(motions=LATCHED, power_on=LATCHED),
+    "error, latched": row(motions=LATCHED, power_on=LATCHED, set_outputs=LATCHED),
     "away": dict.fromkeys(COMMANDS, AWAY) | {"halt": TAKEN, "power off": TAKEN},
 }
 
