@@ -64,11 +64,16 @@ class PollMissed:
 
 @dataclass(frozen=True, slots=True)
 class DriveLost:
-    """The drive is gone: nothing is known any more, and nothing resumes. Its fields are those of `PollMissed`."""
+    """The drive is gone: nothing is known any more, and nothing resumes. The first fields are those of `PollMissed`.
+
+    Attributes:
+        asked: it was asked in vain; otherwise one that was never heard is not missed before its line is up.
+    """
 
     now_ns: int
     another: bool
     before: str = ""
+    asked: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -382,7 +382,7 @@ class AxisReadings:
     def _count_miss(self) -> None:
         before, now_ns = self._tracker.status, self._clock.now_ns()
         status = self._tracker.take(PollMissed(now_ns, self._proof.is_another, self._proof.blocked_by))
-        if status.link is not before.link:
+        if status.link is not before.link or status.faults != before.faults:
             log.warning("drive does not answer", axis=self._name, link=status.link.value)
             if status.link is LinkState.DOWN:
                 self.history.forget()

@@ -256,7 +256,7 @@ def _see_loop(status: AxisStatus, event: LoopSeen) -> AxisStatus:
 def _miss(status: AxisStatus, event: PollMissed) -> AxisStatus:
     status = _with(status, misses=min(status.misses + 1, MISSES_UNTIL_DOWN))
     if status.misses >= MISSES_UNTIL_DOWN:
-        return _lose_drive(status, DriveLost(event.now_ns, event.another, event.before))
+        return _lose_drive(status, DriveLost(event.now_ns, event.another, event.before, asked=True))
     return replace(status, link=LinkState.DEGRADED) if status.link is LinkState.UP else status
 
 
@@ -266,7 +266,7 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
     fault = NOT_IDENTIFIED if event.another else lost
     if not was_up and any(entry.code == fault.code for entry in status.faults):
         return _with_faults(status, (fault,), event.now_ns)  # what is before it is known by now, or answers again
-    if not was_up and not event.another:
+    if not was_up and not event.another and not event.asked:
         return status
     # a counter that is not read may have been set, so what it shows later is no place
     status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=NOTHING_SEEN)

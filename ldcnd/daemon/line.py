@@ -358,6 +358,8 @@ class BusService:
         for axis in self.axes:
             trusted = axis.config.reference == "at_reset" and axis.config.name in report.placed and not self._was_up
             axis.connected(placed=trusted)
+            if not axis.readings.are_of_the_drive:
+                axis.disconnected()  # the others of its line are served without it
             self._poll(axis, now_s)
         for watch in self.network.watches:
             self.bus.add_poller(watch)

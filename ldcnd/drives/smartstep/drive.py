@@ -187,6 +187,8 @@ class SmartStepAxis(PollsItself):
             listeners.monitored(value, timing)
 
         def history(words: tuple[int, ...]) -> bool:
+            if not self.words.is_identified:
+                return False
             added = self._history.take(words)
             for word in added or ():
                 known = alarm(word)
@@ -195,7 +197,7 @@ class SmartStepAxis(PollsItself):
             return added is None
 
         def audited(place: int, value: int) -> bool:
-            return self._audit.read(place, value)
+            return self.words.is_identified and self._audit.read(place, value)
 
         self._poller = UnitPoller(
             self._bus,

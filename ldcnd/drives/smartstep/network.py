@@ -8,13 +8,23 @@ Source: manual 2.1, 2.2.
 
 import asyncio
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from collections.abc import Set as AbstractSet
 from typing import Any
 
 from typing_extensions import override
 
-from ldcnd.contract.errors import DriveFault, NetworkMismatch, ReplyTimeout, TransportLost, WrongState
+from ldcnd.contract.errors import (
+    BadReply,
+    BusBusy,
+    BusDown,
+    DriveFault,
+    LdcndError,
+    NetworkMismatch,
+    ReplyTimeout,
+    TransportLost,
+    WrongState,
+)
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.network import BringUpReport, Network
 from ldcnd.drives.smartstep import commands
@@ -35,6 +45,8 @@ from ldcnd.log import get_logger
 
 BAUD = 9600
 """The only rate (manual 2.1)."""
+OF_THE_LINE = (BusDown, BusBusy, TransportLost, NetworkMismatch)
+"""Errors that are not of one unit: the line was lost, or its wiring is wrong."""
 
 
 class SmartStepPort(Transport):
@@ -182,21 +194,8 @@ class SmartStepNetwork(Network):
         for unit in self._units.values():
             unit.wires_checked = False
             unit.words.forget()
-        for number, unit in self._units.items():
-            try:
-                await self._bus.execute(commands.with_response_time(commands.probe(number), unit.profile))
-            except ReplyTimeout:
-                remarks.append(f"unit {number} (axis {unit.spec.name}) does not answer")
-                continue
-            self._answering.append(number)
-            try:
-                # first: what follows reads words that may be zero
-                await self._check_wires(unit)
-                unit.wires_checked = True
-                remarks += await self._meet(unit)
-            # one unit must not keep the others of its line from being served
-            except (ReplyTimeout, DriveFault) as error:
-                remarks.append(f"unit {number} (axis {unit.spec.name}): {error.message}")
+        for unit in self._units.values():
+            remarks += await self._greet(unit)
         name = self._bus.settings.name
         if not self._answering:
             raise NetworkMismatch(
@@ -210,6 +209,59 @@ class SmartStepNetwork(Network):
             reset=False,
             remarks=tuple(remarks),
         )
+
+    @override
+    def incomplete(self) -> bool:
+        return any(unit.words.nonsense for unit in self._units.values())
+
+    @override
+    async def rejoin(
+        self, restarted: Callable[[str], None], heard: Callable[[str], None] = lambda _: None
+    ) -> frozenset[str]:
+        """See `Network`: ask again who has answered nonsense; a silent one is found by its polls."""
+        found = set()
+        for unit in self._units.values():
+            if not unit.words.nonsense:
+                continue
+            for remark in await self._greet(unit):
+                log.debug("unit asked again", unit=unit.spec.address, remark=remark)
+            if unit.wires_checked and not unit.words.nonsense:
+                found.add(unit.spec.name)
+                heard(unit.spec.name)
+        return frozenset(found)
+
+    @property
+    @override
+    def problem(self) -> str:
+        return "; ".join(_answers_nonsense(unit) for unit in self._units.values() if unit.words.nonsense)
+
+    async def _greet(self, unit: SmartStepAxis) -> list[str]:
+        """Find out what answers at the number of a unit, and whether it may be asked; return what deserves attention.
+
+        Raises:
+            NetworkMismatch: it takes its own replies for commands.
+            BusError: the line failed.
+        """
+        who, number = f"unit {unit.spec.address} (axis {unit.spec.name})", unit.spec.address
+        heard = False
+        try:
+            await self._bus.execute(commands.with_response_time(commands.probe(number), unit.profile))
+            heard = True
+            if number not in self._answering:
+                self._answering.append(number)
+            # first: what follows reads words that may be zero
+            await self._check_wires(unit)
+            unit.wires_checked, unit.words.nonsense = True, ""
+            return await self._meet(unit)
+        except OF_THE_LINE:
+            raise
+        except (BadReply, DriveFault) as error:  # no drive of this family answers so, or lacks these words
+            unit.words.refuse(error.message)
+            return [_answers_nonsense(unit)]
+        # one unit must not keep the others of its line from being served
+        except LdcndError as error:
+            silent = not heard and isinstance(error, ReplyTimeout)
+            return [f"{who} does not answer" if silent else f"{who}: {error.message}"]
 
     async def _check_wires(self, unit: SmartStepAxis) -> None:
         """Refuse a line on which a drive receives its own replies, before a word is read that may be zero.
@@ -249,6 +301,11 @@ class SmartStepNetwork(Network):
         if FunctionSwitch.PARAMETERS_RULE not in function_switches(await words.read(Register.FUNCTION_SWITCHES)):
             remarks.append(f"{who}: its switches seem to overrule parameters (switch 6 is off)")
         return remarks
+
+
+def _answers_nonsense(unit: SmartStepAxis) -> str:
+    number, axis = unit.spec.address, unit.spec.name
+    return f"unit {number} (axis {axis}) does not answer as a SmartStep does: {unit.words.nonsense}"
 
 
 async def hears_itself(bus: Bus, unit: SmartStepAxis) -> bool:

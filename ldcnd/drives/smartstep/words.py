@@ -71,12 +71,14 @@ class Words:
     Attributes:
         self_hearing: the drive takes its own replies for commands. A zero word, or the reply to a setting, makes it
             answer itself without end, so nothing more is sent.
+        nonsense: how something has answered at its number that is no drive of this family; empty otherwise.
     """
 
     def __init__(self, bus: Bus, axis: str, unit: int, profile: SmartStepProfile) -> None:
         self.axis = axis
         self.unit = unit
         self.self_hearing = False
+        self.nonsense = ""
         self._bus = bus
         self._profile = profile
         self._proof = bus.proofs.expect(unit, f"axis {axis}", axis)
@@ -108,6 +110,11 @@ class Words:
         return answer
 
     @property
+    def is_identified(self) -> bool:
+        """Whether what answers is known to be the drive; otherwise its words say nothing about it."""
+        return self._proof.holds
+
+    @property
     def is_lost(self) -> bool:
         """Whether the line has given the drive up because it was silent; it counts again once it was identified."""
         return not (self._proof.holds or self._proof.is_another)
@@ -115,6 +122,12 @@ class Words:
     def forget(self) -> None:
         """The line comes up: any drive may be there."""
         self._type = None
+        self.nonsense = ""
+
+    def refuse(self, problem: str) -> None:
+        """What answers at this number is no drive of this family: nothing that it says identifies it."""
+        self.nonsense = problem
+        self._proof.lose(problem, silent=False)
 
     async def identify(self) -> None:
         """Read which drive answers, unless that is known.
@@ -127,6 +140,8 @@ class Words:
 
     def identified(self, type_word: int) -> None:
         """Take the driver type that was read: another one than before is another drive."""
+        if self.nonsense:
+            return
         # the first one after the line came up is believed: nothing tells drives of one type apart
         if self._type in (None, type_word):
             self._type = type_word
