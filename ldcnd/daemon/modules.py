@@ -48,7 +48,7 @@ class Situation(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Wanted:
+class WantedLevel:
     """A level that an output is to have by a situation.
 
     Attributes:
@@ -143,8 +143,8 @@ class ModuleService:
         self._clock = clock
         self._topic = publisher.item(driver.name, TelemetryItem.IO)
         self._misses = 0
-        self._wanted: dict[str, Wanted] = {}  # of outputs by name what is yet to be written, the newest last
-        self._called_for: dict[str, Wanted] = {}  # what a situation has called for last, written or not
+        self._wanted: dict[str, WantedLevel] = {}  # of outputs by name what is yet to be written, the newest last
+        self._called_for: dict[str, WantedLevel] = {}  # what a situation has called for last, written or not
         self._words = count(1)
         self._applying = asyncio.Lock()
         self._due = asyncio.Event()
@@ -398,7 +398,7 @@ class ModuleService:
             level = situation.level_of(output)
             if level is not None:
                 self._wanted.pop(name, None)
-                self._wanted[name] = self._called_for[name] = Wanted(level, situation, word)
+                self._wanted[name] = self._called_for[name] = WantedLevel(level, situation, word)
                 self._due.set()
 
     async def run(self) -> None:
@@ -426,7 +426,7 @@ class ModuleService:
                 complete = await self._write_one(name, wanted) and complete
         return complete
 
-    async def _write_one(self, name: str, wanted: Wanted) -> bool:
+    async def _write_one(self, name: str, wanted: WantedLevel) -> bool:
         def still_wanted() -> None:
             if self._wanted.get(name) is not wanted:
                 raise CommandAborted(f"output {name} is to have another level since", value=name)
