@@ -3,10 +3,12 @@
 import asyncio
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from enum import StrEnum
+from itertools import count
 
 from ldcnd.axis.clock import Clock
-from ldcnd.contract.errors import BusError, LdcndError, MalformedRequest, ValueOutOfRange
+from ldcnd.contract.errors import BusError, CommandAborted, LdcndError, MalformedRequest, ValueOutOfRange
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.health import ModuleHealth
 from ldcnd.contract.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer
@@ -43,6 +45,21 @@ class Situation(StrEnum):
         group, _, key = self.value.rpartition(".")
         level: OutputLevel = getattr(output.loss if group else output, key)
         return None if level == "keep" else level == "high"
+
+
+@dataclass(frozen=True, slots=True)
+class WantedLevel:
+    """A level that an output is to have by a situation.
+
+    Attributes:
+        level: true for high.
+        situation: that calls for it.
+        word: its number among all that was said of the outputs of its module: the highest is the newest.
+    """
+
+    level: bool
+    situation: Situation
+    word: int
 
 
 class NamedInput:
@@ -126,7 +143,10 @@ class ModuleService:
         self._clock = clock
         self._topic = publisher.item(driver.name, TelemetryItem.IO)
         self._misses = 0
-        self._situations: dict[Situation, None] = {}  # whose levels are yet to be written, the oldest first
+        self._wanted: dict[str, WantedLevel] = {}  # of outputs by name what is yet to be written, the newest last
+        self._called_for: dict[str, WantedLevel] = {}  # what a situation has called for last, written or not
+        self._words = count(1)
+        self._applying = asyncio.Lock()
         self._due = asyncio.Event()
         self._seen = False
         self._writes = asyncio.Lock()
@@ -231,14 +251,42 @@ class ModuleService:
         Raises:
             MalformedRequest: a line is named twice.
             ValueOutOfRange: there is no such name.
+            CommandAborted: a situation has called for another level of one of them since this was asked for.
             LdcndError: as `IoDriver.set_outputs`, as the condition, or as an interlock.
         """
         high, low, inputs = (self._numbers(lines) for lines in (command.high, command.low, command.inputs))
         levels: dict[int, bool] = dict.fromkeys(high, True) | dict.fromkeys(low, False)
         if twice := sorted(set(high) & set(low)):
             raise MalformedRequest(f"module {self.name}: line {twice[0]} cannot be high and low", value=twice[0])
-        reading = await self._write(levels, frozenset(inputs), (command.pwm1, command.pwm2), condition)
+        word = next(self._words)
+        named = [self._names[line] for line in (*levels, *inputs) if line in self._names]
+
+        def still_wanted() -> None:
+            condition()
+            for name in named:
+                self._check_newest(name, word)
+
+        reading = await self._write(levels, frozenset(inputs), (command.pwm1, command.pwm2), still_wanted)
+        for name in named:
+            if (wanted := self._wanted.get(name)) and wanted.word < word:
+                del self._wanted[name]
+                log.info("level not written", module=self.name, output=name, of=wanted.situation.value, why="set since")
         return self._replied(reading)
+
+    def _check_newest(self, name: str, word: int) -> None:
+        """Refuse what was asked of an output before a situation has called for a level of it.
+
+        Raises:
+            CommandAborted: it has.
+        """
+        newer = self._called_for.get(name)
+        if newer and newer.word > word:
+            raise CommandAborted(
+                f"module {self.name}: since this was asked for, {newer.situation.value} has called for output {name}"
+                f" {_word(newer.level)}",
+                value=name,
+                remedy="set it again if it is still wanted",
+            )
 
     def _replied(self, reading: IoReading) -> IoReply:
         names = {name: line for name, line in self._lines.items() if not name.isdigit()}
@@ -341,23 +389,25 @@ class ModuleService:
         self._link_events.back()
 
     def enter(self, situation: Situation) -> None:
-        """Have the outputs written that have a level in a situation, once the module is within reach."""
-        if any(situation.level_of(output) is not None for output in self._outputs.values()):
-            self._situations.pop(situation, None)
-            self._situations[situation] = None  # behind the others: what has happened last has the last word
-            self._due.set()
+        """Have the outputs written that have a level in a situation, once the module is within reach.
+
+        What an earlier situation has called for, and what clients have asked for before, is not written any more.
+        """
+        word = next(self._words)
+        for name, output in self._outputs.items():
+            level = situation.level_of(output)
+            if level is not None:
+                self._wanted.pop(name, None)
+                self._wanted[name] = self._called_for[name] = WantedLevel(level, situation, word)
+                self._due.set()
 
     async def run(self) -> None:
         """Write what situations call for, until cancelled."""
         while True:
             await self._due.wait()
             self._due.clear()
-            while self._situations and self._reading is not None:
-                situation = next(iter(self._situations))
-                del self._situations[situation]  # before it is written: it may come again meanwhile
-                if not await self.apply(situation):
-                    if situation not in self._situations:
-                        self._situations = {situation: None} | self._situations
+            while self._wanted and self._reading is not None:
+                if not await self._write_wanted():
                     await asyncio.sleep(APPLIED_AGAIN_S)
 
     async def apply(self, situation: Situation) -> bool:
@@ -365,23 +415,41 @@ class ModuleService:
 
         Returns False when packets were lost, or the module is out of reach.
         """
+        self.enter(situation)
+        return await self._write_wanted()
+
+    async def _write_wanted(self) -> bool:
+        """Write each level once that is still wanted when its turn comes; as `apply`."""
         complete = True
-        for name, output in self._outputs.items():
-            level = situation.level_of(output)
-            if level is None:
-                continue
-            said = f"output {name} {_word(level)}, its level of {situation.value}"
-            try:
-                await self._write({output.line: level}, frozenset(), (None, None), lambda: None)
-            except LdcndError as error:
-                complete = complete and self._driver.proof.holds and not isinstance(error, BusError)
-                log.warning("output not set", module=self.name, output=name, reason=error.message)
-                self._note(
-                    situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value
-                )
-            else:
-                self._note(situation.value, CommandStatus.DONE, said, None)
+        async with self._applying:
+            for name, wanted in list(self._wanted.items()):
+                complete = await self._write_one(name, wanted) and complete
         return complete
+
+    async def _write_one(self, name: str, wanted: WantedLevel) -> bool:
+        def still_wanted() -> None:
+            if self._wanted.get(name) is not wanted:
+                raise CommandAborted(f"output {name} is to have another level since", value=name)
+
+        if self._wanted.get(name) is not wanted:
+            return True
+        said = f"output {name} {_word(wanted.level)}, its level of {wanted.situation.value}"
+        try:
+            await self._write({self._outputs[name].line: wanted.level}, frozenset(), (None, None), still_wanted)
+        except LdcndError as error:
+            if self._wanted.get(name) is not wanted:
+                return True
+            log.warning("output not set", module=self.name, output=name, reason=error.message)
+            self._note(
+                wanted.situation.value, CommandStatus.REFUSED, f"not set: {said}: {error.message}", error.code.value
+            )
+            if not self._driver.proof.holds or isinstance(error, BusError):
+                return False
+        else:
+            self._note(wanted.situation.value, CommandStatus.DONE, said, None)
+        if self._wanted.get(name) is wanted:
+            del self._wanted[name]
+        return True
 
 
 def _word(level: bool) -> str:  # noqa: FBT001 - a level
