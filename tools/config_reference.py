@@ -47,7 +47,9 @@ def _sections(
     said = attribute_docstrings(model)
     if common is not BaseModel:
         said = attribute_docstrings(common) | said
-    title = f"{f'`[{path}]`' if path else 'Top level'}{f', family `{family}`' if family else ''}"
+    # only a line has a key of that name: what simulates one takes the family of the line that uses it
+    of_family = (f", family `{family}`" if "family" in said else f", for `{family}`") if family else ""
+    title = f"{f'`[{path}]`' if path else 'Top level'}{of_family}"
     what = (model.__doc__ or "").strip().splitlines()[0]
     about = what if not role or what.startswith(role.rstrip(".")) else role
     below = {name: inner for name, field in fields.items() if (inner := _table(field.annotation)[0])}
