@@ -47,9 +47,11 @@ class GuestModule(SimulatedModule):
         self._asked: _StatusReply | None = None
         self.neighbours: Sequence[GuestModule] = ()
         super().__init__(profile, settings)
+        self._powered_up = True  # and not reset since: it counts from where its first program finds it
 
     def restart(self) -> None:
         """A guest's Hard Reset reaches no drive."""
+        self._powered_up = False
         self._reset_here()
 
     def run(self, cycles: int) -> None:
@@ -81,6 +83,8 @@ class GuestModule(SimulatedModule):
             for named in self.neighbours:
                 if named.address == packet.data[0]:
                     return named.obey_again(packet, self._due_cycle, at_s)
+            if self._powered_up:  # modules behind the first do not hear the Hard Reset before it
+                self.restart()
         return super()._obey(packet, at_s)
 
     def drop_half_packets(self) -> None:

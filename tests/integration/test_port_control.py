@@ -211,6 +211,27 @@ async def test_after_a_hard_reset_the_program_finds_its_counter_at_zero(tmp_path
         assert shaft(rig) == pytest.approx(3000, abs=20)
 
 
+async def test_the_first_program_finds_the_counters_of_all_its_axes_at_zero(tmp_path):
+    """Modules behind the first of a chain hear no Hard Reset before they have an address: their axes went elsewhere."""
+    async with guest(tmp_path, "control") as (rig, program):
+        for axis in ("rotor", "table"):
+            await rig.client.ask(Power(on=True), axis)
+            reply = await rig.client.ask(MoveRelative(distance=2.0, velocity=5.0), axis)
+            await rig.client.wait_for_end(axis, reply.command_id)
+        before = shaft(rig, 1), shaft(rig, 2)
+        assert min(before) > COUNTS
+
+        await program.begin()
+        for address in (1, 2):
+            assert abs(position(await program.send(Packet(address, READ, POSITION)))) <= 2
+            await program.send(Packet(address, STOP, b"\x05"))
+            await program.send(load(GO_NOW, counts=500, address=address))
+            await finished(program, address)
+
+        assert shaft(rig, 1) - before[0] == pytest.approx(500, abs=10)
+        assert shaft(rig, 2) - before[1] == pytest.approx(500, abs=10)
+
+
 def home(reply):
     return int.from_bytes(bytes.fromhex(reply)[1:5], "little", signed=True)
 
