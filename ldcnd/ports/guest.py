@@ -13,10 +13,11 @@ from pydantic import ValidationError
 from typing_extensions import override
 
 from ldcnd.config.ports import GuestHost, PortConfig
-from ldcnd.contract.codec import explained
-from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, MoveRelative, Power
+from ldcnd.contract.codec import explained, rebuild_error
+from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Home, MoveRelative, Power
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.keys import RIG_ITSELF
+from ldcnd.contract.questions import Preview, PreviewReply
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import Drive
 from ldcnd.drives.ldcn.commands import Node, read_status
@@ -331,6 +332,9 @@ class Guest(Presence):
     ) -> None:
         meaning = servo.meaning(received)
         if meaning.from_rest:
+            # a drive ignores what it does not carry out: nobody's motion ends for a move that is refused
+            await take_control((axis,))
+            await self._check_speed(axis, meaning.command)
             await self._come_to_rest(axis)
             if isinstance(meaning.command, MoveRelative):
                 meaning = servo.meaning(received)  # the distance is another one from there
@@ -350,6 +354,19 @@ class Guest(Presence):
             scale = self._host.status(axis).scale
             placed = meaning.zeroes / scale.counts_per_unit - scale.position(0)
             servo.set_zero(placed * scale.counts_per_unit, meaning.zeroes)
+
+    async def _check_speed(self, axis: str, command: AxisCommand[CommandReply] | None) -> None:
+        """Refuse a motion whose speed or acceleration would be; its end is another one from where the axis stands.
+
+        Raises:
+            LdcndError: as the motion would be refused.
+        """
+        if isinstance(command, MoveRelative | Home) and command.velocity:
+            reply = await self._host.carry_out(
+                axis, Preview(velocity=command.velocity, acceleration=command.acceleration)
+            )
+            if isinstance(reply, PreviewReply) and reply.refusal:
+                raise rebuild_error(reply.refusal)
 
     async def _settled(self, axis: str) -> None:
         """Wait until a motion whose profile is over has settled: its program knows no more than that it is over."""

@@ -5,7 +5,7 @@ from contextlib import suppress
 
 import pytest
 
-from ldcnd.contract.commands import MoveRelative, Power, SetPosition, Stop
+from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, SetPosition, Stop
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders, Release
@@ -582,6 +582,32 @@ async def test_an_axis_rests_soon_however_much_a_program_has_sent_before_it_was_
 
         assert abs(shaft(rig) - before) <= 2
         assert not (await rig.client.ask(ListHolders())).holders[0].client
+
+
+async def test_a_move_of_the_program_that_is_refused_ends_nobodys_motion(tmp_path):
+    """It halted an axis without a reference first, which would move by a distance, and was refused then."""
+    async with guest(tmp_path, "control", limits={"velocity": 60.0}) as (rig, program):
+        await program.begin()
+        await rig.client.ask(Power(on=True), "rotor")
+        held = await rig.client.ask(Acquire(client="ada", axes=("rotor",), lease_s=60.0))
+        await rig.client.ask(MoveVelocity(velocity=2.0, lease=held.lease), "rotor")
+        await asyncio.sleep(1.0)
+        for control in (GO_NOW, GO_NOW | 0x40):
+            await program.send(load(control, counts=2500))
+            await asyncio.sleep(0.5)
+        assert rig.daemon.rig.axes["rotor"].tracker.status.command
+        await rig.client.ask(Halt(), "rotor")
+        await rig.until("rotor", lambda state: state.state is AxisState.STANDSTILL)
+        await rig.client.ask(Release(lease=held.lease))
+
+        await program.send(ENABLE)
+        await program.send(load(RUN_NOW, speed=2.0))
+        await asyncio.sleep(1.0)
+        await program.send(load(GO_NOW | 0x40, counts=2500, speed=500.0))
+        await asyncio.sleep(1.0)
+        before = shaft(rig)
+        await asyncio.sleep(0.5)
+        assert shaft(rig) - before == pytest.approx(COUNTS, abs=0.2 * COUNTS)
 
 
 async def test_force_on_one_axis_ends_control_of_all_until_it_is_given_back(tmp_path):
