@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import itemgetter
 from typing import Any
 
 from pydantic import ValidationError
@@ -23,7 +24,7 @@ from ldcnd.drives.driver import Drive
 from ldcnd.drives.ldcn.commands import Node, read_status
 from ldcnd.drives.ldcn.io_module import IoModule
 from ldcnd.drives.ldcn.packet import POSITION, CommandCode, StatusFlag, StatusItem, decode_packet, item_bytes
-from ldcnd.drives.ldcn.pic_io import ITEM_BYTES, IoItem, IoNode, IoStatus, read_io_status
+from ldcnd.drives.ldcn.pic_io import ITEM_BYTES, IoItem, IoNode, IoStatus, SynchInput, read_io_status
 from ldcnd.drives.ldcn.profiles import PIC_IO, Profile
 from ldcnd.drives.ldcn.received import LoadTrajectory, PlainCommand, ReceivedCommand, StopMotor
 from ldcnd.drives.ldcn.servo import LdcnAxis
@@ -70,6 +71,8 @@ class _Reached:
         waiting: what waits for its turn.
         idle: set while nothing of the guest's commands is under way.
         at_work: the command that is being carried out.
+        captured: levels and counter that the guest's latest Synch Input has found.
+        capture: reads them.
     """
 
     name: str
@@ -84,6 +87,8 @@ class _Reached:
     waiting: deque[ReceivedCommand] = field(default_factory=deque)
     idle: asyncio.Event = field(default_factory=asyncio.Event)
     at_work: ReceivedCommand | None = None
+    captured: tuple[int, int] = (0, 0)
+    capture: "asyncio.Task[None] | None" = None
 
     def about_to_move(self) -> bool:
         """Tell whether a motion of the guest has yet to begin: a drive that has the command itself would move."""
@@ -215,6 +220,8 @@ class Guest(Presence):
         with suppress(TimeoutError):
             async with asyncio.timeout(REPLY_WAIT_S):
                 await module.idle.wait()
+                if module.capture:
+                    await asyncio.wait((module.capture,))
         status = self._fresh_status(module, int(items)) if self._host.is_up() else None
         if status is None:
             async with self._share.turn():
@@ -240,6 +247,11 @@ class Guest(Presence):
 
     def _command(self, module: _Reached, command: ReceivedCommand) -> None:
         """Take energy out at once; what does more waits for its turn, or is refused."""
+        if module.outputs and isinstance(command, SynchInput):  # the registers of the module are the daemon's
+            earlier = module.capture
+            work = self._capture(module, earlier)
+            module.capture = self._group.create_task(work, name=f"guest {self._name} captures {module.name}")
+            return
         if module.servo and isinstance(command, StopMotor):
             module.servo.stopped(command.control)
         found = relief(command, self._name) if module.servo else None
@@ -259,6 +271,16 @@ class Guest(Presence):
             if module.idle.is_set():
                 module.idle.clear()
                 self._group.create_task(self._work(module), name=f"guest {self._name} commands {module.name}")
+
+    async def _capture(self, module: _Reached, earlier: "asyncio.Task[None] | None") -> None:
+        """Keep what the inputs are, behind what the guest has commanded before."""
+        if earlier:
+            await asyncio.wait((earlier,))
+        await module.idle.wait()
+        with suppress(LdcndError):  # then it keeps what it captured before, as a module that did not hear
+            async with self._share.turn():
+                found = await self._bus.execute(read_io_status(IoNode(module.node), IoItem.LEVELS | IoItem.COUNTER))
+                module.captured = (found.levels or 0, found.counter or 0)
 
     def _closes_the_loop(self, module: _Reached, found: AxisCommand[CommandReply]) -> bool:
         return isinstance(found, Halt) and not self._host.status(module.name).enabled
@@ -286,6 +308,7 @@ class Guest(Presence):
         module.waiting.clear()
         if module.outputs:
             module.outputs.restart()
+            module.captured = (0, 0)
         if module.servo:
             module.servo.hard_reset()
             if self._control and module.name in self._control.axes:
@@ -428,7 +451,7 @@ def _as_guest(module: _Reached, items: StatusItem, status: bytes, now_s: float) 
     """Return a status packet as this guest's own drive would send it now: its counter, and what it has set going."""
     servo = module.servo
     if servo is None:
-        return status
+        return _with_captured(module, int(items), status)
     told, flags = bytearray(status), servo.flags(StatusFlag(status[0]), now_s)
     told[0] = int(flags & ~StatusFlag.MOVE_DONE if module.about_to_move() else flags)
     for item, shown in ((StatusItem.POSITION, servo.counter), (StatusItem.HOME, servo.home)):
@@ -437,3 +460,17 @@ def _as_guest(module: _Reached, items: StatusItem, status: bytes, now_s: float) 
             counter = shown(POSITION.decode(bytes(told[at : at + POSITION.width])))
             told[at : at + POSITION.width] = counter.to_bytes(POSITION.width, "little", signed=True)
     return bytes(told)
+
+
+def _with_captured(module: _Reached, items: int, status: bytes) -> bytes:
+    """Return a status packet of a PIC-I/O with what its guest has captured, not with what the daemon has."""
+    told, at = bytearray(status), 1
+    for item in (1 << bit for bit in range(8) if items & 1 << bit):
+        width = module.width(item)
+        if captured := _CAPTURED.get(item):
+            told[at : at + width] = captured(module.captured).to_bytes(width, "little")
+        at += width
+    return bytes(told)
+
+
+_CAPTURED = {int(IoItem.CAPTURED_LEVELS): itemgetter(0), int(IoItem.CAPTURED_COUNTER): itemgetter(1)}

@@ -127,6 +127,8 @@ def rows(profile: Profile) -> tuple[Row, ...]:
         Row("PIC-I/O: Read Status, inputs", io(CommandCode.READ_STATUS, 1)),
         Row("PIC-I/O: Set PWM", io(CommandCode.LOAD_TRAJECTORY, 0, 0)),
         Row("PIC-I/O: Set Timer Mode", io(CommandCode.IO_CONTROL, 0)),
+        Row("PIC-I/O: Synch Input", io(CommandCode.SAVE_CURRENT_POSITION_AS_HOME)),
+        Row("PIC-I/O: Read Status, what was captured", io(CommandCode.READ_STATUS, 0xC0)),
         Row("PIC-I/O: No Operation", io(CommandCode.NO_OPERATION)),
         Row("Set Baud Rate", Packet(0xFF, CommandCode.SET_BAUD_RATE, b"\x3f")),
         Row("No Operation after it", NOP),
