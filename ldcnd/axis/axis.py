@@ -381,7 +381,7 @@ class AxisService:
             OutcomeUnknown: the drive has not confirmed it; it is sent again until it does.
         """
         if isinstance(command, Stop | QuickStop):
-            confirmed = await self.stops.stop(mode)
+            confirmed = await self.stops.stop(mode, command.verb)
         else:
             confirmed = await self.stops.bring_to_rest(mode, command.verb, command_id=permit.command_id)
         if not confirmed:

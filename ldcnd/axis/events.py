@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from ldcnd.axis.course import Pace
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, SoftLimits, Unsure
+from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import PastFault
 from ldcnd.drives.driver import AxisReading, Fault, StopMode
 
@@ -221,9 +222,10 @@ class StopLatch:
 
 @dataclass(frozen=True, slots=True)
 class StopSent:
-    """A stop is about to be sent, as the strongest of those that are not confirmed."""
+    """A stop is about to be sent, as the strongest of those that are not confirmed; `verb` asked for it."""
 
     mode: StopMode
+    verb: Verb = Verb.STOP
 
 
 @dataclass(frozen=True, slots=True)
@@ -248,6 +250,7 @@ class StopUnconfirmed:
     now_ns: int
     mode: StopMode = StopMode.SMOOTH
     how: str = "confirmed late, when the drive answered again"
+    verb: Verb = Verb.STOP
 
 
 @dataclass(frozen=True, slots=True)

@@ -131,6 +131,21 @@ class CommandEnd:
 
 
 @dataclass(frozen=True, slots=True)
+class AskedStop:
+    """One of the commands that an unconfirmed stop stands for.
+
+    Attributes:
+        verb: its name.
+        mode: how it brings the motor to rest.
+        how: why its line sends it, for the event that it was confirmed; empty while it is first on its way.
+    """
+
+    verb: Verb
+    mode: StopMode
+    how: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class OpenStop:
     """A stop that the drive has not confirmed.
 
@@ -138,12 +153,12 @@ class OpenStop:
         mode: the strongest of those that were sent or are to be.
         fault: what is published of it, from when on it was sent in vain, or is yet to be sent: nothing moves then until
             it is confirmed. None while it is on its way for the first time.
-        how: why its line sends it, for the event that it was confirmed.
+        asked: what asked for it, the first one first; each is told by its own name.
     """
 
     mode: StopMode
     fault: FaultEntry | None = None
-    how: str = ""
+    asked: tuple[AskedStop, ...] = ()
 
 
 PUBLISHED = tuple(name for name in StateSample.model_fields if name not in {"t", "t_error_ns", "seq"})

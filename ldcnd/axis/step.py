@@ -58,7 +58,7 @@ from ldcnd.axis.faults import (
     entry_of,
 )
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, shows_velocity
-from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, CommandEnd, Completion, OpenStop
+from ldcnd.axis.status import STRENGTH, ActiveCommand, AskedStop, AxisStatus, CommandEnd, Completion, OpenStop
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState
@@ -68,6 +68,8 @@ MISSES_UNTIL_DOWN = 3
 """Consecutive polls without a reply after which the drive counts as lost, or with replies that cannot be used after
 which what it does is not understood."""
 
+NAMED_STOPS = frozenset({Verb.HALT, Verb.QUICK_STOP})
+"""Commands that are under way while a drive brakes, and that are sent again by their own name."""
 WENT_ON = "sent again, because the drive went on after it was confirmed: a late reply was taken for its own"
 STRAYED = "sent because the axis was not on the way to its target"
 OUTRUN = "sent because the axis stayed faster than it was told"
@@ -118,7 +120,8 @@ def _watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) ->
         return replace(status, braking=None, driven_open=False)
     if status.driven_open and braking.mode is StopMode.OFF:
         return replace(status, braking=None, off_again=True)  # a rotor that coasts for a minute is no fault
-    return _keep_stop(replace(status, braking=None), StopUnconfirmed(event.now_ns, braking.mode, WENT_ON))
+    verb = status.command.verb if status.command and status.command.verb in NAMED_STOPS else Verb.STOP
+    return _keep_stop(replace(status, braking=None), StopUnconfirmed(event.now_ns, braking.mode, WENT_ON, verb))
 
 
 def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -429,21 +432,23 @@ def _latch(status: AxisStatus, _event: StopLatch) -> AxisStatus:
 
 
 def _send_stop(status: AxisStatus, event: StopSent) -> AxisStatus:
-    stop = status.stop
-    if stop is None:
-        return replace(status, stop=OpenStop(event.mode))
-    return (
-        status if STRENGTH[event.mode] <= STRENGTH[stop.mode] else replace(status, stop=replace(stop, mode=event.mode))
-    )
+    stop, asked = status.stop or OpenStop(event.mode), AskedStop(event.verb, event.mode)
+    known = next((each for each in stop.asked if each.verb is event.verb), None)
+    mode = max(stop.mode, event.mode, key=STRENGTH.__getitem__)
+    if known is None:
+        return replace(status, stop=replace(stop, mode=mode, asked=(*stop.asked, asked)))
+    return status if mode is stop.mode else replace(status, stop=replace(stop, mode=mode))
 
 
 def _keep_stop(status: AxisStatus, event: StopUnconfirmed) -> AxisStatus:
-    status = _send_stop(status, StopSent(event.mode))
+    status = _send_stop(status, StopSent(event.mode, event.verb))
     stop = status.stop
-    # the fault keeps the instant from which the stop was wanted
-    if stop is None or stop.fault:
+    if stop is None or (stop.fault and all(each.how for each in stop.asked)):
         return status
-    return replace(status, stop=OpenStop(stop.mode, entry_of(STOP_UNCONFIRMED, event.now_ns), event.how))
+    # the fault keeps the instant from which the stop was wanted
+    fault = stop.fault or entry_of(STOP_UNCONFIRMED, event.now_ns)
+    asked = tuple(each if each.how else replace(each, how=event.how) for each in stop.asked)
+    return replace(status, stop=OpenStop(stop.mode, fault, asked))
 
 
 def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus:
@@ -454,7 +459,10 @@ def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus
 def _confirm_stop(status: AxisStatus, event: StopConfirmed) -> AxisStatus:
     stop = status.stop
     # the acknowledgement of a halt says nothing of a power-off that was asked for meanwhile
-    return status if stop is None or STRENGTH[stop.mode] > STRENGTH[event.mode] else replace(status, stop=None)
+    if stop is None or STRENGTH[stop.mode] <= STRENGTH[event.mode]:
+        return status if stop is None else replace(status, stop=None)
+    asked = tuple(each for each in stop.asked if STRENGTH[each.mode] > STRENGTH[event.mode])
+    return status if asked == stop.asked else replace(status, stop=replace(stop, asked=asked))
 
 
 def _recall_latch(status: AxisStatus, event: LatchRecalled) -> AxisStatus:

@@ -14,7 +14,7 @@ from ldcnd.axis.latches import LatchKeeper
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Gate, Permit
 from ldcnd.axis.rest import REST_COUNTS
-from ldcnd.axis.status import AxisStatus
+from ldcnd.axis.status import AskedStop, AxisStatus
 from ldcnd.axis.telemetry import Note
 from ldcnd.axis.turns import CommandQueue
 from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Power, QuickStop, Stop, Verb
@@ -35,6 +35,8 @@ SETTLES_WITHIN_S = 0.25
 FOUND_OPEN = "switched off when its line was taken over"
 OVERTAKES = {Verb.POWER: "power off"}
 """What is said of a command that overtakes others, where it is not its name."""
+BY_MODE = {StopMode.SMOOTH: Verb.HALT, StopMode.ABRUPT: Verb.QUICK_STOP, StopMode.OFF: Verb.POWER}
+"""How that is called by which the daemon itself brings an axis to rest."""
 UNDERSTOOD_NO_MORE = {LossPolicy.QUICK_STOP: StopMode.ABRUPT, LossPolicy.POWER_OFF: StopMode.OFF}
 """How a motion is stopped that is not understood any more, by `loss.bus`; smoothly otherwise."""
 
@@ -93,8 +95,8 @@ class AxisStops:
         motion.tracker.watch(self._watch, "stop", "off_again")
         self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
 
-    async def stop(self, mode: StopMode) -> bool:
-        """Stop at once, whatever the state, and latch; return whether the drive confirmed it.
+    async def stop(self, mode: StopMode, verb: Verb = Verb.STOP) -> bool:
+        """Stop at once, whatever the state, and latch; return whether the drive confirmed it; see `bring_to_rest`.
 
         The latch and the new epoch hold from this call on, confirmed or not. A drive that takes no stop over its line
         is not latched either: nothing could clear that, and nothing here moves it.
@@ -103,8 +105,8 @@ class AxisStops:
             log.warning("this drive cannot be stopped over its line", axis=self._name)
             return False
         self._tracker.take(StopLatch())
-        log.info("stop", axis=self._name, mode=mode.value)
-        confirmed = await self.bring_to_rest(mode, Verb.STOP)
+        log.info(verb.value, axis=self._name, mode=mode.value)
+        confirmed = await self.bring_to_rest(mode, verb)
         if self.latches:
             await self.latches.settled()
         return confirmed
@@ -115,21 +117,22 @@ class AxisStops:
         return self.latches is not None and self.latches.holds(self._name)
 
     async def bring_to_rest(
-        self, mode: StopMode, verb: Verb = Verb.HALT, by: Permit | None = None, command_id: str | None = None
+        self, mode: StopMode, verb: Verb | None = None, by: Permit | None = None, command_id: str | None = None
     ) -> bool:
         """Stop at once, before anything that waits; return whether the drive confirmed it.
 
         Args:
             mode: how.
-            verb: the command, for the events.
+            verb: the command, for the events; without one a motion was halted by the daemon.
             by: permit of the command that goes on afterwards; those of all before it are void.
             command_id: of the command that asks for it; the next one of the daemon when missing.
         """
         if not self.possible:
             return False
+        name, verb = verb or BY_MODE[mode], verb or Verb.HALT
         # before its packet: whatever comes to its turn from here on finds that it is void
         overtaken = self.overtake(by, by.verb if by else OVERTAKES.get(verb, verb))
-        stop = self._tracker.take(StopSent(mode)).stop
+        stop = self._tracker.take(StopSent(mode, name)).stop
         try:
             if not self.line_up:
                 return False  # its line is being brought up, or is down: it is the first thing that is sent then
@@ -139,7 +142,7 @@ class AxisStops:
         finally:
             # also when this is cancelled: what is not confirmed by now its line sends again
             if still := self._tracker.status.stop:
-                self.require(still.mode)
+                self.require(still.mode, still.asked[0].verb if still.asked else name)
             self._publish()
 
     def overtake(self, by: Permit | None, cause: str) -> StopLatched | CommandAborted:
@@ -149,9 +152,9 @@ class AxisStops:
         self._queue.refuse(overtaken)
         return overtaken
 
-    def require(self, mode: StopMode) -> None:
+    def require(self, mode: StopMode, verb: Verb = Verb.STOP) -> None:
         """Have a stop sent by the line, before anything else to this drive, until the drive confirms it."""
-        self._tracker.take(StopUnconfirmed(self._clock.now_ns(), mode))
+        self._tracker.take(StopUnconfirmed(self._clock.now_ns(), mode, verb=verb))
         self.wanted.set()
 
     def stop_what_is_not_understood(self, policy: LossPolicy) -> None:
@@ -168,9 +171,7 @@ class AxisStops:
             if self._tracker.status.off_again and not await self._send(StopMode.OFF, Verb.STOP, rounds=1):
                 self.require(StopMode.OFF)
             return
-        if await self._send(stop.mode, Verb.STOP, rounds=1):
-            log.warning("stop confirmed", axis=self._name, how=stop.how)
-            self._note(self._name, Verb.STOP, CommandStatus.DONE, stop.how, None)
+        await self._send(stop.mode, stop.asked[0].verb if stop.asked else Verb.STOP, rounds=1)
         self._publish()
 
     def switch_off(self) -> None:
@@ -235,9 +236,17 @@ class AxisStops:
                 self._commands.brought_to_rest(command_id or self._next_command_id(), verb)
             if not stands:
                 self._acknowledged(mode)
-            tracker.take(StopConfirmed(mode))
+            before, after = tracker.status.stop, tracker.take(StopConfirmed(mode)).stop
+            self._tell_late(before.asked if before else (), after.asked if after else ())
             return True
         return False
+
+    def _tell_late(self, before: tuple[AskedStop, ...], after: tuple[AskedStop, ...]) -> None:
+        """Tell of each command by its own name that its drive has not confirmed at first, and does now."""
+        for asked in before:
+            if asked.how and asked not in after:
+                log.warning("confirmed late", axis=self._name, verb=asked.verb.value, how=asked.how)
+                self._note(self._name, asked.verb, CommandStatus.DONE, asked.how, None)
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
         """Have a stop sent that readings call for."""

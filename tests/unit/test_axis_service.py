@@ -164,7 +164,8 @@ async def test_a_stop_is_sent_a_few_times_and_then_stays_pending_until_the_drive
         assert bench.drive.told == [("stop", StopMode.ABRUPT)]
         assert not bench.tracker.status.stop_pending
         assert bench.tracker.status.active_faults == ()
-        assert bench.notes == [(Verb.STOP, CommandStatus.DONE, "confirmed late, when the drive answered again")]
+        late = "confirmed late, when the drive answered again"
+        assert bench.notes == [(verb, CommandStatus.DONE, late) for verb in (Verb.STOP, Verb.HALT)]
 
         await bench.axis.send_pending_stop()
         assert bench.drive.calls == ["stop"]  # nothing is owed any more
