@@ -492,6 +492,10 @@ class AxisService:
     def _active_id(self) -> str | None:
         return self.tracker.status.command.command_id if self.tracker.status.command else None
 
+    def show(self) -> None:
+        """Publish the state once more; what is read is published by its polls."""
+        self.telemetry.publish_state(self.tracker.status, self._clock.now_ns(), due=True)
+
     def controlled_by(self, client: str | None) -> None:
         """Publish who controls the axis from now on; None when no client does."""
         self.telemetry.publish_state(self.tracker.take(ControlChanged(client)), self._clock.now_ns())

@@ -192,6 +192,7 @@ class AxisStatus:
         unsure: why it is not known whether the motion has begun; None when the drive has shown it.
         off_again: its line is to switch such a motor off again, because its shaft still turns.
         link: whether its drive answers.
+        was_read: it was read since this daemon began; until then `state` and `enabled` say nothing of it.
         misses: polls in a row without a reply.
         in_vain: replies in a row that could not be used.
         command: what is under way.
@@ -235,6 +236,7 @@ class AxisStatus:
     off_again: bool = False
     unsure: Unsure | None = None
     link: LinkState = LinkState.DOWN
+    was_read: bool = False
     misses: int = 0
     in_vain: int = 0
     command: ActiveCommand | None = None

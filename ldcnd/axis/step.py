@@ -97,7 +97,7 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
         faults = (*faults, OUTSIDE_LIMITS)
     # any reading ends both rows: the drive answers, and its reply can be used
     if status.misses or status.in_vain or status.link is not LinkState.UP:
-        status = replace(status, misses=0, in_vain=0, link=LinkState.UP)
+        status = replace(status, misses=0, in_vain=0, link=LinkState.UP, was_read=True)
     if status.braking:
         status = _watch_braking(status, status.braking, event)
     if faults or status.faults or status.stop:
@@ -235,7 +235,8 @@ def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     """Take a reading of a drive that others command: it alone shows whether it is disabled, stands, moves or failed."""
     reading = event.reading
     faults = (*reading.faults, DRIVE_CHANGED) if reading.altered else reading.faults
-    status = _with_faults(_with(status, misses=0, in_vain=0, link=LinkState.UP), faults, event.now_ns)
+    status = _with(status, misses=0, in_vain=0, link=LinkState.UP, was_read=True)
+    status = _with_faults(status, faults, event.now_ns)
     # such a drive shows the speed in coarse steps, and its position comes from another poll
     rest = replace(status.rest, rests=not shows_velocity(reading))
     state = AxisState.STANDSTILL if rest.rests else AxisState.DISCRETE_MOTION

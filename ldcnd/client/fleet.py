@@ -4,7 +4,7 @@ import asyncio
 
 from ldcnd.client.overview import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient, daemons, find_rigs
-from ldcnd.contract.condition import Condition, assess, assess_module, line_troubles
+from ldcnd.contract.condition import OWN, Condition, assess, assess_module, line_troubles
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth
@@ -29,8 +29,8 @@ class AxisReport(Frozen):
     """Its last faults; null before the first."""
     health: AxisHealth | None
     """How fresh its samples are; null before the first report."""
-    line_up: bool = True
-    """Its line is up."""
+    line_up: bool | None = True
+    """Its line is up; null before the first report about it."""
 
     @property
     def condition(self) -> Condition:
@@ -109,14 +109,14 @@ async def _look(session: Session, daemon: DaemonInfo, slots: asyncio.Semaphore, 
         return view.model_copy(update={"problems": (f"stopped answering: {error.message}",)})
     freshness = {axis.axis: axis for bus in buses for axis in bus.axes}
     known = {axis.axis: axis for axis in axes}  # two daemons on one rig tell of each axis twice
-    down = {bus.bus for bus in buses if not bus.up}
+    lines_up = {bus.bus: bus.up for bus in buses}
     views = tuple(
         AxisReport(
             info=axis,
             state=states.get(name),
             fault=faults.get(name),
             health=freshness.get(name),
-            line_up=axis.bus not in down,
+            line_up=lines_up.get(axis.bus),
         )
         for name, axis in known.items()
     )
@@ -146,7 +146,7 @@ def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: t
     problems += [
         f"{axis.info.axis}: {trouble.text}"
         for axis in axes
-        if axis.info.bus not in down
         for trouble in axis.condition.wrong
+        if axis.info.bus not in down or trouble.kind in OWN
     ]
     return problems

@@ -195,6 +195,10 @@ class KnownState(Protocol):
         """Whether the drive answers."""
 
     @property
+    def was_read(self) -> bool:
+        """Its drive was read since its daemon began."""
+
+    @property
     def state(self) -> AxisState:
         """PLCopen state."""
 
@@ -295,6 +299,8 @@ _OVERRIDE_ZERO = Trouble(
 _MISSED_POLLS = Trouble(TroubleKind.MISSED_POLLS, _NOTICE, "the drive missed its latest polls", "missed polls")
 _MODULE_SILENT = replace(_NO_ANSWER, text="the module does not answer; check its power and the line")
 _MODULE_MISSES = replace(_MISSED_POLLS, text="the module missed its latest polls")
+OWN = frozenset({TroubleKind.STOP_PENDING, TroubleKind.STOP_LATCHED})
+"""Troubles that the daemon itself knows of: what becomes of a line or a drive changes nothing about them."""
 SHARED = frozenset({TroubleKind.SILENCE, TroubleKind.NOT_HOMED, TroubleKind.STANDS_BY_OVERRIDE})
 """Troubles of which several axes have one cause, or which are said once for all; so is a line that is down."""
 TELL_OF_THE_PAST = frozenset({"loop_opened"})
@@ -374,11 +380,10 @@ def assess(
         dead = _OPENING if line_up is None else _ON_DEAD_LINE
         lost = (_silent(silence),) if silence else () if line_up else (dead,)
         return _unanswered("unknown", lost or (_NEVER_SEEN,), lost[0].short if lost else "no data")
-    presumed = state.link is LinkState.DOWN and state.state is AxisState.ERROR_STOP  # that only says that it is lost
-    word, last = state.state.words, "unknown, may move" if presumed else f"unknown, was {state.state.words}"
+    word, last = state.state.words, _last_known(state)
     holder = UNKNOWN_HOLDER if silence else state.holder
     control = _control(holder, moves=state.moving is Moving.YES and state.command is not None)
-    gone = _unreachable(state, faults, silence=silence, line_up=line_up is not False)
+    gone = _unreachable(state, faults, silence=silence, line_up=line_up)
     pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
     if gone:
         latched = (_LATCHED,) if state.stop_latched and not state.stop_pending and not silence else ()
@@ -392,6 +397,13 @@ def assess(
     return Condition(place, mark, word if live else last, live, alarm, troubles, holder, control, state.state.is_motion)
 
 
+def _last_known(state: KnownState) -> str:
+    """Return the state of an axis that does not answer, in words."""
+    if state.link is LinkState.DOWN and state.state is AxisState.ERROR_STOP:  # that only says that it is lost
+        return "unknown, may move"
+    return f"unknown, was {state.state.words}" if state.was_read else "unknown"
+
+
 def _unanswered(state: str, troubles: tuple[Trouble, ...], mark: str) -> Condition:
     return Condition(Place.NOT_ANSWERING, mark, state, live=False, alarm=Alarm.INVALID, troubles=troubles)
 
@@ -400,7 +412,7 @@ def _silent(why: str) -> Trouble:
     return Trouble(TroubleKind.SILENCE, _WRONG, why, "daemon silent")
 
 
-def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line_up: bool) -> Trouble | None:
+def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line_up: bool | None) -> Trouble | None:
     """Return why nothing is known of an axis; None when it answers."""
     if silence:
         return _silent(silence)
@@ -408,10 +420,12 @@ def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line
         return _NOT_IDENTIFIED
     if state.link is not LinkState.DOWN:
         return None  # a report on its line may be a second older than this
-    if not line_up:
+    if line_up is False:
         return _ON_DEAD_LINE
     lost = next((fault for fault in faults.active if fault.code == "link_lost"), None) if faults else None
-    return replace(_NO_ANSWER, text=lost.text) if lost else _NO_ANSWER
+    if lost:
+        return replace(_NO_ANSWER, text=lost.text)
+    return _OPENING if line_up is None and not state.was_read else _NO_ANSWER
 
 
 def _is_old(state: KnownState, age_s: float | None, health: AxisHealth | None) -> bool:

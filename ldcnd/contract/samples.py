@@ -331,6 +331,8 @@ class StateSample(Sample):
     """Percent of every velocity, for the whole rig; nothing moves at 0."""
     holder: str | None = UNKNOWN_HOLDER
     """The client in control of the axis; null without one, empty where that is not known."""
+    was_read: bool = True
+    """Its drive was read since its daemon began; until then the daemon shows what it has kept, and what it commands."""
 
 
 class MonitorName(StrEnum):

@@ -164,6 +164,8 @@ class Daemon:
                     group.create_task(bus.run(self._guarded), name=f"line {bus.bus.settings.name}")
                     for bus in self.rig.buses
                 ]
+                for each in self.rig.axes.values():
+                    each.show()  # what is latched and what no drive has confirmed is known before any drive is read
                 await self._declare(declared, requests)
                 serving.append(group.create_task(self._watch_axes(), name="liveliness"))
                 serving.append(group.create_task(self._latches.run(), name="latches"))

@@ -1,4 +1,4 @@
-"""How the rig is doing: gathers what the lines count and publishes it once a second."""
+"""How the rig is doing: gathers what the lines count and publishes it once a second, with axes that are not read."""
 
 import asyncio
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ from ldcnd.contract.health import (
     StopWaitHealth,
 )
 from ldcnd.contract.keys import Keys
-from ldcnd.contract.samples import TelemetryItem
+from ldcnd.contract.samples import LinkState, TelemetryItem
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.line.exchange import Lane
@@ -159,6 +159,9 @@ class HealthWatch:
         }
         for bus in self._rig.buses:
             reports[self._keys.bus_health(bus.bus.settings.name)] = self._bus(bus, t, period_s)
+        for axis in self._rig.axes.values():
+            if axis.tracker.status.link is LinkState.DOWN:
+                axis.show()  # no poll does, and its latch and its pending stop are none of its drive's
         self._seq += 1
         self._note_counters()
         self.latest = reports

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from ldcnd import systemd
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.condition import Condition, TroubleKind, assess, assess_module, line_troubles
+from ldcnd.contract.condition import OWN, Condition, TroubleKind, assess, assess_module, line_troubles
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.rig_commands import Reload, ReloadReply
 from ldcnd.contract.samples import FaultEntry, LinkState
@@ -282,8 +282,9 @@ def describe(rig: OwnedRig) -> str:
             wrong.setdefault(trouble.text, []).append(name)
         found = {axis.config.name: _condition(axis.tracker.status) for axis in bus.axes}
         found |= {name: assess_module(rig.modules[name].health) for name in bus.network.io}
-        for about, condition in found.items() if up else ():
-            for trouble in [each for each in condition.wrong if each.kind is not TroubleKind.MISSED_POLLS][:1]:
+        for about, condition in found.items():
+            lasts = [each for each in condition.wrong if each.kind is not TroubleKind.MISSED_POLLS]
+            for trouble in [each for each in lasts if up or each.kind in OWN][:1]:
                 wrong.setdefault(trouble.text, []).append(about)
     buses_up = sum(bus.report is not None for bus in rig.buses)
     axes_up = sum(axis.tracker.status.link is not LinkState.DOWN for axis in rig.axes.values())

@@ -98,7 +98,7 @@ class HealthCollector(Collector):
         yield from self._of_buses(buses)
         yield from self._of_lanes(buses)
         yield from self._of_axes(buses)
-        yield from self._of_conditions(buses)
+        yield from self._of_conditions(daemon, buses)
         yield from self._of_shadows()
 
     def _of_daemon(self, daemon: DaemonHealth | None) -> Iterator[Metric]:
@@ -172,7 +172,7 @@ class HealthCollector(Collector):
                     wear.add_metric(values, axis.eeprom_writes)
         yield from (up, age, wanted, rate, faults, wear)
 
-    def _of_conditions(self, buses: list[BusHealth]) -> Iterator[Metric]:
+    def _of_conditions(self, daemon: DaemonHealth | None, buses: list[BusHealth]) -> Iterator[Metric]:
         labels = ["rig", "axis"]
         known = GaugeMetricFamily(
             "ldcnd_axis_place_known", "1 while the position says where the axis is", labels=labels
@@ -192,29 +192,33 @@ class HealthCollector(Collector):
         pending = GaugeMetricFamily(
             "ldcnd_axis_stop_pending", "1 while a stop is not confirmed by the drive", labels=labels
         )
-        down = {axis.axis for bus in buses if not bus.up for axis in bus.axes}
+        lines_up = {axis.axis: bus.up for bus in buses for axis in bus.axes}
         reports = {axis.axis: axis for bus in buses for axis in bus.axes}
         since_s = self._now_s() - SILENT_S
         for axis, (at_s, state) in self._states.items():
-            silence = "" if at_s >= since_s else "its state is not reported any more"
             report = reports.get(axis)
+            silence = "" if report or at_s >= since_s else "its daemon does not report any more"
+            if silence and daemon:
+                continue  # the daemon of now has no such axis
             age_s = report.sample_age_s if report else None
             faults = self._faults.get(axis)
-            now = assess(state, faults, report, age_s=age_s, line_up=axis not in down, silence=silence)
+            now = assess(state, faults, report, age_s=age_s, line_up=lines_up.get(axis), silence=silence)
             known.add_metric([self._rig, axis], float(now.place is Place.KNOWN))
             severity.add_metric([self._rig, axis], now.alarm)
             for note in dict.fromkeys((*([now.mark] if now.mark else []), *(each.short for each in now.troubles))):
                 condition.add_metric([self._rig, axis, note], 1.0)
             if now.control:
                 control.add_metric([self._rig, axis, now.control], 1.0)
-            if silence or axis in down:
+            if silence:
+                continue
+            latched.add_metric([self._rig, axis], float(state.stop_latched))
+            pending.add_metric([self._rig, axis], float(state.stop_pending))
+            if not lines_up.get(axis, True):
                 continue  # the last state of an axis that is not heard is not its state
             for each in AxisState:
                 state_is.add_metric([self._rig, axis, each.value], float(state.state is each))
             if state.has_reference:
                 referenced.add_metric([self._rig, axis], float(state.referenced))
-            latched.add_metric([self._rig, axis], float(state.stop_latched))
-            pending.add_metric([self._rig, axis], float(state.stop_pending))
         travelled = CounterMetricFamily(
             "ldcnd_axis_travelled_counts", "Encoder counts travelled since this exporter began", labels=labels
         )
