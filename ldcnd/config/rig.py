@@ -1,23 +1,20 @@
 """The configuration file: TOML, validated whole before anything is opened."""
 
-from collections.abc import Iterator, Mapping
-from contextlib import suppress
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self
 
 from pydantic import Field, SerializeAsAny, model_validator
 
 from ldcnd.config.interlocks import InterlockConfig, check_interlocks
 from ldcnd.config.ports import PortConfig, check_ports
+from ldcnd.config.quantities import with_units
 from ldcnd.config.sequences import check_sequences
 from ldcnd.config.simulated import SimulatedLine, simulator
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.number_text import NotANumber
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig
-from ldcnd.contract.units import DIMENSIONS, AxisUnits, Dimension, converts, read_quantity
 from ldcnd.drives import known
-from ldcnd.drives.axis_config import QUANTITIES, units_of_table
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.toml import NAME_CHARACTERS, Name, Variants, read_toml, refuse_duplicates
 
@@ -196,62 +193,6 @@ def example(name: str) -> Path:
     return (folder if folder.is_dir() else package.parent / "config") / name
 
 
-def _with_units(document: dict[str, Any]) -> dict[str, Any]:
-    """Put numbers that are written with a unit, or meant in another one than that of their axis, into that of the axis.
-
-    Raises:
-        NotANumber: a text is none, or its unit does not fit; says where.
-    """
-    known: dict[str, AxisUnits] = {}
-    for bus_at, bus in _tables(document, "bus"):
-        for axis_at, axis in _tables(bus, "axis"):
-            with suppress(ValueError):  # what is wrong with its units is refused with the rest
-                known[axis.get("name", "")] = units_of_table(axis)
-            _convert(axis, known.get(axis.get("name", "")), QUANTITIES, f"bus[{bus_at}].axis[{axis_at}]")
-    for rule_at, rule in _tables(document, "interlock"):
-        where = f"interlock[{rule_at}]"
-        _convert(rule, known.get(rule.get("of", "")), {"above": Dimension.VELOCITY}, where)
-        for at, each in _tables(rule, "requires"):
-            _convert(each, known.get(each.get("axis", "")), _REQUIRED, f"{where}.requires[{at}]")
-    for at, position in _tables(document, "position"):
-        places = position.get("axes")
-        for axis in places if isinstance(places, dict) else ():
-            _convert(position, known.get(axis), {f"axes.{axis}": Dimension.POSITION}, f"position[{at}]")
-    for at, sequence in _tables(document, "sequence"):
-        for step_at, step in _tables(sequence, "step"):
-            if isinstance(given := step.get("arguments"), dict):
-                where = f"sequence[{at}].step[{step_at}].arguments"
-                _convert(given, known.get(step.get("axis", "")), DIMENSIONS, where)
-    return document
-
-
-_REQUIRED = {"below": Dimension.VELOCITY, "min": Dimension.POSITION, "max": Dimension.POSITION}
-
-
-def _tables(document: dict[str, Any], key: str) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Yield the tables of a list with their places; what is none is refused later."""
-    found = document.get(key)
-    for at, each in enumerate(found if isinstance(found, list) else ()):
-        if isinstance(each, dict):
-            yield at, each
-
-
-def _convert(table: dict[str, Any], units: AxisUnits | None, quantities: Mapping[str, Dimension], where: str) -> None:
-    if units is None:
-        return
-    for path, dimension in quantities.items():
-        *inner, key = path.split(".")
-        holder = table.get(inner[0]) if inner else table
-        value = holder.get(key) if isinstance(holder, dict) else None
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not isinstance(holder, dict) or not (isinstance(value, str) or (is_number and converts(units, dimension))):
-            continue
-        try:
-            holder[key] = read_quantity(str(value), units, dimension)
-        except NotANumber as error:
-            raise NotANumber(f"{where}.{path}: {error}") from None
-
-
 def load_config(path: Path) -> RigConfig:
     """Read and validate a rig's configuration.
 
@@ -260,7 +201,7 @@ def load_config(path: Path) -> RigConfig:
             allowed.
     """
     try:
-        rig = read_toml(path, RigConfig, _with_units)
+        rig = read_toml(path, RigConfig, with_units)
     except NotANumber as error:
         raise ConfigError(f"{path}: {error}") from error
     if rig.zenoh.config_file is None:

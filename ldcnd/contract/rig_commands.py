@@ -381,7 +381,7 @@ class ConfigChange(Frozen):
     key: str
     """Path of the key, such as `bus.line0.axis.x.limits.velocity`."""
     before: str | None
-    """Value that the daemon runs with; null where there is none."""
+    """Value that the daemon runs with, a number of an axis with the unit that people read; null where there is none."""
     after: str | None
     """Value in the file; null where there is none."""
     restart: bool

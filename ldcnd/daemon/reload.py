@@ -8,13 +8,14 @@ where drives are, what they are, or how the daemon was built, and needs a restar
 import asyncio
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
-from pydantic import BaseModel, ValidationError
+from pydantic import ValidationError
 
 from ldcnd.config.plan import require_plan
+from ldcnd.config.quantities import ReadQuantity, as_people_read
 from ldcnd.config.rig import RigConfig
 from ldcnd.contract.errors import ConfigError, WrongState
 from ldcnd.contract.plan import RigBudget
@@ -164,10 +165,8 @@ def plan_reload(running: RigConfig, wanted: RigConfig) -> ReloadPlan:
     config = running.model_copy(
         update={"bus": buses, "position": wanted.position, "sequence": wanted.sequence}  # of clients alone
     )
-    changes = (
-        *_differences(running, config, "", restart=False),
-        *_differences(config, wanted, "", restart=True),
-    )
+    before, now, then = (as_people_read(each) for each in (running, config, wanted))
+    changes = (*_differences(before, now, "", restart=False), *_differences(now, then, "", restart=True))
     revision = hashlib.sha256(wanted.model_dump_json().encode()).hexdigest()[:16]
     return ReloadPlan(config, changes, revision)
 
@@ -201,21 +200,21 @@ def _axis(running: AxisConfig, wanted: AxisConfig) -> AxisConfig:
 
 
 def _differences(one: object, other: object, key: str, *, restart: bool) -> Iterator[ConfigChange]:
-    """Yield where two parts of a configuration differ, as deep down as it can be named."""
+    """Yield where two parts of a document differ, as deep down as it can be named."""
     if one == other:
         return
-    if isinstance(one, BaseModel) and isinstance(other, BaseModel):
-        for name in type(one).model_fields:
-            below = f"{key}.{name}" if key else name
-            yield from _differences(getattr(one, name), getattr(other, name), below, restart=restart)
-        return
     ours, theirs = _by_name(one), _by_name(other)
-    if ours is None or theirs is None or list(ours) == list(theirs) == []:
+    if ours is None and theirs is None:
+        ours, theirs = _by_place(one), _by_place(other)
+        if ours and theirs and ours.keys() != theirs.keys():
+            ours = None  # one that was put in would move all that follow
+    if ours is None or theirs is None or not (ours or theirs):
         yield _change(key, one, other, restart=restart)
         return
     for name in ours | theirs:
-        yield from _differences(ours.get(name), theirs.get(name), f"{key}.{name}", restart=restart)
-    if list(ours) != list(theirs) and ours.keys() == theirs.keys():
+        below = f"{key}.{name}" if key else name
+        yield from _differences(ours.get(name), theirs.get(name), below, restart=restart)
+    if isinstance(one, list) and list(ours) != list(theirs) and ours.keys() == theirs.keys():
         yield _change(key, list(ours), list(theirs), restart=restart)  # only their order has changed
 
 
@@ -227,20 +226,35 @@ def _shown(value: object) -> str | None:
     """Return a value as text; a part with a name is known by that."""
     if value is None:
         return None
-    if isinstance(value, BaseModel):
-        value = getattr(value, "name", None) or value
-    text = json.dumps(value, default=_as_written, ensure_ascii=False)
+    if isinstance(value, ReadQuantity):
+        return str(value)
+    if isinstance(value, dict):
+        value = value.get("name") or value
+    text = json.dumps(_as_written(value), default=str, ensure_ascii=False)
     return text if len(text) <= LONGEST_VALUE else f"{text[:LONGEST_VALUE]} ..."
 
 
 def _as_written(value: object) -> object:
-    """Return a value about as its file has it."""
-    return value.model_dump(mode="json", exclude_defaults=True) if isinstance(value, BaseModel) else str(value)
+    """Return a value about as its file has it: without what is not set."""
+    if isinstance(value, list):
+        return [_as_written(each) for each in value]
+    if isinstance(value, dict):
+        return {key: _as_written(each) for key, each in value.items() if each not in (None, "", [], {})}
+    return value
 
 
-def _by_name(items: object) -> dict[str, BaseModel] | None:
-    """Return the parts of a list that are known by name, or None for anything else."""
-    if not isinstance(items, Sequence) or isinstance(items, str):
+def _by_name(part: object) -> dict[str, object] | None:
+    """Return the parts of a table or a list that are known by name, or None for anything else."""
+    if isinstance(part, dict):
+        return part
+    if not isinstance(part, list):
         return None
-    named = {str(getattr(item, "name", "")): item for item in items if isinstance(item, BaseModel)}
-    return named if len(named) == len(items) and "" not in named else None
+    named: dict[str, object] = {str(item.get("name") or ""): item for item in part if isinstance(item, dict)}
+    return named if len(named) == len(part) and "" not in named else None
+
+
+def _by_place(part: object) -> dict[str, object] | None:
+    """Return the tables of a list by their numbers, the first of which is 1, or None for anything else."""
+    if not isinstance(part, list) or not all(isinstance(item, dict) for item in part):
+        return None
+    return {str(number): item for number, item in enumerate(part, 1)}

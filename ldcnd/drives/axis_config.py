@@ -11,7 +11,7 @@ from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisLimits
 from ldcnd.contract.plan import PollPriority
 from ldcnd.contract.samples import TelemetryItem
-from ldcnd.contract.units import AxisUnits, Dimension, UnitTable, g_velocity, unit_table
+from ldcnd.contract.units import AxisUnits, Dimension, UnitTable, g_velocity, quantity_text, unit_table
 from ldcnd.drives.driver import Gains
 from ldcnd.drives.toml import DeviceIdentity, Name
 
@@ -305,16 +305,21 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             and limits.position_min >= limits.position_max
         ):
             raise ValueError(
-                f"limits: position_min {limits.position_min} is not below position_max {limits.position_max}"
+                f"limits: position_min {self._text(limits.position_min, Dimension.POSITION)} is not below"
+                f" position_max {self._text(limits.position_max, Dimension.POSITION)}"
             )
         if self.modulo is not None and (limits.position_min, limits.position_max) != (None, None):
             raise ValueError("modulo: an axis that turns without an end has no position limits")
         if self.modulo is not None and self.modulo * abs(self.signed_counts_per_unit) < LEAST_TURN_COUNTS:
-            raise ValueError(f"modulo {self.modulo:g} is less than {LEAST_TURN_COUNTS} encoder counts")
+            raise ValueError(
+                f"modulo {self._text(self.modulo, Dimension.POSITION)} is less than {LEAST_TURN_COUNTS} encoder counts"
+            )
         if limits.velocity is not None and self.velocity > limits.velocity:
-            raise ValueError(f"velocity {self.velocity} is above limits.velocity {limits.velocity}")
+            raise ValueError(f"velocity {self._above(self.velocity, limits.velocity, Dimension.VELOCITY)}")
         if limits.acceleration is not None and self.acceleration > limits.acceleration:
-            raise ValueError(f"acceleration {self.acceleration} is above limits.acceleration {limits.acceleration}")
+            raise ValueError(
+                f"acceleration {self._above(self.acceleration, limits.acceleration, Dimension.ACCELERATION)}"
+            )
         # made once here, so that what is wrong with them is said of the file
         _ = self.unit_table, self.g_velocity
         self._check_home()
@@ -348,6 +353,14 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
         """Level of a limit switch input while the switch is actuated."""
         return self.home.switch_active if self.home else "high"
 
+    def _text(self, value: float, dimension: Dimension) -> str:
+        """Return a number of the file about as it is there, with its unit."""
+        return quantity_text(value, AxisUnits(self.unit, self.unit_table, self.g_velocity), dimension, ".10g")
+
+    def _above(self, value: float, limit: float, dimension: Dimension) -> str:
+        of = dimension.value
+        return f"{self._text(value, dimension)} is above limits.{of} {self._text(limit, dimension)}"
+
     def _check_home(self) -> None:
         """Refuse speeds with which every search would be refused."""
         if self.home is None:
@@ -359,9 +372,12 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             ("find_velocity", self.home.find_velocity or 0.0),
         ):
             if self.limits.velocity is not None and velocity > self.limits.velocity:
-                raise ValueError(f"home.{name} {velocity:g} is above limits.velocity {self.limits.velocity:g}")
+                raise ValueError(f"home.{name} {self._above(velocity, self.limits.velocity, Dimension.VELOCITY)}")
         if abs(self.home.position) > (most := self.farthest):
-            raise ValueError(f"home.position {self.home.position:g} is beyond {most:g}")
+            raise ValueError(
+                f"home.position {self._text(self.home.position, Dimension.POSITION)} is beyond"
+                f" {self._text(most, Dimension.POSITION)}"
+            )
 
     def _check_gain_sets(self) -> None:
         """Refuse sets that `gains` do not stand for, and names of sets that there are not."""
@@ -384,9 +400,8 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
             if step_counts >= gains.el:
                 raise ValueError(f"tracking.step is {step_counts:g} counts, not below gains.el {gains.el}")
         if limits.velocity is not None and tracking.step * tracking.rate > limits.velocity:
-            raise ValueError(
-                f"tracking.step x rate is {tracking.step * tracking.rate:g}, above limits.velocity {limits.velocity}"
-            )
+            fastest = tracking.step * tracking.rate
+            raise ValueError(f"tracking.step x rate {self._above(fastest, limits.velocity, Dimension.VELOCITY)}")
 
 
 class MovedAxisConfig(AxisConfig):

@@ -197,7 +197,7 @@ async def test_a_reload_shows_what_it_changes_and_names_what_needs_a_restart(rig
         await opened.ended()
 
     assert shown == (
-        "bus.line.axis.x.velocity: 10.0 -> 9.0",
+        "bus.line.axis.x.velocity: 10 mm/s -> 9 mm/s",
         "bus.line.axis.x.gains.kp: 350 -> 351 (needs a restart of the daemon)",
     )
     assert before == 10

@@ -75,7 +75,10 @@ def test_a_reversed_axis_counts_backwards(tmp_path):
             ("acceleration = 100", "acceleration = 100\nlimits = { position_min = 5, position_max = 5 }"),
             ["bus[0].axis[0]", "position_min 5"],
         ),
-        (("acceleration = 100", "acceleration = 100\nlimits = { velocity = 1 }"), ["velocity 10.0", "1.0"]),
+        (
+            ("acceleration = 100", "acceleration = 100\nlimits = { velocity = 1 }"),
+            ["velocity 10 mm/s", "limits.velocity 1 mm/s"],
+        ),
         (
             ("acceleration = 100", 'acceleration = 100\nhome = { method = "index", velocity = 0 }'),
             ["home.velocity is 0"],

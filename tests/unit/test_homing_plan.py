@@ -106,7 +106,7 @@ def test_a_tracking_step_that_would_trip_the_drive_is_no_configuration():
 
 
 def test_tracking_that_outruns_the_velocity_limit_is_no_configuration():
-    with pytest.raises(ValidationError, match=r"tracking.step x rate is 30, above limits.velocity 25"):
+    with pytest.raises(ValidationError, match=r"tracking.step x rate 30 mm/s is above limits.velocity 25 mm/s"):
         axis(tracking={"step": 3.0, "rate": 10}, limits={"velocity": 25})
 
 

@@ -112,9 +112,16 @@ def test_axes_in_another_order_are_refused():
     assert plan_reload(RUNNING, validated(wanted)).refused == ("bus.line0.axis",)
 
 
-def test_parts_without_a_name_are_refused_whole():
+def test_parts_without_a_name_are_named_by_their_numbers():
     wanted = document()
-    wanted["sim"][0]["module"][0]["travel_counts"] = [-1000, 1000]
+    wanted["sim"][0]["module"][1]["travel_counts"] = [-1000, 1000]
+
+    assert plan_reload(RUNNING, validated(wanted)).refused == ("sim.line0.module.2.travel_counts",)
+
+
+def test_lists_of_different_lengths_are_refused_whole():
+    wanted = document()
+    wanted["sim"][0]["module"].append(wanted["sim"][0]["module"][0])
 
     assert plan_reload(RUNNING, validated(wanted)).refused == ("sim.line0.module",)
 
@@ -125,7 +132,7 @@ def test_change_that_contradicts_what_stays_is_an_error():
     wanted = document()
     axis(wanted, "x")["limits"]["velocity"] = 30
 
-    with pytest.raises(ConfigError, match=r"tracking\.step x rate is 40, above limits\.velocity 30"):
+    with pytest.raises(ConfigError, match=r"tracking\.step x rate 40 mm/s is above limits\.velocity 30 mm/s"):
         plan_reload(validated(running), validated(wanted))
 
 
@@ -159,3 +166,55 @@ def test_what_clients_alone_use_applies():
     reload = plan_reload(RUNNING, validated(wanted))
 
     assert (reload.refused, [each.name for each in reload.config.position]) == ((), ["park"])
+
+
+CENTRIFUGE = SIMULATED.with_name("centrifuge.toml")
+
+
+def changed_centrifuge(tmp_path: Path, *edits: tuple[str, str]) -> dict[str, str]:
+    """Return what a reload says of an edited centrifuge: each key with its numbers."""
+    text = CENTRIFUGE.read_text(encoding="utf-8")
+    for before, after in edits:
+        assert text.count(before) == 1
+        text = text.replace(before, after)
+    (path := tmp_path / "centrifuge.toml").write_text(text, encoding="utf-8")
+    return {
+        each.key: f"{each.before} -> {each.after}"
+        for each in plan_reload(load_config(CENTRIFUGE), load_config(path)).changes
+    }
+
+
+def test_numbers_of_an_axis_are_named_in_the_units_that_people_read(tmp_path: Path):
+    changes = changed_centrifuge(
+        tmp_path,
+        ("velocity = 3300, acceleration = 10 }", "velocity = 200, acceleration = 7.25 }"),
+        ("above = 120", "above = 200"),
+        ("axes = { rotor = 0.1 }", "axes = { rotor = 0.3 }"),
+        ("window = 0.002", 'window = "0.9 deg"'),
+    )
+
+    assert changes == {
+        "bus.line0.axis.rotor.limits.velocity": "3300 rpm (1218 g) -> 200 rpm (4.473 g)",
+        "bus.line0.axis.rotor.limits.acceleration": "10 rev/s² -> 7.25 rev/s²",
+        "bus.line0.axis.rotor.settle.window": "0.002 rev -> 0.0025 rev",
+        "interlock.balance.above": "120 rpm (1.61 g) -> 200 rpm (4.473 g)",
+        "position.bucket1.axes.rotor": "0.1 rev -> 0.3 rev",
+    }
+
+
+def test_a_number_within_a_list_is_named_in_the_units_that_people_read(tmp_path: Path):
+    changes = changed_centrifuge(
+        tmp_path,
+        ('velocity = "100 g", acceleration = 10', 'velocity = "400 g", acceleration = 10'),
+        ('requires = [{ axis = "rotor", below = 6 }]', 'requires = [{ axis = "rotor", below = 3.6 }]'),
+    )
+
+    assert changes == {
+        "sequence.spin.step.4.arguments.velocity": "945.6528153 rpm (100 g) -> 1891.305631 rpm (400 g)",
+        "interlock.lock_opens.requires.1.below": "6 rpm (0.004026 g) -> 3.6 rpm (0.001449 g)",
+    }
+
+
+def test_a_speed_above_its_limit_is_refused_in_the_units_of_the_file(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"velocity 4000 rpm \(\d+ g\) is above limits\.velocity 3300 rpm"):
+        changed_centrifuge(tmp_path, ("velocity = 30 #", "velocity = 4000 #"))

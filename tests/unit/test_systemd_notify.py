@@ -273,11 +273,11 @@ async def test_a_client_is_shown_what_a_reload_changes_and_gets_that(manager: Ma
         again = await rig.reload(dry_run=True)
         told = [(each.axis, each.reason) for each in await latest_events(client, 100) if each.verb == "reload"]
 
-    assert told == [("x", "velocity 20.0 -> 4.0")]
+    assert told == [("x", "velocity 20 mm/s -> 4 mm/s")]
     assert not shown.applied
     assert info.axis == "x"
     assert [(each.key, each.before, each.after, each.restart) for each in shown.changes] == [
-        ("bus.line0.axis.x.velocity", "20.0", "4.0", False),
+        ("bus.line0.axis.x.velocity", "20 mm/s", "4 mm/s", False),
         ("bus.line0.axis.x.gains.kp", "350", "351", True),
     ]
     assert done.applied
