@@ -149,6 +149,34 @@ def test_daemon_that_hangs_is_killed_and_started_again(service: Machine):
     assert "Watchdog timeout" in log_of(service)
 
 
+def test_restarts_by_hand_are_never_too_many(machine: Machine):
+    machine.write(CONFIG, SIMULATED)
+    machine.must("systemctl", "start", UNIT)
+    for _ in range(8):  # each of them as fast as it goes
+        machine.must("systemctl", "restart", UNIT)
+
+    assert machine.show(UNIT, "ActiveState") == "active"
+    machine.must("systemctl", "stop", UNIT)
+
+
+def test_a_daemon_that_fails_again_and_again_stays_down(machine: Machine):
+    machine.write(f"{DROP_INS}/test.conf", "[Service]\nExecStart=\nExecStart=/bin/false\n")
+    machine.must("systemctl", "daemon-reload")
+    machine.run("systemctl", "start", UNIT)
+    machine.until_shown(UNIT, "NRestarts", lambda count: count == "19", within_s=120.0)
+    machine.until_shown(UNIT, "ActiveState", lambda state: state == "failed", within_s=30.0)
+    refused = machine.run("systemctl", "start", UNIT)
+    machine.must("rm", "-r", DROP_INS)
+    machine.must("systemctl", "daemon-reload")
+    machine.write(CONFIG, SIMULATED)
+    machine.must("systemctl", "reset-failed", UNIT)
+    machine.must("systemctl", "start", UNIT)
+    machine.must("systemctl", "stop", UNIT)
+
+    assert refused.returncode != 0
+    assert "too quickly" in machine.must("journalctl", "-u", UNIT)
+
+
 def test_stop_brings_what_moves_to_rest_in_time(service: Machine):
     service.must("ldcnd", "power", "on", "x")
     service.must("ldcnd", "move", "x", "90", "--velocity", "5")
