@@ -351,8 +351,11 @@ class AxisService:
         able = self.driver.capabilities
         moves = any(command.effect is Effect.MOTION and verb in able for verb, command in AXIS_COMMANDS.items())
         absolute = absolute and Verb.MOVE_ABSOLUTE in able
-        row = guards.needs(Verb.MOVE_ABSOLUTE if absolute else Verb.MOVE_RELATIVE) if moves else guards.AT_ALL
+        verb = Verb.MOVE_VELOCITY if turns else Verb.MOVE_ABSOLUTE if absolute else Verb.MOVE_RELATIVE
+        row = guards.needs(verb) if moves else guards.AT_ALL
         found = list(guards.obstacles(row, self.tracker, self._moves))
+        if guards.goes_on(verb, self.tracker):
+            found = [(error, guard) for error, guard in found if guard is not guards.check_stands]
         name = self.config.name
         first = [error for error, guard in found if guard in (guards.check_reachable, guards.check_not_latched)]
         # a warning keeps nothing from moving
@@ -493,8 +496,14 @@ class AxisService:
         return self.tracker.status.command.command_id if self.tracker.status.command else None
 
     def show(self) -> None:
-        """Publish the state once more; what is read is published by its polls."""
-        self.telemetry.publish_state(self.tracker.status, self._clock.now_ns(), due=True)
+        """Publish the state once more; what is read is published by its polls.
+
+        Clients wait for the first state of an axis before they command it: before its drive was read there is none, but
+        for a stop that an earlier daemon has left.
+        """
+        status = self.tracker.status
+        if status.was_read or status.stop_latched or status.stop_pending:
+            self.telemetry.publish_state(status, self._clock.now_ns(), due=True)
 
     def controlled_by(self, client: str | None) -> None:
         """Publish who controls the axis from now on; None when no client does."""
