@@ -225,9 +225,10 @@ class BusService:
 
     def _not_up(self, error: LdcndError) -> None:
         """Keep why the line is not up; its axes show whether nothing answers, or something that is not theirs."""
-        if error.message != self.problem:
+        problem = f"{error.message}; {error.remedy}" if error.remedy else error.message
+        if problem != self.problem:
             log.error("line not up", bus=self.bus.settings.name, reason=error.message, remedy=error.remedy)
-        self.problem = error.message
+        self.problem = problem
         # something that answers and does not match is not silent: its axes say `not_identified`
         self.bus.proofs.lose_all(error.message, silent=not isinstance(error, NetworkMismatch))
         for axis in self.axes:

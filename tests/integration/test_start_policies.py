@@ -119,6 +119,7 @@ async def test_what_cannot_be_adopted_stays_down_and_says_why():
 
     assert not bus.up
     assert "address 1 (axis x): expected Logosol LS-182AP, found nothing" in bus.problem
+    assert "allow adopt_fallback" in bus.problem
     assert sent <= HARMLESS
 
 
