@@ -1,7 +1,6 @@
 """The gains of one axis: those of each kind of motion, and those that a client has lent it while its lease lasts."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import asdict, replace
 
 from ldcnd.axis import guards
@@ -22,9 +21,7 @@ class AxisGains:
         config = motion.config
         self._sets = {name: each.registers for name, each in config.gain_sets.items()}
         self._of_kinds = {kind: self._sets[name] for kind, name in config.gains_for.items()}
-        self._names = config.gains_for
         self._of_others = motion.driver.wanted_gains if self._of_kinds else None
-        self._in_force: str | None = None  # the set that the drive is to hold; None for that of all other motions
 
     def _wanted(self, kind: MotionKind) -> Gains | None:
         """Return the gains for a kind of motion; None where it makes no difference."""
@@ -42,12 +39,9 @@ class AxisGains:
         wanted = self._wanted(kind)
         if wanted is not None and not self._motion.tracker.status.state.is_motion:
             self._motion.driver.wanted_gains = wanted
-            self._in_force = self._names.get(kind)
 
     async def set(self, permit: Permit, request: SetGains) -> CommandReply:
         """Load gains: those that the request names, the others as they are; they act at once.
-
-        What they change is the set in force, for the next motions of its kinds, too, and no other one.
 
         Raises:
             WrongState: the axis has none yet and the request lacks some, or the servo rate or the set would change in
@@ -75,9 +69,8 @@ class AxisGains:
         if not request.lent:
             await permit.set_gains(changed)
             self._own = None
-            if request.gain_set is not None:
-                self._in_force = None  # who loads a set means the motions that have none of their own
-            self._change(asked)
+            # what is set counts for all motions that have no gains of their own
+            self._of_others = self._of_others and replace(self._of_others, **asked)
             return self._motion.reply(permit)
         if request.lease is None:
             raise LeaseRequired(
@@ -88,15 +81,6 @@ class AxisGains:
         self._own = self._own or gains  # before they are sent: a lost reply leaves open which ones act
         await permit.set_gains(changed)
         return self._motion.reply(permit)
-
-    def _change(self, asked: Mapping[str, int]) -> None:
-        # all sets have one servo rate: velocities depend on it
-        of_all = {name: value for name, value in asked.items() if name == "sr"}
-        if self._of_others:
-            self._of_others = replace(self._of_others, **(asked if self._in_force is None else of_all))
-        for kind, name in self._names.items():
-            changed = asked if name == self._in_force else of_all
-            self._of_kinds[kind] = replace(self._of_kinds[kind], **changed)
 
     def _named(self, name: str) -> Gains:
         if name not in self._sets:

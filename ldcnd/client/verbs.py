@@ -298,8 +298,7 @@ class AxisVerbs(ABC):
         """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are.
 
         Args:
-            gain_set: Configured set of gains to load, at standstill, for all motions of kinds without a set; values
-                besides it replace its own.
+            gain_set: Configured set of gains to load, at standstill; values besides it replace its own.
             kp: Position gain.
             kd: Velocity gain.
             ki: Integral gain.

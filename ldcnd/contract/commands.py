@@ -620,15 +620,13 @@ class SetPosition(AxisCommand[CommandReply]):
 class SetGains(AxisCommand[CommandReply]):
     """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are.
 
-    Where kinds of motion have sets of their own, it changes the one in force, that of the latest motion, until the
-    daemon ends. Each motion begins with the set of its kind.
+    Motions of a kind for which the configuration names a set have that set again from the next one on.
     """
 
     verb = Verb.SET_GAINS
 
     gain_set: str | None = Field(default=None, max_length=LONGEST_NAME)
-    """Configured set of gains to load, at standstill, for all motions of kinds without a set; values besides it \
-replace its own."""
+    """Configured set of gains to load, at standstill; values besides it replace its own."""
     kp: int | None = Field(default=None, ge=0, le=0x7FFF)
     """Position gain."""
     kd: int | None = Field(default=None, ge=0, le=0x7FFF)

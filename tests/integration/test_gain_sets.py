@@ -125,27 +125,6 @@ async def test_a_set_is_loaded_by_its_name_at_standstill():
         assert held(rig) == SPIN
 
 
-async def test_gains_that_are_set_in_a_motion_are_those_of_its_kind_and_of_no_other():
-    """They landed in the set of positions, and the next spin had what the configuration says."""
-    async with running_machine(machine(axis=AXIS)) as rig:
-        await rig.client.command("rotor", Power(on=True))
-        await rig.client.command("rotor", MoveVelocity(velocity=2.0))
-        await rig.client.command("rotor", SetGains(kp=25))
-        assert held(rig) == (25, 250, 12_000)
-        await rig.client.command("rotor", Halt())
-        await stands(rig)
-        await rig.client.command("rotor", MoveRelative(distance=0.5))
-        assert held(rig) == POSITION
-        await stands(rig)
-        await rig.client.command("rotor", SetGains(kp=55))
-        await rig.client.command("rotor", MoveVelocity(velocity=2.0))
-        assert held(rig) == (25, 250, 12_000)
-        await rig.client.command("rotor", Halt())
-        await stands(rig)
-        await rig.client.command("rotor", MoveRelative(distance=0.5))
-        assert held(rig) == (55, 250, 8000)
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
