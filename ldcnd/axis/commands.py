@@ -1,6 +1,7 @@
 """The commands of one axis: check, plan, send to the drive, update the tracker."""
 
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import replace
 from typing import Any, ClassVar
 
@@ -123,9 +124,10 @@ class AxisCommands:
         carry_out = self._CARRIED_OUT.get(type(request))
         if carry_out is None:
             raise self._cannot(permit)
-        if request.effect is Effect.MOTION:
-            self.gains.choose(kind_of(request.verb))
-        return await carry_out(self, permit, request)
+        if request.effect is not Effect.MOTION:
+            return await carry_out(self, permit, request)
+        with self.gains.of(kind_of(request.verb)):
+            return await carry_out(self, permit, request)
 
     def _cannot(self, permit: Permit) -> NotSupported:
         return NotSupported(f"axis {self._config.name} cannot {permit.verb}", axis=self._config.name)
@@ -271,9 +273,10 @@ class AxisCommands:
             raise self._cannot(permit)  # a drive that can be switched off takes that as a stop
         permit.check_state()
         await self._motion.check_does_not_coast()
-        self.gains.choose(MotionKind.POSITION)
         guards.check_has_gains(self._driver)
-        await permit.power_on()
+        # a loop that is closed keeps its gains
+        with nullcontext() if self._tracker.status.enabled else self.gains.of(MotionKind.POSITION):
+            await permit.power_on()
         self._drop_procedure()
         self._tracker.take(PowerSwitched(on=True, now_s=self._motion.clock.now_s()))
         self._motion.publish_state()

@@ -1,44 +1,67 @@
 """The gains of one axis: those of each kind of motion, and those that a client has lent it while its lease lasts."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, replace
 
 from ldcnd.axis import guards
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
 from ldcnd.contract.commands import CommandReply, MotionKind, SetGains
-from ldcnd.contract.errors import LeaseRequired, Remedy, ValueOutOfRange, WrongState, step
+from ldcnd.contract.errors import DriveFault, LeaseRequired, Remedy, RequestRefused, ValueOutOfRange, WrongState, step
 from ldcnd.drives.driver import Gains
+
+BASE = ""
+"""Name of the set that `gains` are: of every kind of motion that names none."""
 
 
 class AxisGains:
-    """Loads gains, chooses those of each kind of motion, and takes back those that were lent."""
+    """The sets of gains: chooses that of each kind of motion, keeps what is set in each, takes back what was lent.
+
+    The set in force is the one that the drive was last given, or is given at power-on. Unless gains are lent, what the
+    drive is to hold is what that set has.
+    """
 
     def __init__(self, motion: AxisMotion) -> None:
         self._motion = motion
         self._name = motion.config.name
-        self._own: Gains | None = None  # of the axis while a client has lent it others
         config = motion.config
-        self._sets = {name: each.registers for name, each in config.gain_sets.items()}
-        self._of_kinds = {kind: self._sets[name] for kind, name in config.gains_for.items()}
-        self._of_others = motion.driver.wanted_gains if self._of_kinds else None
+        self._sets: dict[str, Gains | None] = {name: each.registers for name, each in config.gain_sets.items()}
+        self._sets[BASE] = motion.driver.wanted_gains
+        # where no kind names a set, none is chosen
+        self._of_kinds = {kind: config.gains_for.get(kind, BASE) for kind in MotionKind if config.gains_for}
+        self._in_force = BASE
+        self._lent = False
 
-    def _wanted(self, kind: MotionKind) -> Gains | None:
-        """Return the gains for a kind of motion; None where it makes no difference."""
-        return self._of_kinds.get(kind, self._of_others) if self._of_kinds and self._own is None else None
+    def _of_kind(self, kind: MotionKind) -> str:
+        """Return the set of a kind of motion; what was lent serves all kinds."""
+        return self._in_force if self._lent else self._of_kinds.get(kind, self._in_force)
 
     def switches(self, kind: MotionKind) -> bool:
         """Tell whether a kind of motion takes other gains than the drive is to hold now."""
-        return self._wanted(kind) not in (None, self._motion.driver.wanted_gains)
+        return self._sets[self._of_kind(kind)] != self._sets[self._in_force]
 
-    def choose(self, kind: MotionKind) -> None:
-        """Have the drive hold the gains of a kind of motion, loaded before its first packet, if the axis stands.
+    @contextmanager
+    def of(self, kind: MotionKind) -> Iterator[None]:
+        """Have the drive hold the set of a kind of motion, loaded before its first packet, if the axis stands.
 
-        Set Gain acts at once: in mid-motion it would change the force on a shaft that lags behind.
+        Set Gain acts at once: in mid-motion it would change the force on a shaft that lags behind. A motion that is
+        refused before its gains were loaded leaves the set in force.
         """
-        wanted = self._wanted(kind)
-        if wanted is not None and not self._motion.tracker.status.state.is_motion:
-            self._motion.driver.wanted_gains = wanted
+        before = self._in_force
+        if not self.switches(kind) or not self._motion.tracker.status.state.is_motion:
+            self._put_in_force(self._of_kind(kind))
+        try:
+            yield
+        except (RequestRefused, DriveFault):
+            if self.differ:
+                self._put_in_force(before)
+            raise
+
+    def _put_in_force(self, name: str) -> None:
+        if name != self._in_force:
+            self._in_force, self._motion.driver.wanted_gains = name, self._sets[name]
 
     async def set(self, permit: Permit, request: SetGains) -> CommandReply:
         """Load gains: those that the request names, the others as they are; they act at once.
@@ -68,9 +91,10 @@ class AxisGains:
         self._check_tracking_step(changed)
         if not request.lent:
             await permit.set_gains(changed)
-            self._own = None
-            # what is set counts for all motions that have no gains of their own
-            self._of_others = self._of_others and replace(self._of_others, **asked)
+            self._lent = False
+            # only now: what was not acknowledged must not be loaded later by itself
+            self._in_force = self._in_force if request.gain_set is None else request.gain_set
+            self._sets[self._in_force] = changed
             return self._motion.reply(permit)
         if request.lease is None:
             raise LeaseRequired(
@@ -78,13 +102,14 @@ class AxisGains:
                 axis=self._name,
                 remedy=Remedy("{}", step("acquire", "acquire one first")),
             )
-        self._own = self._own or gains  # before they are sent: a lost reply leaves open which ones act
+        self._lent = True  # before they are sent: a lost reply leaves open which ones act
         await permit.set_gains(changed)
         return self._motion.reply(permit)
 
     def _named(self, name: str) -> Gains:
-        if name not in self._sets:
-            known = ", ".join(self._sets) or "none"
+        found = self._sets.get(name) if name != BASE else None
+        if found is None:
+            known = ", ".join(filter(None, self._sets)) or "none"
             raise ValueOutOfRange(
                 f"axis {self._name} has no set of gains {name!r}; it has {known}",
                 axis=self._name,
@@ -92,15 +117,14 @@ class AxisGains:
                 limit=known,
                 remedy="configure it in gain_sets",
             )
-        return self._sets[name]
+        return found
 
     def take_back(self) -> bool:
-        """Have the drive hold the gains of the axis from its next motion on; tell whether others were lent to it."""
-        own, self._own = self._own, None
-        if own is None:
-            return False
-        self._motion.driver.wanted_gains = own
-        return True
+        """Have the drive hold the set in force from its next motion on; tell whether other gains were lent to it."""
+        lent, self._lent = self._lent, False
+        if lent:
+            self._motion.driver.wanted_gains = self._sets[self._in_force]
+        return lent
 
     @property
     def differ(self) -> bool:

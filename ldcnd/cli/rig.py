@@ -127,12 +127,12 @@ def reload(sender: Sender, *, dry_run: bool, yes: bool) -> None:
     """Have the daemon read its configuration again: limits, default speeds, settling, rates and priorities.
 
     What would change is shown first. A key that needs a restart of the daemon is named, and stays as it is. An axis
-    that another client controls keeps its settings.
+    that another client controls keeps its settings, and is named.
     """
     target = sender.target
     leases = (sender.lease,) if sender.lease else ()
     shown = target.run(lambda client: client.ask(Reload(dry_run=True, leases=leases)))
-    if dry_run or all(each.restart for each in shown.changes):
+    if dry_run or not any(each.taken for each in shown.changes):
         target.show(shown, *shown.lines())
         return
     if not yes:

@@ -283,6 +283,8 @@ class Rig:
     async def reload(self, *, dry_run: bool = False, revision: str | None = None) -> ReloadReply:
         """Have the daemon read its configuration again; what needs a restart is named and stays as it is.
 
+        So do the settings of an axis that another client controls.
+
         Args:
             dry_run: only name the changes.
             revision: of an earlier reply; refused when the file has changed since.
@@ -290,7 +292,6 @@ class Rig:
         Raises:
             ConfigError: the file makes no configuration; the daemon goes on with the one that it has.
             WrongState: it has another revision.
-            LeaseHeld: another client controls an axis whose settings would change.
         """
         return await self._client.ask(valid(Reload, dry_run=dry_run, revision=revision, leases=self._leases()))
 

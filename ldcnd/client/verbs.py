@@ -298,7 +298,8 @@ class AxisVerbs(ABC):
         """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are.
 
         Args:
-            gain_set: Configured set of gains to load, at standstill; values besides it replace its own.
+            gain_set: Configured set of gains to load, at standstill, and to change by the values besides it; a motion
+                loads the set of its kind if kinds have sets.
             kp: Position gain.
             kd: Velocity gain.
             ki: Integral gain.

@@ -620,13 +620,15 @@ class SetPosition(AxisCommand[CommandReply]):
 class SetGains(AxisCommand[CommandReply]):
     """Change the position loop of a drive; register values as in its manual, the missing ones stay as they are.
 
-    Motions of a kind for which the configuration names a set have that set again from the next one on.
+    What changes is the set in force, that of the last motion or power-on, and it stays so until the daemon restarts;
+    `gain_set` puts another one in force.
     """
 
     verb = Verb.SET_GAINS
 
     gain_set: str | None = Field(default=None, max_length=LONGEST_NAME)
-    """Configured set of gains to load, at standstill; values besides it replace its own."""
+    """Configured set of gains to load, at standstill, and to change by the values besides it; a motion loads the set of
+    its kind if kinds have sets."""
     kp: int | None = Field(default=None, ge=0, le=0x7FFF)
     """Position gain."""
     kd: int | None = Field(default=None, ge=0, le=0x7FFF)

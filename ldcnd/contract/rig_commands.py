@@ -386,6 +386,22 @@ class ConfigChange(Frozen):
     """Value in the file; null where there is none."""
     restart: bool
     """Whether only a restart of the daemon takes it."""
+    axis: str | None = None
+    """Axis that keeps its value because another client controls it."""
+    held_by: str | None = None
+    """That client."""
+
+    @property
+    def taken(self) -> bool:
+        """Whether a reload takes it."""
+        return not self.restart and self.held_by is None
+
+    def __str__(self) -> str:
+        """Return it in words, for people."""
+        words = f"{self.key}: {self.before or 'not set'} -> {self.after or 'not set'}"
+        if self.restart:
+            return f"{words} (needs a restart of the daemon)"
+        return words if self.taken else f"{words} (not taken: {self.held_by} controls axis {self.axis})"
 
 
 class ReloadReply(Frozen):
@@ -396,23 +412,19 @@ class ReloadReply(Frozen):
     more: int = Field(default=0, ge=0)
     """Number of further keys that differ."""
     applied: bool
-    """Whether the changes that need no restart are in use."""
+    """Whether the changes are in use that need no restart, and are of no axis that another client controls."""
     revision: str
     """Revision of the file as it was read, for a request that applies what was shown."""
 
     def lines(self) -> list[str]:
         """Return the changes for people, one in a line."""
-        lines = [
-            f"{each.key}: {each.before or 'not set'} -> {each.after or 'not set'}"
-            + (" (needs a restart of the daemon)" if each.restart else "")
-            for each in self.changes
-        ]
+        lines = [str(each) for each in self.changes]
         if self.more:
             lines.append(f"and {self.more} more")
         if not lines:
             lines.append("the daemon runs with what is in the file")
         elif self.applied:
-            lines.append("reloaded; what needs a restart stays as it is until then")
+            lines.append("reloaded; what is not taken, or needs a restart, stays as it is until then")
         return lines
 
 
@@ -431,7 +443,7 @@ class Reload(Command[ReloadReply]):
     revision: str | None = Field(default=None, max_length=64)
     """Revision whose changes were shown; with another one in the file the request is refused."""
     leases: tuple[Annotated[str, Field(max_length=64)], ...] = Field(default=(), max_length=128)
-    """Leases of the sender. An axis that another client controls keeps its settings, and the request is refused."""
+    """Leases of the sender. An axis that another client controls keeps its settings."""
 
 
 class WireLogReply(Frozen):

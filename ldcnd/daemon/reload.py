@@ -8,9 +8,10 @@ where drives are, what they are, or how the daemon was built, and needs a restar
 import asyncio
 import hashlib
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
+from types import MappingProxyType
 
 from pydantic import ValidationError
 
@@ -31,6 +32,7 @@ log = get_logger("reload")
 RELOAD_TIME_S = 10.0
 """A configuration that takes longer to be read is given up: TimeoutStartSec= bounds a reload, too."""
 LONGEST_VALUE = 120
+NOBODY: Mapping[str, str] = MappingProxyType({})
 MOST_CHANGES = 100
 """What a reply names; of more changes the rest is in the log."""
 
@@ -50,7 +52,7 @@ class Reloader:
         self._reading = OwnThread("configuration")
 
     async def reload(self) -> "ReloadPlan":
-        """Take what can be taken.
+        """Take what can be taken, for a signal: whoever may send that outranks control of an axis.
 
         Raises:
             ConfigError: the file cannot be read, or makes no configuration; the running one stays.
@@ -60,20 +62,24 @@ class Reloader:
             self._take(reload, budget)
             return reload
 
-    async def answer(self, command: Reload, admit: Callable[[str], None]) -> ReloadReply:
+    async def answer(self, command: Reload, held: Callable[[], Mapping[str, str]]) -> ReloadReply:
         """Answer a client: what a reload would change, or has changed.
 
         Args:
             command: the request.
-            admit: raises when another client controls an axis.
+            held: returns the axes that other clients control, and who does.
 
         Raises:
             ConfigError: as `reload`.
             WrongState: the file is another one than the client has seen.
-            LeaseHeld: another client controls an axis whose settings would change.
         """
         async with self._one_at_a_time:
-            reload, budget = await self._read()
+            keep = held()
+            reload, budget = await self._read(keep)
+            # control may change hands while the file is read
+            while any(axis in held() for axis in reload.axes):
+                keep = held()
+                reload, budget = await self._read(keep)
             if not command.dry_run:
                 if command.revision not in (None, reload.revision):
                     raise WrongState(
@@ -82,9 +88,6 @@ class Reloader:
                         limit=reload.revision,
                         remedy="look at the changes again, then reload",
                     )
-                # all of them before the first is changed
-                for axis in reload.axes:
-                    admit(axis)
                 self._take(reload, budget)
             return ReloadReply(
                 changes=reload.changes[:MOST_CHANGES],
@@ -93,15 +96,15 @@ class Reloader:
                 revision=reload.revision,
             )
 
-    async def _read(self) -> "tuple[ReloadPlan, RigBudget]":
+    async def _read(self, held: Mapping[str, str] = NOBODY) -> "tuple[ReloadPlan, RigBudget]":
         """Read and judge the file, beside the loop: lines go on meanwhile."""
         try:
-            return await self._reading.run(partial(self._prepare, self._daemon.config), RELOAD_TIME_S)
+            return await self._reading.run(partial(self._prepare, self._daemon.config, held), RELOAD_TIME_S)
         except TimeoutError:
             raise ConfigError(f"the configuration cannot be read within {RELOAD_TIME_S:g} s") from None
 
-    def _prepare(self, running: RigConfig) -> "tuple[ReloadPlan, RigBudget]":
-        reload = plan_reload(running, self._load())
+    def _prepare(self, running: RigConfig, held: Mapping[str, str]) -> "tuple[ReloadPlan, RigBudget]":
+        reload = plan_reload(running, self._load(), held)
         # before anything is taken: polls that the line cannot carry are refused whole
         return reload, require_plan(reload.config)
 
@@ -112,6 +115,8 @@ class Reloader:
             self._daemon.note_reload(axis, reload.of_axis(axis))
         if reload.refused:
             log.warning("changes need a restart", keys=reload.refused)
+        if kept := [each.key for each in reload.changes if each.held_by is not None]:
+            log.warning("other clients control axes, which keep their settings", keys=kept)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +125,8 @@ class ReloadPlan:
 
     Attributes:
         config: to run with from now on.
-        changes: every key that differs in the file; those that need a restart keep their value until then.
+        changes: every key that differs in the file; those that need a restart, or are of an axis that another client
+            controls, keep their value.
         revision: of the file, as it was read.
     """
 
@@ -131,7 +137,7 @@ class ReloadPlan:
     @property
     def changed(self) -> tuple[str, ...]:
         """Keys that have another value from now on."""
-        return tuple(each.key for each in self.changes if not each.restart)
+        return tuple(each.key for each in self.changes if each.taken)
 
     @property
     def refused(self) -> tuple[str, ...]:
@@ -147,12 +153,12 @@ class ReloadPlan:
     def of_axis(self, name: str) -> str:
         """Return in words what an axis gets."""
         mark = f".axis.{name}."
-        keys = [(each.key.partition(mark)[2], each) for each in self.changes if mark in each.key and not each.restart]
+        keys = [(each.key.partition(mark)[2], each) for each in self.changes if mark in each.key and each.taken]
         return ", ".join(f"{key} {each.before or 'none'} -> {each.after or 'none'}" for key, each in keys)
 
 
-def plan_reload(running: RigConfig, wanted: RigConfig) -> ReloadPlan:
-    """Decide which changes apply.
+def plan_reload(running: RigConfig, wanted: RigConfig, held: Mapping[str, str] = NOBODY) -> ReloadPlan:
+    """Decide which changes apply; an axis that another client controls keeps its settings.
 
     Keys name buses and axes: `bus.line0.axis.x.limits.velocity`; a bus or axis that was added or removed is one key.
 
@@ -162,13 +168,27 @@ def plan_reload(running: RigConfig, wanted: RigConfig) -> ReloadPlan:
     """
     wanted_buses = {bus.name: bus for bus in wanted.bus}
     buses = tuple(_bus(bus, wanted_buses.get(bus.name, bus)) for bus in running.bus)
-    config = running.model_copy(
+    possible = running.model_copy(
         update={"bus": buses, "position": wanted.position, "sequence": wanted.sequence}  # of clients alone
     )
-    before, now, then = (as_people_read(each) for each in (running, config, wanted))
-    changes = (*_differences(before, now, "", restart=False), *_differences(now, then, "", restart=True))
+    axes = {axis.name: axis for bus in running.bus for axis in bus.axis if axis.name in held}
+    buses = tuple(
+        bus.model_copy(update={"axis": tuple(axes.get(axis.name, axis) for axis in bus.axis)}) for bus in possible.bus
+    )
+    config = possible.model_copy(update={"bus": buses})
+    before, now, could, then = (as_people_read(each) for each in (running, config, possible, wanted))
+    changes = (
+        *_differences(before, now, "", restart=False),
+        *(_of_held(each, held) for each in _differences(now, could, "", restart=False)),
+        *_differences(could, then, "", restart=True),
+    )
     revision = hashlib.sha256(wanted.model_dump_json().encode()).hexdigest()[:16]
     return ReloadPlan(config, changes, revision)
+
+
+def _of_held(change: ConfigChange, held: Mapping[str, str]) -> ConfigChange:
+    axis = next(name for name in held if f".axis.{name}." in change.key)
+    return change.model_copy(update={"axis": axis, "held_by": held[axis]})
 
 
 def _bus(running: BusConfig, wanted: BusConfig) -> BusConfig:

@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable, Iterable
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from dataclasses import replace
 
 from ldcnd.axis import guards
@@ -16,7 +16,6 @@ from ldcnd.contract.commands import AxisCommand, Capability, Command, CommandRep
 from ldcnd.contract.errors import (
     InternalError,
     LdcndError,
-    LeaseHeld,
     NotSupported,
     WrongState,
 )
@@ -77,11 +76,11 @@ Admit = Callable[[str, str | None], None]
 """Raises when nothing may be moved on an axis under a lease, or without one."""
 
 
-AnswerReload = Callable[[Reload, Callable[[str], None]], Awaitable[ReloadReply]]
-"""Has the configuration read again; the second argument raises when another client controls an axis."""
+AnswerReload = Callable[[Reload, Callable[[], Mapping[str, str]]], Awaitable[ReloadReply]]
+"""Has the configuration read again; the second argument returns the axes that other clients control, and who does."""
 
 
-async def refuse_reload(command: Reload, _admit: Callable[[str], None]) -> ReloadReply:
+async def refuse_reload(command: Reload, _held: Callable[[], Mapping[str, str]]) -> ReloadReply:
     """Refuse a reload of a daemon that was not started from a file."""
     raise NotSupported(f"{command.verb}: this daemon has no file that it could read again", remedy="restart it")
 
@@ -151,7 +150,7 @@ class RigCommands:
             case SendGuestAway():
                 return await self._send_guest_away(command, login)
             case Reload():
-                return await self.answer_reload(command, lambda name: self._refuse_held(name, command.leases))
+                return await self.answer_reload(command, lambda: self._held_by_others(command.leases))
             case Rehearse():
                 for name in concerned(self._rig, command):
                     self._admit(name, command.lease)
@@ -217,20 +216,10 @@ class RigCommands:
         reply = explain(axis, request, lambda: self._admit(name, request.lease))
         return reply.model_copy(update={"overrides": self._interlocks.overrides(name)})
 
-    def _refuse_held(self, axis: str, leases: tuple[str, ...]) -> None:
-        """Refuse what changes an axis that another client controls; without control of it, it is open to all.
-
-        Raises:
-            LeaseHeld: names the holder.
-        """
-        holder = self._authority.holder(axis)
-        if holder and holder.token not in leases:
-            raise LeaseHeld(
-                f"axis {axis} is controlled by {holder.client}",
-                axis=axis,
-                value=holder.client,
-                remedy="wait until it is released, or reload with that lease",
-            )
+    def _held_by_others(self, leases: tuple[str, ...]) -> dict[str, str]:
+        """Return the axes that other clients control, and who does; without control, an axis is open to all."""
+        holders = {name: self._authority.holder(name) for name in self._rig.axes}
+        return {name: each.client for name, each in holders.items() if each and each.token not in leases}
 
     def _own(self, axis: str, leases: tuple[str, ...]) -> str | None:
         """Return which of these leases is the one on an axis; None when another one is, or none."""

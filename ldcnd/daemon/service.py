@@ -11,7 +11,7 @@ import gc
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -258,8 +258,8 @@ class Service:
             return f"configuration not reloaded: {error.message.splitlines()[0]}"
         return _remark(reload.refused)
 
-    async def _answer_reload(self, command: Reload, admit: Callable[[str], None]) -> ReloadReply:
-        reply = await self._reloader.answer(command, admit)
+    async def _answer_reload(self, command: Reload, held: Callable[[], Mapping[str, str]]) -> ReloadReply:
+        reply = await self._reloader.answer(command, held)
         if reply.applied:
             self._remark = _remark([each.key for each in reply.changes if each.restart])
         return reply

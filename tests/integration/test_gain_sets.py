@@ -5,6 +5,7 @@ import asyncio
 import pytest
 from pydantic import ValidationError
 
+from ldcnd.client.lease import control
 from ldcnd.contract.commands import (
     BufferMode,
     Halt,
@@ -18,7 +19,7 @@ from ldcnd.contract.commands import (
     SetPosition,
     Stop,
 )
-from ldcnd.contract.errors import ValueOutOfRange, WrongState
+from ldcnd.contract.errors import ValueOutOfRange, VelocityLimit, WrongState
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from tests.support.machine_rig import GAINS, Machine, machine, running_machine
@@ -109,19 +110,102 @@ async def test_the_gains_of_the_position_are_back_after_a_fault_and_a_restart(wh
         assert held(rig) == SPIN
 
 
-async def test_a_set_is_loaded_by_its_name_at_standstill():
+async def spins(rig: Machine) -> None:
+    await rig.client.command("rotor", MoveVelocity(velocity=2.0))
+
+
+async def goes_and_stands(rig: Machine) -> None:
+    await rig.client.command("rotor", Halt())
+    await stands(rig)
+    await rig.client.command("rotor", MoveRelative(distance=0.1))
+
+
+async def test_what_is_set_in_a_spin_stays_in_the_set_of_the_spin():
     async with running_machine(machine(axis=AXIS)) as rig:
         await rig.client.command("rotor", Power(on=True))
-        await rig.client.command("rotor", SetGains(gain_set="gentle", ol=100))
-        assert held(rig) == (40, 100, 2000)
-        await rig.client.command("rotor", MoveRelative(distance=0.5))  # of a kind without a set
-        assert held(rig) == (40, 100, 2000)
+        await spins(rig)
+        await rig.client.command("rotor", SetGains(kp=50))
+        assert held(rig) == (50, *SPIN[1:])
+        await goes_and_stands(rig)
+        assert held(rig) == POSITION
+        await stands(rig)
+        await rig.client.command("rotor", Power(on=False))
+        await rig.client.command("rotor", Power(on=True))
+        assert held(rig) == POSITION
+        await spins(rig)
+        assert held(rig) == (50, *SPIN[1:])
+
+
+async def test_what_is_set_at_rest_stays_in_the_set_that_is_in_force():
+    async with running_machine(machine(axis=AXIS)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", SetGains(kp=70))
+        await spins(rig)
+        assert held(rig) == SPIN
+        await goes_and_stands(rig)
+        assert held(rig) == (70, *POSITION[1:])
+
+
+async def test_a_set_that_is_loaded_by_its_name_is_that_of_its_kind_alone():
+    async with running_machine(machine(axis=AXIS)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", SetGains(gain_set="spin", ol=100))
+        assert held(rig) == (30, 100, 12_000)
+        await rig.client.command("rotor", MoveRelative(distance=0.5))
+        assert held(rig) == POSITION
         with pytest.raises(WrongState):
             await rig.client.command("rotor", SetGains(gain_set="spin"))
         await stands(rig)
         with pytest.raises(ValueOutOfRange, match="no set of gains 'fast'; it has gentle, spin"):
             await rig.client.command("rotor", SetGains(gain_set="fast"))
-        await rig.client.command("rotor", MoveVelocity(velocity=2.0))
+        await spins(rig)
+        assert held(rig) == (30, 100, 12_000)
+
+
+async def test_where_no_kind_names_a_set_one_that_is_loaded_serves_all():
+    async with running_machine(machine(axis=AXIS | {"gains_for": {}})) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", SetGains(gain_set="gentle"))
+        await rig.client.command("rotor", MoveRelative(distance=0.5))
+        assert held(rig) == GENTLE
+        await stands(rig)
+        await spins(rig)
+        assert held(rig) == GENTLE
+
+
+async def test_a_motion_that_is_refused_leaves_the_set_that_is_in_force():
+    async with running_machine(machine(axis=AXIS | {"limits": {"velocity": 20.0}})) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        with pytest.raises(VelocityLimit):
+            await rig.client.command("rotor", MoveVelocity(velocity=21.0))
+        await rig.client.command("rotor", SetGains(kp=70))
+        assert held(rig) == (70, *POSITION[1:])
+        await spins(rig)
+        assert held(rig) == SPIN
+
+
+async def test_power_to_a_closed_loop_leaves_the_set_that_is_in_force():
+    async with running_machine(machine(axis=AXIS)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await spins(rig)
+        await rig.client.command("rotor", Halt())
+        await stands(rig)
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", SetGains(kp=50))
+        assert held(rig) == (50, *SPIN[1:])
+
+
+async def test_lent_gains_leave_each_set_as_it_is():
+    async with running_machine(machine(axis=AXIS)) as rig:
+        async with control(rig.client, "tuner", "rotor", lease_s=30.0) as tuner:
+            await tuner.command("rotor", Power(on=True))
+            await tuner.command("rotor", SetGains(gain_set="spin", kp=77, lent=True))
+            await tuner.command("rotor", MoveRelative(distance=0.1))
+            assert held(rig) == (77, *SPIN[1:])
+        await rig.until("rotor", lambda state: state.state is AxisState.DISABLED)
+        await rig.client.command("rotor", Power(on=True))
+        assert held(rig) == POSITION
+        await spins(rig)
         assert held(rig) == SPIN
 
 

@@ -14,9 +14,10 @@ from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import MoveAbsolute, Power
-from ldcnd.contract.errors import ConfigError, LeaseHeld, VelocityLimit, WrongState
+from ldcnd.contract.errors import ConfigError, VelocityLimit, WrongState
 from ldcnd.contract.rig_commands import Reload
 from ldcnd.contract.samples import AxisState, PositionSample, TelemetryItem
+from ldcnd.contract.sequences import NamedPosition
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.service import Service, describe
@@ -264,10 +265,6 @@ async def test_a_client_is_shown_what_a_reload_changes_and_gets_that(manager: Ma
         with pytest.raises(WrongState, match="changed again"):
             await rig.reload(revision=shown.revision)
         files.pop()
-        async with rig.control("x", client="ann"):
-            with pytest.raises(LeaseHeld, match="axis x is controlled by ann"):
-                await client.ask(Reload())
-            await client.command("x", Power(on=False))  # open to all, as ever
         done = await rig.reload(revision=shown.revision)
         taken = daemon.config.bus[0].axis[0]
         again = await rig.reload(dry_run=True)
@@ -284,6 +281,35 @@ async def test_a_client_is_shown_what_a_reload_changes_and_gets_that(manager: Ma
     assert done.changes == shown.changes
     assert (taken.velocity, taken.gains.kp) == (4.0, 350)
     assert [each.key for each in again.changes] == ["bus.line0.axis.x.gains.kp"]
+
+
+async def test_an_axis_that_another_client_controls_keeps_its_settings_and_the_rest_is_taken(manager: Manager):
+    config = load_config(SIMULATED)
+    place = NamedPosition(name="park", axes={"x": 1.0})
+    file = with_axis(with_axis(config, "x", velocity=4.0), "y", velocity=3.0).model_copy(update={"position": (place,)})
+    async with service_of(manager, lambda: file) as (_, daemon, client):
+        await daemon.wait_up()
+        rig = Rig(client, await client.daemon())
+        async with rig.control("x", client="ann"):
+            shown = await client.ask(Reload(dry_run=True))
+            done = await client.ask(Reload(revision=shown.revision))
+            x, y, *_ = daemon.config.bus[0].axis
+            assert (x.velocity, y.velocity, daemon.config.position) == (config.bus[0].axis[0].velocity, 3.0, (place,))
+            told = {each.axis for each in await latest_events(client, 100) if each.verb == "reload"}
+            again = await client.ask(Reload(dry_run=True))
+            await rig.reload()  # hers
+            assert daemon.config == file
+
+    assert {(each.key, each.held_by, each.restart) for each in shown.changes} == {
+        ("position.park", None, False),
+        ("bus.line0.axis.x.velocity", "ann", False),
+        ("bus.line0.axis.y.velocity", None, False),
+    }
+    assert done.changes == shown.changes
+    assert "bus.line0.axis.x.velocity: 20.0 -> 4.0 (not taken: ann controls axis x)" in shown.lines()
+    assert done.lines()[-1] == "reloaded; what is not taken, or needs a restart, stays as it is until then"
+    assert told == {"y"}
+    assert [each.key for each in again.changes] == ["bus.line0.axis.x.velocity"]
 
 
 async def test_a_file_that_makes_no_configuration_is_refused_and_the_daemon_goes_on(manager: Manager):

@@ -25,9 +25,8 @@ from ldcnd.client.kept_gains import PUT_BACK_S, KeptGains, kept_for, put_back, p
 from ldcnd.client.rig import Rig
 from ldcnd.config.edit import edited_for_axis, write_over
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.contract.errors import LdcndError, UnknownAxis, WrongState
+from ldcnd.contract.errors import LdcndError, LeaseHeld, UnknownAxis, WrongState
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.rig_commands import ReloadReply
 from ldcnd.drives.axis_config import AxisConfig, MovedAxisConfig
 
 STEPS: dict[str, Step] = {
@@ -222,13 +221,16 @@ class Checklist:
         """
         write_over(self._config, change.before, change.text)
 
-    async def reload(self) -> ReloadReply:
+    async def reload(self) -> None:
         """Have the daemon read its configuration again.
 
         Raises:
             LdcndError: as the daemon refused it.
+            LeaseHeld: another client controls the axis, which keeps its settings.
         """
-        return await self._rig.reload()
+        reply = await self._rig.reload()
+        if kept := next((each for each in reply.changes if each.axis == self._axis), None):
+            raise LeaseHeld(str(kept), axis=self._axis, remedy="wait until it is released, then: ldcnd reload")
 
     # -- what it stands on -------------------------------------------------------------------------------------------
 

@@ -80,7 +80,7 @@ class ScanConversation(Conversation):
         rig = Rig(client, await client.daemon())
         shown = await rig.reload(dry_run=True)
         self.person.tell(*shown.lines())
-        if any(not each.restart for each in shown.changes) and await self.person.choose("reload", TAKE) == "yes":
+        if any(each.taken for each in shown.changes) and await self.person.choose("reload", TAKE) == "yes":
             self.person.tell(*(await rig.reload(revision=shown.revision)).lines()[-1:])
 
     async def _found(self, name: str, port: str, *, give_addresses: bool) -> list[ScannedDrive]:
