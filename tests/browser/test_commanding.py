@@ -6,7 +6,7 @@ import re
 import pytest
 import serial
 
-from ldcnd.contract.commands import SetPosition
+from ldcnd.contract.commands import Halt, SetPosition
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 
@@ -327,3 +327,20 @@ async def test_a_page_without_the_button_says_on_which_page_it_is(house):
         await desk.page.evaluate("() => { location.hash = '#/rig'; }")
         row = desk.page.get_by_role("group", name="Commands for x", exact=True)
         await expect(row.get_by_role("button", name="Home x")).to_have_attribute("title", re.compile("press Enable.$"))
+
+
+async def test_the_events_page_has_all_events_and_says_since_when_they_are_known(house):
+    await house.sim.quiet("x")
+    for _ in range(80):  # more than one reply takes
+        await house.sim.rig.command("x", Halt())
+    started = (await house.sim.rig.daemon()).started
+    async with house.desk() as desk:
+        await desk.open("events")
+        panel = desk.panel("Commands and how they ended")
+        lost = panel.get_by_text("Events of sim before")
+        await expect(lost).to_contain_text("were lost with the daemon that ended. A recorder keeps them: ldcnd record.")
+        clock = await desk.page.evaluate("(ms) => new Date(ms).toTimeString().slice(0, 8)", started / 1e6)
+        await expect(lost).to_contain_text(clock)
+        await panel.get_by_label("Axis").select_option("sim/x")
+        shown = await panel.get_by_role("status").inner_text()
+    assert int(shown.split()[0]) >= 160
