@@ -2,7 +2,9 @@
 
 import asyncio
 import importlib.metadata
+import os
 import signal
+import sys
 from collections.abc import Callable
 from importlib.util import find_spec
 
@@ -87,3 +89,15 @@ def on_signals(call: Callable[[], None], *names: str) -> None:
             loop.add_signal_handler(number, call)
         except NotImplementedError:
             signal.signal(number, lambda *_: loop.call_soon_threadsafe(call))
+
+
+def on_end_of_input(call: Callable[[], None]) -> None:
+    """Call something on the running loop when the standard input ends: it is a pipe from a program that has ended."""
+    loop, descriptor = asyncio.get_running_loop(), sys.stdin.fileno()
+
+    def read() -> None:
+        if not os.read(descriptor, 4096):
+            loop.remove_reader(descriptor)
+            call()
+
+    loop.add_reader(descriptor, read)

@@ -78,7 +78,8 @@ async def _console(endpoint: str, address: ListenAddress) -> AsyncIterator[str |
     """Run a console until the context ends; with its link, or None when it does not serve: the daemon goes on."""
     words = ("-m", "ldcnd", "console", "--json", "-e", endpoint, "--listen", f"{address.in_url}:{address.port}")
     try:
-        console = await asyncio.create_subprocess_exec(sys.executable, *words, stdout=PIPE)
+        # the pipe ends with this process, however that ends, and the console with the pipe
+        console = await asyncio.create_subprocess_exec(sys.executable, *words, "--with-input", stdin=PIPE, stdout=PIPE)
     except OSError:
         yield None
         return

@@ -54,6 +54,7 @@ if TYPE_CHECKING:
 )
 @click.option("--link", is_flag=True, help="Print another link of the console that listens at --listen.")
 @click.option("--json", "as_json", is_flag=True, help="Print the link as a line of JSON.")
+@click.option("--with-input", is_flag=True, hidden=True, help="End when the standard input ends: `run` has that pipe.")
 @click.option(
     "--log-level",
     type=click.Choice(["debug", "info", "warning", "error"]),
@@ -74,6 +75,7 @@ def console(
     commission: Path | None,
     link: bool,
     as_json: bool,
+    with_input: bool,
     log_level: str,
 ) -> None:
     """Show rigs in a browser until SIGTERM or SIGINT; prints the link that opens it; --link prints another.
@@ -108,6 +110,7 @@ def console(
         key=key,
         token=read_token(token_file) if token_file else None,
         as_json=as_json,
+        with_input=with_input,
     )
     asyncio.run(serve(settings, _commissioning(commission, endpoints) if commission else None))
 

@@ -1,5 +1,7 @@
 """What happened on a rig, in one order: commands, who had control, faults, and what drives did by themselves."""
 
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from enum import StrEnum
 
 from ldcnd.client.events import latest_events
@@ -13,6 +15,7 @@ from ldcnd.contract.events import (
     REFERENCE,
     UNSETTLED,
     CommandEvent,
+    ReadEvents,
 )
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo, DaemonInfo
@@ -63,6 +66,8 @@ class HistoryRow(Frozen):
     """The command."""
     line: str | None = None
     """The line of the axis: `ldcnd bus wire-log` shows its packets of that moment, as long as they are kept."""
+    known_from: int | None = None
+    """Instant from which on all events are known, UTC in ns; null in rows of what happens meanwhile."""
 
 
 def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
@@ -109,14 +114,50 @@ def _row_of_start(daemon: DaemonInfo) -> HistoryRow:
     return HistoryRow(t=daemon.started, kind=HistoryKind.DAEMON, axis="", what="started", how="", who="", why=why)
 
 
-async def history(client: RigClient, axis: str | None = None, since_ns: int = 0, count: int = 50) -> list[HistoryRow]:
-    """Return the latest things that happened, oldest first, as far as the daemon remembers them.
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """From when on all events are known.
+
+    Attributes:
+        t: that instant, UTC in ns since 1970.
+        discarded: how many events of this run were before it; 0 when it is the start of the daemon.
+    """
+
+    t: int
+    discarded: int
+
+    def __str__(self) -> str:
+        """Return what became of those before, for people."""
+        if self.discarded:
+            lost = f"the {self.discarded} events before {clock_time(self.t)} are not kept any more"
+        else:
+            lost = f"events before {clock_time(self.t)} were lost with the daemon that ended"
+        return f"{lost}; a recorder keeps them: ldcnd record"
+
+
+async def beginning(client: RigClient) -> Beginning:
+    """Return from when on a daemon knows all events: it keeps those of its own run, and of these the latest."""
+    page = await client.ask(ReadEvents(from_number=0, count=1))
+    if page.first_number and page.events:
+        return Beginning(page.events[0].t, page.first_number)
+    return Beginning((await client.daemon()).started, 0)
+
+
+def clock_time(t_ns: int) -> str:
+    """Return an instant as the rows of `ldcnd log` have it."""
+    return datetime.fromtimestamp(t_ns / 1e9, UTC).isoformat(timespec="milliseconds")
+
+
+async def history(
+    client: RigClient, known_from: Beginning, axis: str | None = None, since_ns: int = 0
+) -> list[HistoryRow]:
+    """Return what happened, oldest first, as far as the daemon remembers it.
 
     Args:
         client: of the rig.
+        known_from: from when on that is.
         axis: only of this axis; of all when missing.
         since_ns: none before this instant, UTC in ns since 1970.
-        count: the most that are wanted.
     """
     axes = {info.axis: info for info in await client.axes()}
     faults = {name: sample.active for name, sample in (await client.faults()).items()}
@@ -128,4 +169,4 @@ async def history(client: RigClient, axis: str | None = None, since_ns: int = 0,
             rows += [_row_of_fault(info, fault) for fault in seen.values()]
     rows.append(_row_of_start(await client.daemon()))
     rows = sorted((row for row in rows if row.t >= since_ns), key=lambda row: row.t)
-    return rows[-count:]
+    return [row.model_copy(update={"known_from": known_from.t}) for row in rows]

@@ -35,7 +35,7 @@ from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import LINK_S, Visitors
 from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
-from ldcnd.parts import ENDS, on_signals
+from ldcnd.parts import ENDS, on_end_of_input, on_signals
 from ldcnd.systemd import Beside
 
 END_TIME_S = 1.0
@@ -115,6 +115,8 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
     ):
         server = _Server(_config(build_app(settings, rigs, feed, visitors, new_link, commissioning), settings))
         on_signals(server.end, *ENDS)
+        if settings.with_input:
+            on_end_of_input(server.end)
         on_signals(lambda: show_link(give_link(), as_json=settings.as_json), "SIGUSR1")
         watching = [
             group.create_task(rigs.run(endpoint), name=f"endpoint {endpoint.name}") for endpoint in settings.endpoints

@@ -27,6 +27,7 @@ class ConsoleSettings:
         key: PEM file with its key.
         token: lets every browser in that has it; None hands out links that work once.
         as_json: print the link as a line of JSON.
+        with_input: end when the standard input ends.
     """
 
     endpoints: tuple[Endpoint, ...]
@@ -37,6 +38,7 @@ class ConsoleSettings:
     key: Path | None = None
     token: str | None = None
     as_json: bool = False
+    with_input: bool = False
 
     def __post_init__(self) -> None:
         """Refuse settings that would admit unauthorised visitors.

@@ -85,6 +85,8 @@ class ModuleInfo(Frozen):
     """The axis that it is; null for a module that is only kept on the line."""
     name: str | None = None
     """Name under which an I/O module is served; null for others."""
+    outputs: tuple[str, ...] = ()
+    """Names of the lines of an I/O module that are configured as outputs; no other line can be driven."""
     status: int | None
     """Latest status byte of a module that is no axis; null while it does not answer, and for axes."""
 

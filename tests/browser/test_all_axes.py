@@ -76,7 +76,7 @@ async def taken_and_enabled(daemon, desk):
     every = commands(desk)
     await every.get_by_role("button", name="Take control of all").click()
     await every.get_by_role("button", name="Enable all").click()
-    await expect(every.locator(".told")).to_have_text("Enable: x, y, z done.")
+    await expect(every.locator(".told")).to_have_text(re.compile(r"^Enable at [0-9:]+: x, y, z done\.$"))
     return every
 
 
@@ -129,7 +129,7 @@ async def test_a_command_for_all_that_cannot_be_sent_says_what_each_axis_wants_f
         "title", re.compile("y: .*press Reset")
     )
     await every.get_by_role("button", name="Reset all").click()
-    await expect(every.locator(".told")).to_have_text("Reset: y, z done.")
+    await expect(every.locator(".told")).to_have_text(re.compile(r"^Reset at [0-9:]+: y, z done\.$"))
     await expect(every.get_by_role("button", name="Home all")).to_have_attribute(
         "title", re.compile("x, y, z: it is disabled: press Enable|y: it is disabled: press Enable")
     )

@@ -125,3 +125,40 @@ async def test_run_without_a_configuration_and_a_terminal_says_what_to_type():
     assert run.returncode == 2
     assert b"--config rig.toml" in said
     assert b"simulated.toml" in said
+
+
+async def _run_until_it_names_a_link(endpoint, port):
+    run = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "ldcnd", "run", "--config", str(ROOT / "config" / "simulated.toml")),
+        *("--listen", endpoint, "--console", f"127.0.0.1:{port}", "--log-level", "warning"),
+        stdout=PIPE,
+    )
+    async with asyncio.timeout(UP_S):
+        said = (await run.stdout.readuntil(b"Ctrl-C here ends it")).decode()
+    return run, re.search(r"http://\S+", said)
+
+
+async def _listens(port):
+    try:
+        _, writer = await asyncio.open_connection("127.0.0.1", port)
+    except ConnectionRefusedError:
+        return False
+    writer.close()
+    await writer.wait_closed()
+    return True
+
+
+async def test_the_console_beside_a_daemon_ends_with_it_however_that_ends():
+    endpoint, port = f"tcp/127.0.0.1:{free_port()}", free_port()
+    first, link = await _run_until_it_names_a_link(endpoint, port)
+    assert link
+    first.kill()
+    await first.wait()
+    async with asyncio.timeout(UP_S):
+        while await _listens(port):
+            await asyncio.sleep(0.05)
+
+    second, link = await _run_until_it_names_a_link(endpoint, port)
+    second.send_signal(signal.SIGTERM)
+    await second.communicate()
+    assert link

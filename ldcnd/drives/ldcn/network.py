@@ -569,6 +569,7 @@ class LdcnNetwork(Network):
     def _module(self, address: int, identity: Identity) -> ModuleInfo:
         profile = next((each.profile for each in self._expected if each.address == address), identity.profile)
         watch = self._watches.get(address)
+        served = self._io.get(address)
         return ModuleInfo(
             address=address,
             title=str(identity),
@@ -577,7 +578,8 @@ class LdcnNetwork(Network):
             version=identity.version,
             axis=self._names.get(address),
             status=watch.status if watch else None,
-            name=self._io[address].name if address in self._io else None,
+            name=served.name if served else None,
+            outputs=tuple(served.outputs) if served else (),
         )
 
 

@@ -7,9 +7,8 @@ import { save } from "../parts/chart_view.js";
 import { dateAndClock, words } from "../parts/format.js";
 import { faultPage, Mark } from "../parts/state.js";
 import { COMMAND_STATUSES } from "../session/contract.js";
-import { learnEvents, useRigs } from "../session/rigs.js";
+import { learnAllEvents, useRigs } from "../session/rigs.js";
 
-const ASKED = 500;
 const MOST_SHOWN = 300;
 const LEVELS = { refused: "warn", aborted: "warn", failed: "bad", unknown: "bad", fault: "bad" };
 
@@ -19,10 +18,10 @@ export function EventsPage() {
   const [refusal, setRefusal] = useState(null);
   const connected = all
     .filter((rig) => rig.connected)
-    .map((rig) => rig.name)
+    .map((rig) => `${rig.name} ${rig.daemon?.instance}`)
     .join();
   useEffect(() => {
-    for (const rig of all) if (rig.connected) learnEvents(rig, ASKED).catch(setRefusal);
+    for (const rig of all) if (rig.connected) learnAllEvents(rig).catch(setRefusal);
   }, [connected]);
 
   const set = (name) => (value) => setOnly((last) => ({ ...last, [name]: value ?? "" }));
@@ -45,6 +44,7 @@ export function EventsPage() {
       <p class="row"><${Action} act=${() => save(new Blob([csvOf(found)], { type: "text/csv" }), "events.csv")}
         obstacle=${found.length ? null : "There is nothing to save."}>Save CSV<//></p>
       <${RefusalText} refusal=${refusal} />
+      ${all.filter((rig) => rig.eventsBegin?.t).map((rig) => html`<p class="quiet">${lostOf(rig)}</p>`)}
       <p class="quiet" role="status">${found.length} events${found.length > MOST_SHOWN ? `, the latest ${MOST_SHOWN} are shown` : ""}.</p>
       <${Table} label="Events" head=${["When", "Axis", "Command", "Status", "By", "Reason"]}
         rows=${found.slice(0, MOST_SHOWN).map(Row)} />
@@ -72,6 +72,14 @@ function faultsOf(rig) {
     const seen = new Map([...axis.info.past_faults, ...axis.faults].map((fault) => [`${fault.code} ${fault.since}`, fault]));
     return [...seen.values()].map(({ code, since, text }) => ({ t: since, axis: axis.name, verb: "fault", status: "fault", reason: text, code }));
   });
+}
+
+/** What became of the events before those that the daemon knows. */
+function lostOf({ name, events, eventsBegin: { t, discarded } }) {
+  const before = `vents of ${name} before ${dateAndClock(t)}`;
+  const lost = discarded ? `The ${discarded} e${before} are not kept any more` : `E${before} were lost with the daemon that ended`;
+  const seen = events.length && events[0].t < t ? ", but for those that this page has seen" : "";
+  return `${lost}${seen}. A recorder keeps them: ldcnd record.`;
 }
 
 /** The start of the daemon: what an earlier run of it has done is not known any more. */

@@ -12,7 +12,6 @@ const BECOMES = [
   ["low", "output, low"],
   ["inputs", "input"],
 ];
-const LINES = Array.from({ length: 12 }, (_, index) => [`${index + 1}`, `${index + 1}`]);
 const TIMER = [
   ["off", "nothing"],
   ["timer", "time, at 5 MHz"],
@@ -41,31 +40,32 @@ export function Snapshot({ rig, bus }) {
 /** A panel for each module that has a name. */
 export function Modules({ rig, bus }) {
   const named = bus.info.modules.filter((module) => module.name);
-  return named.map((module) => html`<${Module} key=${module.name} rig=${rig} name=${module.name} />`);
+  return named.map((module) => html`<${Module} key=${module.name} rig=${rig} name=${module.name} outputs=${module.outputs} />`);
 }
 
-function Module({ rig, name }) {
-  const [line, setLine] = useState("1");
+function Module({ rig, name, outputs }) {
+  const [chosen, setLine] = useState(null);
+  const line = chosen ?? outputs[0];
   const [becomes, setBecomes] = useState("high");
   const [pwm, setPwm] = useState({});
   const [counts, setCounts] = useState("off");
   const { named, all } = readingOf(rig, name);
   const troubles = rig.worth ? [] : rig.axis(name).condition.troubles;
-  const lines = [...named.map(([each]) => [each, each]), ...LINES];
   const told = (verb, body) => ofRig(rig, verb, { module: name, ...body });
   return html`<${Panel} title=${`Module ${name}`} note="An output may move something; it keeps its level when this page is gone.">
     ${troubles.map(({ level, text }) => html`<p class="notice mark" data-level=${level}>${text}</p>`)}
     <${Facts} of=${[...named, ...all]} />
     <div class="fields">
-      <${Choice} label="Line" options=${lines} value=${line} onChange=${setLine} />
-      <${Choice} label="Becomes" options=${BECOMES} value=${becomes} onChange=${setBecomes} />
+      ${line && html`<${Choice} label="Line" options=${outputs.map((each) => [each, each])} value=${line} onChange=${setLine} />
+      <${Choice} label="Becomes" options=${BECOMES} value=${becomes} onChange=${setBecomes} />`}
       <${NumberField} label="PWM 1" value=${pwm.pwm1} min=${0} max=${1} onChange=${(pwm1) => setPwm((last) => ({ ...last, pwm1 }))} hint="0 to 1; empty: as it is" />
       <${NumberField} label="PWM 2" value=${pwm.pwm2} min=${0} max=${1} onChange=${(pwm2) => setPwm((last) => ({ ...last, pwm2 }))} hint="0 to 1; empty: as it is" />
       <${Choice} label="Counts" options=${TIMER} value=${counts} onChange=${setCounts} />
     </div>
+    ${!line && html`<p class="quiet">None of its lines is configured as an output.</p>`}
     <p class="row">
       <${Action} act=${() => told("set_io")}>Read ${name}<//>
-      <${Action} kind="main" act=${() => told("set_io", { [becomes]: [Number(line) || line] })}>Set line ${line}<//>
+      ${line && html`<${Action} kind="main" act=${() => told("set_io", { [becomes]: [Number(line) || line] })}>Set line ${line}<//>`}
       <${Action} act=${() => told("set_io", pwm)} obstacle=${unread({ "PWM 1": pwm.pwm1, "PWM 2": pwm.pwm2 })}>Set PWM<//>
       <${Action} act=${() => told("set_io_timer", { mode: counts })}>Count<//>
     </p>

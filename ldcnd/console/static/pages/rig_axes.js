@@ -5,7 +5,7 @@ import { Action } from "../parts/controls.js";
 import { askEach } from "../parts/fates.js";
 import { decimalsOf, number, percent, words } from "../parts/format.js";
 import { shownQuantity } from "../parts/number_text.js";
-import { inPageTerms } from "../parts/remedies.js";
+import { inPageTerms, pageOf } from "../parts/remedies.js";
 import { Homed, Mark, Meter, Place, StateWord, TroubleWords } from "../parts/state.js";
 import { command, controls, take } from "../session/control.js";
 import { calms, obstacle } from "../session/obstacles.js";
@@ -100,7 +100,7 @@ function AxisRow({ axis }) {
 /** Why an axis refused a command, what to do, and the nearest value that it would take. */
 export function refused(axis, verb, { message, nearest, remedy, steps }) {
   const text = message.replace(`axis ${axis.name}: `, "");
-  const way = remedy ? `; ${inPageTerms({ remedy, steps })}` : "";
+  const way = remedy ? `; ${inPageTerms({ remedy, steps, axis: axis.name })}` : "";
   return `${words(verb)} refused: ${text}${nearest === null ? way : `; nearest that is taken: ${nearest}`}`;
 }
 
@@ -117,7 +117,7 @@ function AxisCommands({ axis }) {
   const home = ["Home", "home", () => follow("Home", () => command(axis, "home"))];
   const second = obstacle(axis, "reset") === null || !axis.can("home") ? reset : home;
   const taking = ["Take control", "none", () => take([axis])];
-  const held = axis.holder ? `Control is held by ${axis.holder}: take it on the page of ${axis.name}.` : null;
+  const held = axis.holder ? `Control is held by ${axis.holder}: take it on ${pageOf(axis.name)}.` : null;
   const refuse = (title) => (error) => {
     axis.refusal = refused(axis, title.toLowerCase(), error); // below the row, which is one line
     changed();

@@ -2,7 +2,7 @@
 
 import { html, useEffect, useId, useLayoutEffect, useRef, useState } from "../html.js";
 import { sentence } from "./format.js";
-import { inPageTerms } from "./remedies.js";
+import { inPageTerms, pageOf } from "./remedies.js";
 import { faultPage } from "./state.js";
 import { cameUnderHand } from "./under_hand.js";
 
@@ -117,10 +117,19 @@ export function RefusalText({ refusal }) {
   return html`<span class="refusal" role="alert">
     ${
       refusal &&
-      html`<b>${refusal.message}</b> ${refusal.remedy && html`<span>${sentence(inPageTerms(refusal))}</span>`}
+      html`<b>${refusal.message}</b> ${refusal.remedy && html`<span><${RemedyText} refusal=${refusal} /></span>`}
       ${refusal.code && html` <a href=${faultPage(refusal.code)}>${refusal.code}</a>`}`
     }
   </span>`;
+}
+
+/** What to do, with a link where that is on the page of an axis. */
+function RemedyText({ refusal }) {
+  const text = sentence(inPageTerms(refusal));
+  const place = pageOf(refusal.axis);
+  const [before, ...after] = text.split(place);
+  if (!refusal.axis || !refusal.rig || !after.length) return text;
+  return html`${before}<a href=${`#/axis/${refusal.rig}/${refusal.axis}`}>${place}</a>${after.join(place)}`;
 }
 
 /** Enter in a field does what the main button of its panel does. */

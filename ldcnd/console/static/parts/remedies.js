@@ -1,28 +1,51 @@
-/** A remedy names commands; on a page they are buttons. */
+/** A remedy names commands; on a page they are buttons, of that page or of another one. */
 
+const AXIS = ["axis"];
+const PAGES_WITH_CONTROL = ["axis", "rig", "tuning", "parameters"]; // and with the power that goes with it
+const RIG = ["rig"];
+/** What is pressed for a command, and on which pages that is; the first is named on all others. */
 const PRESSED = {
-  power: "press Enable",
-  home: "home the axis",
-  set_position: "set its current position",
-  move_relative: "move it by a distance",
-  jog: "hold a button of Jog",
-  set_speed_override: "set the speed override of the rig",
-  reset: "press Reset",
-  halt: "press Halt",
-  set_gains: "write gains, at least kp and el",
-  set_outputs: "make the pin an input again, under Outputs",
-  trace_abort: "press Abort on the trace page",
-  clear_counter: "clear the counter",
-  restart_eeprom_count: "press Count anew on the parameters page",
-  list_parameters: "look at the list of parameters",
-  acquire: "press Take control",
-  events: "look at the events",
+  power: ["press Enable", PAGES_WITH_CONTROL],
+  home: ["home the axis", ["axis", "rig"]],
+  set_position: ["set its current position", AXIS],
+  move_relative: ["move it by a distance", AXIS],
+  jog: ["hold a button of Jog", AXIS],
+  set_speed_override: ["set the speed override of the rig", RIG],
+  reset: ["press Reset", PAGES_WITH_CONTROL],
+  halt: ["press Halt", ["axis", "rig"]],
+  set_gains: ["write gains, at least kp and el", ["axis", "tuning"]],
+  set_outputs: ["make the pin an input again, under Outputs", AXIS],
+  trace_abort: ["press Abort", ["trace"]],
+  clear_counter: ["clear the counter", ["parameters"]],
+  restart_eeprom_count: ["press Count anew", ["parameters"]],
+  list_parameters: ["look at the list of parameters", ["parameters"]],
+  acquire: ["press Take control", PAGES_WITH_CONTROL],
+  events: ["look at the events", ["events"]],
 };
 
-/** Return a remedy in the words of the pages; `told` is an error reply or a cause. */
-export function inPageTerms({ remedy, steps = [] }) {
-  return steps.reduce((text, { verb, said, arguments: given }) => {
-    const words = verb === "acquire" && given?.force ? "take it from there by the tick" : (PRESSED[verb] ?? said);
-    return text.replace(said, words);
+/** The page that is open, as its address names it. */
+const here = () => location.hash.slice(2).split("/")[0] || "rig";
+
+/** Return where a command is pressed, as " on the page of x"; empty where that is the page that is open. */
+export function whereElse(verb, axis) {
+  const pages = PRESSED[verb]?.[1] ?? [here()];
+  if (pages.includes(here())) return "";
+  return ` on ${pages[0] === "axis" ? pageOf(axis) : `the ${pages[0]} page`}`;
+}
+
+/** Return how the page of an axis is called. */
+export function pageOf(axis) {
+  return axis ? `the page of ${axis}` : "the page of the axis";
+}
+
+/** Return a remedy in the words of the pages; `told` is an error reply or a cause, with the name of its axis. */
+export function inPageTerms({ remedy, steps = [], axis }) {
+  return steps.reduce((text, { verb, said, arguments: given }, at) => {
+    const where = whereElse(verb, axis);
+    const forced = verb === "acquire" && given?.force && `take it from there${where ? "" : " by the tick"}`;
+    const words = forced || PRESSED[verb]?.[0];
+    const next = steps[at + 1];
+    // of several commands on one other page, the last one names it
+    return text.replace(said, words ? `${words}${next && whereElse(next.verb, axis) === where ? "" : where}` : said);
   }, remedy);
 }

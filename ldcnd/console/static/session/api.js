@@ -18,9 +18,11 @@ export function nameThisPage(name) {
 
 /** What a question was refused with: the daemon's error reply, or what came instead of one. */
 export class Refusal extends Error {
-  constructor(reply, status) {
+  constructor(reply, status, rig = null) {
     super(reply.message);
     this.code = reply.code ?? null; // one of the daemon's, each has a page
+    this.rig = rig; // of which it was asked
+    this.axis = reply.axis ?? null;
     this.remedy = reply.remedy ?? null;
     this.steps = reply.steps ?? [];
     this.nearest = reply.nearest ?? null;
@@ -90,6 +92,11 @@ export function rigPath(rig) {
   return `/api/rigs/${encodeURIComponent(rig)}`;
 }
 
+function rigOf(path) {
+  const [, rig] = path.match(/^\/api\/rigs\/([^/]+)\//) ?? [];
+  return rig ? decodeURIComponent(rig) : null;
+}
+
 async function answer(path, request) {
   let response;
   try {
@@ -98,7 +105,7 @@ async function answer(path, request) {
     throw new Refusal(silence(error), 0);
   }
   const reply = await response.json().catch(() => ({}));
-  if (!response.ok) throw new Refusal(explained(reply, response.status), response.status);
+  if (!response.ok) throw new Refusal(explained(reply, response.status), response.status, rigOf(path));
   return reply;
 }
 

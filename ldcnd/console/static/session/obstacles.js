@@ -1,6 +1,6 @@
 /** What is in the way of a command, as the daemon says; what is said here concerns this page, or a press without a use. */
 
-import { inPageTerms } from "../parts/remedies.js";
+import { inPageTerms, whereElse } from "../parts/remedies.js";
 import { controls } from "./control.js";
 
 /** What buttons send, where that is not what they are called. */
@@ -19,7 +19,8 @@ const USELESS = {
 };
 
 function notControlled(axis) {
-  return axis.holder ? `Control is held by ${axis.holder}: take it first.` : "Take control first.";
+  const where = whereElse("acquire", axis.name);
+  return axis.holder ? `Control is held by ${axis.holder}: take it first${where}.` : `Take control first${where}.`;
 }
 
 /** Return the first obstacle in words, or null.
@@ -35,7 +36,7 @@ export function obstacle(axis, act, joins = false) {
   if (here) return here;
   const causes = act === "disable" ? [] : (axis.samples.obstacles?.[verb] ?? []); // nothing refuses what takes energy out
   const cause = causes.find(({ passes }) => !(joins && passes));
-  return cause ? inWords(cause) : null;
+  return cause ? inWords({ ...cause, axis: axis.name }) : null;
 }
 
 /** Why an act would change nothing on an axis as it is, or false; of one whose readings are old nobody knows. */

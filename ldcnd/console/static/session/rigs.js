@@ -502,6 +502,20 @@ function joined(rig, { connected, problem }) {
   if (came) describe(); // another run of the daemon may have other axes
 }
 
+/** Ask a rig for all events that it knows, page by page, and note from when on that is. */
+export async function learnAllEvents(rig) {
+  const page = (from_number) => ask(`${rigPath(rig.name)}/rig/events`, { from_number, count: EVENTS_KEPT });
+  const first = await page(0);
+  for (let { run, events, next_number: next, end_number: end } = first; run === first.run; ) {
+    for (const event of events) rig.happened(event);
+    if (next >= end) break;
+    ({ run, events, next_number: next, end_number: end } = await page(next));
+  }
+  const discarded = first.events.length ? first.first_number : 0;
+  rig.eventsBegin = { discarded, t: discarded ? first.events[0].t : rig.daemon?.started };
+  changed();
+}
+
 /** Ask a rig for its latest events: of what happened before this page was there, or while it slept. */
 export async function learnEvents(rig, count) {
   const { events } = await ask(`${rigPath(rig.name)}/rig/events`, { count });
