@@ -321,6 +321,18 @@ def line_troubles(*, up: bool, problem: str = "") -> tuple[Trouble, ...]:
     return () if up else (Trouble(TroubleKind.LINE_DOWN, _WRONG, text, _ON_DEAD_LINE.short),)
 
 
+def disk_troubles(not_kept: Sequence[str]) -> tuple[str, ...]:
+    """Return in words what is wrong with the state directory of a daemon; empty while all of it can be written.
+
+    Args:
+        not_kept: the files that cannot be written, each with the reason, as in a `DaemonHealth`.
+    """
+    if not not_kept:
+        return ()
+    more = f", and {len(not_kept) - 1} more" if len(not_kept) > 1 else ""
+    return (f"not kept over a restart, {not_kept[0]}{more}: make room in state_dir, or mend its disk",)
+
+
 def assess_module(health: ModuleHealth, *, line_up: bool = True, silence: str = "") -> Condition:
     """Return the condition of an I/O module.
 

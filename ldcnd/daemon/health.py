@@ -152,7 +152,7 @@ class HealthWatch:
                 missed_reports=self._missed,
                 waiting_queries=load.waiting,
                 dropped=load.lost,
-                not_kept=tuple(f"{name}: {why}" for name, why in self._rig.not_kept.items()),
+                not_kept=self._rig.not_kept_in_words,
                 heartbeat=self.heartbeat(),
                 version=version(),
             )

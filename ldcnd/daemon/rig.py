@@ -72,6 +72,11 @@ class OwnedRig:
             ),
         )
 
+    @property
+    def not_kept_in_words(self) -> tuple[str, ...]:
+        """Files of the state directory that cannot be written, each with the reason."""
+        return tuple(f"{name}: {why}" for name, why in self.not_kept.items())
+
     def guest(self, port: str) -> GuestView:
         """Return the guest of a port.
 

@@ -20,7 +20,7 @@ from typing import NamedTuple
 from ldcnd import systemd
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.condition import OWN, Condition, TroubleKind, assess, assess_module, line_troubles
+from ldcnd.contract.condition import OWN, Condition, TroubleKind, assess, assess_module, disk_troubles, line_troubles
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.rig_commands import Reload, ReloadReply
 from ldcnd.contract.samples import FaultEntry, LinkState
@@ -289,6 +289,7 @@ def describe(rig: OwnedRig) -> str:
     buses_up = sum(bus.report is not None for bus in rig.buses)
     axes_up = sum(axis.tracker.status.link is not LinkState.DOWN for axis in rig.axes.values())
     parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {axes_up}/{len(rig.axes)} axes up"]
+    parts += disk_troubles(rig.not_kept_in_words)
     return "; ".join(parts + [f"{', '.join(names)}: {text}" for text, names in wrong.items()])
 
 

@@ -11,9 +11,11 @@ from structlog.testing import capture_logs
 
 from ldcnd import durable
 from ldcnd.axis import kept as kept_files
+from ldcnd.client.fleet import survey
 from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, QuickStop, Reset
 from ldcnd.contract.errors import OutcomeUnknown, RequestRefused, WrongState
 from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.daemon.service import describe
 from ldcnd.drives.ldcn.config import ModuleConfig
 from ldcnd.durable import DISK_TIME_S
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
@@ -278,8 +280,11 @@ async def test_a_disk_that_fails_delays_no_stop_and_the_answer_says_so(tmp_path,
         with capture_logs() as logs:
             reply = await rig.client.stop("x")
             await rig.client.stop("x")
+        await asyncio.sleep(2.0)  # virtual: until the next report
+        status, (report,) = describe(rig.daemon.rig), await survey(rig.session)
         monkeypatch.undo()
         await asyncio.sleep(20.0)  # virtual: it is tried again
+        later = describe(rig.daemon.rig)
         await rig.kill()
     async with rig_on(chain, config) as rig:
         await up(rig)
@@ -288,6 +293,8 @@ async def test_a_disk_that_fails_delays_no_stop_and_the_answer_says_so(tmp_path,
     assert (reply.confirmed, reply.kept) == (("x",), ())
     assert len([line for line in logs if line["event"] == "not kept on disk" and line["file"] == "latches.json"]) == 1
     assert state.stop_latched
+    told = "not kept over a restart, latches.json: No space left on device"
+    assert [told in said for said in (status, " ".join(report.problems), later)] == [True, True, False]
 
 
 async def test_a_disk_that_hangs_delays_the_answer_by_a_bounded_time_and_the_packet_by_none(tmp_path, monkeypatch):
