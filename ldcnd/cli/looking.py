@@ -18,7 +18,7 @@ from ldcnd.client.overview import AxisNow, AxisSeen, modules_now, overview
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
 from ldcnd.contract.commands import Verb
-from ldcnd.contract.condition import SILENT_S, Condition, assess
+from ldcnd.contract.condition import SILENT_S, Condition, assess, explained_as
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.fault_pages import codes, page_text
 from ldcnd.contract.meta import AxisInfo
@@ -325,13 +325,17 @@ class Code(click.types.StringParamType):
 
 
 @click.command()
-@click.argument("code", required=False, type=Code())
-def fault(code: str | None) -> None:
-    """Explain CODE, a fault or an error: what to check, how to clear it; without CODE list all of them."""
-    if code is None:
+@click.argument("words", nargs=-1, metavar="[CODE]", type=Code())
+def fault(words: tuple[str, ...]) -> None:
+    """Explain CODE, a fault or an error: what to check, how to clear it; without CODE list all of them.
+
+    CODE may also be what `list` says of an axis, such as: not homed.
+    """
+    if not words:
         print("\n".join(sorted(codes())))
         return
-    page = page_text(code)
+    code = " ".join(words)
+    page = page_text(code) or page_text(explained_as(code))
     if page is None:
         near = next(iter(get_close_matches(code, codes(), 1)), None)
         meant = f"did you mean {near!r}? " if near else ""

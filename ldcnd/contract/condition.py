@@ -4,7 +4,8 @@ Every face shows what this module decides: command line, console, gateways, metr
 sentence of its own; the console's pages get the result from the console's server.
 """
 
-from collections.abc import Collection, Sequence
+import re
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum, auto
 from typing import Protocol
@@ -259,6 +260,8 @@ class Faults(Protocol):
         """The one that came first."""
 
 
+_FLOATS, _NO_DATA, _DAEMON_SILENT, _POSITION_LOST = "outputs float", "no data", "daemon silent", "position lost"
+_BY_INTERLOCK, _ERROR_STOP, _OVERRIDE, _SLOW = "ended by interlock", "error stop", "speed override", "slow"
 _WRONG, _NOTICE, _FINE = Severity.WRONG, Severity.NOTICE, Severity.FINE
 _NOT_CONFIRMED = Trouble(
     TroubleKind.STOP_PENDING,
@@ -294,7 +297,7 @@ _UNCOMMANDED = Trouble(
 )
 _PUSHED = Trouble(TroubleKind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command")
 _OVERRIDE_ZERO = Trouble(
-    TroubleKind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: no command moves it", "speed override 0 %"
+    TroubleKind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: no command moves it", f"{_OVERRIDE} 0 %"
 )
 _MISSED_POLLS = Trouble(TroubleKind.MISSED_POLLS, _NOTICE, "the drive missed its latest polls", "missed polls")
 _MODULE_SILENT = replace(_NO_ANSWER, text="the module does not answer; check its power and the line")
@@ -307,7 +310,28 @@ TELL_OF_THE_PAST = frozenset({"loop_opened"})
 """Faults that say what has happened and are seen in one reading only; the others say what is so while they stand."""
 _MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
 """Faults whose name says best why the position is lost."""
+PAGES: Mapping[str, str] = {
+    _NOT_CONFIRMED.short: "stop_unconfirmed",
+    **dict.fromkeys((_NO_ANSWER.short, _MISSED_POLLS.short, Place.NOT_ANSWERING.value, _FLOATS), "link_lost"),
+    **dict.fromkeys((_ON_DEAD_LINE.short, _OPENING.short), "bus_down"),
+    **dict.fromkeys((_NEVER_SEEN.short, _NO_DATA, _DAEMON_SILENT, _OLD.short), "session_failed"),
+    **dict.fromkeys((_NOT_HOMED.short, _REFERENCE_LOST.short, _HOMING.short), "not_referenced"),
+    **dict.fromkeys((_POSITION_LOST, Place.CONTRADICTED.value), "readings_contradict"),
+    **dict.fromkeys((_ERROR_STOP, _OVERRIDE), "wrong_state"),
+    _UNCOMMANDED.short: "drive_changed",
+    _BY_INTERLOCK: "interlock_violated",
+    _SLOW: "bus_busy",
+}
+"""The code of the page that explains what a face says in a few words; other words are those of a code."""
 _DRIVEN = frozenset(each for each in AxisState if each.is_motion) - {AxisState.STOPPING}
+
+
+def explained_as(said: str) -> str:
+    """Return the code whose page explains what a face says, however its words are written; others stay as they are."""
+    code = re.sub("[^a-z0-9]+", "_", said.lower()).strip("_")
+    # a word may have a value behind it: "speed override 30 %"
+    pages = (page for words, page in PAGES.items() if f"{code}_".startswith(f"{words.lower().replace(' ', '_')}_"))
+    return next(pages, code)
 
 
 def line_troubles(*, up: bool, problem: str = "") -> tuple[Trouble, ...]:
@@ -349,7 +373,7 @@ def assess_module(health: ModuleHealth, *, line_up: bool = True, silence: str = 
     troubles = [_MODULE_MISSES] if health.link is LinkState.DEGRADED else []
     if health.floating:
         text = f"{', '.join(health.floating)}: was set before the module lost its power, and floats until it is set"
-        troubles.append(Trouble(TroubleKind.FLOATING, _NOTICE, text, "outputs float"))
+        troubles.append(Trouble(TroubleKind.FLOATING, _NOTICE, text, _FLOATS))
     alarm = Alarm(max((trouble.severity for trouble in troubles), default=_FINE))
     return Condition(Place.KNOWN, "", "answers", live=True, alarm=alarm, troubles=tuple(troubles))
 
@@ -391,7 +415,7 @@ def assess(
     if state is None:
         dead = _OPENING if line_up is None else _ON_DEAD_LINE
         lost = (_silent(silence),) if silence else () if line_up else (dead,)
-        return _unanswered("unknown", lost or (_NEVER_SEEN,), lost[0].short if lost else "no data")
+        return _unanswered("unknown", lost or (_NEVER_SEEN,), lost[0].short if lost else _NO_DATA)
     word, last = state.state.words, _last_known(state)
     holder = UNKNOWN_HOLDER if silence else state.holder
     control = _control(holder, moves=state.moving is Moving.YES and state.command is not None)
@@ -421,7 +445,7 @@ def _unanswered(state: str, troubles: tuple[Trouble, ...], mark: str) -> Conditi
 
 
 def _silent(why: str) -> Trouble:
-    return Trouble(TroubleKind.SILENCE, _WRONG, why, "daemon silent")
+    return Trouble(TroubleKind.SILENCE, _WRONG, why, _DAEMON_SILENT)
 
 
 def _unreachable(state: KnownState, faults: Faults | None, *, silence: str, line_up: bool | None) -> Trouble | None:
@@ -451,7 +475,7 @@ def _place(state: KnownState, faults: Faults | None, *, is_old: bool) -> tuple[P
     """Return whether the position of an axis that answers says where it is, and its mark."""
     if state.link is LinkState.UP and state.quality is Quality.UNCERTAIN:
         codes = [fault.code for fault in faults.active if fault.code in _MARKING_FAULTS] if faults else []
-        return Place.CONTRADICTED, _words(codes[0]) if codes else "position lost"
+        return Place.CONTRADICTED, _words(codes[0]) if codes else _POSITION_LOST
     if is_old:
         return Place.OLD, _OLD.short
     if state.referenced or not state.has_reference:
@@ -492,7 +516,7 @@ def _ended(state: KnownState, faults: Faults | None, *, in_fault: bool) -> tuple
     """Return how a motion ended that leaves an axis in error stop, or that an interlock has ended."""
     if state.state is not AxisState.ERROR_STOP:
         text = f"its motion was ended by interlock {state.interlock}"
-        return (Trouble(TroubleKind.INTERLOCK, _NOTICE, text, "ended by interlock"),) if state.interlock else ()
+        return (Trouble(TroubleKind.INTERLOCK, _NOTICE, text, _BY_INTERLOCK),) if state.interlock else ()
     if in_fault:
         return ()
     first = faults.first if faults else None
@@ -500,7 +524,7 @@ def _ended(state: KnownState, faults: Faults | None, *, in_fault: bool) -> tuple
         text = f"in error stop because of {over_in_words(first)}: reset it to go on"
     else:
         text = f"in error stop: {state.last_error or 'reset it to go on'}"
-    return (Trouble(TroubleKind.ERROR_STOP, _WRONG, text, "error stop"),)
+    return (Trouble(TroubleKind.ERROR_STOP, _WRONG, text, _ERROR_STOP),)
 
 
 def _overridden(health: AxisHealth | None) -> tuple[Trouble, ...]:
@@ -513,7 +537,7 @@ def _slowed(state: KnownState) -> tuple[Trouble, ...]:
     """Return what is to be known and is not wrong."""
     if not (state.has_reference and 0 < state.speed_override < FULL_SPEED):
         return ()
-    short = f"speed override {state.speed_override:g} %"
+    short = f"{_OVERRIDE} {state.speed_override:g} %"
     return (Trouble(TroubleKind.SLOWED, _FINE, f"{short} of every velocity", short),)
 
 
@@ -543,4 +567,4 @@ def _slowness(health: AxisHealth) -> list[Trouble]:
     if health.rate_hz + EDGE_HZ >= ENOUGH * wanted_hz:
         return []
     text = f"fewer samples a second than asked for: {health.rate_hz:.1f} of {wanted_hz:.1f}"
-    return [Trouble(TroubleKind.SLOW, _NOTICE, text, "slow")]
+    return [Trouble(TroubleKind.SLOW, _NOTICE, text, _SLOW)]

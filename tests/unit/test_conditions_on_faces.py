@@ -10,10 +10,12 @@ from pathlib import Path
 
 import msgpack
 import pytest
+from click.testing import CliRunner
 from prometheus_client import CollectorRegistry, generate_latest
 
 from ldcnd.cli.looking import Watched, axes_table, rig_table
 from ldcnd.cli.looking import row as row_of
+from ldcnd.cli.main import cli
 from ldcnd.client.axis import Axis
 from ldcnd.client.fleet import AxisReport, RigReport
 from ldcnd.client.overview import AxisNow, LastOfAxis
@@ -21,6 +23,7 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.condition import Place, assess
+from ldcnd.contract.fault_pages import page_text
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth, StopWaitHealth
 from ldcnd.contract.keys import Keys
@@ -338,6 +341,36 @@ def test_a_joint_state_leaves_out_a_place_that_is_not_known(case):
     joint = bridge.take("x", at.position)
 
     assert (joint is not None) is (case.place in (Place.KNOWN, Place.OLD))
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_the_words_of_a_list_lead_to_a_page(case):
+    condition = axis_now(known(case)).condition
+    said = {condition.mark, condition.place.value, *(trouble.short for trouble in condition.troubles)} - {"", "known"}
+
+    for words in said:
+        for typed in ([words], words.split(), [words.replace(" ", "_")]):
+            assert CliRunner().invoke(cli, ["fault", *typed]).exit_code == 0, typed
+
+
+@pytest.mark.parametrize(
+    ("said", "page"),
+    [
+        ("not_homed", "not_referenced"),
+        ("reference lost", "not_referenced"),
+        ("stop latched", "stop_latched"),
+        ("speed override 30 %", "wrong_state"),
+        ("stop NOT CONFIRMED by the drive", "stop_unconfirmed"),
+        ("outputs float", "link_lost"),
+        ("daemon silent", "session_failed"),
+        ("nothing received", "session_failed"),
+        ("line is being opened", "bus_down"),
+        ("slow", "bus_busy"),
+        ("homing", "not_referenced"),
+    ],
+)
+def test_a_word_of_a_list_leads_to_the_page_of_what_it_is(said, page):
+    assert CliRunner().invoke(cli, ["fault", said]).output == page_text(page)
 
 
 CALM = ("moved by another", "controlled by another", "not controlled", "moved by pulses")
