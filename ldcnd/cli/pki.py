@@ -57,7 +57,7 @@ def add(folder: Path, name: str, role: str, hosts: tuple[str, ...], addresses: t
     else:
         click.echo(f"{file}: hand it over on a safe way; use it as --config {file.name}")
     if login.role is not Role.DAEMON:
-        _say_restart(other for other in site.listener_files() if other != file)
+        _say_restart((other for other in site.listener_files() if other != file), f"{name} is not let in")
 
 
 @command.command()
@@ -84,12 +84,14 @@ def revoke(folder: Path, name: str) -> None:
     site = Site(folder)
     site.revoke(name)
     click.echo(f"{name}: revoked")
-    _say_restart(site.listener_files())
+    _say_restart(site.listener_files(), f"{name} keeps its rights, on links that are open, too")
 
 
-def _say_restart(files: Iterable[Path]) -> None:
+def _say_restart(files: Iterable[Path], until_then: str) -> None:
+    """Say that daemons and routers read their rules at their start; nobody else decides on what a login may do."""
     for file in files:
-        click.echo(f"restart what runs with {file}: rules are read at its start")
+        click.echo(f"put {file} in the place of the one before, and restart the daemon or router that runs with it;")
+        click.echo(f"  a reload does not do; until then {until_then}")
 
 
 def _now() -> dt.datetime:

@@ -9,7 +9,7 @@ import asyncio
 import hashlib
 import json
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
 
@@ -50,6 +50,7 @@ class Reloader:
         self._load = load
         self._one_at_a_time = asyncio.Lock()
         self._reading = OwnThread("configuration")
+        self._access = _access_of(daemon.config)  # the session is open: it was read just now
 
     async def reload(self) -> "ReloadPlan":
         """Take what can be taken, for a signal: whoever may send that outranks control of an axis.
@@ -105,6 +106,8 @@ class Reloader:
 
     def _prepare(self, running: RigConfig, held: Mapping[str, str]) -> "tuple[ReloadPlan, RigBudget]":
         reload = plan_reload(running, self._load(), held)
+        if _access_of(running) != self._access:
+            reload = replace(reload, changes=(*reload.changes, ACCESS_CHANGED))
         # before anything is taken: polls that the line cannot carry are refused whole
         return reload, require_plan(reload.config)
 
@@ -117,6 +120,20 @@ class Reloader:
             log.warning("changes need a restart", keys=reload.refused)
         if kept := [each.key for each in reload.changes if each.held_by is not None]:
             log.warning("other clients control axes, which keep their settings", keys=kept)
+
+
+ACCESS_CHANGED = ConfigChange(
+    key="zenoh.config_file", before="as it was at the start", after="with other logins or rules", restart=True
+)
+
+
+def _access_of(config: RigConfig) -> bytes | None:
+    """Return what tells one Zenoh configuration, with its logins and access rules, from another; None without one."""
+    path = config.zenoh.config_file
+    try:
+        return hashlib.sha256(path.read_bytes()).digest() if path else None
+    except OSError:
+        return b""
 
 
 @dataclass(frozen=True, slots=True)

@@ -223,7 +223,11 @@ def test_the_command_line_makes_a_site_and_says_what_to_do_next(tmp_path: Path) 
         printed += result.output
 
     assert f'config_file = "{folder}/bench.json5"' in printed
-    assert printed.count(f"restart what runs with {folder}/bench.json5") == 2
+    said = (
+        f"put {folder}/bench.json5 in the place of the one before, and restart the daemon or router that runs with it"
+    )
+    assert printed.count(said) == 2
+    assert "until then ada keeps its rights" in printed
     assert read_roster(tmp_path / "site").find("ada") == Login(name="ada", role=Role.OPERATOR, revoked=True)
 
 

@@ -4,9 +4,11 @@ from typing import Any
 
 import pytest
 
+from ldcnd.config.plan import plan_rig
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import ConfigError
-from ldcnd.daemon.reload import plan_reload
+from ldcnd.daemon.reload import Reloader, plan_reload
+from tests.support.rig import running_rig
 
 SIMULATED = Path(__file__).parents[2] / "config" / "simulated.toml"
 RUNNING = load_config(SIMULATED)
@@ -218,3 +220,17 @@ def test_a_number_within_a_list_is_named_in_the_units_that_people_read(tmp_path:
 def test_a_speed_above_its_limit_is_refused_in_the_units_of_the_file(tmp_path: Path):
     with pytest.raises(ConfigError, match=r"velocity 4000 rpm \(\d+ g\) is above limits\.velocity 3300 rpm"):
         changed_centrifuge(tmp_path, ("velocity = 30 #", "velocity = 4000 #"))
+
+
+async def test_a_file_of_logins_that_was_changed_needs_a_restart(tmp_path):
+    (tmp_path / "bench.json5").write_text("{}")
+    zenoh = RUNNING.zenoh.model_copy(update={"config_file": tmp_path / "bench.json5"})
+    config = RUNNING.model_copy(update={"zenoh": zenoh})
+    async with running_rig(RUNNING) as rig:
+        rig.daemon.reconfigure(config, plan_rig(config))
+        reloader = Reloader(rig.daemon, lambda: config)
+        before = (await reloader.reload()).refused
+        (tmp_path / "bench.json5").write_text("{access_control: {}}")
+        after = (await reloader.reload()).refused
+
+    assert (before, after) == ((), ("zenoh.config_file",))
