@@ -74,6 +74,8 @@ class DriveState:
         self._question: object = ()  # what flags and faults were worked out from last
         self._shown: _Shown = NOTHING_SHOWN
         self.restarted()
+        # nothing is known of a drive that this host has not met: it may hold a load, and a stop must not let go of it
+        self.known = Knowledge()
 
     # -- what was commanded ------------------------------------------------------------------------------------------
 
