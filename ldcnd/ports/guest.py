@@ -71,6 +71,7 @@ class _Reached:
         waiting: what waits for its turn.
         idle: set while nothing of the guest's commands is under way.
         at_work: the command that is being carried out.
+        restarts: how often its drive had restarted when the guest's module was as that drive was last.
         captured: levels and counter that the guest's latest Synch Input has found.
         capture: reads them.
     """
@@ -87,6 +88,7 @@ class _Reached:
     waiting: deque[ReceivedCommand] = field(default_factory=deque)
     idle: asyncio.Event = field(default_factory=asyncio.Event)
     at_work: ReceivedCommand | None = None
+    restarts: int = 0
     captured: tuple[int, int] = (0, 0)
     capture: "asyncio.Task[None] | None" = None
 
@@ -148,6 +150,7 @@ class Guest(Presence):
                 outputs = GuestOutputs(io.name, io.outputs, host.levels)
                 read_io = partial(_read_io, io.node)
                 add(io.node, _Reached(io.name, PIC_IO, io.node, read_io, _io_width, outputs=outputs))
+        self._by_node = modules
         self._modules = tuple(modules[address] for address in sorted(modules))
         self.chain = Chain(self._modules)
         for each in self._modules:
@@ -209,8 +212,19 @@ class Guest(Presence):
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
+    def _has_restarted(self, module: _Reached) -> bool:
+        """Tell whether its drive was reset or lost power since; the guest's module is then as after that."""
+        seen = module.servo.drive.restarts if module.servo else 0
+        if seen == module.restarts:
+            return False
+        module.restarts = seen
+        self._by_node[module.node].lose_power(self._loop.time())
+        return True
+
     def _ask(self, module: _Reached, items: StatusItem, answer: PendingReply) -> None:
         self.packets += 1
+        if self._has_restarted(module):
+            return  # what counts from 0 anew would pass for where the program has left it
         self._group.create_task(self._read(module, items, answer), name=f"guest {self._name} reads {module.name}")
 
     async def _read(self, module: _Reached, items: StatusItem, answer: PendingReply) -> None:
@@ -247,6 +261,8 @@ class Guest(Presence):
 
     def _command(self, module: _Reached, command: ReceivedCommand) -> None:
         """Take energy out at once; what does more waits for its turn, or is refused."""
+        if self._has_restarted(module) and not isinstance(command, StopMotor):
+            return
         if module.outputs and isinstance(command, SynchInput):  # the registers of the module are the daemon's
             earlier = module.capture
             work = self._capture(module, earlier)
@@ -310,6 +326,7 @@ class Guest(Presence):
             module.outputs.restart()
             module.captured = (0, 0)
         if module.servo:
+            module.restarts = module.servo.drive.restarts
             module.servo.hard_reset()
             if self._control and module.name in self._control.axes:
                 self._relieve(module, Power(on=False, client=self._name))

@@ -45,14 +45,14 @@ class GuestModule(SimulatedModule):
     ) -> None:
         self._ask, self._command, self._reset_here = ask, command, reset
         self._asked: _StatusReply | None = None
+        self._powered_up = True  # and not reset since: it counts from where a program gives it its address
         self.neighbours: Sequence[GuestModule] = ()
         super().__init__(profile, settings)
-        self._powered_up = True  # and not reset since: it counts from where its first program finds it
 
     def restart(self) -> None:
-        """A guest's Hard Reset reaches no drive."""
-        self._powered_up = False
-        self._reset_here()
+        """A guest's Hard Reset reaches no drive; after a loss of power the guest has to begin."""
+        if not self._powered_up:
+            self._reset_here()
 
     def run(self, cycles: int) -> None:
         """The drive counts its own servo cycles."""
@@ -84,8 +84,14 @@ class GuestModule(SimulatedModule):
                 if named.address == packet.data[0]:
                     return named.obey_again(packet, self._due_cycle, at_s)
             if self._powered_up:  # modules behind the first do not hear the Hard Reset before it
-                self.restart()
+                self._powered_up = False
+                self._reset_here()
         return super()._obey(packet, at_s)
+
+    def lose_power(self, at_s: float) -> None:
+        """Its drive has restarted: this one is without an address too, and silent until the guest gives it one."""
+        self._powered_up = True
+        self.power(on=True, at_s=at_s)
 
     def drop_half_packets(self) -> None:
         """Take the next byte for the first one of a packet: another program sends it."""

@@ -9,7 +9,7 @@ from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, Set
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, ListHolders, Release
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, StatusItem, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
@@ -230,6 +230,35 @@ async def test_the_first_program_finds_the_counters_of_all_its_axes_at_zero(tmp_
 
         assert shaft(rig, 1) - before[0] == pytest.approx(500, abs=10)
         assert shaft(rig, 2) - before[1] == pytest.approx(500, abs=10)
+
+
+async def test_a_drive_that_loses_power_is_silent_for_its_program_until_that_gives_it_an_address_again(tmp_path):
+    """Its counter begins at 0 anew: the program read a false position, and its next move went elsewhere."""
+    async with guest(tmp_path, "control") as (rig, program):
+        await program.begin()
+        await program.send(ENABLE)
+        await program.send(load(GO_NOW, counts=2000))
+        await finished(program)
+        drive = rig.chain.modules[0]
+        drive.power(on=False, at_s=asyncio.get_running_loop().time())
+        await rig.until("rotor", lambda state: state.link is LinkState.DOWN)
+        drive.power(on=True, at_s=asyncio.get_running_loop().time())
+        await rig.until("rotor", lambda state: state.link is LinkState.UP)
+        before = shaft(rig)
+
+        assert await program.send(Packet(1, READ, POSITION), 0.3) == ""
+        await program.send(ENABLE, 0.3)
+        await program.send(load(GO_NOW, counts=2000), 0.3)
+        await asyncio.sleep(1.0)
+        assert shaft(rig) == pytest.approx(before, abs=5)
+
+        await program.begin()
+        assert abs(position(await program.send(Packet(1, READ, POSITION)))) <= 5
+        await program.send(ENABLE)
+        await program.send(Packet(1, CommandCode.CLEAR_STICKY_BITS))
+        await program.send(load(GO_NOW, counts=1000))
+        await finished(program)
+        assert shaft(rig) - before == pytest.approx(1000, abs=20)
 
 
 def home(reply):

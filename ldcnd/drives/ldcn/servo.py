@@ -142,6 +142,7 @@ class LdcnAxis(Moves):
         self.path_packet = MOST_POINTS_PER_PACKET
         self.path_most_counts = PATH_MOST_COUNTS
         self._switching_off = 0
+        self.restarts = 0  # it was reset or lost power so often, as far as was seen
         self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
         self._stops: dict[int, Exchange[StatusPacket]] = {}
 
@@ -150,6 +151,7 @@ class LdcnAxis(Moves):
         self.state.restarted()
         self._book.reset()
         self._initialised = False
+        self.restarts += 1
 
     def adopted(self, status: StatusPacket, *, known: bool) -> None:
         """The drive was taken over as it is, with this status; its gains are assumed to be the configured ones.
