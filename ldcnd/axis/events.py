@@ -184,10 +184,11 @@ class CommandOver:
 
 @dataclass(frozen=True, slots=True)
 class PowerSwitched:
-    """The drive has acknowledged a change of power."""
+    """The drive has acknowledged a change of power; `by` is the id of the command that it has carried out."""
 
     on: bool
     now_s: float
+    by: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

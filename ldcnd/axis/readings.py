@@ -16,7 +16,7 @@ from ldcnd.axis.history import ReadingRing
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.plausibility import ROUNDS, CounterStep, PlausibilityGate, ReadingVerdict, agree
 from ldcnd.axis.scale import AxisScale
-from ldcnd.axis.status import ActiveCommand, AxisStatus, CommandEnd
+from ldcnd.axis.status import AxisStatus, CommandEnd
 from ldcnd.axis.stopping import AxisStops
 from ldcnd.axis.telemetry import Note
 from ldcnd.axis.tracker import AxisTracker
@@ -55,7 +55,7 @@ class Arrival:
     settled: bool | None
 
 
-OnEnded = Callable[[ActiveCommand, CommandStatus, str | None, Arrival | None], None]
+OnEnded = Callable[[CommandEnd, Arrival | None], None]
 """Takes a command that is over, how it ended, why when it was not done, and where; None where no reading shows it."""
 
 
@@ -325,7 +325,7 @@ class AxisReadings:
         if end is None:
             return
         if reading is None:  # nothing shows where
-            self._on_ended(end.command, end.status, end.reason, None)
+            self._on_ended(end, None)
         else:
             self._over = end, arrival_of(end, reading, after.scale)
 
@@ -335,7 +335,7 @@ class AxisReadings:
         if over is None:
             return
         end, arrival = over
-        self._on_ended(end.command, end.status, end.reason, arrival)
+        self._on_ended(end, arrival)
         settling = end.command.settling
         if end.settled is False and settling:
             scale = self._tracker.status.scale

@@ -30,8 +30,7 @@ class AxisScale:
     @classmethod
     def of(cls, config: AxisConfig) -> "AxisScale":
         """Return the scale that an axis is configured with, with its origin at count 0."""
-        units = AxisUnits(config.unit, config.unit_table, config.g_velocity)
-        return cls(units, config.signed_counts_per_unit, config.modulo)
+        return cls(config.axis_units, config.signed_counts_per_unit, config.modulo)
 
     def text(self, value: float, dimension: Dimension) -> str:
         """Return a number in units of the axis as people read it."""

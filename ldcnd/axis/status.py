@@ -122,12 +122,26 @@ class CommandEnd:
         status: how it ended.
         reason: why it was not done; None when it was.
         settled: whether it has settled; None where that means nothing.
+        by: verb and id of the command that has ended it; None where none has, or where it is not known.
     """
 
     command: ActiveCommand
     status: CommandStatus
     reason: str | None
     settled: bool | None
+    by: tuple[Verb, str] | None = None
+
+    def told(self, client: str | None) -> str | None:
+        """Return the reason with the client whose command has ended it."""
+        if self.by is None or self.reason is None or client is None:
+            return self.reason
+        said = aborted_by(self.by[0])
+        return f"{said} of {client}{self.reason.removeprefix(said)}"
+
+
+def aborted_by(verb: Verb) -> str:
+    """Return how the reason begins of a command that another one has ended."""
+    return f"aborted by {verb}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,7 +58,16 @@ from ldcnd.axis.faults import (
     entry_of,
 )
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, shows_velocity
-from ldcnd.axis.status import STRENGTH, ActiveCommand, AskedStop, AxisStatus, CommandEnd, Completion, OpenStop
+from ldcnd.axis.status import (
+    STRENGTH,
+    ActiveCommand,
+    AskedStop,
+    AxisStatus,
+    CommandEnd,
+    Completion,
+    OpenStop,
+    aborted_by,
+)
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, FaultEntry, LinkState
@@ -337,7 +346,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
     if before is None:
         last_error = None
     elif before.command_id != command.command_id:
-        status = _abort(status, command.verb)
+        status = _abort(status, command.verb, command.command_id)
         # what takes a motion over goes on with it as another command's
         last_error = status.last_error if command.state is AxisState.STOPPING else None
     return replace(
@@ -402,7 +411,7 @@ def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:
 def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
     on = event.on
     return replace(
-        _abort(status, Verb.POWER),
+        _abort(status, Verb.POWER, event.by),
         state=_state_at_rest(status, enabled=on),
         enabled=on,
         effective_from_s=event.now_s,
@@ -580,13 +589,18 @@ def _fail(status: AxisStatus, reason: str, *, settled: bool | None = None) -> Ax
     return _end(_with(status, state=AxisState.ERROR_STOP), CommandStatus.FAILED, reason, settled=settled)
 
 
-def _abort(status: AxisStatus, by: Verb) -> AxisStatus:
+def _abort(status: AxisStatus, by: Verb, command_id: str | None) -> AxisStatus:
     """Return the status of a command that another one ends, with the reason where something is wrong, too."""
     if by is Verb.HALT and status.command and status.command.verb is Verb.JOG and not status.failure:
         return _end(status, CommandStatus.DONE)  # MC_Jog: a jog has no other end than to be let go
     when = " while it settled: its profile was over" if status.settle else ""
     why = f": {status.failure}" if status.failure else ""
-    return _end(status, CommandStatus.ABORTED, f"aborted by {by}{when}{why}")
+    return _end(
+        status,
+        CommandStatus.ABORTED,
+        f"{aborted_by(by)}{when}{why}",
+        by=(by, command_id) if command_id else None,
+    )
 
 
 def _finished(status: AxisStatus, error: str | None = None, *, settled: bool | None = None) -> AxisStatus:
@@ -603,7 +617,12 @@ def _state_at_rest(status: AxisStatus, *, enabled: bool) -> AxisState:
 
 
 def _end(
-    status: AxisStatus, how: CommandStatus, reason: str | None = None, *, settled: bool | None = None
+    status: AxisStatus,
+    how: CommandStatus,
+    reason: str | None = None,
+    *,
+    settled: bool | None = None,
+    by: tuple[Verb, str] | None = None,
 ) -> AxisStatus:
     """Return the status behind the command under way, if there is one."""
     command = status.command
@@ -626,5 +645,5 @@ def _end(
         status,
         command=None,
         last_error=f"{command.verb}: {reason}" if reason else status.last_error,
-        last_end=CommandEnd(command, how, reason, settled),
+        last_end=CommandEnd(command, how, reason, settled, by),
     )

@@ -231,7 +231,7 @@ class AxisStops:
                 return False
             if mode is StopMode.OFF:
                 self._commands.switched_off()
-                tracker.take(PowerSwitched(on=False, now_s=self._clock.now_s()))
+                tracker.take(PowerSwitched(on=False, now_s=self._clock.now_s(), by=command_id))
             elif not stands:  # what was proven to stand is not watched coming to rest, and keeps its target
                 self._commands.brought_to_rest(command_id or self._next_command_id(), verb)
             if not stands:

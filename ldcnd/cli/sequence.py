@@ -42,8 +42,12 @@ def sequence() -> None:
 @click.argument("file", type=CONFIGURATION)
 def list_sequences(file: Path) -> None:
     """Show the sequences of FILE, a rig's configuration, and their steps."""
-    for each in load_config(file).sequence:
-        show_lines(each.name, *(f"  {at:3}  {step.title}" for at, step in enumerate(each.step, 1)))
+    rig = load_config(file)
+    units = {axis.name: axis.axis_units for bus in rig.bus for axis in bus.axis}
+    positions = {each.name: each for each in rig.position}
+    for each in rig.sequence:
+        titles = [step.title(units, positions) for step in each.step]
+        show_lines(each.name, *(f"  {at:3}  {title}" for at, title in enumerate(titles, 1)))
 
 
 @sequence.command("run")

@@ -3,12 +3,13 @@
 The daemon reads them over and does nothing with them: every command of a sequence passes its gate as any other.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Literal
 
 from pydantic import Field
 
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.units import DIMENSIONS, POSITION, Described, quantity_text
 
 SequenceVerb = Literal[
     "power", "home", "move_absolute", "move_relative", "move_velocity", "halt", "set_gains", "set_position", "reset"
@@ -50,15 +51,43 @@ class SequenceStep(Frozen):
     timeout_s: float = Field(default=60.0, gt=0, le=90_000)
     """Longest time of all but the pause, seconds; then the sequence has failed."""
 
-    @property
-    def title(self) -> str:
-        """What people read."""
-        parts = [f"{self.do.replace('_', ' ')} {self.axis}"] if self.do else []
-        parts += [f"go to {self.go}"] if self.go else []
+    def title(self, units: Mapping[str, Described], positions: Mapping[str, NamedPosition]) -> str:
+        """Return what people read.
+
+        Args:
+            units: of the axes, by name.
+            positions: the named positions, by name.
+        """
+        parts = [" ".join([self.do.replace("_", " "), str(self.axis), *self._given(units)])] if self.do else []
+        parts += [f"go to {self.go}{_places(positions[self.go], units)}"] if self.go else []
         parts += [f"{name} {'high' if high else 'low'}" for name, high in self.set.items()]
         parts += [f"until {name} is {str(value).lower()}" for name, value in self.until.items()]
         parts += [f"until {axis} stands" for axis in self.standstill]
         return self.name or ", ".join(parts) or f"wait for {self.pause_s:g} s"
+
+    def _given(self, units: Mapping[str, Described]) -> Iterator[str]:
+        """Yield the arguments in words, numbers of the axis in the units in which people read them."""
+        info = units.get(str(self.axis))
+        for name, value in self.arguments.items():
+            said = _SAID.get(name, name)
+            if name == "on":
+                yield "on" if value else "off"
+            elif isinstance(value, str | bool):
+                yield f"{said} {str(value).lower() if isinstance(value, bool) else value}"
+            elif info and name in DIMENSIONS:
+                yield f"{said} {quantity_text(value, info, DIMENSIONS[name])}"
+            else:
+                yield f"{said} {value:g}{' s' if name.endswith('_s') else ''}"
+
+
+_SAID = {"position": "to", "distance": "by", "velocity": "at", "acceleration": "with", "duration_s": "for"}
+
+
+def _places(position: NamedPosition, units: Mapping[str, Described]) -> str:
+    known = [
+        f"{axis} {quantity_text(at, units[axis], POSITION)}" for axis, at in position.axes.items() if axis in units
+    ]
+    return f" ({', '.join(known)})" if known else ""
 
 
 class SequenceConfig(Frozen):

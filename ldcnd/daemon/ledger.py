@@ -16,7 +16,7 @@ from itertools import count
 
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.readings import Arrival
-from ldcnd.axis.status import ActiveCommand
+from ldcnd.axis.status import CommandEnd
 from ldcnd.contract.codec import to_json
 from ldcnd.contract.commands import REPLAYED_WITHIN_S, AxisCommand, Capability, CommandReply, Effect, Power, Verb
 from ldcnd.contract.errors import (
@@ -186,9 +186,11 @@ class Ledger:
         reason = error.message if error else _changed_by(entry.command) if status is CommandStatus.DONE else None
         self._reached(entry, answer, status, reason, error)
 
-    def ended(self, command: ActiveCommand, status: CommandStatus, reason: str | None, arrival: Arrival | None) -> None:
+    def ended(self, end: CommandEnd, arrival: Arrival | None) -> None:
         """Take from an axis that a command is over; a final status is kept."""
-        if entry := self._entries.get(command.command_id):
+        if entry := self._entries.get(end.command.command_id):
+            status, other = end.status, self._entries.get(end.by[1]) if end.by else None
+            reason = end.told(other.client or other.login if other else None)
             if status is CommandStatus.DONE and isinstance(entry.answer, CommandReply) and entry.answer.ends:
                 reason = f"came to its own end: it {entry.answer.ends}"
             self._reached(entry, entry.answer, status, reason, None, arrival)

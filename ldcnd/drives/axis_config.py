@@ -338,6 +338,11 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
         return g_velocity(self.unit_table, self.radius_m) if self.radius_m else None
 
     @property
+    def axis_units(self) -> AxisUnits:
+        """The units in which people read its numbers."""
+        return AxisUnits(self.unit, self.unit_table, self.g_velocity)
+
+    @property
     def signed_counts_per_unit(self) -> float:
         """Encoder counts per unit, 1 when the axis works in counts; negative where forward is backward in counts."""
         counts_per_unit = self.counts_per_unit or 1.0
@@ -355,7 +360,7 @@ daemon dies it runs on for as long, and a jog that is held for longer pauses the
 
     def _text(self, value: float, dimension: Dimension) -> str:
         """Return a number of the file about as it is there, with its unit."""
-        return quantity_text(value, AxisUnits(self.unit, self.unit_table, self.g_velocity), dimension, ".10g")
+        return quantity_text(value, self.axis_units, dimension, ".10g")
 
     def _above(self, value: float, limit: float, dimension: Dimension) -> str:
         of = dimension.value

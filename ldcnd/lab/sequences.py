@@ -11,6 +11,7 @@ from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.errors import ConfigError, LdcndError, Remedy, WrongState
 from ldcnd.contract.errors import step as remedy_step
+from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import IoSample, Moving, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
 
@@ -48,6 +49,7 @@ class SequenceRun:
         self._report = report
         self._now_ns = now_ns
         self._axes: dict[str, Axis] = {}
+        self._units: dict[str, AxisInfo] = {}
         self._modules: dict[str, str] = {}  # by the names of their lines
 
     async def run(self, first: int = 1, *, force: bool = False) -> None:
@@ -71,6 +73,7 @@ class SequenceRun:
         async with AsyncExitStack() as held:
             controlled = await held.enter_async_context(self._rig.controlled(axes, who, LEASE_S, force=force))
             self._axes = {axis.name: axis for axis in controlled}
+            self._units = {info.axis: info for info in await self._rig.describe()}
             self._modules = await self._lines()
             for number in range(first, len(steps) + 1):
                 await self._carry_out(number, steps[number - 1])
@@ -117,7 +120,7 @@ class SequenceRun:
 
         def report(event: str, took_s: float | None = None, reason: str | None = None) -> None:
             about = {"sequence": self._sequence.name, "step": number, "of": len(self._sequence.step)}
-            said = {"title": step.title, "event": event, "t": self._now_ns(), "took_s": took_s, "reason": reason}
+            said = {"title": self._title(step), "event": event, "t": self._now_ns(), "took_s": took_s, "reason": reason}
             self._report(StepReport.model_validate(about | said))
 
         if not self.going.is_set():
@@ -136,6 +139,9 @@ class SequenceRun:
             raise
         report("done", loop.time() - began_s)
 
+    def _title(self, step: SequenceStep) -> str:
+        return step.title(self._units, self._positions)
+
     async def _within(self, number: int, step: SequenceStep) -> None:
         seen: dict[str, bool | None] = dict.fromkeys(step.until)
         try:
@@ -151,7 +157,7 @@ class SequenceRun:
             words = [f"{name} is {'not known' if each is None else str(each).lower()}" for name, each in seen.items()]
             words += [f"{axis} moves: {self._axes[axis].state.sample.moving.value}" for axis in step.standstill]
             raise WrongState(
-                f"sequence {self._sequence.name}: step {number}, {step.title}, is not over within"
+                f"sequence {self._sequence.name}: step {number}, {self._title(step)}, is not over within"
                 f" {step.timeout_s:g} s{': ' if words else ''}{', '.join(words)}",
                 limit=step.timeout_s,
             ) from None

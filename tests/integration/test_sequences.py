@@ -7,8 +7,8 @@ import tomllib
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.contract.commands import MoveVelocity
-from ldcnd.contract.errors import ConfigError, InterlockViolated, WrongState
+from ldcnd.contract.commands import Halt, MoveVelocity, Power
+from ldcnd.contract.errors import CommandAborted, ConfigError, InterlockViolated, WrongState
 from ldcnd.contract.sequences import SequenceConfig, SequenceStep
 from ldcnd.lab.sequences import SequenceRun
 from ldcnd.testing import run, simulated_rig
@@ -287,3 +287,49 @@ def test_axes_go_to_a_position_one_after_the_other_in_the_order_of_the_configura
 
     assert order == [(axis, status) for axis in "yx" for status in ("accepted", "executing", "done")]
     assert there == pytest.approx([2.0, 10.0], abs=0.05)
+
+
+@pytest.mark.parametrize("ending", [Halt(client="anna"), Power(on=False, client="anna")])
+def test_a_sequence_that_somebody_else_ends_says_who_and_what_it_was_doing(ending):
+    slow = {"velocity": 5.0, "acceleration": 10.0, "duration_s": 60.0}
+    spin = SequenceStep(do="move_velocity", axis="rotor", arguments=slow)
+
+    async def program(rig, made):
+        await made(SEQUENCES["shut"])[0].run()
+        await made(SequenceConfig(name="ready", step=SEQUENCES["spin"].step[:3]))[0].run()
+        running, reports = made(SequenceConfig(name="spins", step=(spin, SequenceStep(go="bucket1"))))
+        spinning = asyncio.create_task(running.run())
+        while speed(rig) < 4.9:
+            await asyncio.sleep(0.05)
+        await rig.client.client.command("rotor", ending)
+        with pytest.raises(CommandAborted, match=f"aborted by {ending.verb} of anna$"):
+            await spinning
+        return reports
+
+    begun, failed = machine(program)
+
+    assert begun.title == failed.title == "move velocity rotor at 300 rpm (10.06 g) with 10 rev/s² for 60 s"
+    assert failed.event == "failed"
+    assert failed.reason.endswith(f"aborted by {ending.verb} of anna")
+
+
+def test_steps_are_called_by_what_they_command():
+    units = {axis.name: axis.axis_units for bus in CENTRIFUGE.bus for axis in bus.axis}
+    titles = [
+        step.title(units, POSITIONS)
+        for step in (
+            SequenceStep(do="power", axis="rotor", arguments={"on": False}),
+            SequenceStep(do="move_absolute", axis="rotor", arguments={"position": 0.25, "velocity": 0.5}),
+            SequenceStep(do="set_gains", axis="rotor", arguments={"kp": 100.0}),
+            SequenceStep(go="bucket2"),
+            SequenceStep(name="by hand", go="bucket2"),
+        )
+    ]
+
+    assert titles == [
+        "power rotor off",
+        "move absolute rotor to 0.25 rev at 30 rpm (0.1006 g)",
+        "set gains rotor kp 100",
+        "go to bucket2 (rotor 0.6 rev)",
+        "by hand",
+    ]

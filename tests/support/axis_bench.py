@@ -17,7 +17,7 @@ from ldcnd.axis.clock import Clock
 from ldcnd.axis.permit import UNCONDITIONAL, Right
 from ldcnd.axis.readings import Arrival
 from ldcnd.axis.scale import AxisScale
-from ldcnd.axis.status import ActiveCommand, AxisStatus
+from ldcnd.axis.status import AxisStatus, CommandEnd
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.codec import Encoding
 from ldcnd.contract.commands import AxisCommand, CommandReply, HomeMethod, PinMode, Power, Verb
@@ -235,10 +235,8 @@ class AxisBench:
         self.tracker = self.axis.tracker
         self.axis.connected(placed=True)
 
-    def _ended(
-        self, command: ActiveCommand, status: CommandStatus, reason: str | None, _arrival: Arrival | None
-    ) -> None:
-        self.ended.append((command.command_id, status, reason))
+    def _ended(self, end: CommandEnd, _arrival: Arrival | None) -> None:
+        self.ended.append((end.command.command_id, end.status, end.reason))
 
     def published(self, item: TelemetryItem) -> Sample | None:
         """Return the last sample of an item; its fields are those of its model, in their order."""

@@ -1,6 +1,6 @@
 import pytest
 
-from ldcnd.axis.status import ActiveCommand, Completion
+from ldcnd.axis.status import ActiveCommand, CommandEnd, Completion
 from ldcnd.contract.commands import REPLAYED_WITHIN_S, CommandReply, Halt, MoveAbsolute, Verb
 from ldcnd.contract.errors import CommandIdReused, StopLatched, TooManyRequests, UnknownCommand
 from ldcnd.contract.events import CommandStatus
@@ -17,7 +17,8 @@ def entry(command_id="c1", command=MOVE) -> LedgerEntry:
 def reached(ledger: Ledger, command_id: str, status: CommandStatus, reason: str | None = None) -> None:
     """Say that a command has got so far, as its axis does."""
     state, completion = AxisState.DISCRETE_MOTION, Completion.PROFILE
-    ledger.ended(ActiveCommand(command_id, Verb.MOVE_ABSOLUTE, 0, state, completion), status, reason, None)
+    command = ActiveCommand(command_id, Verb.MOVE_ABSOLUTE, 0, state, completion)
+    ledger.ended(CommandEnd(command, status, reason, None), None)
 
 
 @pytest.fixture

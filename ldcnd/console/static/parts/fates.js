@@ -3,7 +3,7 @@
 import { html } from "../html.js";
 import { changed } from "../session/rigs.js";
 import { clock } from "./format.js";
-import { ORDINARY } from "./motion_story.js";
+import { ordinary } from "./motion_story.js";
 import { Mark } from "./state.js";
 
 /** So long the news that a command has ended may be late, ms. */
@@ -54,7 +54,7 @@ function fateOf({ axis, run, sent, error, atMs }) {
   if (!sent) return { level: "", text: "sent" };
   const event = axis.ended(sent.command_id);
   if (event?.status === "done") return event.settled === false ? { level: "warn", text: "done, NOT settled" } : { level: "", text: "done" };
-  if (event) return { level: LEVELS[event.status] ?? "", text: ORDINARY[event.reason] ?? `${event.status}: ${event.reason}` };
+  if (event) return { level: LEVELS[event.status] ?? "", text: ordinary(event.reason) ?? `${event.status}: ${event.reason}` };
   if (rig.worth) return { level: "bad", text: "not known how far it is" };
   if (rig.daemon?.instance !== run) return { level: "warn", text: "not known how it ended, the daemon was started again" };
   const isOver = state?.command?.command_id !== sent.command_id && performance.now() - atMs > LATE_MS && !sent.waits_for;

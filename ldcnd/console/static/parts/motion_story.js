@@ -4,8 +4,13 @@ import { html } from "../html.js";
 import { clock, decimalsOf, duration, number, words } from "./format.js";
 import { Mark } from "./state.js";
 
-/** Ends that are nobody's mistake, by how the event says them. */
-export const ORDINARY = { "aborted by halt": "halted", "aborted by stop": "stopped", "aborted by quick_stop": "stopped" };
+const ENDINGS = { halt: "halted", stop: "stopped", quick_stop: "stopped" };
+
+/** An end that is nobody's mistake, in words, and whose it was; null for any other reason that an event says. */
+export function ordinary(reason) {
+  const [, verb, client] = /^aborted by (halt|stop|quick_stop)(?: of ([^:]+))?$/.exec(reason ?? "") ?? [];
+  return verb ? `${ENDINGS[verb]}${client ? ` by ${client}` : ""}` : null;
+}
 
 /** How a motion ended; `event` is its last event. */
 export function EndOfMotion({ axis, event }) {
@@ -22,7 +27,7 @@ export function EndOfMotion({ axis, event }) {
       : settled && tookS !== null ? `, settled in ${duration(tookS)}` : settled ? ", settled" : "";
     return html`${words(verb)}${target}:${place || " done"}${rest}${at}`;
   }
-  if (status === "aborted") return html`${words(verb)}${target}, ${ORDINARY[reason] ?? `ended, ${reason}`}${place}${at}`;
+  if (status === "aborted") return html`${words(verb)}${target}, ${ordinary(reason) ?? `ended, ${reason}`}${place}${at}`;
   return html`${words(verb)}${target} <${Mark} level="bad">${status}<//>${place}: ${reason}${at}`;
 }
 
