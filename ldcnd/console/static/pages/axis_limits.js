@@ -11,7 +11,7 @@ export function LimitsPanel({ axis }) {
   const { limits, unit, counts_per_unit: scale, direction, adc_full_scale: full } = axis.info;
   const limit = (value, dimension) => {
     const shown = shownQuantity(value, axis.info, dimension);
-    return value === null ? "none" : html`${number(shown.value, 3)} <span class="unit">${shown.unit}</span>`;
+    return value === null ? "none" : html`${number(shown.value, 3)} <span class="unit">${shown.said}</span>`;
   };
   return html`<${Panel} title="Limits" of=${axis.rig} note="From the configuration of the daemon.">
     <${Facts} of=${[

@@ -207,7 +207,7 @@ function Planned({ axis, plan, field, onNearest }) {
   const held = (value, error, dimension) => {
     const [shown, off] = [value, error].map((each) => shownQuantity(each, axis.info, dimension));
     const noticed = Math.abs(error) > NOTICED * Math.abs(value);
-    return `${number(shown.value, 3)} ${shown.unit}${noticed ? ` (${error > 0 ? "+" : ""}${number(off.value, 4)} by rounding)` : ""}`;
+    return `${number(shown.value, 3)} ${shown.said}${noticed ? ` (${error > 0 ? "+" : ""}${number(off.value, 4)} by rounding)` : ""}`;
   };
   const { known, mark } = axis.condition;
   const end = known ? `${number(plan.position, decimals)} ${unit}` : `(${number(plan.position, decimals)}) ${unit}, ${mark}`;

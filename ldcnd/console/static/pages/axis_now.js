@@ -26,7 +26,7 @@ export function NowPanel({ axis }) {
       <p class="now-state"><${StateWord} axis=${axis} /> <${QualityWord} axis=${axis} /></p>
     </div>
     <${Facts} of=${[
-      ["velocity", html`${number(velocity.value, decimals)} <span class="unit">${velocity.unit}</span>`],
+      ["velocity", html`${number(velocity.value, decimals)} <span class="unit">${velocity.said}</span>`],
       ["following error", html`${number(live ? position?.following_error : null, decimals)} <span class="unit">${info.unit}</span>`],
       ["target", html`${number(target, decimals)} <span class="unit">${info.unit}</span>`],
       ["left to go", html`${number(left, decimals)} <span class="unit">${info.unit}</span>`],

@@ -86,7 +86,7 @@ function AxisRow({ axis }) {
       "said", [axis.condition.state, ...troubles.map(({ text }) => text)].join(". "))}
     ${cell("Position", html`<${Place} axis=${axis} decimals=${decimals} label="Position" />`, "number main")}
     ${cell("Homed", html`<${Homed} axis=${axis} />`, "homed")}
-    ${cell("Velocity", html`${number(velocity.value, Math.min(decimals, 2))}<span class="unit"> ${velocity.unit}</span>`, "number")}
+    ${cell("Velocity", html`${number(velocity.value, Math.min(decimals, 2))}<span class="unit"> ${velocity.unit}</span>${velocity.acts && html` <small class="acts">${velocity.acts}</small>`}`, "number")}
     ${cell("Target", number(live ? state?.command?.target : null, decimals), "number")}
     ${cell("Following error", number(live ? samples.position?.following_error : null, decimals), "number")}
     ${cell("Control", html`<${HolderWord} axis=${axis} />`, "holder", axis.control)}

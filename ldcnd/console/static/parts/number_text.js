@@ -61,13 +61,14 @@ export function unitsOf(info, dimension) {
   return units;
 }
 
-/** Return a quantity of an axis as it is shown, and its unit, behind it with g where the axis has a radius. */
+/** Return a quantity of an axis as it is shown, its unit, what acts in g where the axis has a radius, and both as they are said. */
 export function shownQuantity(value, info, dimension) {
   const [{ unit, to }, ...others] = unitsOf(info, dimension);
   const g = others.find((each) => each.unit === "g" && dimension === "velocity");
   const known = value !== null && value !== undefined;
-  const acts = g && known ? ` (${Number(g.to(value).toPrecision(3))} g)` : "";
-  return { value: known ? to(value) : null, unit: `${unit.replace("/s2", "/s²")}${acts}` };
+  const acts = g && known ? `(${Number(g.to(value).toPrecision(3))} g)` : "";
+  const shown = unit.replace("/s2", "/s²");
+  return { value: known ? to(value) : null, unit: shown, acts, said: acts ? `${shown} ${acts}` : shown };
 }
 
 function numberOf(written, units) {
