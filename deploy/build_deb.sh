@@ -118,6 +118,9 @@ main_package() {
     install -Dm644 -t "$doc/examples/grafana" "$here"/grafana/*
     (cd "$source/config" && find zenoh -type f -exec install -Dm644 {} "$doc/examples/{}" \;)
     install -Dm644 -t "$doc" "$here/INSTALL.md"
+    # without what only a built site needs: its indices, and the copies that it makes
+    (cd "$source" && find docs -type f ! -name conf.py ! -name index.md ! -name fault-index.md ! -name install.md \
+        ! -path 'docs/faults/*' -exec install -Dm644 {} "$doc/{}" \;)
     gzip -9nc "$source/CHANGELOG.md" > "$doc/CHANGELOG.md.gz"
     ln -s /opt/ldcnd/bin/ldcnd "$root/usr/bin/ldcnd"
     (cd "$source" && "$opt/bin/python" -m tools man "$root/usr/share/man/man1")

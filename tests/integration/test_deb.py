@@ -30,6 +30,7 @@ OURS = (
     "./usr/share/fish/vendor_completions.d/ldcnd.fish",
     "./usr/share/lintian/overrides/ldcnd",
 )
+PAGE = re.compile(r"docs/[\w/-]+\.md")
 WANTED = {"tune": "numpy", "epics": "caproto"}
 DRIVES = ("/usr/bin/ldcnd", "sim", "--pty", "/run/drives/port", "--chain", "ls-182ap,ls-182ap")
 AXIS = """
@@ -96,6 +97,7 @@ def test_package_holds_what_the_service_needs_and_touches_nothing_else(deb: Path
         "./usr/lib/sysusers.d/ldcnd.conf",
         "./usr/lib/modules-load.d/ldcnd.conf",
         "./usr/share/doc/ldcnd/INSTALL.md",
+        *(f"./usr/share/doc/ldcnd/{page}" for page in PAGE.findall((DEPLOY / "INSTALL.md").read_text())),
         "./usr/share/doc/ldcnd/copyright",
         f"./usr/lib/{sysconfig.get_config_var('MULTIARCH')}/wireshark/plugins/ldcnd.lua",
         "./usr/share/doc/ldcnd/examples/simulated.toml",
