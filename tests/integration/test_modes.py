@@ -201,6 +201,17 @@ async def test_a_duty_turns_the_motor_for_its_time_and_then_the_axis_holds(diale
         assert (await rig.until_fault(lambda _: True)).first is None
 
 
+@named((V4, CMC, SC, LS_182AP))
+async def test_a_raw_duty_runs_its_time_where_limit_switches_would_stop_it(dialect):
+    """The drive has a capture armed then, and its open loop passed for one that a position error had opened."""
+    async with dialect_rig(dialect, pwm=PWM, acceleration=2000, limit_switches="stop") as rig:
+        await rig.power_on()
+        state = await rig.done(SetPwm(duty=0.1, duration_s=0.1))
+
+        assert (state.state, state.enabled, state.last_error) == (AxisState.STANDSTILL, True, None)
+        assert rig.position_mm > 0
+
+
 async def test_a_duty_on_a_reversed_axis_turns_the_other_way():
     async with dialect_rig(V4, pwm=PWM, direction="reverse", acceleration=2000) as rig:
         await rig.power_on()

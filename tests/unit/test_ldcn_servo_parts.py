@@ -293,15 +293,19 @@ def test_an_open_loop_on_purpose_is_no_position_error():
 
     state.switched(pic_ae=True, closed=True)
     state.known = replace(state.known, latched=None)
-    state.loaded(absolute=False, opens_loop=True)
+    state.loaded(absolute=False, runs_open=False, opens_at_home=True)
 
     assert state.faults(tripped) == ()
     assert [fault.code for fault in state.faults(searching)] == ["position_error"]
 
+    state.known = replace(state.known, latched=None)
+    state.loaded(absolute=False, runs_open=True, opens_at_home=False)  # a limit switch is to end a raw duty
+    assert state.faults(searching) == ()
+
 
 def test_a_loop_that_was_closed_again_is_not_open_on_purpose():
     state = state_of(PIC_SERVO_V4)
-    state.loaded(absolute=False, opens_loop=True)
+    state.loaded(absolute=False, runs_open=False, opens_at_home=True)
     state.switched(pic_ae=True, closed=True)
     tripped = status(flags=StatusFlag.POWER_ON | StatusFlag.POSITION_ERROR, aux=AuxFlag.INDEX)
 

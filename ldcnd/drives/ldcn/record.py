@@ -58,6 +58,7 @@ class DriveState:
         off_before: the motor was switched off, and nothing shows that what was to close its loop since has done so.
         loop_may_open: the loop is open on purpose (PWM mode), or will be once home is captured: then the position
             error flag, which every open loop shows, is no fault.
+        runs_open: it is open from the start of the motion, also while a capture is armed that stops it at a switch.
         motion_locked: the drive refuses motion since it homed on a limit switch.
         guard: the limit switch at which the drive stops the present motion by itself; empty without one.
         guard_hit: it has.
@@ -83,7 +84,7 @@ class DriveState:
         """The drive was reset or lost power: nothing that was sent before holds any more."""
         self.known = AFTER_RESET
         self.homing_armed = self.arming = self.off_before = False
-        self.loop_may_open = False
+        self.loop_may_open = self.runs_open = False
         self.motion_locked = False
         self.guard = ""
         self.guard_hit = False
@@ -114,7 +115,7 @@ class DriveState:
         self.known = Knowledge(
             pic_ae=pic_ae, nothing_latched=False, latched=self.known.latched, closed=closed, seen=True, absolute=False
         )
-        self.loop_may_open = self.off_before = False
+        self.loop_may_open = self.runs_open = self.off_before = False
 
     def clearing(self) -> None:
         """Clear Sticky Bits is on its way: a cause that was known may be gone before that is acknowledged."""
@@ -129,10 +130,10 @@ class DriveState:
         if self.known.pic_ae is False:
             self.known = replace(self.known, latched=None, nothing_latched=True)
 
-    def loaded(self, *, absolute: bool, opens_loop: bool) -> None:
+    def loaded(self, *, absolute: bool, runs_open: bool, opens_at_home: bool) -> None:
         """A motion was loaded: to an analog target or not; one that opens the loop on purpose, at once or at home."""
         self.known = replace(self.known, absolute=absolute)
-        self.loop_may_open = opens_loop
+        self.loop_may_open, self.runs_open = runs_open or opens_at_home, runs_open
 
     # -- what it shows -----------------------------------------------------------------------------------------------
 
@@ -183,10 +184,10 @@ class DriveState:
     def faults(self, status: StatusPacket) -> tuple[driver.Fault, ...]:
         """Return the drive's complaints; recomputed only when something that they depend on has changed."""
         adc = status.adc if self.known.absolute is not False else None
-        if (status.flags, status.aux, adc, self.known, self.loop_may_open) != self._question:
+        if (status.flags, status.aux, adc, self.known, self.loop_may_open, self.runs_open) != self._question:
             faults = self._diagnose(status)
             self._shown = _Shown(faults, self._levels(int(status.flags), int(status.aux or 0)))
-            self._question = (status.flags, status.aux, adc, self.known, self.loop_may_open)
+            self._question = (status.flags, status.aux, adc, self.known, self.loop_may_open, self.runs_open)
         return self._shown.faults
 
     def _levels(self, flags: int, aux: int) -> "Levels":
@@ -215,7 +216,8 @@ class DriveState:
 
     def _diagnose(self, status: StatusPacket) -> tuple[driver.Fault, ...]:
         self._learn(status)
-        open_on_purpose = self.loop_may_open and not status.flags & StatusFlag.HOME_IN_PROGRESS
+        waits_for_home = bool(status.flags & StatusFlag.HOME_IN_PROGRESS) and not self.runs_open
+        open_on_purpose = self.loop_may_open and not waits_for_home
         found = tuple(
             fault
             for fault in diagnose(self._profile, status, self.known)

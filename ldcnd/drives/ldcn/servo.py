@@ -429,7 +429,8 @@ class LdcnAxis(Moves):
         await self._load(trajectory)
         self.state.loaded(
             absolute=isinstance(motion, AnalogMotion),
-            opens_loop=isinstance(motion, PwmOutput) or (home is not None and opens_loop(self.profile, home)),
+            runs_open=isinstance(motion, PwmOutput),
+            opens_at_home=home is not None and opens_loop(self.profile, home),
         )
 
     async def _set_counter_back(self, target_counts: int) -> None:
@@ -577,7 +578,7 @@ class LdcnAxis(Moves):
                 remedy=Remedy("{}, a small distance: it sets the counter back", step("move_relative")),
             )
         exchange = commands.stop_motor(self._node, control, counter)
-        self.state.loaded(absolute=False, opens_loop=False)
+        self.state.loaded(absolute=False, runs_open=False, opens_at_home=False)
         # harmless to repeat by itself, but a repetition could come after the stop that has overtaken it
         told = replace(exchange, repeatable=False)
         await self._bus.execute(told)
@@ -621,7 +622,7 @@ class LdcnAxis(Moves):
             OutcomeUnknown: the reply was lost.
         """
         points = [PathPoint(counts, PATH_CYCLES) for counts in steps]
-        self.state.loaded(absolute=False, opens_loop=False)
+        self.state.loaded(absolute=False, runs_open=False, opens_at_home=False)
         await self._bus.execute(commands.add_path_points(self._node, points))
         return await self.path_status()
 
