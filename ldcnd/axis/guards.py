@@ -22,6 +22,7 @@ from ldcnd.contract.errors import (
     PositionLimit,
     Remedy,
     StopLatched,
+    StopNotConfirmed,
     ValueOutOfRange,
     VelocityLimit,
     WrongState,
@@ -54,10 +55,12 @@ def check_not_latched(axis: AxisTracker) -> None:
 def check_stop_confirmed(axis: AxisTracker) -> None:
     """Refuse while the drive has not confirmed a stop; what latches counts from the instant at which it is sent."""
     if axis.status.stop_pending or (axis.status.stop and axis.status.stop_latched):
-        raise StopLatched(
+        away = axis.status.link is LinkState.DOWN
+        raise StopNotConfirmed(
             f"axis {axis.name}: the drive has not confirmed a stop yet",
             axis=axis.name,
-            remedy="wait: it is sent again until the drive confirms it; check the drive and its line",
+            remedy=f"{'give the drive power' if away else 'wait'}: the stop is sent again until the drive confirms it;"
+            " check the drive and its line",
         )
 
 

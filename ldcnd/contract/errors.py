@@ -49,6 +49,7 @@ class ErrorCode(StrEnum):
     NOT_REFERENCED = "not_referenced"
     INTERLOCK_VIOLATED = "interlock_violated"
     STOP_LATCHED = "stop_latched"
+    STOP_UNCONFIRMED = "stop_unconfirmed"
     ABORTED = "aborted"
     AXIS_UNREACHABLE = "axis_unreachable"
     NOT_IDENTIFIED = "not_identified"
@@ -419,6 +420,13 @@ class StopLatched(RequestRefused):
 
     code = ErrorCode.STOP_LATCHED
     way_out = "send `reset`"
+
+
+class StopNotConfirmed(StopLatched):
+    """The drive has not confirmed a stop, latched or not."""
+
+    code = ErrorCode.STOP_UNCONFIRMED
+    way_out = "give the drive power and look after its line: the stop is sent again until the drive confirms it"
 
 
 class CommandAborted(RequestRefused):

@@ -11,7 +11,7 @@ import pytest
 
 from ldcnd.client.events import latest_events
 from ldcnd.config.rig import load_config
-from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseExpired
+from ldcnd.contract.errors import ErrorCode, InterlockViolated, LdcndError, LeaseExpired
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import OverrideInterlock
 from ldcnd.lab.sequences import SequenceRun
@@ -323,6 +323,32 @@ def test_an_output_that_is_high_refuses_a_spin_though_its_part_has_jammed(part):
         return machine.speed
 
     assert operated(jams) < CREEPS
+
+
+@pytest.mark.promise("stop-until-confirmed")
+def test_a_lock_behind_an_unconfirmed_stop_is_refused_with_that_and_opens_once_the_drive_has_power_again():
+    async def loses_power(machine):
+        now_s = asyncio.get_running_loop().time
+        await machine.spin()
+        machine.drive.power(on=False, at_s=now_s())
+        told = set()
+        for _ in range(20):
+            await asyncio.sleep(0.1)
+            latched = machine.rotor.state.sample.stop_latched
+            with pytest.raises(LdcndError) as refusal:
+                await machine.high("unlock")
+            told.add((refusal.value.code, latched))
+        machine.drive.power(on=True, at_s=now_s())
+        async with asyncio.timeout(60):
+            while machine.part("lock") > 0.0:
+                with suppress(LdcndError):
+                    await machine.high("unlock")
+                await asyncio.sleep(0.5)
+        return told
+
+    told = operated(loses_power)
+    assert (ErrorCode.STOP_UNCONFIRMED, False) in told
+    assert not [code for code, latched in told if code is ErrorCode.STOP_LATCHED and not latched]
 
 
 def test_an_output_that_is_written_the_level_that_it_has_stays_known():

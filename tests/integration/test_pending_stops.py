@@ -12,7 +12,7 @@ from ldcnd.client.events import latest_events
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import Halt, MoveAbsolute, MoveVelocity, Power, Reset
-from ldcnd.contract.errors import BusDown, StopLatched, WrongState
+from ldcnd.contract.errors import BusDown, StopNotConfirmed, WrongState
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving, TelemetryItem
 from ldcnd.daemon.assembly import build_daemon
@@ -206,7 +206,7 @@ async def test_nothing_moves_and_nothing_is_reset_while_a_stop_is_not_confirmed(
         axis.driver.stop = lost
         await rig.client.stop("x")
         for command in (Reset(), Power(on=True), MoveAbsolute(position=0.0)):
-            with pytest.raises(StopLatched, match="not confirmed"):
+            with pytest.raises(StopNotConfirmed, match="not confirmed"):
                 await rig.client.command("x", command)
         assert (await rig.client.state("x")).stop_latched
 

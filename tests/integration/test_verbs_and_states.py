@@ -30,6 +30,7 @@ from ldcnd.contract.errors import ErrorCode, LdcndError
 from ldcnd.contract.samples import AxisState, LinkState
 from tests.support.dialect_rig import AXIS, V4, dialect_rig
 
+PENDING = ErrorCode.STOP_UNCONFIRMED
 TAKEN, WRONG, LATCHED, AWAY = "taken", ErrorCode.WRONG_STATE, ErrorCode.STOP_LATCHED, ErrorCode.AXIS_UNREACHABLE
 MOTIONS = {
     "move_absolute": MoveAbsolute(position=1.0),
@@ -73,7 +74,7 @@ TABLE = {
     "pwm": BUSY | {"set_pwm": TAKEN},
     "latched": row(motions=LATCHED, power_on=LATCHED, set_outputs=LATCHED),
     "stopping, latched": row(motions=LATCHED, power_on=LATCHED, set_outputs=LATCHED, set_position=WRONG, reset=WRONG),
-    "stop pending": row(motions=LATCHED, power_on=LATCHED, set_outputs=LATCHED, reset=LATCHED),
+    "stop pending": row(motions=PENDING, power_on=PENDING, set_outputs=PENDING, reset=PENDING),
     "error": row(motions=WRONG, power_on=WRONG),
     "error, moving": row(motions=WRONG, power_on=WRONG, reset=WRONG),
     "error, latched": row(motions=LATCHED, power_on=LATCHED, set_outputs=LATCHED),

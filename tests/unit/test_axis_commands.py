@@ -29,6 +29,7 @@ from ldcnd.contract.errors import (
     PositionLimit,
     ReplyTimeout,
     StopLatched,
+    StopNotConfirmed,
     ValueOutOfRange,
     WrongState,
 )
@@ -242,7 +243,7 @@ async def test_a_reset_waits_for_a_stop_that_no_drive_has_confirmed():
     async with axis_bench() as bench:
         bench.tracker.take(StopUnconfirmed(0))
 
-        with pytest.raises(StopLatched, match="not confirmed"):
+        with pytest.raises(StopNotConfirmed, match="not confirmed"):
             await bench.send(Reset())
 
         assert bench.drive.calls == []

@@ -13,6 +13,7 @@ from ldcnd.contract.errors import (
     NotReferenced,
     PositionLimit,
     StopLatched,
+    StopNotConfirmed,
     VelocityLimit,
     WrongState,
 )
@@ -42,7 +43,7 @@ def test_an_axis_that_stands_and_is_powered_may_move():
     [
         ({"link": LinkState.DOWN}, AxisUnreachable, "power"),
         ({"stop_latched": True}, StopLatched, "reset"),
-        ({"stop": OpenStop(StopMode.SMOOTH, entry_of(STOP_UNCONFIRMED, 0))}, StopLatched, "wait"),
+        ({"stop": OpenStop(StopMode.SMOOTH, entry_of(STOP_UNCONFIRMED, 0))}, StopNotConfirmed, "wait"),
         ({"state": AxisState.ERROR_STOP}, WrongState, "reset"),
         ({"state": AxisState.DISABLED, "enabled": False}, WrongState, "power"),
         ({"state": AxisState.DISCRETE_MOTION}, WrongState, "halt"),
