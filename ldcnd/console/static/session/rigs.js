@@ -211,7 +211,7 @@ export class Axis {
 
   /** Keep a sample as far as it is in the units of the description: a restart of the daemon may bring others. */
   #judge(item, sample) {
-    const unit = this.#info?.sample_units[item];
+    const unit = this.#info?.sample_units?.[item];
     const fits = !unit || !sample?.unit || sample.unit === unit;
     const fitting = fits ? sample : item === "state" ? { ...sample, command: sample.command && { ...sample.command, target: null } } : null;
     this.#keep(this.samples, item, fitting);
