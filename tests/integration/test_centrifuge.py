@@ -168,11 +168,20 @@ async def drops_its_pin_into_a_spin(machine):
     return machine.part("pin") > 0.0
 
 
+async def drives_its_bolt_out_beside_an_open_door(machine):
+    await machine.shut_door_opens()
+    with suppress(InterlockViolated):
+        await machine.low("unlock")
+    await asyncio.sleep(1.0)
+    return machine.part("lock") > 0.0
+
+
 NEEDS = {
     "door_shut": turns_with_an_open_door,
     "balance": goes_on_out_of_balance,
     "door_opens": opens_against_its_lock,
     "lock_opens": unlocks_in_a_spin,
+    "lock_closes": drives_its_bolt_out_beside_an_open_door,
     "pin_goes_in": drops_its_pin_into_a_spin,
 }
 
@@ -212,9 +221,7 @@ async def bolt_jams_half_way(machine):
 
 async def open_door_jams_before_its_bolt(machine):
     await machine.shut_door_opens()
-    machine.jam("door")
-    await machine.low("door", "unlock")
-    await asyncio.sleep(0.5)
+    await open_door_jams(machine)
 
 
 async def door_jams_half_way_before_its_bolt(machine):
@@ -227,6 +234,7 @@ async def door_jams_half_way_before_its_bolt(machine):
 
 async def open_door_jams(machine):
     machine.jam("door")
+    await machine.rig.client.override_interlock("lock_closes", 1.0, reason="a door with its bolt beside it")
     await machine.low("door", "unlock")
     await asyncio.sleep(0.5)
 
@@ -272,6 +280,33 @@ def test_the_sequence_that_shuts_the_door_does_not_let_a_broken_wire_tell_it_tha
                 return machine.open_or_unlocked and await machine.tries_to_spin()
 
     assert not run(program())
+
+
+@pytest.mark.long
+def test_outputs_that_a_cabinet_lost_beside_an_open_door_leave_its_bolt_alone_until_the_door_is_shut():
+    async def program():
+        now_s = asyncio.get_running_loop().time
+        async with simulated_rig(CENTRIFUGE) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                await machine.shut_door_opens()
+                machine.io.power(on=False, at_s=now_s())
+                await asyncio.sleep(3)
+                machine.io.power(on=True, at_s=now_s())
+                await machine.sees(door_open=True, door=False)
+                await asyncio.sleep(2)
+                written = bool(machine.io.outputs & 1 << CABINET.outputs["unlock"].line - 1)
+                told = await latest_events(rig.client.client, 1000, "cabinet")
+                refused = [each.reason for each in told if each.verb == "reset" and each.status == "refused"]
+            await shutting(rig).run()
+            async with rig.client.control("rotor", client="test") as machine.rotor:
+                return written, refused, machine.open_or_unlocked, await machine.tries_to_spin()
+
+    written, (refused,), *after = run(program())
+    assert not written
+    assert "output unlock low, its level of reset" in refused
+    assert "interlock lock_closes: input door_closed is false" in refused
+    assert after == [False, True]
 
 
 @pytest.mark.long
