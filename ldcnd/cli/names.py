@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from contextvars import ContextVar
 from typing import Final
 
-from ldcnd.contract.errors import RemedyCommand
+from ldcnd.contract.errors import Argument, RemedyCommand
 
 GROUPS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
     "Run": {
@@ -209,6 +209,7 @@ TYPED = {
     "set_position": "axis set-position {axis} POSITION",
     "set_speed_override": "speed PERCENT",
     "set_gains": "axis gains {axis} --kp KP --el EL",
+    "set_io": "bus set-io {module} {lines}",
     "set_outputs": "axis outputs {axis} --limit1 input --limit2 input",
     "move_relative": "move {axis} DISTANCE --relative",
     "jog": "jog {axis} VELOCITY",
@@ -233,10 +234,20 @@ def typed(step: RemedyCommand, axis: str | None) -> str:
     """
     name = step.verb.replace("_", "-")
     words = TYPED.get(step.verb, f"{name} {{axis}}" if name in COMMANDS else f"axis {name} {{axis}}")
-    on = "on" if step.arguments.get("on", True) else "off"
-    words, separator, program = words.format(axis=shlex.quote(axis) if axis else "AXIS", on=on).partition(" -- ")
+    given = step.arguments
+    lines = " ".join(f"{line}={level}" for level in ("high", "low") for line in _lines(given.get(level)))
+    words, separator, program = words.format(
+        axis=shlex.quote(axis) if axis else "AXIS",
+        on="on" if given.get("on", True) else "off",
+        module=given.get("module"),
+        lines=lines,
+    ).partition(" -- ")
     force = " --force" if step.arguments.get("force") else ""
     return f"ldcnd {words}{force}{OPTIONS_TYPED.get()}{separator}{program}"
+
+
+def _lines(given: Argument | None) -> tuple[str, ...]:
+    return given if isinstance(given, tuple) else ()
 
 
 def whose(rig: str, among: int = 1) -> str:

@@ -338,7 +338,7 @@ class RemedyStep(Frozen):
     """The command."""
     said: str
     """The words of the remedy that name it."""
-    arguments: dict[str, bool | float | str] = Field(default_factory=dict)
+    arguments: dict[str, bool | float | str | tuple[str, ...]] = Field(default_factory=dict)
     """The arguments of the command."""
 
 

@@ -72,7 +72,7 @@ class ErrorCode(StrEnum):
     INTERNAL = "internal"
 
 
-Argument = bool | float | str
+Argument = bool | float | str | tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)

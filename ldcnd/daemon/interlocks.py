@@ -7,7 +7,7 @@ lines they are.
 
 import asyncio
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -17,7 +17,7 @@ from ldcnd.axis.rest import REST_COUNTS
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
 from ldcnd.contract.commands import kind_of
-from ldcnd.contract.errors import InterlockViolated, LdcndError, ValueOutOfRange
+from ldcnd.contract.errors import InterlockViolated, LdcndError, Remedy, RemedyCommand, ValueOutOfRange, step
 from ldcnd.contract.events import INTERLOCK, CommandStatus
 from ldcnd.contract.rig_commands import OverrideInterlock, OverrideReply
 from ldcnd.contract.samples import AxisState, LinkState
@@ -33,9 +33,41 @@ log = get_logger("interlocks")
 
 HUNTING = 0.1
 """Share of its speed by which a servo may be faster than its profile, between two readings."""
-Obstacle = Callable[[bool], str]
-"""Returns in words why a requirement does not hold, or is not known to; empty when it does. Takes whether a motion is
-only watched: an output that is being written counts with its last reading then, as long as that is not too old."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lack:
+    """A requirement that does not hold, or is not known to.
+
+    Attributes:
+        of: what it is required of.
+        text: how that is instead.
+        because: why it is not known, in words that are the same for all of which that is so.
+        step: the command that has it hold, if there is one.
+    """
+
+    of: str
+    text: str
+    because: str = ""
+    step: RemedyCommand | None = None
+
+
+def in_words(lacks: Iterable[Lack]) -> str:
+    """Return all that is lacking; what is not known for one cause is said once."""
+    alike: dict[str, list[Lack]] = {}
+    for each in lacks:
+        alike.setdefault(each.because or f"{each.of} {each.text}", []).append(each)
+    texts = []
+    for group in alike.values():
+        names, first = list(dict.fromkeys(each.of for each in group)), group[0]
+        text = f"{', '.join(names)} {first.text if len(names) == 1 else 'are not known'}"
+        texts.append(f"{text}: {first.because}" if first.because else text)
+    return "; ".join(texts)
+
+
+Obstacle = Callable[[bool], Lack | None]
+"""Returns how a requirement does not hold, or is not known to; None when it does. Takes whether a motion is only
+watched: an output that is being written counts with its last reading then, as long as that is not too old."""
 
 
 @dataclass(slots=True)
@@ -81,14 +113,18 @@ class BoundRule:
     override: Override | None = None
     reacted: bool = False
 
-    def violation(self, what: str, obstacle: str) -> InterlockViolated:
+    def violation(self, what: str, lacks: Sequence[Lack]) -> InterlockViolated:
         """Return the refusal of what it binds."""
         name = self.config.name
+        steps = tuple(each.step for each in lacks if each.step)
+        ways = [each.said for each in steps]
+        if len(steps) < len(lacks):
+            ways.append(f"see to it that {'the rest' if steps else 'this'} holds")
         return InterlockViolated(
-            f"{what}: interlock {name}: {obstacle}",
+            f"{what}: interlock {name}: {in_words(lacks)}",
             axis=self.axis.config.name if self.axis else None,
             value=name,
-            remedy=f"see to it that this holds; for service override_interlock lifts {name} for a time",
+            remedy=Remedy.of(f"{', '.join(ways)}; for service override_interlock lifts {name} for a time", steps),
         )
 
 
@@ -162,34 +198,33 @@ class Interlocks:
         self._version += 1
         self._changed.set()
 
-    def _obstacle(self, rule: BoundRule, *, watched: bool = False) -> str:
-        """Return why a rule forbids what it binds; empty when it does not."""
+    def _lacks(self, rule: BoundRule, *, watched: bool = False) -> tuple[Lack, ...]:
+        """Return why a rule forbids what it binds; nothing when it does not."""
         if rule.override is not None and self._goes_on(rule, rule.override):
-            return ""
-        for requirement in rule.requires:
-            if text := requirement(watched):
-                return text
+            return ()
+        if lacks := tuple(lack for requirement in rule.requires if (lack := requirement(watched))):
+            return lacks
         # not while an output is being written: then it may hold for those who only watch
         if rule.modules and not any(module.before for module in rule.modules):
             age_s = rule.config.within_ms / 1e3 * (1 - 1 / LOOKS)
             rule.version, rule.until_s = self._version, min(each.read_at_s for each in rule.modules) + age_s
-        return ""
+        return ()
 
     # -- what must hold ----------------------------------------------------------------------------------------------
 
     def _requirement(self, each: Requirement, age_s: float) -> Obstacle:
         if each.axis is not None:
-            return partial(self._obstacle_of_axis, self._rig.axes[each.axis], each, age_s)
+            return partial(self._lack_of_axis, self._rig.axes[each.axis], each, age_s)
         if each.module is not None:
-            return partial(self._obstacle_of_module, self._rig.modules[each.module], age_s)
+            return partial(self._lack_of_module, self._rig.modules[each.module], age_s)
         name, what = (each.input, "input") if each.input else (each.output, "output")
         assert name is not None  # noqa: S101 - a requirement names one of the four
-        return partial(self._obstacle_of_line, self._modules[name], name, what, each.value, age_s)
+        return partial(self._lack_of_line, self._modules[name], name, what, each.value, age_s)
 
-    def _obstacle_of_module(self, module: ModuleService, age_s: float, _watched: bool) -> str:  # noqa: FBT001
-        return "" if self._now_s() - module.read_at_s <= age_s else f"module {module.name} does not answer"
+    def _lack_of_module(self, module: ModuleService, age_s: float, _watched: bool) -> Lack | None:  # noqa: FBT001
+        return None if self._now_s() - module.read_at_s <= age_s else Lack(f"module {module.name}", "does not answer")
 
-    def _obstacle_of_line(
+    def _lack_of_line(
         self,
         module: ModuleService,
         name: str,
@@ -197,20 +232,38 @@ class Interlocks:
         wanted: bool,  # noqa: FBT001 - of a configuration
         age_s: float,
         watched: bool,  # noqa: FBT001 - see `Obstacle`
-    ) -> str:
+    ) -> Lack | None:
         if self._now_s() - module.read_at_s > age_s:
-            return f"{what} {name} is not known: module {module.name} does not answer"
+            return Lack(f"{what} {name}", "is not known", f"module {module.name} does not answer")
         value = module.values[name]
         if watched and value is None and name in module.before:
             before, read_at_s = module.before[name]
             value = before if self._now_s() - read_at_s <= age_s else None
         if value is wanted:
-            return ""
-        words = ("true", "false") if what == "input" else ("high", "low")
-        return f"{what} {name} is not known" if value is None else f"{what} {name} is {words[wanted]}"
+            return None
+        if what == "input":
+            return Lack(f"input {name}", "is not known" if value is None else f"is {'false' if wanted else 'true'}")
+        level, other = ("high", "low") if wanted else ("low", "high")
+        lines = {level: (name,)}
+        sets = step("set_io", f"set output {name} {level}", module=module.name, **lines)
+        if value is None:
+            why = module.why_unknown(name)
+            return Lack(f"output {name}", "is not known", why, None if why else sets)
+        return Lack(f"output {name}", f"is {other}", step=sets)
 
-    def _obstacle_of_axis(self, axis: AxisService, each: Requirement, age_s: float, _watched: bool) -> str:  # noqa: FBT001
-        tracker, name = axis.tracker, axis.config.name
+    def _lack_of_axis(
+        self,
+        axis: AxisService,
+        each: Requirement,
+        age_s: float,
+        _watched: bool,  # noqa: FBT001 - see `Obstacle`
+    ) -> Lack | None:
+        text = self._is_instead(axis, each, age_s)
+        return Lack(f"axis {axis.config.name}", text) if text else None
+
+    def _is_instead(self, axis: AxisService, each: Requirement, age_s: float) -> str:
+        """Return how an axis is that is required to be another way; empty when it is as required."""
+        tracker = axis.tracker
         status, reading = tracker.status, tracker.reading
         if (
             reading is None
@@ -218,19 +271,19 @@ class Interlocks:
             or status.link is LinkState.DOWN
             or self._now_s() - tracker.read_at_s > age_s
         ):
-            return f"axis {name} is not known: its drive does not answer"
+            return "is not known: its drive does not answer"
         if each.standstill and not (status.rest.rests is True and not _commanded(status)):
-            return f"axis {name} does not stand, or is not known to"
+            return "does not stand, or is not known to"
         if each.below is not None and (speed := _speed(axis)) >= each.below:
             now, limit = (status.scale.text(value, Dimension.VELOCITY) for value in (speed, each.below))
-            return f"axis {name} may be at {now}, which is not below {limit}"
+            return f"may be at {now}, which is not below {limit}"
         in_range = (each.min, each.max) != (None, None)
         if (each.homed or in_range) and (not status.referenced or status.position_lost):
-            return f"axis {name} is not homed"
+            return "is not homed"
         if in_range:
             here = status.scale.shown_at(reading.position_counts)
             if (each.min is not None and here < each.min) or (each.max is not None and here > each.max):
-                return f"axis {name} is at {here:.6g} {status.unit}, outside {each.min} to {each.max}"
+                return f"is at {here:.6g} {status.unit}, outside {each.min} to {each.max}"
         return ""
 
     # -- asked -------------------------------------------------------------------------------------------------------
@@ -243,8 +296,8 @@ class Interlocks:
             return
         for rule in own.rules:
             above = rule.config.above
-            if kind in rule.kinds and (above is None or speed > above) and (text := self._obstacle(rule)):
-                yield rule.violation(what, text)
+            if kind in rule.kinds and (above is None or speed > above) and (lacks := self._lacks(rule)):
+                yield rule.violation(what, lacks)
 
     def _check_outputs(self, levels: Mapping[str, bool | None]) -> None:
         """Refuse to write outputs; see `ModuleService.check`."""
@@ -254,8 +307,8 @@ class Interlocks:
             level = levels[rule.config.of]
             # an output that is let go of may become anything, so every rule of it binds
             kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW
-            if kind in (None, *rule.kinds) and (text := self._obstacle(rule)):
-                raise rule.violation(f"output {rule.config.of}", text)
+            if kind in (None, *rule.kinds) and (lacks := self._lacks(rule)):
+                raise rule.violation(f"output {rule.config.of}", lacks)
 
     # -- watched -----------------------------------------------------------------------------------------------------
 
@@ -287,15 +340,16 @@ class Interlocks:
         moves = moves and (status.rest.rests is False or _commanded(status))
         moves = moves and not own.hold(self._version, self._now_s())
         for rule in own.rules:
-            text = self._obstacle(rule, watched=True) if moves and self._binds(rule, axis, status) else ""
-            if text and not rule.reacted:
-                self._react(axis, rule, text, group)
-            rule.reacted = bool(text)
+            lacks = self._lacks(rule, watched=True) if moves and self._binds(rule, axis, status) else ()
+            if lacks and not rule.reacted:
+                self._react(axis, rule, lacks, group)
+            rule.reacted = bool(lacks)
 
-    def _react(self, axis: AxisService, rule: BoundRule, text: str, group: asyncio.TaskGroup) -> None:
+    def _react(self, axis: AxisService, rule: BoundRule, lacks: Sequence[Lack], group: asyncio.TaskGroup) -> None:
         name, reaction = axis.config.name, LossPolicy(rule.config.reaction)
+        text = in_words(lacks)
         log.warning("interlock violated", axis=name, interlock=rule.config.name, reason=text, reaction=reaction.value)
-        error = rule.violation(f"axis {name}", text)
+        error = rule.violation(f"axis {name}", lacks)
         reason = f"{error.message}; reaction: {reaction.value}"
         self._events.note(name, INTERLOCK, CommandStatus.ABORTED, reason, code=error.code.value)
         # the end of the command gives this as its reason

@@ -243,6 +243,13 @@ class ModuleService:
             each.forget()
         self._take(dict.fromkeys(self._lines))
 
+    def why_unknown(self, output: str) -> str:
+        """Return why the level of an output is not known though the module answers; empty where none was written."""
+        if output in self._unread_until_s:
+            return "it is being written"
+        written = self._driver.written(self._outputs[output].line)
+        return "" if written is None else f"it was set {_word(written)} and its pin shows {_word(not written)}"
+
     # -- commands ----------------------------------------------------------------------------------------------------
 
     async def set_io(self, command: SetIo, condition: Condition) -> IoReply:

@@ -23,10 +23,11 @@ from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.questions import Preview, Why
 from ldcnd.contract.rig_commands import OverrideInterlock, SetIo
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.sim.faults import FaultInjector, FaultyRequest
 from tests.support.chain_rig import rig_on
+from tests.support.command_line import virtual_rig
 from tests.support.machine_rig import (
     CLOSED,
     DOOR_OPENS,
@@ -229,11 +230,12 @@ async def test_a_motion_is_ended_when_a_requirement_is_lost(reaction):
         state = await rig.client.state("rotor")
         assert state.state is (AxisState.DISABLED if reaction == "power_off" else AxisState.STANDSTILL)
         noticed = [each.text for each in assess(state, None, None).troubles if "interlock" in each.text]
-        assert noticed == ["its motion was ended by interlock door_shut: input door_closed is false"]
+        both = "interlock door_shut: input door_closed is false; input door_open is true"
+        assert noticed == [f"its motion was ended by {both}"]
         (said,) = await events(rig, "interlock")
-        assert said == f"axis rotor: interlock door_shut: input door_closed is false; reaction: {reaction}"
+        assert said == f"axis rotor: {both}; reaction: {reaction}"
         (*_, ended) = await events(rig, "move_velocity")
-        assert ended.endswith(": axis rotor: interlock door_shut: input door_closed is false"), ended
+        assert ended.endswith(f": axis rotor: {both}"), ended
 
 
 @pytest.mark.long
@@ -359,6 +361,37 @@ async def test_why_and_preview_name_the_interlock():
         assert "interlock door_shut" in fast.obstacles[0]
 
 
+async def test_all_requirements_that_do_not_hold_are_named():
+    async with running_machine(machine(DOOR_SHUT)) as rig:
+        await power(rig)
+        rig.door(closed=False)
+        await rig.named(door_closed=False)
+        parts = "input door_closed is false; input door_open is true; output lock is not known"
+        await refused(rig, "rotor", SPIN, f"interlock door_shut: {parts}$")
+        (cause,) = (await rig.client.ask(Why(absolute=False), "rotor")).causes
+        assert cause.text.endswith(parts)
+        assert cause.remedy.startswith("set output lock high, see to it that the rest holds; for service")
+
+        rig.io.power(on=False, at_s=asyncio.get_running_loop().time())
+        await asyncio.sleep(0.5)
+        gone = "input door_closed, input door_open, output lock are not known: module cabinet does not answer$"
+        await refused(rig, "rotor", SPIN, f"interlock door_shut: {gone}")
+
+
+def test_the_refusal_names_what_makes_an_output_known(monkeypatch):
+    with virtual_rig(monkeypatch, machine(DOOR_SHUT), {"line": chain_of_machine()}) as rig:
+        rig.wait(rig.rig.until("rotor", lambda state: state.link is LinkState.UP))
+        rig.wait(asyncio.sleep(1.0))
+        rig.run("power on rotor")
+        refused = rig.run("move rotor 3 --at-velocity")
+        way_out = "ldcnd bus set-io cabinet lock=high"
+        assert (refused.code, f"  {way_out}; for service" in refused.errors) == (1, True)
+        assert f": {way_out}; for service" in rig.run("why rotor").printed
+        assert rig.run(way_out.removeprefix("ldcnd ")).code == 0
+        rig.wait(asyncio.sleep(0.2))
+        assert rig.run("move rotor 3 --at-velocity").code == 0
+
+
 # -- overridden --------------------------------------------------------------------------------------------------------
 
 
@@ -465,7 +498,7 @@ async def test_a_machine_that_is_taken_over_with_its_door_open_is_brought_to_res
         await asyncio.sleep(1.0)
         assert rig.speed() == 0
         state = await rig.client.state("rotor")
-        assert state.interlock == "door_shut: input door_closed is false"
+        assert state.interlock == "door_shut: input door_closed is false; output lock is not known"
 
 
 @pytest.mark.promise("outputs-by-command")
