@@ -239,7 +239,7 @@ def typed(step: RemedyCommand, axis: str | None) -> str:
     words, separator, program = words.format(
         axis=shlex.quote(axis) if axis else "AXIS",
         on="on" if given.get("on", True) else "off",
-        module=given.get("module"),
+        module=given.get("module", "MODULE"),
         lines=lines,
     ).partition(" -- ")
     force = " --force" if step.arguments.get("force") else ""

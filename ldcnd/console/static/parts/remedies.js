@@ -14,6 +14,7 @@ const PRESSED = {
   reset: ["press Reset", PAGES_WITH_CONTROL],
   halt: ["press Halt", ["axis", "rig"]],
   set_gains: ["write gains, at least kp and el", ["axis", "tuning"]],
+  set_io: null, // which output, and how, its own words say
   set_outputs: ["make the pin an input again, under Outputs", AXIS],
   trace_abort: ["press Abort", ["trace"]],
   clear_counter: ["clear the counter", ["parameters"]],
