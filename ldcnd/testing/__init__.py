@@ -18,11 +18,12 @@ if TYPE_CHECKING:
     from ldcnd.testing.lines import simulated_config
     from ldcnd.testing.rig import SimulatedRig, run, simulated_rig
     from ldcnd.testing.served import ServedRig, served_rig
-    from ldcnd.testing.truth import Truth
+    from ldcnd.testing.truth import ModuleTruth, Truth
 
 __all__ = [
     "FaultSpan",
     "FaultStart",
+    "ModuleTruth",
     "RigFault",
     "RigFaults",
     "ServedRig",

@@ -18,7 +18,7 @@ from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.module import EVERYBODY, SimulatedModule
 from ldcnd.sim.ldcn.power import OF_POWER, FaultCondition, LogosolPower
 from ldcnd.sim.plant import MotorPlant
-from ldcnd.testing.truth import Machine, Truth
+from ldcnd.testing.truth import Machine, Terminals, Truth, terminals_of
 
 Switch = Literal["forward", "reverse"]
 Change = Callable[[float], None]
@@ -105,19 +105,21 @@ class RigFaults:
 
     Raises:
         UnknownAxis: there is no such axis.
+        ValueOutOfRange: there is no such input, part, module or line.
         NotSupported: it cannot happen to such a drive.
     """
 
     def __init__(
         self,
         machine_of: Callable[[str], Machine],
+        modules: Mapping[str, Terminals],
         lines: Mapping[str, Chain],
         look: Callable[[str], Truth],
         loop: asyncio.AbstractEventLoop,
         processes: Processes,
         note: Callable[[str], None],
     ) -> None:
-        self._machine_of, self._lines, self._look = machine_of, lines, look
+        self._machine_of, self._modules, self._lines, self._look = machine_of, modules, lines, look
         self._loop, self._processes, self._note = loop, processes, note
         self._made_so_far: list[RigFault] = []
 
@@ -349,6 +351,49 @@ class RigFaults:
             "mute",
             lambda _: chain.mute(place, on=True),
             lambda _: chain.mute(place, on=False),
+            start,
+        )
+
+    # -- I/O modules and what stands around them ---------------------------------------------------------------------
+
+    def input_stuck(self, name: str, *, high: bool, **start: Unpack[FaultSpan]) -> RigFault:
+        """Hold the line of a named input at a level, whatever its sensor sees: a wire that is cut leaves it high.
+
+        One that is shorted to ground makes it low. At the end the sensor is connected again.
+        """
+        inputs = {
+            of: (each.io, wired.line) for each in self._modules.values() for of, wired in each.config.inputs.items()
+        }
+        if name not in inputs:
+            raise ValueOutOfRange(f"there is no input {name!r}; there are: {', '.join(inputs) or 'none'}", value=name)
+        io, line = inputs[name]
+        return self._of_rig(
+            f"{name}: stuck {'high' if high else 'low'}",
+            lambda at_s: io.drive_line(line, high=high, at_s=at_s),
+            lambda at_s: io.plug_in(line, at_s),
+            start,
+        )
+
+    def part_stuck(self, part: str, **start: Unpack[FaultSpan]) -> RigFault:
+        """Let a door, a bolt or another part of the machine, see `[[sim.part]]`, stay where it is."""
+        parts = {name: each.io for each in self._modules.values() for name in each.io.around.names}
+        if part not in parts:
+            raise ValueOutOfRange(f"there is no part {part!r}; there are: {', '.join(parts) or 'none'}", value=part)
+        io = parts[part]
+        return self._of_rig(
+            f"{part}: stuck",
+            lambda at_s: io.jam(part, jammed=True, at_s=at_s),
+            lambda at_s: io.jam(part, jammed=False, at_s=at_s),
+            start,
+        )
+
+    def module_power_loss(self, module: str, **start: Unpack[FaultSpan]) -> RigFault:
+        """Switch an I/O module's supply off, and on again at the end: all its lines are inputs then."""
+        io = terminals_of(self._modules, module).io
+        return self._of_rig(
+            f"{module}: power loss",
+            lambda at_s: io.power(on=False, at_s=at_s),
+            lambda at_s: io.power(on=True, at_s=at_s),
             start,
         )
 

@@ -20,6 +20,7 @@ from ldcnd.contract.samples import LinkState
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.drives.known import FAMILIES
+from ldcnd.drives.ldcn.config import LdcnBusConfig
 from ldcnd.line.flight_recorder import WireEvent
 from ldcnd.line.transport import Opener, Receiver, Transport
 from ldcnd.net.hand_over import Answer
@@ -32,7 +33,7 @@ from ldcnd.testing.jumping_loop import JumpingLoop
 from ldcnd.testing.lines import simulated_config
 from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 from ldcnd.testing.timeline import Timeline
-from ldcnd.testing.truth import Machine, Truth
+from ldcnd.testing.truth import Machine, ModuleTruth, Terminals, Truth, terminals_of
 from ldcnd.testing.twin import RigState, config_of_twin, place, recall, restore
 
 P = ParamSpec("P")
@@ -194,11 +195,20 @@ class SimulatedRig:
             if bus.name in lines
             for place in [sorted(bus.models).index(axis.address) + 1]
         }
+        self._modules = {
+            module.name: Terminals(module, lines[bus.name], sorted(bus.models).index(module.address) + 1)
+            for bus in config.bus
+            if isinstance(bus, LdcnBusConfig) and bus.name in lines
+            for module in bus.module
+            if module.name
+        }
         processes = Processes(
             kill_daemon=(lambda _: self._later(self.kill_daemon()), lambda _: self._later(self.start_daemon())),
             lose_client=lose_client,
         )
-        self.faults = RigFaults(self.machine, lines, self.truth, self._loop, processes, self.timeline.note)
+        self.faults = RigFaults(
+            self.machine, self._modules, lines, self.truth, self._loop, processes, self.timeline.note
+        )
 
     @property
     def now_s(self) -> float:
@@ -223,6 +233,14 @@ class SimulatedRig:
             UnknownAxis: there is no such axis.
         """
         return self.machine(axis).look(self._loop.time())
+
+    def module_truth(self, module: str) -> ModuleTruth:
+        """Return what is really so at the terminals of an I/O module: levels, outputs, doors, bolts.
+
+        Raises:
+            ValueOutOfRange: there is no such module.
+        """
+        return terminals_of(self._modules, module).look(self._loop.time())
 
     def packets(self, count: int = 12) -> str:
         """Return the last packets of each line, in words; those of a daemon that was killed are gone with it."""

@@ -4,11 +4,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from ldcnd.axis.scale import AxisScale
-from ldcnd.contract.errors import NotSupported
+from ldcnd.contract.errors import NotSupported, ValueOutOfRange
 from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.ldcn.config import ModuleConfig
 from ldcnd.drives.smartstep.parameters import PARAMETERS
 from ldcnd.sim.chain import Chain, Module
 from ldcnd.sim.ldcn.drive import SimulatedDrive
+from ldcnd.sim.ldcn.io import SimulatedIo
 from ldcnd.sim.smartstep.cable import SimulatedSmartSteps
 from ldcnd.sim.smartstep.drive import SimulatedSmartStep
 from ldcnd.sim.smartstep.unit import SimulatedUnit
@@ -42,6 +44,70 @@ class Truth:
     energised: bool
     output: float | None
     registers: Mapping[str, int]
+
+
+@dataclass(frozen=True, slots=True)
+class ModuleTruth:
+    """One I/O module and what stands at its terminals, at an instant.
+
+    Attributes:
+        powered: whether it has its supply.
+        inputs: whether each named input is on, by the level of its pin.
+        outputs: level of each named output, true for high; None while the module does not drive the line.
+        parts: where each door, bolt or other part of the machine is, by the names of the configuration: 0 at its start,
+            1 at its end.
+    """
+
+    powered: bool
+    inputs: Mapping[str, bool]
+    outputs: Mapping[str, bool | None]
+    parts: Mapping[str, float]
+
+
+class Terminals:
+    """One simulated I/O module under its name.
+
+    Attributes:
+        config: of the module.
+        chain: the line.
+        io: the module.
+    """
+
+    def __init__(self, config: ModuleConfig, chain: Chain, place: int) -> None:
+        module = chain.modules[place - 1]
+        assert isinstance(module, SimulatedIo)  # noqa: S101 - only such a module has a name
+        self.config, self.chain, self.io = config, chain, module
+
+    def look(self, now_s: float) -> ModuleTruth:
+        """Return what is so at an instant of the line's clock."""
+        self.chain.pass_until(now_s)
+        io = self.io
+        io.catch_up(now_s)
+        levels = io.levels
+
+        def level(line: int, of: int) -> bool:
+            return bool(of & 1 << line - 1)
+
+        return ModuleTruth(
+            powered=io.powered,
+            inputs={name: level(each.line, levels) is not each.inverted for name, each in self.config.inputs.items()},
+            outputs={
+                name: level(each.line, levels) if level(each.line, io.outputs) else None
+                for name, each in self.config.outputs.items()
+            },
+            parts={name: io.around.at(name) for name in io.around.names},
+        )
+
+
+def terminals_of(modules: Mapping[str, Terminals], name: str) -> Terminals:
+    """Return a module by its name.
+
+    Raises:
+        ValueOutOfRange: there is no such module.
+    """
+    if name not in modules:
+        raise ValueOutOfRange(f"there is no I/O module {name!r}; there are: {', '.join(modules) or 'none'}", value=name)
+    return modules[name]
 
 
 class Machine:

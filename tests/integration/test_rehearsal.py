@@ -409,3 +409,54 @@ def test_what_is_asked_of_a_served_rig_takes_no_reply_from_its_daemon(tmp_path):
                 x.move_absolute(10.0, velocity=20).done()
         assert jam.begun
         assert served.ask(lambda there: there.truth("x").position) == pytest.approx(7.5, abs=0.5)
+
+
+CENTRIFUGE = ROOT / "config" / "centrifuge.toml"
+
+
+@pytest.mark.ldcnd_rig(CENTRIFUGE)
+async def test_what_stands_at_an_io_module_can_be_seen_and_can_fail(ldcnd_rig):
+    def cabinet():
+        return ldcnd_rig.module_truth("cabinet")
+
+    async def said():
+        return (await ldcnd_rig.client.latest("cabinet", "io")).named
+
+    assert cabinet().powered
+    assert cabinet().parts == {"lock": 1.0, "door": 0.0, "pin": 0.0}
+    assert cabinet().inputs["locked"]
+    await asyncio.sleep(1)  # the rotor is known to stand by then
+    await ldcnd_rig.client.set_io("cabinet", high=["unlock"])
+    await ldcnd_rig.until(lambda: cabinet().parts["lock"] == 0.0)
+    assert cabinet().outputs["unlock"] is True
+
+    with ldcnd_rig.faults.input_stuck("unlocked", high=False):
+        assert not cabinet().inputs["unlocked"]
+        await asyncio.sleep(1)
+        assert (await said())["unlocked"] is False
+    await asyncio.sleep(1)
+    assert (await said())["unlocked"] is True
+
+    with ldcnd_rig.faults.part_stuck("door"):
+        await ldcnd_rig.client.set_io("cabinet", high=["door"])
+        await asyncio.sleep(3)
+        assert cabinet().parts["door"] == 0.0
+    await ldcnd_rig.until(lambda: cabinet().parts["door"] == 1.0)
+
+    with ldcnd_rig.faults.module_power_loss("cabinet"):
+        await asyncio.sleep(3)
+        assert cabinet().outputs["unlock"] is None
+        assert (cabinet().powered, cabinet().parts["lock"]) == (False, 1.0)  # its spring pushes the bolt in
+    assert "cabinet: power loss begins" in str(ldcnd_rig.timeline)
+
+
+@pytest.mark.ldcnd_rig(CENTRIFUGE)
+async def test_what_is_not_at_an_io_module_is_refused_with_what_there_is(ldcnd_rig):
+    for use, says in (
+        (lambda: ldcnd_rig.module_truth("rotor"), "there are: cabinet"),
+        (lambda: ldcnd_rig.faults.module_power_loss("rotor"), "there are: cabinet"),
+        (lambda: ldcnd_rig.faults.part_stuck("lid"), "there are: lock, pin, door"),
+        (lambda: ldcnd_rig.faults.input_stuck("door", high=True), "there are: pin_out, "),
+    ):
+        with pytest.raises(ldcnd.LdcndError, match=says):
+            use()

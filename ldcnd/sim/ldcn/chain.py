@@ -216,7 +216,7 @@ def _happening(event: TimedEvent, module: SimulatedModule) -> Callable[[float], 
             return lambda at_s: io.drive_line(number, high=event.present, at_s=at_s)
         case Analog(channel, value), SimulatedIo() as io:
             return lambda at_s: io.set_adc(channel, value, at_s)
-        case Jam(part), SimulatedIo() as io if io.around.has(part):
+        case Jam(part), SimulatedIo() as io if part in io.around.names:
             return lambda at_s: io.jam(part, jammed=event.present, at_s=at_s)
     if isinstance(event.what, Jam):
         raise ValueOutOfRange(f"module {event.place} has no part {event.what.part}", value=event.place)

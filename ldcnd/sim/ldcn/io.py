@@ -99,7 +99,7 @@ class SimulatedIo(SimulatedModule):
         wiring = wiring or IoWiring()
         self._wires = [(line, driver, 0) for driver, line in wiring.wires]
         self._wires += [(line, driver, 1) for driver, line in wiring.inverted_wires]
-        self._low = sum(1 << line - 1 for line in wiring.low)
+        self._wired_low = self._low = sum(1 << line - 1 for line in wiring.low)
         self._adc = list(wiring.adc)
         self._pulses_per_cycle = wiring.pulses_hz * SERVO_CYCLE_S
         self._unplugged = 0  # lines that something outside drives, whatever was wired to them
@@ -128,6 +128,14 @@ class SimulatedIo(SimulatedModule):
         before = self.levels
         self._low = self._low & ~(1 << line - 1) | (0 if high else 1 << line - 1)
         self._unplugged |= 1 << line - 1
+        self._count_edges(before)
+
+    def plug_in(self, line: int, at_s: float) -> None:
+        """Connect again what was at a line before `drive_line`."""
+        self.catch_up(at_s)
+        before, bit = self.levels, 1 << line - 1
+        self._low = self._low & ~bit | self._wired_low & bit
+        self._unplugged &= ~bit
         self._count_edges(before)
 
     def jam(self, part: str, *, jammed: bool, at_s: float) -> None:

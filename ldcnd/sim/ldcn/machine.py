@@ -130,9 +130,10 @@ class Surroundings:
         """Put a switch beside the rotor of a drive."""
         self._switches.append((switch, drive))
 
-    def has(self, part: str) -> bool:
-        """Tell whether there is such a part."""
-        return part in self._parts
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the parts."""
+        return tuple(self._parts)
 
     def at(self, part: str) -> float:
         """Return where a part is: 0 at its start, 1 at its end."""

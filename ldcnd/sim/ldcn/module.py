@@ -164,6 +164,11 @@ class SimulatedModule(Module):
         if on:
             self.restore()
 
+    @property
+    def powered(self) -> bool:
+        """Whether it has its supply."""
+        return self._powered
+
     def catch_up(self, to_s: float) -> None:
         """Let the servo cycles up to that instant pass; also before something is changed from outside."""
         self._pass_cycles(math.floor((to_s - self.settings.phase_s) / self._cycle_s + _ROUNDING))
