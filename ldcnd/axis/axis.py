@@ -351,11 +351,8 @@ class AxisService:
         able = self.driver.capabilities
         moves = any(command.effect is Effect.MOTION and verb in able for verb, command in AXIS_COMMANDS.items())
         absolute = absolute and Verb.MOVE_ABSOLUTE in able
-        verb = Verb.MOVE_VELOCITY if turns else Verb.MOVE_ABSOLUTE if absolute else Verb.MOVE_RELATIVE
-        row = guards.needs(verb) if moves else guards.AT_ALL
+        row = guards.needs(Verb.MOVE_ABSOLUTE if absolute else Verb.MOVE_RELATIVE) if moves else guards.AT_ALL
         found = list(guards.obstacles(row, self.tracker, self._moves))
-        if guards.goes_on(verb, self.tracker):
-            found = [(error, guard) for error, guard in found if guard is not guards.check_stands]
         name = self.config.name
         first = [error for error, guard in found if guard in (guards.check_reachable, guards.check_not_latched)]
         # a warning keeps nothing from moving

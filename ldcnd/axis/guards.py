@@ -86,10 +86,8 @@ def check_enabled(axis: AxisTracker) -> None:
 def check_stands(axis: AxisTracker) -> None:
     """Refuse while a motion runs: a trapezoid loaded in mid-move is erratic on most drives (PIC-SERVO manual, 4.4)."""
     if axis.status.state.is_motion:
-        goes_on = goes_on_in(axis)
         raise WrongState(
-            f"axis {axis.name} is {axis.status.state.words}"
-            + (f": only {goes_on} goes on from that" if goes_on else ""),
+            f"axis {axis.name} is {axis.status.state.words}",
             axis=axis.name,
             value=axis.status.state,
             remedy=Remedy("{} and wait", step("halt")),
@@ -334,11 +332,6 @@ def goes_on(verb: Verb, axis: AxisTracker) -> bool:
         and axis.status.command.verb is verb
         and axis.status.state in GOES_ON.get(verb, ())
     )
-
-
-def goes_on_in(axis: AxisTracker) -> Verb | None:
-    """Return the command that another one of its own would take over now; None when there is none."""
-    return next((verb for verb in GOES_ON if goes_on(verb, axis)), None)
 
 
 def check(verb: Verb, axis: AxisTracker, *, follows: bool = False) -> None:

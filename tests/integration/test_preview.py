@@ -2,9 +2,9 @@
 
 import pytest
 
-from ldcnd.contract.commands import MoveAbsolute, MoveVelocity, Power
+from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.errors import MalformedRequest
-from ldcnd.contract.questions import Preview, Why
+from ldcnd.contract.questions import Preview
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.line.flight_recorder import WireEvent
 from tests.support.rig import RunningRig, running_rig
@@ -78,19 +78,3 @@ async def test_a_plan_says_which_motion_is_meant():
         for vague in (Preview(), Preview(position=1.0, distance=1.0)):
             with pytest.raises(MalformedRequest):
                 await rig.client.ask(vague, "x")
-
-
-async def test_a_plan_of_another_velocity_is_free_while_the_axis_moves_at_one_and_why_says_what_goes_on():
-    async with running_rig() as rig:
-        await rig.until("x", lambda state: state.link == "up")
-        await rig.client.command("x", Power(on=True))
-        await rig.client.command("x", MoveVelocity(velocity=2.0))
-
-        changed = await rig.client.ask(Preview(velocity=3.0), "x")
-        elsewhere = await rig.client.ask(Preview(position=3.0), "x")
-        why = await rig.client.ask(Why(), "x")
-        await rig.client.command("x", MoveVelocity(velocity=3.0))
-
-        assert changed.obstacles == ()
-        assert any("only move_velocity goes on from that" in each for each in elsewhere.obstacles)
-        assert any("only move_velocity goes on from that" in cause.text for cause in why.causes)
