@@ -50,7 +50,7 @@ class AxisVerbs(ABC):
         """Send a command that ends later."""
 
     @abstractmethod
-    async def _ask(self, command: type[Command[ReplyT]], **fields: object) -> ReplyT:
+    async def _ask(self, command: type[Command[ReplyT]], /, **fields: object) -> ReplyT:
         """Query the daemon about the axis."""
 '''
 

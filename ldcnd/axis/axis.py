@@ -324,12 +324,15 @@ class AxisService:
             self._check_takes(verb)
         except NotSupported as error:
             return [(error, False)]
-        found = guards.obstacles(guards.needs(verb), self.tracker, self._moves)
-        if guards.goes_on(verb, self.tracker):
-            causes = [(error, False) for error, guard in found if guard is not guards.check_stands]
-        else:
-            causes = [(error, guard is guards.check_stands) for error, guard in found]
+        causes = [(error, guard is guards.check_stands) for error, guard in self._found(verb, guards.needs(verb))]
         return causes + self._violations(verb, None)
+
+    def _found(self, verb: Verb, row: guards.Needs) -> Iterator[tuple[LdcndError, guards.Guard | None]]:
+        """Yield what guards refuse a command with; one that takes over one of its own need not stand."""
+        follows = guards.goes_on(verb, self.tracker)
+        for error, guard in guards.obstacles(row, self.tracker, self._moves):
+            if not (follows and guard is guards.check_stands):
+                yield error, guard
 
     def _while_it_coasts(self) -> Iterator[LdcndError]:
         """Yield what forbids to close the loop of a shaft that still turns with it open; that passes by itself."""
@@ -338,21 +341,17 @@ class AxisService:
         except LdcndError as error:
             yield error
 
-    def obstacles_to_motion(
-        self, *, absolute: bool, turns: bool = False, speed: float | None = None
-    ) -> list[tuple[LdcndError, bool]]:
+    def obstacles_to_motion(self, verb: Verb, *, speed: float | None = None) -> list[tuple[LdcndError, bool]]:
         """Return all that keeps the axis from a motion, each cause once: what has stopped its drive one by one.
 
         Args:
-            absolute: the motion is to a position.
-            turns: it is at a velocity.
+            verb: begins the motion; one by a distance stands for one to a position that the drive does not take.
             speed: of it, in units a second; that of moves which name none when missing.
         """
         able = self.driver.capabilities
         moves = any(command.effect is Effect.MOTION and verb in able for verb, command in AXIS_COMMANDS.items())
-        absolute = absolute and Verb.MOVE_ABSOLUTE in able
-        row = guards.needs(Verb.MOVE_ABSOLUTE if absolute else Verb.MOVE_RELATIVE) if moves else guards.AT_ALL
-        found = list(guards.obstacles(row, self.tracker, self._moves))
+        verb = Verb.MOVE_RELATIVE if verb is Verb.MOVE_ABSOLUTE and verb not in able else verb
+        found = list(self._found(verb, guards.needs(verb) if moves else guards.AT_ALL))
         name = self.config.name
         first = [error for error, guard in found if guard in (guards.check_reachable, guards.check_not_latched)]
         # a warning keeps nothing from moving
@@ -366,7 +365,7 @@ class AxisService:
                     causes += [(each, True) for each in self._while_it_coasts()]
                 causes.append((error, guard is guards.check_stands))
         if moves:
-            causes += self._violations(Verb.MOVE_VELOCITY if turns else Verb.MOVE_ABSOLUTE, speed)
+            causes += self._violations(verb, speed)
         if not moves:
             text = f"axis {name}: its drive takes no motion over the line"
             causes.append((NotSupported(text, axis=name, remedy=NO_COMMAND_HELPS), False))

@@ -241,19 +241,27 @@ OTHER_MOTIONS = {Verb.MOVE_RELATIVE: "by a distance", Verb.MOVE_VELOCITY: "at a 
 
 @click.command()
 @click.argument("axis", type=AXIS)
+@click.argument("command", type=click.Choice([verb.value for verb in Verb]), required=False, metavar="[COMMAND]")
 @with_target
-def why(target: Target, axis: str) -> None:
-    """Tell why AXIS cannot move now, and what would clear that; exits with 1 when something is in the way."""
+def why(target: Target, axis: str, command: str | None) -> None:
+    """Tell why AXIS cannot move now, and what would clear that; exits with 1 when something is in the way.
+
+    With a COMMAND, such as move_velocity, that is asked of this command alone.
+    """
+    asked = None if command is None else Verb(command)
 
     async def work(client: RigClient) -> tuple[AxisInfo, WhyReply]:
-        reply = await client.ask(Why(each_command=True), axis)
+        reply = await client.ask(Why(command=asked, each_command=asked is None), axis)
         return await axis_of(client, axis), reply
 
     info, reply = target.run(work)
     taken = {verb for each in reply.commands if not each.causes for verb in each.verbs}
     others = " or ".join(words for verb, words in OTHER_MOTIONS.items() if verb in taken)
     without = f"cannot move to a position now, only {others}" if others else "cannot move now"
-    lines = [f"{axis}: {'ready to move' if reply.can_move else without}"]
+    ready = "ready to move"
+    if asked:
+        ready, without = f"ready for {asked}", f"{asked} would be refused now"
+    lines = [f"{axis}: {ready if reply.can_move else without}"]
     for cause in reply.causes:
         known = remedy_of(cause)
         remedy = known and known.phrased(lambda step: typed(step, axis))

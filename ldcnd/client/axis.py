@@ -300,7 +300,7 @@ class Axis(AxisVerbs):
         request = await self._made(command, fields)
         return self.begun(await self._sent_as(request), getattr(request, "position", None))
 
-    async def _ask(self, command: type[Command[ReplyT]], **fields: object) -> ReplyT:
+    async def _ask(self, command: type[Command[ReplyT]], /, **fields: object) -> ReplyT:
         request = await self._made(command, fields)
         if self.control and "lease" in command.model_fields:
             request = request.model_copy(update={"lease": self.control.lease.lease})

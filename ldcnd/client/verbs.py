@@ -32,6 +32,7 @@ from ldcnd.contract.commands import (
     SetPosition,
     SetPwm,
     Track,
+    Verb,
 )
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.parameters import (
@@ -79,7 +80,7 @@ class AxisVerbs(ABC):
         """Send a command that ends later."""
 
     @abstractmethod
-    async def _ask(self, command: type[Command[ReplyT]], **fields: object) -> ReplyT:
+    async def _ask(self, command: type[Command[ReplyT]], /, **fields: object) -> ReplyT:
         """Query the daemon about the axis."""
 
     async def power(self, *, on: bool) -> CommandReply:
@@ -481,14 +482,15 @@ class AxisVerbs(ABC):
         """End the trace that is under way, or one that was left armed in the drive; its samples are lost."""
         return await self._send(AbortTrace)
 
-    async def why(self, *, absolute: bool = True, each_command: bool = False) -> WhyReply:
+    async def why(self, *, absolute: bool = True, command: Verb | None = None, each_command: bool = False) -> WhyReply:
         """Report why an axis cannot move.
 
         Args:
             absolute: Whether the motion would name a position, which needs a referenced axis.
+            command: Command that is asked about; any motion, with or without a position, when missing.
             each_command: Whether to say of each command of the axis as well what forbids it.
         """
-        return await self._ask(Why, absolute=absolute, each_command=each_command)
+        return await self._ask(Why, absolute=absolute, command=command, each_command=each_command)
 
     async def preview(
         self,

@@ -2,7 +2,7 @@
 
 from pydantic import Field
 
-from ldcnd.contract.commands import LATEST_NS, About, Command, Direction, Effect, ErrorReply, RemedyStep
+from ldcnd.contract.commands import LATEST_NS, About, Command, Direction, Effect, ErrorReply, RemedyStep, Verb
 from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
 from ldcnd.contract.samples import MOST_SHADOW_FIGURES, ShadowFigure
 
@@ -39,7 +39,7 @@ class WhyReply(Frozen):
     axis: str
     """The axis."""
     can_move: bool
-    """Whether a motion within the limits would be accepted from the sender."""
+    """Whether a motion within the limits, or the command that was asked about, would be accepted from the sender."""
     causes: tuple[Cause, ...]
     """The obstacles, in the order in which they have to be cleared."""
     first_fault: str | None
@@ -62,6 +62,8 @@ class Why(Command[WhyReply]):
     """The lease under which the motion would be sent."""
     absolute: bool = True
     """Whether the motion would name a position, which needs a referenced axis."""
+    command: Verb | None = None
+    """Command that is asked about; any motion, with or without a position, when missing."""
     each_command: bool = False
     """Whether to say of each command of the axis as well what forbids it."""
 
@@ -115,6 +117,13 @@ class Preview(Command[PreviewReply]):
     """Speed of the move; alone: a motion at this velocity, signed. Units a second."""
     acceleration: float | None = Field(default=None, gt=0)
     """Units a second squared; the axis default when missing."""
+
+    @property
+    def motion(self) -> Verb:
+        """The command that would begin the motion."""
+        if self.position is not None:
+            return Verb.MOVE_ABSOLUTE
+        return Verb.MOVE_VELOCITY if self.distance is None else Verb.MOVE_RELATIVE
 
 
 class ShadowReply(Frozen):

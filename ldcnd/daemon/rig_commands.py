@@ -12,7 +12,7 @@ from ldcnd.axis.procedures.group import GroupMoveRequest
 from ldcnd.axis.procedures.path import PathShareRequest
 from ldcnd.contract.catalogue import AXIS_COMMANDS, verbs_for
 from ldcnd.contract.codec import remedy_steps
-from ldcnd.contract.commands import AxisCommand, Capability, Command, CommandReply, Effect
+from ldcnd.contract.commands import AxisCommand, Capability, Command, CommandReply, Effect, Verb
 from ldcnd.contract.errors import (
     InternalError,
     LdcndError,
@@ -189,9 +189,8 @@ class RigCommands:
             case Why():
                 return self._why(self._rig.axes[axis], command)
             case Preview():
-                service, to_place = self._rig.axes[axis], command.position is not None
-                turns = not to_place and command.distance is None
-                causes = service.obstacles_to_motion(absolute=to_place, turns=turns, speed=command.velocity)
+                service = self._rig.axes[axis]
+                causes = service.obstacles_to_motion(command.motion, speed=command.velocity)
                 # a preview names no lease
                 not_admitted = refused(lambda: self._admit(axis, None))
                 return service.preview(command, tuple(each.text for each in _causes(service, not_admitted + causes)))
@@ -413,13 +412,23 @@ def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyRe
     """Say what forbids a motion of an axis, and each of its commands; `admit` raises what its sender may not."""
     not_admitted = refused(admit)
     alike: dict[tuple[str, ...], Hindered] = {}
-    for verb, command in AXIS_COMMANDS.items() if request.each_command else ():
-        asks_right = [] if command.effect is Effect.QUESTION else not_admitted
-        causes = () if command.effect is Effect.REST else _causes(axis, asks_right + axis.obstacles(verb))
+
+    def causes_of(verb: Verb) -> tuple[Cause, ...]:
+        effect = AXIS_COMMANDS[verb].effect
+        asks_right = [] if effect is Effect.QUESTION else not_admitted
+        return () if effect is Effect.REST else _causes(axis, asks_right + axis.obstacles(verb))
+
+    for verb in AXIS_COMMANDS if request.each_command else ():
+        causes = causes_of(verb)
         texts = tuple(cause.text for cause in causes)
         others = alike[texts].verbs if texts in alike else ()
         alike[texts] = Hindered(verbs=(*others, verb.value), causes=causes)
-    causes = _causes(axis, not_admitted + axis.obstacles_to_motion(absolute=request.absolute))
+    asked = request.command or (Verb.MOVE_ABSOLUTE if request.absolute else Verb.MOVE_RELATIVE)
+    takes = request.command is None or asked in axis.driver.capabilities
+    if takes and AXIS_COMMANDS[asked].effect is Effect.MOTION:
+        causes = _causes(axis, not_admitted + axis.obstacles_to_motion(asked))
+    else:
+        causes = causes_of(asked)
     status = axis.tracker.status
     first = status.first_fault
     return WhyReply(

@@ -2,11 +2,13 @@
 
 import pytest
 
-from ldcnd.contract.commands import MoveAbsolute, Power
-from ldcnd.contract.errors import MalformedRequest
-from ldcnd.contract.questions import Preview
+from ldcnd.contract.commands import MoveAbsolute, MoveRelative, MoveVelocity, Power, SetPosition, Verb
+from ldcnd.contract.errors import MalformedRequest, WrongState
+from ldcnd.contract.questions import Preview, Why
 from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.line.flight_recorder import WireEvent
+from tests.support.command_line import virtual_rig
+from tests.support.machine_rig import machine, running_machine
 from tests.support.rig import RunningRig, running_rig
 
 
@@ -78,3 +80,40 @@ async def test_a_plan_says_which_motion_is_meant():
         for vague in (Preview(), Preview(position=1.0, distance=1.0)):
             with pytest.raises(MalformedRequest):
                 await rig.client.ask(vague, "x")
+
+
+async def test_at_a_constant_velocity_both_questions_answer_as_the_command_would():
+    runs = "axis rotor is moving at a velocity"
+    async with running_machine(machine()) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", SetPosition(position=0.0))
+        await rig.client.command("rotor", MoveVelocity(velocity=2.0))
+
+        planned = [
+            (await rig.client.ask(each, "rotor")).obstacles
+            for each in (Preview(velocity=3.0), Preview(position=3.0), Preview(distance=3.0))
+        ]
+        why = {
+            verb: await rig.client.ask(Why(command=verb), "rotor")
+            for verb in (Verb.MOVE_VELOCITY, Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.SET_GAINS, Verb.POWER, None)
+        }
+        await rig.client.command("rotor", MoveVelocity(velocity=3.0))
+        for refused in (MoveAbsolute(position=3.0), MoveRelative(distance=3.0)):
+            with pytest.raises(WrongState, match=runs):
+                await rig.client.command("rotor", refused)
+
+    assert planned == [(), (runs,), (runs,)]
+    assert {verb for verb, each in why.items() if each.can_move} == {Verb.MOVE_VELOCITY, Verb.SET_GAINS}
+    assert {cause.text for each in why.values() for cause in each.causes} == {runs}
+
+
+def test_the_command_line_asks_about_one_command(monkeypatch):
+    with virtual_rig(monkeypatch) as rig:
+        rig.wait(rig.rig.until("x", lambda state: state.link == "up"))
+        told = rig.run("why x read_alarms")
+        assert told.code == 1
+        assert "cannot read_alarms" in told.printed
+        rig.run("power on x")
+        rig.run("move x 1 --at-velocity")
+        assert rig.run("why x").printed.startswith("x: cannot move to a position now, only at a velocity\n")
+        assert rig.run("why x move_velocity").printed == "x: ready for move_velocity\n"
