@@ -17,7 +17,7 @@ BASE = ""
 
 
 class AxisGains:
-    """The sets of gains: chooses that of each kind of motion, keeps what is set in each, takes back what was lent.
+    """The sets of gains: chooses one for each kind of motion, keeps what is set in each, and takes back lent ones.
 
     The set in force is the one that the drive was last given, or is given at power-on. Unless gains are lent, what the
     drive is to hold is what that set has.

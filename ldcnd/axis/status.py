@@ -167,7 +167,7 @@ class OpenStop:
         mode: the strongest of those that were sent or are to be.
         fault: what is published of it, from when on it was sent in vain, or is yet to be sent: nothing moves then until
             it is confirmed. None while it is on its way for the first time.
-        asked: what asked for it, the first one first; each is told by its own name.
+        asked: the commands that asked for it, in their order; each has an event under its own name.
     """
 
     mode: StopMode

@@ -88,7 +88,7 @@ def revoke(folder: Path, name: str) -> None:
 
 
 def _say_restart(files: Iterable[Path], until_then: str) -> None:
-    """Say that daemons and routers read their rules at their start; nobody else decides on what a login may do."""
+    """Say what has to be restarted: daemons and routers judge logins, and read their rules at their start."""
     for file in files:
         click.echo(f"put {file} in the place of the one before, and restart the daemon or router that runs with it;")
         click.echo(f"  a reload does not do; until then {until_then}")

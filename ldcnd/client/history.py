@@ -131,7 +131,7 @@ class Beginning:
         if self.discarded:
             lost = f"the {self.discarded} events before {clock_time(self.t)} are not kept any more"
         else:
-            lost = f"events before {clock_time(self.t)} were lost with the daemon that ended"
+            lost = f"events before {clock_time(self.t)} are not known: this daemon began then"
         return f"{lost}; a recorder keeps them: ldcnd record"
 
 

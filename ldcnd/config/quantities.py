@@ -57,7 +57,7 @@ def as_people_read(config: BaseModel) -> dict[str, Any]:
     document = config.model_dump(mode="json", serialize_as_any=True)
     for place in _places(document):
         if _is_number(value := place.value):
-            # so many digits that everything typed is there, and nothing that the conversion has added
+            # ten digits: all that was typed, without the rounding of the conversion
             place.table[place.key] = ReadQuantity(value, quantity_text(value, place.units, place.dimension, ".10g"))
     return document
 

@@ -53,7 +53,7 @@ class Reloader:
         self._access = _access_of(daemon.config)  # the session is open: it was read just now
 
     async def reload(self) -> "ReloadPlan":
-        """Take what can be taken, for a signal: whoever may send that outranks control of an axis.
+        """Apply the changes that need no restart, for a signal: who may send one may change axes that clients control.
 
         Raises:
             ConfigError: the file cannot be read, or makes no configuration; the running one stays.

@@ -338,7 +338,7 @@ async def test_the_events_page_has_all_events_and_says_since_when_they_are_known
         await desk.open("events")
         panel = desk.panel("Commands and how they ended")
         lost = panel.get_by_text("Events of sim before")
-        await expect(lost).to_contain_text("were lost with the daemon that ended. A recorder keeps them: ldcnd record.")
+        await expect(lost).to_contain_text("are not known: its daemon began then. A recorder keeps them: ldcnd record.")
         clock = await desk.page.evaluate("(ms) => new Date(ms).toTimeString().slice(0, 8)", started / 1e6)
         await expect(lost).to_contain_text(clock)
         await panel.get_by_label("Axis").select_option("sim/x")

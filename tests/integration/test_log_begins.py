@@ -22,7 +22,7 @@ def rows(ran):
 
 
 LOST = re.compile(
-    r"^events before (\S+) were lost with the daemon that ended; a recorder keeps them: ldcnd record$", re.MULTILINE
+    r"^events before (\S+) are not known: this daemon began then; a recorder keeps them: ldcnd record$", re.MULTILINE
 )
 
 

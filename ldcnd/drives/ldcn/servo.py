@@ -142,7 +142,7 @@ class LdcnAxis(Moves):
         self.path_packet = MOST_POINTS_PER_PACKET
         self.path_most_counts = PATH_MOST_COUNTS
         self._switching_off = 0
-        self.restarts = 0  # it was reset or lost power so often, as far as was seen
+        self.restarts = 0  # how often the drive was seen to have been reset or to have lost power
         self._readings: dict[tuple[frozenset[TelemetryItem], bool], Exchange[AxisReading]] = {}
         self._stops: dict[int, Exchange[StatusPacket]] = {}
 

@@ -77,7 +77,7 @@ function faultsOf(rig) {
 /** What became of the events before those that the daemon knows. */
 function lostOf({ name, events, eventsBegin: { t, discarded } }) {
   const before = `vents of ${name} before ${dateAndClock(t)}`;
-  const lost = discarded ? `The ${discarded} e${before} are not kept any more` : `E${before} were lost with the daemon that ended`;
+  const lost = discarded ? `The ${discarded} e${before} are not kept any more` : `E${before} are not known: its daemon began then`;
   const seen = events.length && events[0].t < t ? ", but for those that this page has seen" : "";
   return `${lost}${seen}. A recorder keeps them: ldcnd record.`;
 }

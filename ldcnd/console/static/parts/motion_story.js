@@ -6,7 +6,7 @@ import { Mark } from "./state.js";
 
 const ENDINGS = { halt: "halted", stop: "stopped", quick_stop: "stopped" };
 
-/** An end that is nobody's mistake, in words, and whose it was; null for any other reason that an event says. */
+/** An ordinary end in words, with the client whose command it was; null for any other reason of an event. */
 export function ordinary(reason) {
   const [, verb, client] = /^aborted by (halt|stop|quick_stop)(?: of ([^:]+))?$/.exec(reason ?? "") ?? [];
   return verb ? `${ENDINGS[verb]}${client ? ` by ${client}` : ""}` : null;
