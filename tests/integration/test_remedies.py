@@ -67,6 +67,10 @@ RESTART = (
 CLOSE = "configure gains or ldcnd axis gains AXIS --kp KP --el EL"
 AXES = ("x", "n", "z", "g", "feed")
 HELD = "wait until it is released, or ldcnd lease hold --axis AXIS --force -- COMMAND"
+TAKEN = (
+    "wait until it is released or not renewed, ldcnd lease hold --axis AXIS --force -- COMMAND, or share it by its"
+    " token in LDCND_LEASE"
+)
 LEASE = "ldcnd lease hold --axis AXIS -- COMMAND"
 DAMAGED = (
     "restore the file from a backup and start the daemon again, or ldcnd params restart-count AXIS with the writes that"
@@ -274,7 +278,20 @@ def test_a_lease_that_is_missing_is_taken_as_the_refusal_says(monkeypatch):
         assert here.run("power on x").code == 0
 
 
-BY_OTHER_TESTS = {CLOSE, DAMAGED, HELD, LEASE}
+def test_a_lease_that_another_program_of_the_same_name_holds_is_taken_or_shared_as_the_refusal_says(rig, monkeypatch):
+    here = rig
+    held = here.wait(here.rig.client.ask(Acquire(client="ldcnd lease hold", axes=("x",), lease_s=60.0)))
+    refused = here.run("lease hold --axis x -- true")
+    assert refused.code != 0
+    assert TAKEN.replace("AXIS", "x") in refused.errors
+
+    monkeypatch.setenv("LDCND_LEASE", held.lease)
+    assert here.run("power on x").code == 0
+    monkeypatch.delenv("LDCND_LEASE")
+    assert here.run("lease hold --axis x --force -- true").code == 0
+
+
+BY_OTHER_TESTS = {CLOSE, DAMAGED, HELD, LEASE, TAKEN}
 NOT_RUN = {
     "ldcnd halt AXIS, wait until it stands, then ldcnd reset AXIS": "a shaft that turns without its drive",
     "wait until it stands, then ldcnd power on AXIS": "a shaft that turns without its drive",
