@@ -102,6 +102,9 @@ class Daemon:
 
     def end(self) -> None:
         """Request the daemon to stop its axes and to leave; `run` returns when that is done."""
+        # at once: what has its turn before `run` wakes would begin, and what waits would behind the stop of its policy
+        for axis in self.rig.axes.values():
+            axis.close()
         self._ending.set()
 
     def capture(self, bus: str, cause: str) -> Capture:
@@ -184,8 +187,6 @@ class Daemon:
                 log.info("serving", rig=self.rig.name, axes=list(self.rig.axes), instance=self._run.instance)
                 await self._ending.wait()
                 requests.close()
-                for axis in self.rig.axes.values():
-                    axis.close()  # first: what waits now would begin behind the stop that its policy sends
                 await self._come_to_rest()
                 # behind the axes: an interlock may forbid a level while something moves
                 await self._leave_outputs()
@@ -212,7 +213,7 @@ class Daemon:
         except BaseException as error:  # noqa: BLE001 - whatever is wrong in here, axes must not go on unwatched
             log.error("internal error, the daemon ends", reason=repr(error))
             self._failure = self._failure or error
-            self._ending.set()
+            self.end()
 
     async def _declare_stops(self, declared: contextlib.AsyncExitStack, requests: Requests) -> None:
         stops = self._stops
