@@ -15,7 +15,7 @@ from ldcnd.contract.commands import AxisCommand, Command, CommandReply, Jog, Mov
 from ldcnd.contract.errors import LdcndError, Remedy, step
 from ldcnd.contract.events import ReadOutcome
 from ldcnd.contract.frozen import Frozen
-from ldcnd.contract.leases import Acquire
+from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.samples import LinkState
 from ldcnd.contract.traces import TakeTrace
 from ldcnd.drives.smartstep.ledger import EEPROM_LIFE
@@ -259,6 +259,7 @@ def test_control_that_a_refusal_tells_people_to_take_is_enough(rig, monkeypatch)
 
     assert here.run("move x 1 --relative --wait").code == 0
     assert here.run("jog x 1 --for 0.2").code == 0
+    here.wait(client.ask(Release(lease=held.lease)))
 
 
 def test_a_lease_that_is_missing_is_taken_as_the_refusal_says(monkeypatch):
@@ -278,17 +279,18 @@ def test_a_lease_that_is_missing_is_taken_as_the_refusal_says(monkeypatch):
         assert here.run("power on x").code == 0
 
 
-def test_a_lease_that_another_program_of_the_same_name_holds_is_taken_or_shared_as_the_refusal_says(rig, monkeypatch):
-    here = rig
-    held = here.wait(here.rig.client.ask(Acquire(client="ldcnd lease hold", axes=("x",), lease_s=60.0)))
-    refused = here.run("lease hold --axis x -- true")
-    assert refused.code != 0
-    assert TAKEN.replace("AXIS", "x") in refused.errors
+def test_a_lease_that_another_program_of_the_same_name_holds_is_taken_or_shared_as_the_refusal_says(monkeypatch):
+    with virtual_rig(monkeypatch, rig_config()) as here:
+        here.wait(here.rig.until("x", lambda state: state.link is LinkState.UP))
+        held = here.wait(here.rig.client.ask(Acquire(client="ldcnd lease hold", axes=("x",), lease_s=60.0)))
+        refused = here.run("lease hold --axis x -- true")
+        assert refused.code != 0
+        assert TAKEN.replace("AXIS", "x") in refused.errors
 
-    monkeypatch.setenv("LDCND_LEASE", held.lease)
-    assert here.run("power on x").code == 0
-    monkeypatch.delenv("LDCND_LEASE")
-    assert here.run("lease hold --axis x --force -- true").code == 0
+        monkeypatch.setenv("LDCND_LEASE", held.lease)
+        assert here.run("power on x").code == 0
+        monkeypatch.delenv("LDCND_LEASE")
+        assert here.run("lease hold --axis x --force -- true").code == 0
 
 
 BY_OTHER_TESTS = {CLOSE, DAMAGED, HELD, LEASE, TAKEN}
