@@ -449,6 +449,34 @@ async def test_a_drive_at_a_waiting_address_is_not_forgotten_when_a_late_reply_p
         assert chain.modules[1].address == 2
 
 
+@pytest.mark.parametrize("after_ms", range(0, 1000, 40))
+async def test_drives_that_got_one_waiting_address_come_back_whenever_the_one_between_them_loses_its_power(after_ms):
+    chain = chain_of("ls182ap", "picservo-v4", "ls173ap")
+    async with bare_network(chain, specs("ls-182ap", "pic-servo-v4", "ls-173ap")) as line:
+        await line.network.bring_up()
+        loop = asyncio.get_running_loop()
+        chain.modules[2].power(on=False, at_s=loop.time())
+        chain.modules[2].power(on=True, at_s=loop.time())
+        await restart(chain, line, 1)
+
+        async def lose_power() -> None:
+            await asyncio.sleep(after_ms / 1000)
+            chain.modules[1].power(on=False, at_s=loop.time())
+            await asyncio.sleep(1.5)
+            chain.modules[1].power(on=True, at_s=loop.time())
+
+        lost = asyncio.create_task(lose_power())
+        async with asyncio.timeout(30.0):
+            while line.network.incomplete() or not lost.done():
+                await line.network.rejoin(lambda _: None)
+                await asyncio.sleep(0.1)
+                for address in (1, 2, 3):
+                    with contextlib.suppress(BusError):
+                        await line.bus.execute(read_status(Node(address, PIC_SERVO_V4), StatusItem.AUX))
+
+    assert [module.address for module in chain.modules] == [1, 2, 3]
+
+
 async def test_a_line_is_not_taken_down_again_and_again_for_a_drive_that_stays_dark():
     chain = chain_of("ls182ap", "picservo-v4", "picservo-v4")
     async with bare_network(chain, specs("ls-182ap", "pic-servo-v4", "pic-servo-v4")) as line:

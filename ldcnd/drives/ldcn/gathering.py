@@ -152,9 +152,16 @@ class Gathering:
             stock = await self._take_stock(heard)
         if not stock.silent:
             self.problem = ""
-            if not stock.waiting:  # one that waits has a place: a late reply may have passed for its answer from there
-                self._taken, self._waiting = 0, []
         return frozenset(each.address for at, each in enumerate(self.places) if at not in stock.silent)
+
+    def all_placed(self) -> None:
+        """Take every waiting address for free: the place of each module was proven.
+
+        Not earlier. Where one module was moved to its place, another may still wait: it got the address together with
+        the first, and was deaf when the first was told the rate of the line. Nor is it enough that each place has
+        answered: a late reply may have passed for the answer from a place whose module still waits.
+        """
+        self._taken, self._waiting = 0, []
 
     async def left_behind(self) -> frozenset[int]:
         """Return the rates of modules that a bring-up or a search has left when it was cut short, if no place answers.
@@ -247,7 +254,8 @@ class Gathering:
             await self._rate.execute_at(at_reset, commands.hard_reset(UNADDRESSED))
         # before the packet: if its reply is lost, the module may be there
         self._waiting.append(address)
-        self._empty.discard(address)
+        # this lets another one hear, which may have been deaf when it was told the rate of the line
+        self._empty.clear()
         await self._acknowledged(at_reset, commands.set_address(UNADDRESSED, address, WAITING_GROUP))
         await self._to_line_rate()
         return address
@@ -446,7 +454,6 @@ class Gathering:
         log.info("newcomer", bus=self._bus.settings.name, address=place.address)
         addressing(place.address)
         if await self._addressing.move(waiting, place.address):
-            self._waiting.remove(waiting)
             await self._addressing.lead(place.address)
 
     async def _split(self, stock: Stock) -> bool:

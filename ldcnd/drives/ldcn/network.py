@@ -497,6 +497,8 @@ class LdcnNetwork(Network):
             await self._gathering.search(addressing, reached)
         for address in await self._identify():
             reached(address)
+        if not self.incomplete():
+            self._gathering.all_placed()
         self._note_blocked()
         return frozenset(back)
 
