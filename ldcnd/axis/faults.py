@@ -96,3 +96,7 @@ def entry_of(fault: Fault, now_ns: int) -> FaultEntry:
 def entry_again(past: PastFault) -> FaultEntry:
     """Return the entry of a fault that an earlier daemon has kept."""
     return FaultEntry(**past.model_dump(), page=page_of(past.code))
+
+
+UNFOLLOWED = frozenset({"position_error", "alarm_00d0", NOT_SETTLED.code, JUMPED.code, READINGS_CONTRADICT.code})
+"""Faults in which shaft and encoder did not go where they were sent: what the encoder shows then proves no rest."""

@@ -13,6 +13,7 @@ from functools import partial
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.events import CommandFailing
+from ldcnd.axis.faults import UNFOLLOWED
 from ldcnd.axis.rest import REST_COUNTS
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
@@ -272,6 +273,9 @@ class Interlocks:
             or self._now_s() - tracker.read_at_s > age_s
         ):
             return "is not known: its drive does not answer"
+        # a counter that stands still beside a shaft that turns looks like rest, as a jam does
+        if (each.standstill or each.below is not None) and (doubt := _unfollowed(status)):
+            return f"may turn: its encoder has not followed, as {doubt} tells; look at it, then reset the axis"
         if each.standstill and not (status.rest.rests is True and not _commanded(status)):
             return "does not stand, or is not known to"
         if each.below is not None and (speed := _speed(axis)) >= each.below:
@@ -425,6 +429,10 @@ class Interlocks:
         log.warning("interlock override", interlock=rule.config.name, reason=reason, client=client)
         reason = f"interlock {rule.config.name} {reason}"
         self._events.note(rule.holders[0], OverrideInterlock.verb, status, reason, client=client)
+
+
+def _unfollowed(status: AxisStatus) -> str:
+    return next((entry.code for entry in status.active_faults if entry.code in UNFOLLOWED), "")
 
 
 def _commanded(status: AxisStatus) -> bool:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AsyncExitStack
 
 from ldcnd.client.axis import Axis, at_rest
-from ldcnd.client.motion import Motion
+from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
@@ -14,6 +14,7 @@ from ldcnd.contract.errors import step as remedy_step
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import IoSample, Moving, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
+from ldcnd.contract.units import POSITION, quantity_text
 
 LEASE_S = 2.0
 """The daemon applies `loss.client` so soon when this program disappears, seconds."""
@@ -169,11 +170,22 @@ class SequenceRun:
 
     async def _command(self, step: SequenceStep) -> None:
         for axis, place in self._positions[step.go].axes.items() if step.go else ():
-            await (await self._axes[axis].move_absolute(place)).done()
+            self._arrived(axis, await (await self._axes[axis].move_absolute(place)).done())
         if step.do and step.axis:
             done = await getattr(self._axes[step.axis], step.do)(**step.arguments)
             if isinstance(done, Motion) and not step.leave_running:
-                await done.done()
+                self._arrived(step.axis, await done.done())
+
+    def _arrived(self, axis: str, end: State) -> None:
+        """Go on only from where an axis was sent: the next step may open what relies on it."""
+        if end.settled is False and end.following_error is not None:
+            off = quantity_text(end.following_error, self._units[axis], POSITION)
+            raise WrongState(
+                f"axis {axis} has not settled at its target, it is {off} off; sequence {self._sequence.name} ends",
+                axis=axis,
+                value=end.following_error,
+                remedy=Remedy("look for a jam, at the load, the gains and the encoder"),
+            )
 
     async def _come(self, step: SequenceStep, seen: dict[str, bool | None]) -> None:
         """Wait until lines have their values; samples of before the step are not looked at."""

@@ -128,6 +128,16 @@ def operated(what: Callable, without: str | None = None):
     return run(program())
 
 
+def alone(what):
+    """Return what an operation returns on the centrifuge, whose rotor nobody brings to rest afterwards."""
+
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig, rig.client.control("rotor", client="test") as rotor:
+            return await what(await made_ready(rig, rotor))
+
+    return run(program())
+
+
 async def turns_with_an_open_door(machine):
     await machine.shut_door_opens()
     with suppress(InterlockViolated):
@@ -337,6 +347,44 @@ def test_a_wire_that_is_cut_in_a_spin_brings_the_rotor_to_rest_behind_the_locked
         return machine.part("door"), machine.part("lock")
 
     assert operated(falls_out) == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("fault", ["encoder_stuck", "jam"])
+def test_the_sequence_does_not_open_the_door_of_a_rotor_that_did_not_come_to_its_bucket(fault):
+    spin = next(each for each in CENTRIFUGE.sequence if each.name == "spin")
+    positions = {each.name: each for each in CENTRIFUGE.position}
+
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                await (await rotor.move_absolute(0.4)).done()
+            getattr(rig.faults, fault)("rotor")
+            with pytest.raises(LdcndError):
+                await SequenceRun(rig.client, spin, positions, lambda _: None, lambda: 0).run(6)
+            with pytest.raises(InterlockViolated):
+                await machine.high("unlock")
+            await asyncio.sleep(5.0)
+            return machine.open_or_unlocked
+
+    assert not run(program())
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.2, 0.35, 1.0, 3.0])
+def test_a_counter_that_stands_still_in_a_spin_opens_no_lock(after_s):
+    async def freezes(machine):
+        await machine.spin()
+        machine.rig.faults.encoder_stuck("rotor")
+        await asyncio.sleep(after_s)
+        written_at = []
+        for _ in range(40):
+            with suppress(LdcndError):
+                await machine.high("unlock")
+                written_at.append(machine.speed)
+            await asyncio.sleep(0.05)
+        return written_at
+
+    assert alone(freezes) == []
 
 
 @pytest.mark.parametrize("part", ["lock", "door", "pin"])
