@@ -193,6 +193,13 @@ class GuestHost(Protocol):
     def require_control(self, axis: str, lease: str) -> None:
         """Refuse what a guest sends by itself once it has lost control of the axis; raises LdcndError."""
 
+    def leave(self, lease: str) -> None:
+        """End the control of a guest that has gone: its axes and outputs do what their `loss.client` says.
+
+        Raises:
+            LdcndError: the lease has ended before.
+        """
+
     def tell(self, about: str, what: str, client: str) -> None:
         """Enter among the events what a guest has begun by itself."""
 

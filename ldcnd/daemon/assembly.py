@@ -195,6 +195,9 @@ class _GuestHost:
     def require_control(self, axis: str, lease: str) -> None:
         self._dispatcher.require_control(axis, lease)
 
+    def leave(self, lease: str) -> None:
+        self._dispatcher.leases.release(lease, gone=True)
+
     def tell(self, about: str, what: str, client: str) -> None:
         self._dispatcher.events.note(about, "guest", CommandStatus.DONE, what, client=client)
 

@@ -367,8 +367,13 @@ class LeaseWatch:
         log.info("control acquired", client=lease.client, axes=sorted(lease.axes))
         return lease
 
-    def release(self, token: str, *, leave_running: bool) -> Lease:
-        """End a lease that its holder needs no longer; `leave_running` lets what moves go on.
+    def release(self, token: str, *, leave_running: bool = False, gone: bool = False) -> Lease:
+        """End a lease that its holder needs no longer.
+
+        Args:
+            token: the lease.
+            leave_running: what moves goes on.
+            gone: the holder is not there any more, so that outputs have their levels for the loss of a client.
 
         Raises:
             LeaseExpired, LeaseUnknown: it does not hold any more, or never did.
@@ -379,6 +384,8 @@ class LeaseWatch:
         # what is not seen to rest counts as moving
         states = {name: self._rig.axes[name].tracker.status for name in lease.axes}
         moving = [name for name, each in states.items() if each.commanded and each.moving is not Moving.NO]
+        if gone:
+            self._leave_outputs(lease)
         if not leave_running:
             for name in moving:
                 seen = states[name].moving is Moving.YES
@@ -405,9 +412,7 @@ class LeaseWatch:
         axes = sorted(axes)
         # who gives control back is there, and sets its outputs itself
         if code is ErrorCode.LEASE_EXPIRED:
-            for module in self._rig.modules.values():
-                if not lease.axes.isdisjoint(module.axes):
-                    module.enter(Situation.CLIENT)
+            self._leave_outputs(lease)
         for name in axes:
             axis = self._rig.axes[name]
             commanded = axis.tracker.status.commanded
@@ -418,6 +423,11 @@ class LeaseWatch:
                     apply_policy(axis, axis.config.loss.client, f"loss of control: {cause}"), name=f"client loss {name}"
                 )
         self._take_gains_back(axes)
+
+    def _leave_outputs(self, lease: Lease) -> None:
+        for module in self._rig.modules.values():
+            if not lease.axes.isdisjoint(module.axes):
+                module.enter(Situation.CLIENT)
 
     def _note(self, axis: str, lease: Lease, status: CommandStatus, reason: str, code: ErrorCode | None) -> None:
         self._events.note(

@@ -71,14 +71,21 @@ class GuestControl:
                 raise AssertionError("a lease that was given has a name")
             return self._token
 
-    async def end(self) -> None:
-        """Give control back; an axis that still moves does what its policy for the loss of a client says."""
+    async def end(self, *, gone: bool = False) -> None:
+        """Give control back; an axis that still moves does what its policy for the loss of a client says.
+
+        Args:
+            gone: its program is not there any more; then outputs do likewise.
+        """
         async with self._changing:
             self._claimed = self.axes = frozenset()
             if self._token is not None:
                 token, self._token = self._token, None
                 with suppress(LdcndError):  # it was taken away meanwhile
-                    await self._host.carry_out(RIG_ITSELF, Release(lease=token))
+                    if gone:
+                        self._host.leave(token)
+                    else:
+                        await self._host.carry_out(RIG_ITSELF, Release(lease=token))
 
     async def watch(self, gone: Callable[[], Awaitable[None]]) -> None:
         """Keep the lease for as long as the guest uses it, until cancelled.

@@ -55,7 +55,7 @@ class Presence:
         """The program has gone: what it has commanded and has not begun is dropped, and control ends."""
         self.leave(b"", None)
         if self._control:
-            await self._control.end()
+            await self._control.end(gone=True)
 
     async def send_away(self) -> None:
         """Close the program's terminal or connection; it has gone afterwards.

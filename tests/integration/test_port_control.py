@@ -13,8 +13,8 @@ from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, StatusFlag, StatusItem, encode_packet
 from ldcnd.drives.ldcn.profiles import PIC_SERVO_SC
 from ldcnd.drives.ldcn.trajectory import programmed_acceleration, programmed_velocity
-from tests.support.guest_program import guest, open_port
-from tests.support.machine_rig import COUNTS, GAINS
+from tests.support.guest_program import guest, open_port, with_port
+from tests.support.machine_rig import COUNTS, GAINS, running_machine
 
 LOAD, START, STOP = CommandCode.LOAD_TRAJECTORY, CommandCode.START_MOTION, CommandCode.STOP_MOTOR
 READ, NO_OPERATION = CommandCode.READ_STATUS, CommandCode.NO_OPERATION
@@ -458,6 +458,22 @@ async def test_an_output_that_the_program_writes_is_the_named_one_and_others_are
         await program.send(Packet(3, CommandCode.RESET_POSITION, bytes((0xFE, 0x0D))))  # and line 1
         await asyncio.sleep(0.1)
         assert any("no output at line 1" in (each.reason or "") for each in await events(rig, "cabinet"))
+
+
+@pytest.mark.parametrize("how", ["closes", "falls silent"])
+async def test_outputs_of_a_program_that_goes_have_their_levels_for_the_loss_of_a_client(tmp_path, how):
+    valve = {"outputs": {"lock": {"line": 10, "loss": {"client": "low"}}}}
+    async with running_machine(with_port(tmp_path / "port", "control", module=valve)) as rig:
+        program = open_port(tmp_path / "port")
+        await program.begin()
+        await program.send(Packet(3, CommandCode.RESET_POSITION, bytes((0xFF, 0x0D))))
+        await program.send(Packet(3, CommandCode.SET_GAIN, bytes((0x00, 0x02))))
+        await rig.named(lock=True)
+        if how == "closes":
+            program.close()
+        else:
+            await asyncio.sleep(5.0)
+        await rig.named(lock=False)
 
 
 async def test_what_the_program_has_set_going_is_refused_to_nobody_who_stops_it(tmp_path):

@@ -16,9 +16,16 @@ LOOK_S = 0.0002
 """How often a program looks for more of a reply, seconds."""
 
 
-def with_port(link: Path, access: str = "read", *, fresh_ms: float = 0.0, **axis: object) -> RigConfig:
+def with_port(
+    link: Path,
+    access: str = "read",
+    *,
+    fresh_ms: float = 0.0,
+    module: dict[str, object] | None = None,
+    **axis: object,
+) -> RigConfig:
     """Return the machine with a port."""
-    document = machine(axis=axis).model_dump(mode="json", exclude_defaults=True)
+    document = machine(axis=axis, module=module).model_dump(mode="json", exclude_defaults=True)
     port = {"name": "old", "bus": "line", "link": str(link), "access": access, "idle_s": 5.0, "fresh_ms": fresh_ms}
     return RigConfig.model_validate(document | {"port": [port]})
 
@@ -89,7 +96,7 @@ async def guest(
     tmp_path: Path, access: str = "read", *, fresh_ms: float = 0.0, **axis: object
 ) -> AsyncIterator[tuple[Machine, Program]]:
     """Run the machine, and a program with its port open."""
-    async with running_machine(with_port(tmp_path / "port", access, fresh_ms=fresh_ms, **axis)) as rig:
+    async with running_machine(with_port(tmp_path / "port", access, fresh_ms=fresh_ms, module=None, **axis)) as rig:
         program = open_port(tmp_path / "port")
         try:
             yield rig, program
