@@ -136,7 +136,7 @@ class SequenceRun:
             report("failed", loop.time() - began_s, str(error))
             raise
         except BaseException:
-            report("stopped", loop.time() - began_s)
+            report("stopped", loop.time() - began_s, "what it moves is halted")
             raise
         report("done", loop.time() - began_s)
 
