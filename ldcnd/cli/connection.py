@@ -92,6 +92,10 @@ class TargetOption(click.Option):
     """An option that `with_target` gives to a command; the reference explains them once."""
 
 
+def _say(problem: str | None) -> None:
+    show_lines(problem or "a daemon is heard again", err=True)
+
+
 class Serving:
     """What a program that serves others says of itself: to its service manager, and in its journal or terminal."""
 
@@ -105,7 +109,7 @@ class Serving:
 
     def lacks(self, problem: str | None) -> None:
         """Say what is missing, or None once nothing is."""
-        show_lines(problem or "a daemon is heard again", err=True)
+        _say(problem)
         self._beside.lacks(problem)
 
     @contextmanager
@@ -164,23 +168,27 @@ class Target:
 
         return asyncio.run(within())
 
-    def serve(self, work: Callable[[RigClient, Serving], Awaitable[None]]) -> None:
-        """Do the same for a program that serves others until it is ended; it says when it does, and what it lacks."""
-        service = Serving()
+    def follow(self, work: Callable[[RigClient], Awaitable[None]], say: Callable[[str | None], None] = _say) -> None:
+        """Do the same for a command that goes on until it is ended; it says when no daemon is heard any more."""
 
         async def watch(client: RigClient) -> None:
             with suppress(LdcndError):
-                await tell_absence(client.session, self._settings(), service.lacks, (client.rig,))
+                await tell_absence(client.session, self._settings(), say, (client.rig,))
 
         async def within(client: RigClient) -> None:
             watching = asyncio.create_task(watch(client), name="presence of the daemon")
             try:
-                await work(client, service)
+                await work(client)
             finally:
                 watching.cancel()
 
+        self.run(within)
+
+    def serve(self, work: Callable[[RigClient, Serving], Awaitable[None]]) -> None:
+        """Do the same for a program that serves others until it is ended; it says when it does, and what it lacks."""
+        service = Serving()
         with service.last_words():
-            self.run(within)
+            self.follow(lambda client: work(client, service), service.lacks)
 
     def run_on_each(self, work: Callable[[RigClient], Awaitable[ResultT]]) -> dict[str, ResultT | LdcndError]:
         """Do the same with the rig that is named, unsearched, or with every one that can be reached.

@@ -93,7 +93,7 @@ def log(
                 if (row := row_of(event, lines.get(event.axis))).kind in kinds:
                     show(row)
 
-    target.run(work)
+    (target.follow if follow else target.run)(work)
 
 
 def _missing(known_from: Beginning, since: int | None, left_out: int) -> Iterator[str]:

@@ -139,7 +139,7 @@ def watch(target: Target, axis: str, item: str | None, count: int | None) -> Non
                 target.show(sample, f"{name:8} {watched.text(name, sample)}")
                 seen += 1
 
-    target.run(work)
+    target.follow(work)
 
 
 class Watched:

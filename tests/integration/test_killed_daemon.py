@@ -2,13 +2,23 @@
 
 import asyncio
 import contextlib
+from asyncio.subprocess import PIPE
 from contextlib import asynccontextmanager
 
 import pytest
 
 from ldcnd.contract.commands import Home, MoveAbsolute, Power, Probe
 from ldcnd.contract.samples import AxisState, LinkState, PositionSample, TelemetryItem
-from tests.support.process import ROOT, START_TIME_S, _all_axes_answer, client, free_port, process, simulated_terminal
+from tests.support.process import (
+    LDCND,
+    ROOT,
+    START_TIME_S,
+    _all_axes_answer,
+    client,
+    free_port,
+    process,
+    simulated_terminal,
+)
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
@@ -95,3 +105,31 @@ async def test_what_a_killed_daemon_has_started_ends_within_its_bound(tmp_path):
 
     assert [abs(b - a) <= 2 for a, b in zip(first, last, strict=True)] == [True] * 3
     assert last[0] == pytest.approx(4000, abs=20)
+
+
+async def said(looking, what):
+    async with asyncio.timeout(START_TIME_S):
+        while what not in (line := await looking.stderr.readline()):
+            assert line, "the command has ended"
+
+
+@pytest.mark.parametrize("command", [["watch", "x"], ["log", "--follow"]])
+async def test_who_looks_on_is_told_that_the_daemon_is_gone_and_that_one_is_there_again(tmp_path, command):
+    config, shown = ROOT / "config" / "simulated.toml", tmp_path / "shown"
+    async with killable_daemon(config) as (running, endpoint):
+        words = (*LDCND, *command, "--connect", endpoint)
+        with shown.open("wb") as output:
+            looking = await asyncio.create_subprocess_exec(*words, stdout=output, stderr=PIPE)
+        try:
+            async with asyncio.timeout(START_TIME_S):
+                while not shown.stat().st_size:  # it has found the daemon
+                    assert looking.returncode is None, "the command has ended"
+                    await asyncio.sleep(0.1)
+            running.kill()
+            await said(looking, b"no daemon of rig sim is heard")
+            async with process("run", "--config", str(config), "--listen", endpoint):
+                await said(looking, b"a daemon is heard again")
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                looking.terminate()
+            await looking.wait()
