@@ -27,8 +27,13 @@ def no_answer(key: str, timeout_s: float) -> OutcomeUnknown:
 
 def login_refused(refusals: Sequence[str]) -> SessionError:
     """Return the error for a session that the other side did not let in."""
+    reason = "; ".join(refusals)
+    if "expired" in reason:
+        return SessionError(
+            reason, remedy="renew the certificate that has ended, this login's or the daemon's: pki renew"
+        )
     return SessionError(
-        "; ".join(refusals), remedy="check the login in the configuration file (--config), and what the daemon expects"
+        reason, remedy="check the login in the configuration file (--config), and what the daemon expects"
     )
 
 

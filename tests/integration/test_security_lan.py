@@ -1,5 +1,6 @@
 """The set-up for a network: mutual TLS with certificates that `ldcnd pki` makes, roles by common name."""
 
+import base64
 import datetime as dt
 import json
 from collections.abc import Callable, Iterator
@@ -102,13 +103,13 @@ def test_the_token_of_an_operator_reaches_the_daemon_and_that_of_a_viewer_does_n
     assert str(first.key_expr) == "ldcn/sim/client/operator"
 
 
-async def refused(rig: SecuredRig, file: Path, endpoint: str | None = None) -> str:
+async def refused(rig: SecuredRig, file: Path, endpoint: str | None = None) -> SessionError:
     """Return what a user is told whose login is refused."""
     settings = ZenohSettings(connect=(endpoint or rig.endpoint,), mode="client", config_file=file)
     with pytest.raises(SessionError) as caught:
         async with open_zenoh_session(settings):
             pass
-    return caught.value.message
+    return caught.value
 
 
 def changed(rig: SecuredRig, folder: Path, login: str, **settings: str | None) -> Path:
@@ -130,7 +131,7 @@ def tls_of(file: Path) -> dict[str, str]:
 async def test_no_certificate_is_refused_and_says_so(rig: SecuredRig, tmp_path: Path) -> None:
     file = changed(rig, tmp_path, "operator", connect_certificate_base64=None, connect_private_key_base64=None)
 
-    assert "refuses this login: no certificate" in await refused(rig, file)
+    assert "refuses this login: no certificate" in (await refused(rig, file)).message
 
 
 async def test_an_operator_of_another_authority_is_refused_and_says_so(rig: SecuredRig, tmp_path: Path) -> None:
@@ -139,46 +140,70 @@ async def test_an_operator_of_another_authority_is_refused_and_says_so(rig: Secu
     wanted = ("connect_certificate_base64", "connect_private_key_base64")
     file = changed(rig, tmp_path, "operator", **{name: rogue[name] for name in wanted})
 
-    assert "one of another authority" in await refused(rig, file)
+    assert "one of another authority" in (await refused(rig, file)).message
 
 
 async def test_a_certificate_that_has_ended_is_refused_and_says_so(rig: SecuredRig, tmp_path: Path) -> None:
     Site(rig.folder).add(new_login("late", Role.OPERATOR, ()), NOW - dt.timedelta(days=9), 1)
 
-    assert "one that has ended" in await refused(rig, rig.folder / "late.json5")
+    assert "one that has ended" in (await refused(rig, rig.folder / "late.json5")).message
 
 
 async def test_plain_tcp_is_refused_and_says_so(rig: SecuredRig, tmp_path: Path) -> None:
     file = tmp_path / "plain.json5"
     file.write_text("{}")
 
-    assert "it wants TLS" in await refused(rig, file, rig.endpoint.replace("tls/", "tcp/"))
+    assert "it wants TLS" in (await refused(rig, file, rig.endpoint.replace("tls/", "tcp/"))).message
 
 
 async def test_a_client_refuses_a_daemon_of_another_authority_and_says_so(rig: SecuredRig, tmp_path: Path) -> None:
     people(tmp_path / "rogue")
 
-    assert "is not who it should be" in await refused(rig, tmp_path / "rogue" / "operator.json5")
+    assert "is not who it should be" in (await refused(rig, tmp_path / "rogue" / "operator.json5")).message
 
 
-async def test_an_operator_cannot_pose_as_the_daemon(rig: SecuredRig, tmp_path: Path) -> None:
-    own = tls_of(rig.folder / "operator.json5")
-    posing = {
+def posing(authority: str, certificate: bytes | str, key: bytes | str) -> tuple[str, zenoh.Config]:
+    """Return where somebody listens with a certificate, and its configuration; all in base64."""
+    tls = {
+        "enable_mtls": False,
+        "root_ca_certificate_base64": authority,
+        "listen_certificate_base64": certificate,
+        "listen_private_key_base64": key,
+    }
+    config = {
         "mode": "peer",
         "listen": {"endpoints": [endpoint := f"tls/127.0.0.1:{free_port()}"]},
         "scouting": {"multicast": {"enabled": False}},
-        "transport": {"link": {"tls": {
-            "enable_mtls": False,
-            "root_ca_certificate_base64": own["root_ca_certificate_base64"],
-            "listen_certificate_base64": own["connect_certificate_base64"],
-            "listen_private_key_base64": own["connect_private_key_base64"],
-        }}},
-    }  # fmt: skip
+        "transport": {"link": {"tls": tls}},
+    }
+    return endpoint, zenoh.Config.from_json5(json.dumps(config))
 
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(posing))):
+
+async def test_an_operator_cannot_pose_as_the_daemon(rig: SecuredRig) -> None:
+    own = tls_of(rig.folder / "operator.json5")
+    endpoint, config = posing(
+        own["root_ca_certificate_base64"], own["connect_certificate_base64"], own["connect_private_key_base64"]
+    )
+
+    with zenoh.open(config):
         told = await refused(rig, rig.folder / "viewer.json5", endpoint)
 
-    assert "is not who it should be" in told
+    assert "is not who it should be" in told.message
+
+
+async def test_of_a_daemon_whose_certificate_has_ended_people_are_told_to_renew_it(tmp_path: Path) -> None:
+    site = set_up(tmp_path / "site", "test site", NOW)
+    site.add(new_login("viewer", Role.VIEWER, ()), NOW, 10)
+    site.add(new_login("daemon", Role.DAEMON, ("127.0.0.1",)), NOW - dt.timedelta(days=20), 10)
+    made = [base64.b64encode((tmp_path / "site" / f"daemon.{each}").read_bytes()).decode() for each in ("pem", "key")]
+    authority = base64.b64encode((tmp_path / "site" / "ca.pem").read_bytes()).decode()
+    endpoint, config = posing(authority, *made)
+
+    with zenoh.open(config):
+        told = await refused(SecuredRig(tmp_path / "site", endpoint), tmp_path / "site" / "viewer.json5", endpoint)
+
+    assert "expired" in told.message
+    assert "pki renew" in str(told.remedy)
 
 
 async def test_a_viewer_who_commands_is_told_that_he_may_not(rig: SecuredRig) -> None:
