@@ -69,3 +69,19 @@ async def test_narrower_limits_mark_an_axis_that_stands_outside_them_and_wider_o
             await asyncio.sleep(0.5)
             seen.append(WRONG in codes(rig, "x"))
         assert seen == [True, False]
+
+
+async def test_a_warning_is_not_named_as_what_has_stopped_an_axis():
+    chain = build_chain(four_drives())
+    async with rig_on(chain, simulated_config({"reference": "at_reset"})) as rig:
+        await standing_at(rig, "x", 98.0, on=False)
+        scale = next(each for each in rig.line.axes if each.config.name == "x").tracker.status.scale
+        await pushed(chain, 1, round(5 * scale.counts_per_unit))
+        await rig.until("x", lambda state: state.moving is Moving.NO)
+        assert WRONG in codes(rig, "x")
+
+        chain.modules[0].power(on=False, at_s=asyncio.get_running_loop().time())
+        await rig.until("x", lambda state: state.link is LinkState.DOWN)
+        first = next(each for each in rig.line.axes if each.config.name == "x").tracker.status.first_fault
+        assert first is not None
+        assert first.code == "link_lost"
