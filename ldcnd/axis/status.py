@@ -226,7 +226,7 @@ class AxisStatus:
         approached: that motion came from the side that the configuration names.
         faults: what stands now, without a pending stop.
         own: faults that this daemon has found, until reset.
-        first_fault: what came first since the last reset of all that stops an axis; a warning does not.
+        first_fault: the fault that came first since the last reset; a warning gives way to what stops the axis.
         speed_share: share of every velocity that the speed override leaves, 0 to 1.
         holder: the client in control; None without one.
         rest: what readings prove of its rest.

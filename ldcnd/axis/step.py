@@ -254,7 +254,7 @@ def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     elif not reading.enabled:
         state = AxisState.DISABLED
     # no reset of this daemon ends it: it goes with its faults
-    first = status.first_fault if any(entry.stops for entry in status.faults) else None
+    first = status.first_fault if status.active_faults else None
     return _with(status, first_fault=first, rest=rest, enabled=reading.enabled, state=state)
 
 
@@ -552,8 +552,10 @@ def _with_faults(status: AxisStatus, faults: tuple[Fault, ...], now_ns: int) -> 
     entries = tuple(_entry(known.get(fault.code), fault, now_ns) for fault in faults)
     first = status.first_fault
     if first is None:
-        # a warning puts no axis into error stop, and would hide what does
-        first = next((entry for entry in entries if entry.stops), None)
+        pending = (status.stop.fault,) if status.stop and status.stop.fault else ()
+        first = next((entry for entry in (*entries, *pending) if entry.code != REFERENCE_REFUSED.code), None)
+    if first and not first.stops:  # a warning puts no axis into error stop, and would hide what does
+        first = next((entry for entry in entries if entry.stops), first)
     return _with(status, faults=entries, first_fault=first)
 
 

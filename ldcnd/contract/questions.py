@@ -43,7 +43,7 @@ class WhyReply(Frozen):
     causes: tuple[Cause, ...]
     """The obstacles, in the order in which they have to be cleared."""
     first_fault: str | None
-    """The first fault since the last reset, warnings aside; null when there was none."""
+    """The first fault since the last reset, a warning only if none stops; null when there was none."""
     overrides: tuple[str, ...] = ()
     """Overridden interlocks that bind the axis or an output of its line: which, by whom, for how long still; for
     people."""

@@ -227,7 +227,7 @@ class FaultSample(Sample):
     active: tuple[FaultEntry, ...]
     """Faults that stand now."""
     first: FaultEntry | None
-    """The fault that came first since the last reset, warnings aside: the likely cause of the others."""
+    """The fault that came first since the last reset, a warning only if none stops: the likely cause of the rest."""
 
 
 MOST_SHADOW_FIGURES = 8
