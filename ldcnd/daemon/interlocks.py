@@ -274,8 +274,8 @@ class Interlocks:
         ):
             return "is not known: its drive does not answer"
         # a counter that stands still beside a shaft that turns looks like rest, as a jam does
-        if (each.standstill or each.below is not None) and (doubt := _unfollowed(status)):
-            return f"may turn: its encoder has not followed, as {doubt} tells; look at it, then reset the axis"
+        if (each.standstill or each.below is not None) and (fault := _unfollowed(status)):
+            return f"may move: after fault {fault} its encoder does not prove that it stands; look, then reset the axis"
         if each.standstill and not (status.rest.rests is True and not _commanded(status)):
             return "does not stand, or is not known to"
         if each.below is not None and (speed := _speed(axis)) >= each.below:

@@ -129,7 +129,7 @@ def operated(what: Callable, without: str | None = None):
 
 
 def alone(what):
-    """Return what an operation returns on the centrifuge, whose rotor nobody brings to rest afterwards."""
+    """Return what an operation returns on the centrifuge; its rotor is left as it is."""
 
     async def program():
         async with simulated_rig(CENTRIFUGE) as rig, rig.client.control("rotor", client="test") as rotor:

@@ -4,6 +4,8 @@ import asyncio
 from contextlib import suppress
 from typing import Any
 
+import pytest
+
 from ldcnd.contract.commands import MoveAbsolute, Power
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.samples import LinkState
@@ -40,10 +42,11 @@ async def started_after_end(record: int, steps: int) -> tuple[bool, bool]:
             if left == 0:
                 end(steps)
 
-        log.add = watched  # type: ignore[method-assign]
-        with suppress(LdcndError):
-            await rig.client.command("x", MoveAbsolute(position=5.0))
-        await asyncio.sleep(3.0)
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr(log, "add", watched)
+            with suppress(LdcndError):
+                await rig.client.command("x", MoveAbsolute(position=5.0))
+            await asyncio.sleep(3.0)
         starts = [n for n, packet in enumerate(rig.sent) if n >= before and packet.command is CommandCode.START_MOTION]
     return bool(starts), any(n >= ended_at[0] for n in starts)
 

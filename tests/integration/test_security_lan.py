@@ -163,7 +163,7 @@ async def test_a_client_refuses_a_daemon_of_another_authority_and_says_so(rig: S
 
 
 def posing(authority: str, certificate: bytes | str, key: bytes | str) -> tuple[str, zenoh.Config]:
-    """Return where somebody listens with a certificate, and its configuration; all in base64."""
+    """Return an endpoint and the Zenoh configuration that listens there; arguments are in base64."""
     tls = {
         "enable_mtls": False,
         "root_ca_certificate_base64": authority,
