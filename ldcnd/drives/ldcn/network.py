@@ -270,6 +270,7 @@ class LdcnNetwork(Network):
             drive.identity = str(modules[address])
         for proof in self._proofs.values():
             proof.prove()
+        self._gathering.all_placed()
         self._was_up = True
         self._restarted.clear()
         log.info("network up", bus=self._bus.settings.name, modules=len(modules), baud=self._bus.baud, reset=reset)
