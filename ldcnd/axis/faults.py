@@ -24,18 +24,21 @@ NOT_SETTLED = Fault(
     "not_settled",
     "the axis did not stay within its window around the target in time; check for a jam, the load and the gains,"
     " then send reset",
+    hides_motion=True,
 )
 JUMPED = Fault(
     "position_jump",
     "the position has changed by more than the axis can have moved; check the encoder, its cable and the coupling,"
     " then send reset and home",
     loses_position=True,
+    hides_motion=True,
 )
 READINGS_CONTRADICT = Fault(
     "readings_contradict",
     "the drive replies, and its readings contradict each other and what was commanded; a stop was sent; switch the axis"
     " off, check gains, servo rate divisor and encoder, then send reset and home",
     loses_position=True,
+    hides_motion=True,
 )
 REPLIES_UNUSABLE = Fault(
     "replies_unusable",
@@ -89,6 +92,7 @@ def entry_of(fault: Fault, now_ns: int) -> FaultEntry:
         since=now_ns,
         source="daemon" if fault.code in OF_DAEMON_CODES else "drive",
         stops=fault.stops,
+        hides_motion=fault.hides_motion,
         page=page_of(fault.code),
     )
 
@@ -96,7 +100,3 @@ def entry_of(fault: Fault, now_ns: int) -> FaultEntry:
 def entry_again(past: PastFault) -> FaultEntry:
     """Return the entry of a fault that an earlier daemon has kept."""
     return FaultEntry(**past.model_dump(), page=page_of(past.code))
-
-
-UNFOLLOWED = frozenset({"position_error", "alarm_00d0", NOT_SETTLED.code, JUMPED.code, READINGS_CONTRADICT.code})
-"""Faults in which shaft and encoder did not go where they were sent: what the encoder shows then proves no rest."""

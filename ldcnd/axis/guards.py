@@ -208,11 +208,15 @@ def check_speed(axis: AxisTracker) -> None:
 def check_not_forced(axis: AxisTracker) -> None:
     """Refuse to reset a faulted axis whose motor has voltage and turns, or may, whatever the state says."""
     if axis.status.state is AxisState.ERROR_STOP and axis.status.energised and axis.status.moving is not Moving.NO:
+        off = step("power", 'send power {"on": false}', on=False)
         raise WrongState(
             f"axis {axis.name} still moves, or may: a reset would switch its motor off at speed",
             axis=axis.name,
             value=axis.status.moving.value,
-            remedy=Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
+            # of what readings cannot tell only a person can know that it stands
+            remedy=Remedy("{}, look that it stands, then {}", off, step("reset"))
+            if axis.status.motion_hidden_by
+            else Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
         )
 
 
@@ -228,11 +232,12 @@ def check_has_gains(drive: QuietDrive) -> None:
 
 def fault(axis: str, entry: FaultEntry) -> DriveFault:
     """Return a fault of a drive as what keeps its axis from moving."""
+    looks = "look at it, for it may move unseen; " if entry.hides_motion else ""
     return DriveFault(
         f"axis {axis}: {entry.text}",
         axis=axis,
         value=entry.code,
-        remedy=Remedy("remove the cause, then {}", step("reset")),
+        remedy=Remedy(f"{looks}remove the cause, then {{}}", step("reset")),
     )
 
 

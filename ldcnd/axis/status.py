@@ -305,6 +305,15 @@ class AxisStatus:
         return 100.0 * self.speed_share
 
     @property
+    def motion_hidden_by(self) -> str:
+        """Code of the fault behind which readings do not prove that the axis stands; empty without one."""
+        first = self.first_fault
+        if not self.faults and first is None:
+            return ""
+        entries = self.faults if first is None else (*self.faults, first)
+        return next((entry.code for entry in entries if entry.hides_motion), "")
+
+    @property
     def moving(self) -> Moving:
         """Whether the axis moves, as far as readings tell; never "no" without readings that prove it."""
         # one that cannot be read may do anything, and so may one whose start was not confirmed
@@ -313,13 +322,20 @@ class AxisStatus:
         rests = self.rest.rests
         if rests is False or (self.command and self.state.is_motion):
             return Moving.YES
-        return Moving.NO if rests else Moving.UNKNOWN
+        return Moving.NO if rests and not self.motion_hidden_by else Moving.UNKNOWN
+
+    @property
+    def to_be_stopped(self) -> bool:
+        """Whether a stop may take something out: it moves, or may under voltage."""
+        only_hidden = self.at_rest and not self.energised and bool(self.motion_hidden_by)
+        return self.moving is not Moving.NO and not only_hidden
 
     @property
     def quality(self) -> Quality:
         """Quality of a value read just now: whether the drive counts it; `referenced` tells whether it is a place."""
         link = self.link
-        return Quality.UNCERTAIN if self.position_lost and link is LinkState.UP else QUALITIES[link]
+        doubtful = link is LinkState.UP and (self.position_lost or self.motion_hidden_by)
+        return Quality.UNCERTAIN if doubtful else QUALITIES[link]
 
     @property
     def at_rest(self) -> bool:

@@ -413,12 +413,12 @@ async def seen(axis: Axis) -> Axis:
             return axis
 
 
-async def at_rest(axis: Axis, within_s: float | None = REST_S) -> StateSample:
-    """Wait until an axis stands, and return its state then; without `within_s` as long as anything comes from it.
+async def at_rest(axis: Axis, within_s: float | None = REST_S, *, watched: bool = False) -> StateSample:
+    """Wait until an axis stands, and return its state then; see `until_at_rest`.
 
     Raises:
         LeaseExpired: control was lost.
-        OutcomeUnknown: the drive does not answer, or nothing comes from it any more.
+        OutcomeUnknown: the drive does not answer, nothing comes from it any more, or its readings prove no rest.
         WrongState: it does not come to rest in time.
     """
-    return await until_at_rest(axis.name, lambda: axis.state.sample, lambda: axis.news(None), within_s)
+    return await until_at_rest(axis.name, lambda: axis.state.sample, lambda: axis.news(None), within_s, watched=watched)

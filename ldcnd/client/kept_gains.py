@@ -127,11 +127,11 @@ async def open_loop(axis: Axis) -> None:
     if axis.control and axis.control.lost:
         raise axis.control.lost  # the daemon sees to it, and another client may move the axis
     if state.state is AxisState.ERROR_STOP and not state.stop_latched:
-        await at_rest(axis)
+        await at_rest(axis, watched=True)
         with suppress(StopLatched):  # a stop has come meanwhile: only a person clears its latch
             await axis.reset(faults_only=True)
     await axis.power(on=False)
-    await at_rest(axis)
+    await at_rest(axis, watched=True)
 
 
 async def load(axis: Axis, gains: dict[str, int]) -> None:

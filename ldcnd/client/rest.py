@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import Awaitable, Callable
 
-from ldcnd.contract.errors import OutcomeUnknown, WrongState
+from ldcnd.contract.errors import OutcomeUnknown, Remedy, WrongState, step
 from ldcnd.contract.samples import LinkState, Moving, StateSample
 
 REST_S = 10.0
@@ -13,7 +13,12 @@ PATIENCE_S = 10.0
 
 
 async def until_at_rest(
-    axis: str, state: Callable[[], StateSample | None], news: Callable[[], Awaitable[object]], within_s: float | None
+    axis: str,
+    state: Callable[[], StateSample | None],
+    news: Callable[[], Awaitable[object]],
+    within_s: float | None,
+    *,
+    watched: bool = False,
 ) -> StateSample:
     """Wait until an axis stands, and return the state that says so: one that is out of sight does not stand.
 
@@ -22,9 +27,10 @@ async def until_at_rest(
         state: returns the last one.
         news: returns once something has come from the axis.
         within_s: longest wait, in seconds; without one as long as anything comes from it.
+        watched: somebody is at the machine: what may move unseen counts as standing once its readings rest.
 
     Raises:
-        OutcomeUnknown: the drive does not answer, or nothing comes any more.
+        OutcomeUnknown: the drive does not answer, nothing comes any more, or its readings prove no rest.
         WrongState: it does not come to rest in time.
     """
     try:
@@ -32,6 +38,10 @@ async def until_at_rest(
             while (last := state()) is None or last.moving is not Moving.NO:
                 if last and last.link is LinkState.DOWN:
                     raise drive_silent(axis)
+                if last and last.has_ended:
+                    if watched:
+                        break
+                    raise motion_hidden(axis, last.motion_hidden_by)
                 try:
                     async with asyncio.timeout(PATIENCE_S):
                         await news()
@@ -49,6 +59,16 @@ async def until_at_rest(
 def drive_silent(axis: str) -> OutcomeUnknown:
     """Return the error for an axis whose drive has stopped answering."""
     return OutcomeUnknown(f"axis {axis}: the drive does not answer any more", axis=axis)
+
+
+def motion_hidden(axis: str, fault: str) -> OutcomeUnknown:
+    """Return the error for an axis whose readings do not prove that it stands."""
+    return OutcomeUnknown(
+        f"axis {axis}: it is not known whether it stands: after fault {fault} its encoder does not prove it",
+        axis=axis,
+        value=fault,
+        remedy=Remedy("look at the machine, then {}", step("reset")),
+    )
 
 
 def nothing_received(axis: str) -> OutcomeUnknown:

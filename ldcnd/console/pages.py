@@ -33,7 +33,6 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.leases import ListHolders
 from ldcnd.contract.rig_commands import MoveTogether, MoveTogetherReply
-from ldcnd.contract.samples import Moving
 from ldcnd.log import get_logger
 
 log = get_logger("console")
@@ -413,4 +412,4 @@ async def _bring_to_rest(hold: _Hold, client: str) -> None:
 
 async def _at_rest(hold: _Hold) -> bool:
     state = await hold.client.state(hold.axis)
-    return state is not None and state.moving is Moving.NO
+    return state is not None and state.has_ended

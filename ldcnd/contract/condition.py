@@ -63,6 +63,7 @@ class TroubleKind(Enum):
     NOT_IDENTIFIED = auto()
     FAULT = auto()
     ERROR_STOP = auto()
+    HIDDEN = auto()
     OLD = auto()
     REFERENCE_LOST = auto()
     NOT_HOMED = auto()
@@ -208,6 +209,10 @@ class KnownState(Protocol):
         """Whether it moves."""
 
     @property
+    def motion_hidden_by(self) -> str:
+        """The fault behind which readings do not prove that it stands; empty without one."""
+
+    @property
     def has_reference(self) -> bool:
         """Whether it can be referenced at all."""
 
@@ -289,6 +294,13 @@ _REFERENCE_LOST = Trouble(
 _NOT_HOMED = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "not homed: its position is not known", "not homed")
 _HOMING = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "it is being homed: its position is not known yet", "homing")
 _LATCHED = Trouble(TroubleKind.STOP_LATCHED, _NOTICE, "a stop is latched: nothing moves before reset", "stop latched")
+_MAY_MOVE = Trouble(
+    TroubleKind.HIDDEN,
+    _WRONG,
+    "it may move: readings do not prove that it stands, because shaft and encoder did not go where they were sent; look"
+    " at the machine, then reset the axis",
+    "may move",
+)
 _UNCOMMANDED = Trouble(
     TroubleKind.UNCOMMANDED,
     _WRONG,
@@ -308,8 +320,8 @@ SHARED = frozenset({TroubleKind.SILENCE, TroubleKind.NOT_HOMED, TroubleKind.STAN
 """Troubles of which several axes have one cause, or which are said once for all; so is a line that is down."""
 TELL_OF_THE_PAST = frozenset({"loop_opened"})
 """Faults that say what has happened and are seen in one reading only; the others say what is so while they stand."""
-_MARKING_FAULTS = frozenset({"readings_contradict", "drive_reset", "position_jump"})
-"""Faults whose name says best why the position is lost."""
+_COUNTER_SET = "drive_reset"
+"""The fault whose name says best why the position is lost, where no fault hides motion."""
 PAGES: Mapping[str, str] = {
     _NOT_CONFIRMED.short: "stop_unconfirmed",
     **dict.fromkeys((_NO_ANSWER.short, _MISSED_POLLS.short, Place.NOT_ANSWERING.value, _FLOATS), "link_lost"),
@@ -319,6 +331,7 @@ PAGES: Mapping[str, str] = {
     **dict.fromkeys((_POSITION_LOST, Place.CONTRADICTED.value), "readings_contradict"),
     **dict.fromkeys((_ERROR_STOP, _OVERRIDE), "wrong_state"),
     _UNCOMMANDED.short: "drive_changed",
+    _MAY_MOVE.short: "position_error",
     _BY_INTERLOCK: "interlock_violated",
     _SLOW: "bus_busy",
 }
@@ -474,8 +487,9 @@ def _is_old(state: KnownState, age_s: float | None, health: AxisHealth | None) -
 def _place(state: KnownState, faults: Faults | None, *, is_old: bool) -> tuple[Place, str]:
     """Return whether the position of an axis that answers says where it is, and its mark."""
     if state.link is LinkState.UP and state.quality is Quality.UNCERTAIN:
-        codes = [fault.code for fault in faults.active if fault.code in _MARKING_FAULTS] if faults else []
-        return Place.CONTRADICTED, _words(codes[0]) if codes else _POSITION_LOST
+        was_set = faults is not None and any(fault.code == _COUNTER_SET for fault in faults.active)
+        cause = state.motion_hidden_by or (_COUNTER_SET if was_set else _POSITION_LOST)
+        return Place.CONTRADICTED, _words(cause)
     if is_old:
         return Place.OLD, _OLD.short
     if state.referenced or not state.has_reference:
@@ -490,6 +504,8 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     entries = _first_cause_first(faults) if faults else []
     found = [_of_fault(entry, TroubleKind.FAULT, _WRONG) for entry in entries if entry.stops]
     found += _ended(state, faults, in_fault=bool(found))
+    if state.motion_hidden_by and state.moving is Moving.UNKNOWN:
+        found.append(_MAY_MOVE)
     if place is Place.OLD:
         found.append(_OLD)
     if state.has_reference and not state.referenced and place is not Place.CONTRADICTED:  # that is its cause

@@ -424,7 +424,8 @@ class ReloadReply(Frozen):
         if not lines:
             lines.append("the daemon runs with what is in the file")
         elif self.applied:
-            lines.append("reloaded; what is not taken, or needs a restart, stays as it is until then")
+            rest = self.more or any(not each.taken for each in self.changes)
+            lines.append("reloaded; what is not taken, or needs a restart, stays as it is" if rest else "reloaded")
         return lines
 
 

@@ -203,6 +203,8 @@ class PastFault(Frozen):
     """Instant at which the daemon first saw the fault, UTC in ns since 1970."""
     source: str
     """Who said so: drive or daemon."""
+    hides_motion: bool = False
+    """Shaft and encoder did not go where they were sent, so that readings do not prove that the axis stands."""
 
 
 class FaultEntry(PastFault):
@@ -305,7 +307,7 @@ class StateSample(Sample):
     """The position is valid: the axis was homed or its position was set since its drive was last reset, and neither
     the link nor the encoder was lost since then, nor has the counter wrapped."""
     moving: Moving
-    """Whether it moves; unknown when the drive does not answer."""
+    """Whether it moves; unknown when the drive does not answer, and where `motion_hidden_by` names a fault."""
     link: LinkState
     """Whether the drive answers."""
     stop_latched: bool
@@ -318,6 +320,9 @@ class StateSample(Sample):
     """Why the last command ended other than done, until the next command is accepted."""
     interlock: str = ""
     """The interlock that has ended it and what that lacks, for as long; empty where none has."""
+    motion_hidden_by: str = ""
+    """Code of a fault in which shaft and encoder did not go where they were sent, so that readings do not prove that
+    the axis stands; empty without one, and again after reset."""
     has_reference: bool = True
     """Whether its drive can have a reference; false where `home` and `set_position` are not among its commands."""
     reference_lost: bool = False
@@ -333,6 +338,13 @@ class StateSample(Sample):
     """The client in control of the axis; null without one, empty where that is not known."""
     was_read: bool = True
     """Its drive was read since its daemon began; until then the daemon shows what it has kept, and what it commands."""
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether nothing is to be waited for: it stands, or only a look at the machine tells whether it does."""
+        if self.moving is Moving.UNKNOWN and self.link is LinkState.UP and self.command is None:
+            return bool(self.motion_hidden_by)
+        return self.moving is Moving.NO
 
 
 class MonitorName(StrEnum):

@@ -13,7 +13,6 @@ from functools import partial
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.events import CommandFailing
-from ldcnd.axis.faults import UNFOLLOWED
 from ldcnd.axis.rest import REST_COUNTS
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
@@ -274,7 +273,7 @@ class Interlocks:
         ):
             return "is not known: its drive does not answer"
         # a counter that stands still beside a shaft that turns looks like rest, as a jam does
-        if (each.standstill or each.below is not None) and (fault := _unfollowed(status)):
+        if (each.standstill or each.below is not None) and (fault := status.motion_hidden_by):
             return f"may move: after fault {fault} its encoder does not prove that it stands; look, then reset the axis"
         if each.standstill and not (status.rest.rests is True and not _commanded(status)):
             return "does not stand, or is not known to"
@@ -402,7 +401,7 @@ class Interlocks:
         now_s = self._now_s()
         return tuple(
             f"interlock {rule.config.name} is overridden by {rule.override.client or 'somebody'}"
-            f" for {max(0.0, rule.override.until_s - now_s):.0f} s still"
+            f" for {max(1, math.ceil(rule.override.until_s - now_s))} s still"
             for rule in self._rules.values()
             if rule.override and axis in rule.holders
         )
@@ -429,10 +428,6 @@ class Interlocks:
         log.warning("interlock override", interlock=rule.config.name, reason=reason, client=client)
         reason = f"interlock {rule.config.name} {reason}"
         self._events.note(rule.holders[0], OverrideInterlock.verb, status, reason, client=client)
-
-
-def _unfollowed(status: AxisStatus) -> str:
-    return next((entry.code for entry in status.active_faults if entry.code in UNFOLLOWED), "")
 
 
 def _commanded(status: AxisStatus) -> bool:

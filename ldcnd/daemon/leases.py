@@ -383,7 +383,7 @@ class LeaseWatch:
         log.info("control released", client=lease.client, axes=sorted(lease.axes), leave_running=leave_running)
         # what is not seen to rest counts as moving
         states = {name: self._rig.axes[name].tracker.status for name in lease.axes}
-        moving = [name for name, each in states.items() if each.commanded and each.moving is not Moving.NO]
+        moving = [name for name, each in states.items() if each.commanded and each.to_be_stopped]
         if gone:
             self._leave_outputs(lease)
         if not leave_running:
@@ -461,7 +461,7 @@ async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> str
         return ""  # it is sent again until the drive confirms it, whatever the policy
     if policy is LossPolicy.RUN_TO_TARGET and (tracker.status.stop_latched or tracker.status.driven_open):
         policy = LossPolicy.HALT  # a raw duty has no target, and no drive ends it
-    if policy is LossPolicy.RUN_TO_TARGET or tracker.status.moving is Moving.NO:
+    if policy is LossPolicy.RUN_TO_TARGET or not tracker.status.to_be_stopped:
         return ""
     log.warning("loss policy", axis=axis.config.name, policy=policy.value, cause=cause)
     if await axis.stops.bring_to_rest(STOP_MODES[policy]):

@@ -43,12 +43,15 @@ class Fault:
         text: what it means and what to do.
         stops: the drive has switched the motor off; false for a warning.
         loses_position: what the drive counts from then on is not where the axis is: it needs a new reference.
+        hides_motion: shaft and encoder did not go where they were sent, or no encoder is seen: what the drive counts
+            from then on does not prove that the axis stands.
     """
 
     code: str
     text: str
     stops: bool = True
     loses_position: bool = False
+    hides_motion: bool = False
 
 
 @dataclass(frozen=True, slots=True)

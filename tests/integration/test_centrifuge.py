@@ -14,6 +14,7 @@ from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ErrorCode, InterlockViolated, LdcndError, LeaseExpired
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import OverrideInterlock
+from ldcnd.contract.samples import Moving
 from ldcnd.lab.sequences import SequenceRun
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
@@ -385,6 +386,33 @@ def test_a_counter_that_stands_still_in_a_spin_opens_no_lock(after_s):
         return written_at
 
     assert alone(freezes) == []
+
+
+def test_a_rotor_whose_counter_stands_still_may_move_on_every_face_until_somebody_has_looked(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        machine.wait(asyncio.sleep(1))
+        for each in ("power on rotor", "home rotor --wait", "move rotor 600 --at-velocity --for 60"):
+            assert machine.run(each).code == 0
+        machine.wait(asyncio.sleep(5))
+        machine.rig.lives.faults.encoder_stuck("rotor")
+        machine.wait(machine.rig.until("rotor", lambda state: state.moving is Moving.UNKNOWN))
+        speed = abs(machine.rig.lives.truth("rotor").velocity)
+        text, why = machine.run("list").printed, machine.run("why rotor").printed
+        seen = json.loads(machine.run("list --json").printed)
+        halted = machine.run("halt rotor --wait")
+        reset = machine.run("reset rotor")
+        machine.wait(machine.rig.until("rotor", lambda state: state.moving is Moving.NO))
+        after = json.loads(machine.run("list --json").printed)
+
+    assert speed > CREEPS
+    assert "moving unknown" in text
+    assert "may move" in text
+    assert "may move unseen" in why
+    assert (seen["moving"], seen["quality"], seen["referenced"]) == ("unknown", "uncertain", True)
+    assert halted.code != 0
+    assert "it is not known whether it stands" in halted.errors
+    assert reset.code == 0
+    assert (after["moving"], after["quality"]) == ("no", "good")
 
 
 @pytest.mark.parametrize("part", ["lock", "door", "pin"])

@@ -121,7 +121,7 @@ async def test_a_second_without_the_cable_leaves_the_fault_its_name(condition):
 async def test_a_tripped_drive_that_is_taken_over_has_a_fault_without_a_cause(condition):
     async with dialect_rig(LS_182AP, gains=GAINS | {"el": 500}) as rig:
         await trip(rig, condition)
-        await rig.until(lambda state: state.moving is Moving.NO)  # else the daemon would stop it as it ends
+        await rig.until(lambda state: state.moving is not Moving.YES)  # else the daemon would stop it as it ends
 
     async with adopting_rig(LS_182AP, rig) as later:
         await later.until(lambda state: state.state is AxisState.ERROR_STOP)
@@ -137,7 +137,7 @@ async def test_a_tripped_drive_that_is_taken_over_has_a_fault_without_a_cause(co
 async def stopped_after(rig: DialectRig, condition: FaultCondition) -> None:
     """Trip a drive and stop it: with its power driver off it hides a cause that is over, and holds it all the same."""
     await trip(rig, condition)
-    await rig.until(lambda state: state.moving is Moving.NO)
+    await rig.until(lambda state: state.moving is not Moving.YES)
     await rig.send(Stop())
 
 

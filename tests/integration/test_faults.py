@@ -149,7 +149,10 @@ async def test_a_jam_ends_in_a_position_error(dialect):
 
         assert (codes(sample), sample.first.text) == (["position_error"], FaultCode.POSITION_ERROR.remedy)
         why = await rig.rig.client.ask(Why(), AXIS)
-        assert (why.causes[0].code, why.causes[0].remedy) == ("drive_fault", "remove the cause, then send reset")
+        assert (why.causes[0].code, why.causes[0].remedy) == (
+            "drive_fault",
+            "look at it, for it may move unseen; remove the cause, then send reset",
+        )
         assert (await rig.until(lambda state: state.state is AxisState.ERROR_STOP)).enabled is False
         rig.condition(FaultCondition.STALLED, present=False)
         await rig.send(Reset())

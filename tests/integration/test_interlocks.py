@@ -18,7 +18,7 @@ from ldcnd.contract.commands import (
     Stop,
 )
 from ldcnd.contract.condition import assess
-from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseHeld, LeaseUnknown
+from ldcnd.contract.errors import InterlockViolated, LdcndError, LeaseHeld, LeaseUnknown, WrongState
 from ldcnd.contract.events import ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.questions import Preview, Why
@@ -316,8 +316,12 @@ async def test_a_reset_does_not_drop_a_load_that_its_loop_holds():
         await power(rig)
         await rig.client.command("table", MoveRelative(distance=0.1))
         await rig.until("table", lambda state: state.state is AxisState.ERROR_STOP)
-        await refused(rig, "table", Reset(), "interlock brake")
+        # whether it stands no reading proves, and a reset would switch its motor off
+        with pytest.raises(WrongState, match="still moves, or may"):
+            await rig.client.command("table", Reset())
+        await refused(rig, "table", Power(on=False), "interlock brake")
         await locked(rig)
+        await rig.client.command("table", Power(on=False))
         await rig.client.command("table", Reset())
 
 

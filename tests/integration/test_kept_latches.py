@@ -31,7 +31,9 @@ HUNTS = 20
 
 
 async def up(rig: ChainRig, axis: str = "x") -> None:
-    await rig.until(axis, lambda state: state.link is LinkState.UP and state.moving != "unknown")
+    await rig.until(
+        axis, lambda state: state.link is LinkState.UP and (state.moving != "unknown" or state.motion_hidden_by)
+    )
 
 
 async def jogging(rig: ChainRig, axis: str = "x") -> None:

@@ -12,7 +12,7 @@ from ldcnd.client.axis import Axis
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, Reset, Stop
-from ldcnd.contract.errors import DriveFault
+from ldcnd.contract.errors import DriveFault, WrongState
 from ldcnd.contract.events import CommandEvent, CommandStatus, ReadEvents, ReadOutcome
 from ldcnd.contract.samples import AxisState, FaultSample, PositionSample, TelemetryItem
 from ldcnd.drives.axis_config import RatesConfig, SettleConfig
@@ -134,6 +134,9 @@ async def test_a_move_that_does_not_settle_is_a_fault_where_the_configuration_sa
         failed = await moved(rig, "x", 5.0)
         fault = await rig.client.last("x", TelemetryItem.FAULT)
         state = await rig.client.state("x")
+        with pytest.raises(WrongState, match="still moves, or may"):
+            await rig.client.command("x", Reset())
+        await rig.client.command("x", Power(on=False))
         await rig.client.command("x", Reset())
 
         assert (failed.status, failed.settled) == (CommandStatus.FAILED, False)

@@ -307,7 +307,7 @@ async def test_an_axis_that_another_client_controls_keeps_its_settings_and_the_r
     }
     assert done.changes == shown.changes
     assert "bus.line0.axis.x.velocity: 20 mm/s -> 4 mm/s (not taken: ann controls axis x)" in shown.lines()
-    assert done.lines()[-1] == "reloaded; what is not taken, or needs a restart, stays as it is until then"
+    assert done.lines()[-1] == "reloaded; what is not taken, or needs a restart, stays as it is"
     assert told == {"y"}
     assert [each.key for each in again.changes] == ["bus.line0.axis.x.velocity"]
 

@@ -131,7 +131,7 @@ async def rest_counts(axis: Axis) -> int:
     Raises:
         WrongState: it does not come to rest, or its positions are not published.
     """
-    await at_rest(axis)
+    await at_rest(axis, watched=True)
     try:
         async with asyncio.timeout(REST_S):
             positions = axis.positions()
@@ -226,7 +226,7 @@ async def moved_while_held(
         if not ended.done():
             ended.cancel()  # which halts the axis
     if ended.cancelled():
-        await at_rest(axis)
+        await at_rest(axis, watched=True)
         return None
     outcome = ended.result()
     if isinstance(outcome, LdcndError):

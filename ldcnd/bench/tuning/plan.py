@@ -156,7 +156,7 @@ async def check_off(axis: Axis) -> None:
             if state.state is AxisState.ERROR_STOP
             else f"secure the load, then type: ldcnd power off {axis.name}",
         )
-    await at_rest(axis)
+    await at_rest(axis, watched=True)
 
 
 async def _check_travel(axis: Axis, info: AxisInfo, within: float) -> None:

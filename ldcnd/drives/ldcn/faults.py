@@ -50,6 +50,9 @@ class FaultCode(StrEnum):
 WARNINGS = frozenset({FaultCode.CURRENT_LIMIT, FaultCode.POSITION_WRAP, FaultCode.SERVO_OVERRUN})
 """Conditions that do not switch the motor off: current limiting only lowers the PWM value (PIC-SERVO manual, 4.3)."""
 
+_UNFOLLOWED = frozenset({FaultCode.POSITION_ERROR, FaultCode.ENCODER_OR_HALL, FaultCode.LATCHED_FAULT})
+"""A jam and an encoder that stands still look the same, and a cause that is not known may be either."""
+
 _REMEDIES = MappingProxyType(
     {
         FaultCode.STOP_INPUT: "the stop input is open: close the emergency stop circuit, then reset",
@@ -118,6 +121,11 @@ class LdcnFault:
     def remedy(self) -> str:
         """Meaning and remedy, for an operator."""
         return (_REMEMBERED.get(self.code) if self.latched else None) or self.code.remedy
+
+    @property
+    def hides_motion(self) -> bool:
+        """Whether it may be an encoder that does not count: what is read then looks like rest."""
+        return self.code in _UNFOLLOWED
 
     @property
     def stops(self) -> bool:

@@ -228,7 +228,13 @@ class DriveState:
         if status.aux is not None:
             self.known = replace(self.known, latched=cause, seen=True)
         return tuple(
-            driver.Fault(fault.code.value, fault.remedy, stops=fault.stops, loses_position=fault.loses_position)
+            driver.Fault(
+                fault.code.value,
+                fault.remedy,
+                stops=fault.stops,
+                loses_position=fault.loses_position,
+                hides_motion=fault.hides_motion,
+            )
             for fault in found
         )
 

@@ -249,4 +249,4 @@ class SmartStepAxis(PollsItself):
 
 def fault_of(known: AlarmCode) -> Fault:
     """Return an alarm or a warning as a fault of the axis."""
-    return Fault(f"alarm_{known.code:04x}", f"A.{known.code:02X}: {known.text}")
+    return Fault(f"alarm_{known.code:04x}", f"A.{known.code:02X}: {known.text}", hides_motion=known.unfollowed)

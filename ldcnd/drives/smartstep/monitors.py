@@ -184,6 +184,8 @@ class AlarmCode:
     code: int
     text: str
     kind: AlarmKind = AlarmKind.ALARM
+    unfollowed: bool = False
+    """Shaft and encoder did not go where they were sent."""
 
 
 ALARMS: tuple[AlarmCode, ...] = (
@@ -198,10 +200,10 @@ ALARMS: tuple[AlarmCode, ...] = (
     AlarmCode(0x0074, "Inrush resistance overload"),
     AlarmCode(0x007A, "Radiator overheating"),
     AlarmCode(0x00BF, "System error"),
-    AlarmCode(0x00C1, "Runaway detected"),
-    AlarmCode(0x00C2, "Phase error detected"),
-    AlarmCode(0x00C3, "Encoder disconnection detected"),
-    AlarmCode(0x00D0, "Deviation counter over"),
+    AlarmCode(0x00C1, "Runaway detected", unfollowed=True),
+    AlarmCode(0x00C2, "Phase error detected", unfollowed=True),
+    AlarmCode(0x00C3, "Encoder disconnection detected", unfollowed=True),
+    AlarmCode(0x00D0, "Deviation counter over", unfollowed=True),
     AlarmCode(0x0091, "Overload alarm", AlarmKind.WARNING),
     AlarmCode(0x0092, "Regeneration overload alarm", AlarmKind.WARNING),
     AlarmCode(NO_ALARM, "Normal (No alarm)", AlarmKind.NONE),

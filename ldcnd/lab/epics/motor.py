@@ -23,7 +23,7 @@ from ldcnd.contract.errors import (
     WrongState,
 )
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import Moving, Sample, StateSample
+from ldcnd.contract.samples import Sample, StateSample
 from ldcnd.lab.borrowed_control import BorrowedControl
 from ldcnd.lab.epics.fields import Action, Number, Put, RecordAlarm, RecordField, Value
 from ldcnd.lab.epics.record import NO_LIMIT, Defaults, MotorRecord
@@ -146,7 +146,7 @@ class MovedRecord(MotorRecord):
 
     def is_busy(self) -> bool:
         """Tell whether the axis moves, or is to move."""
-        return bool(self._pending) or self._wanted is not None or self.moving is not Moving.NO
+        return bool(self._pending) or self._wanted is not None or not super().stands()
 
     async def show_control(self, holder: str) -> None:
         """Show who controls the axis."""

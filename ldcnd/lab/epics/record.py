@@ -377,7 +377,7 @@ class MotorRecord:
 
     async def grow_old(self) -> None:
         """Show that nothing newer is known of the axis: its drive, its line or its daemon is silent."""
-        self.state = self.state and self.state.model_copy(update={"moving": Moving.UNKNOWN})
+        self.state = self.state and self.state.model_copy(update={"moving": Moving.UNKNOWN, "motion_hidden_by": ""})
         await self._take_alarm(SILENT)
         self.condition = assess(self.state, self._faults, age_s=math.inf)
         for name in (":velocity", ":adc", *(f":{monitor}" for monitor in self.info.monitors)):
@@ -406,8 +406,8 @@ class MotorRecord:
         return self.state.moving if self.state else Moving.UNKNOWN
 
     def stands(self) -> bool:
-        """Tell whether the axis has done what was put: one of which that is not known has not arrived."""
-        return self.moving is Moving.NO
+        """Tell whether what was put is over: of one that is out of sight that is not known."""
+        return self.state is not None and self.state.has_ended
 
     async def show_motion(self) -> None:
         """Show whether the axis moves."""
@@ -416,7 +416,7 @@ class MotorRecord:
         await self["MOVN"].show(int(not stands))
         await self["MIP"].show(0 if stands else MIP_MOVE)
         await self["MSTA"].show(
-            (MSTA_DONE if self.moving is Moving.NO else MSTA_MOVING)
+            (MSTA_DONE if self.state and self.state.has_ended else MSTA_MOVING)
             | MSTA_PLUS * bool(self["TDIR"].value)
             | MSTA_ENCODER
             | MSTA_GAIN_SUPPORT * (Verb.POWER in self.info.capabilities)

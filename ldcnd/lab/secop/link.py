@@ -107,7 +107,7 @@ class AxisLink:
 
     def is_busy(self) -> bool:
         """Tell whether the axis moves, or is to move."""
-        return bool(self._pending) or (self._state is not None and self._state.moving is not Moving.NO)
+        return bool(self._pending) or (self._state is not None and not self._state.has_ended)
 
     # -- what it says ------------------------------------------------------------------------------------------------
 
