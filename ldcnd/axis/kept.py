@@ -90,7 +90,15 @@ class KeptLatch(Frozen):
     stopped: bool = False
     """A stop is latched."""
     again: StopMode | None = None
-    """How it is to be stopped again, because no drive has confirmed that."""
+    """How it is to be stopped, because its drive has not confirmed that, or was not read since."""
+    confirmed: bool = False
+    """No stop was asked for in vain; false in a file of an earlier version, which does not say."""
+    since: int | None = None
+    """When the stop was latched, UTC in ns since 1970; null where that is not known."""
+    client: str | None = None
+    """Who has latched it, as it calls itself."""
+    login: str | None = None
+    """Common name of the certificate of its link."""
     in_error: bool = False
     """It is in error_stop."""
     first_fault: PastFault | None = None

@@ -176,7 +176,7 @@ class AxisReadings:
     def judge(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
         """Take a reading if the drive can have got there; true when it has to be read again first."""
         tracker, status = self._tracker, self._tracker.status
-        if status.stop and status.stop_pending:
+        if status.stop and status.stop_due:
             self._stops.wanted.set()  # it replies again, whatever it says
         if not self._proof.holds:
             self._count_miss()  # from its drive: who answers was not identified

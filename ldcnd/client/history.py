@@ -10,6 +10,7 @@ from ldcnd.contract.events import (
     ALARM_HISTORY,
     DRIVE_CHANGED,
     INTERLOCK,
+    LATCH,
     LINK_BACK,
     LINK_LOST,
     REFERENCE,
@@ -36,7 +37,7 @@ class HistoryKind(StrEnum):
     FAULT = "fault"
     """A fault was seen, or the loss of a line or of an I/O module."""
     DAEMON = "daemon"
-    """The daemon was started: what an earlier run of it has seen is not known any more, but for faults."""
+    """The daemon was started: of what an earlier run of it has seen only faults and latched stops are known."""
     DRIVE = "drive"
     """A drive did something that no command of the daemon explains; what was lost answers again."""
 
@@ -75,6 +76,8 @@ def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
     kind = HistoryKind.COMMAND
     if event.verb in CONTROL:
         kind = HistoryKind.CONTROL
+    elif event.verb == LATCH:
+        kind = HistoryKind.DAEMON
     elif event.verb == LINK_LOST:
         kind = HistoryKind.FAULT
     elif event.verb in BY_ITSELF:
@@ -85,7 +88,7 @@ def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
         kind=kind,
         axis=event.axis,
         what=event.verb if event.on is None else f"{event.verb} {'on' if event.on else 'off'}",
-        how="" if kind in (HistoryKind.DRIVE, HistoryKind.FAULT) else event.status.value,
+        how="" if kind in (HistoryKind.DAEMON, HistoryKind.DRIVE, HistoryKind.FAULT) else event.status.value,
         who=f"{event.client or ''}{login}".strip(),
         why=event.reason or "",
         code=event.code,

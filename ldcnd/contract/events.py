@@ -9,6 +9,8 @@ from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
 
 ALARM_HISTORY = "alarm_history"
 """The verb of an event that no command has caused: a drive has entered an alarm in its own history."""
+LATCH = "latch"
+"""The verb of an event of the start: a stop is latched that an earlier daemon has kept."""
 REFERENCE = "reference"
 """The verb of an event of the start: the reference that an earlier daemon has kept holds, or was refused."""
 DRIVE_CHANGED = "drive_changed"
@@ -71,10 +73,10 @@ class CommandEvent(Frozen):
     """Id of the command."""
     verb: str
     """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
-    motion that did not settle, `reference` for what became of a kept reference, `drive_changed` for a drive that was
-    reset or that another program has changed, `interlock` for a motion that an interlock has ended, `link_lost` and
-    `link_back` for what has stopped answering and answers again, and of an I/O module the situation for which its
-    outputs were set, or `output_differs`: these have no request."""
+    motion that did not settle, `reference` for what became of a kept reference, `latch` for a stop that an earlier
+    daemon has kept, `drive_changed` for a drive that was reset or that another program has changed, `interlock` for a
+    motion that an interlock has ended, `link_lost` and `link_back` for what has stopped answering and answers again,
+    and of an I/O module the situation for which its outputs were set, or `output_differs`: these have no request."""
     on: bool | None = None
     """Direction of `power`: true to close the loop, false to open it; null of every other verb."""
     client: str | None
