@@ -190,7 +190,11 @@ class KeptFiles:
 
         def write() -> None:
             now = reference.model_copy(update={"on_disk": time.time_ns()})
-            durable.replace(path, now.model_dump_json())
+            try:
+                durable.replace(path, now.model_dump_json())
+            except OSError:
+                durable.keep_room(path, 0)  # a full disk takes a draft without a text, by which the next start knows
+                raise
 
         with self._noted(path):
             await self._in_thread(write)
@@ -204,6 +208,14 @@ class KeptFiles:
         path = self._path("references", axis)
         with self._noted(path):
             await self._in_thread(lambda: durable.remove(path))
+
+    async def is_unwritten(self, axis: str) -> bool:
+        """Tell whether the disk has not taken the latest reference of an axis."""
+        path = self._path("references", axis)
+        try:
+            return await self._in_thread(lambda: durable.has_draft(path))
+        except OSError:
+            return False
 
     async def faults(self, axis: str) -> tuple[PastFault, ...]:
         """Return the faults that are kept of an axis, oldest first.
