@@ -351,8 +351,10 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         last_error = None
     elif before.command_id != command.command_id:
         status = _abort(status, command.verb, command.command_id)
-        # what takes a motion over goes on with it as another command's
-        last_error = status.last_error if command.state is AxisState.STOPPING else None
+        if command.state is not AxisState.STOPPING:  # what takes a motion over goes on with it as another command's
+            last_error = None
+        elif before.state is not AxisState.STOPPING:  # a stop that gives way to another one has not failed
+            last_error = status.last_error
     return replace(
         status,
         command=command,
@@ -630,7 +632,8 @@ def _abort(status: AxisStatus, by: Verb, command_id: str | None) -> AxisStatus:
     if by is Verb.HALT and status.command and status.command.verb is Verb.JOG and not status.failure:
         return _end(status, CommandStatus.DONE)  # MC_Jog: a jog has no other end than to be let go
     when = " while it settled: its profile was over" if status.settle else ""
-    why = f": {status.failure}" if status.failure else ""
+    failing = f"; it was failing already: {status.failure}" if status.failure else ""
+    why = f", because of interlock {status.interlock}" if failing and status.interlock else failing
     return _end(
         status,
         CommandStatus.ABORTED,
