@@ -112,6 +112,11 @@ class ActiveCommand:
     settling: Settling | None = None
     way: Way | None = None
 
+    @property
+    def goal(self) -> float | None:
+        """Where it is to come to rest, in axis units; None of one that somebody is to end."""
+        return None if self.state is AxisState.CONTINUOUS_MOTION else self.target
+
 
 @dataclass(frozen=True, slots=True)
 class CommandEnd:

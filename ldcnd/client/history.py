@@ -61,8 +61,12 @@ class HistoryRow(Frozen):
     """The reason, or what the fault means."""
     code: str | None = None
     """The error code of what was refused or failed."""
+    target: float | None = None
+    """Where a motion was to come to rest, in axis units."""
     position: float | None = None
     """Where a motion ended, in axis units."""
+    last_position: float | None = None
+    """Where the axis was read last when a motion ended otherwise; it may have moved on."""
     command_id: str | None = None
     """The command."""
     line: str | None = None
@@ -92,7 +96,9 @@ def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
         who=f"{event.client or ''}{login}".strip(),
         why=event.reason or "",
         code=event.code,
+        target=event.target,
         position=event.position,
+        last_position=event.last_position,
         command_id=event.command_id,
         line=line,
     )

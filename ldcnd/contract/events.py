@@ -90,8 +90,14 @@ class CommandEvent(Frozen):
     """Why, when it did not end as requested; of one that moves nothing and is done, the values that it has set."""
     code: str | None = None
     """The error code, when there is one."""
+    target: float | None = None
+    """Position at which the motion is to come to rest, in axis units; null of what names none before it has begun, and
+    of a motion that somebody is to end."""
     position: float | None = None
     """Position at the end of a motion, in axis units, measured after it; null where none was measured."""
+    last_position: float | None = None
+    """Position that was read last when a motion ended otherwise than by coming to rest, such as one that was aborted,
+    in axis units: the axis may have moved on. Null where `position` is known, and where it was never read."""
     following_error: float | None = None
     """Target minus that position, in axis units; without a target what the drive reports, null where it does not."""
     settled: bool | None = None

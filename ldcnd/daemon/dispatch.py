@@ -29,6 +29,7 @@ from ldcnd.contract.commands import (
     Ends,
     Jog,
     Move,
+    MoveAbsolute,
     Power,
     QuickStop,
     Stop,
@@ -472,7 +473,8 @@ class Dispatcher:
         if hold:
             right = right.also(lambda: hold.check(self._clock.now_s()))
         permit = axis.permit(command_id, command.verb, right)
-        self._enter(LedgerEntry(command_id, axis_name, command, client, login))
+        target = command.position if isinstance(command, MoveAbsolute) else None
+        self._enter(LedgerEntry(command_id, axis_name, command, client, login, target=target))
         over = self._under_way[command_id] = asyncio.Event()
         try:
             if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
@@ -515,10 +517,11 @@ class Dispatcher:
     async def _start(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
         reply = await axis.execute(command, permit)
         # a reading may have ended it while its reply was on the way: then its end is entered already
-        moving = axis.tracker.status.is_at(permit.command_id)
+        begun = axis.tracker.status.command
+        moving = begun is not None and begun.command_id == permit.command_id
         ends_later = command.ends is Ends.BY_READING and moving
         status = CommandStatus.EXECUTING if ends_later else CommandStatus.DONE
-        self._ledger.answered(permit.command_id, reply, status)
+        self._ledger.answered(permit.command_id, reply, status, begun.goal if begun and moving else None)
         return reply
 
     def stopped(self, names: tuple[str, ...], confirmed: tuple[str, ...], command: Stop, login: str | None) -> None:
