@@ -108,6 +108,11 @@ def keep_room(path: Path, size_bytes: int) -> None:
             os.fsync(file.fileno())
 
 
+def has_draft(path: Path) -> bool:
+    """Tell whether there is a draft of a file that has not become the file: its writing failed, or was cut short."""
+    return _draft_of(Path(os.path.realpath(path))).exists()
+
+
 def _draft_of(path: Path) -> Path:
     return path.with_name(f"{path.name}.new")
 
@@ -118,11 +123,14 @@ def _opened(draft: Path) -> BinaryIO:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, if it is there; it has gone from the disk when this returns.
+    """Remove a file and its draft, if they are there; they have gone from the disk when this returns.
 
     Raises:
         OSError: it cannot be removed.
     """
+    draft = _draft_of(Path(os.path.realpath(path)))
+    with _WRITING[draft], contextlib.suppress(FileNotFoundError, IsADirectoryError):
+        draft.unlink()
     try:
         path.unlink()
     except (FileNotFoundError, IsADirectoryError):  # a directory holds nothing that anybody would read

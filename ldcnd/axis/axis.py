@@ -497,8 +497,9 @@ class AxisService:
         Clients wait for the first state of an axis before they command it: before its drive was read there is none, but
         for a stop that an earlier daemon has left.
         """
+        self.stops.note_overdue()
         status = self.tracker.status
-        if status.was_read or status.stop_latched or status.stop_pending:
+        if status.was_read or status.stop_latched or status.stop_due:
             self.telemetry.publish_state(status, self._clock.now_ns(), due=True)
 
     def controlled_by(self, client: str | None) -> None:
@@ -578,7 +579,7 @@ class AxisService:
 
     async def send_pending_stop(self) -> None:
         """Send a stop again that the drive has not confirmed, whatever the state of the axis."""
-        if not (self.tracker.status.stop_pending or self.tracker.status.off_again):
+        if not (self.tracker.status.stop_due or self.tracker.status.off_again):
             return
         try:
             # a stop would close an open loop: see how a drive was left, or what became of it while it was out of reach

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ldcnd.axis.course import Pace
 from ldcnd.axis.scale import AxisScale
-from ldcnd.axis.status import ActiveCommand, SoftLimits, Unsure
+from ldcnd.axis.status import ActiveCommand, LatchedBy, SoftLimits, Unsure
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import PastFault
 from ldcnd.drives.driver import AxisReading, Fault, StopMode
@@ -222,6 +222,13 @@ class StopLatch:
 
 
 @dataclass(frozen=True, slots=True)
+class LatchNamed:
+    """It is known who has latched the stop; who has latched it first stays."""
+
+    by: LatchedBy
+
+
+@dataclass(frozen=True, slots=True)
 class StopSent:
     """A stop is about to be sent, as the strongest of those that are not confirmed; `verb` asked for it."""
 
@@ -255,6 +262,22 @@ class StopUnconfirmed:
 
 
 @dataclass(frozen=True, slots=True)
+class StopDue:
+    """A stop is to be sent because the drive was not read yet; none is known to have failed, see `StopUnconfirmed`."""
+
+    mode: StopMode
+    how: str
+    verb: Verb = Verb.STOP
+
+
+@dataclass(frozen=True, slots=True)
+class StopOverdue:
+    """The drive could not be sent in time what was due: it counts as not confirmed."""
+
+    now_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class StopConfirmed:
     """The drive has confirmed a stop; a stronger one that is not confirmed yet stands.
 
@@ -270,10 +293,12 @@ class LatchRecalled:
 
     Attributes:
         stopped: a stop is latched.
-        again: how it is to be stopped, if it was not confirmed, or may not have been sent; None when it stood.
+        again: how it is to be stopped; None when nothing was stopped.
         in_error: it is in error_stop.
         first: what brought it there.
         now_ns: when, UTC.
+        confirmed: as far as the earlier daemon knew it, no stop was asked for in vain.
+        by: who has latched the stop.
     """
 
     stopped: bool
@@ -281,6 +306,8 @@ class LatchRecalled:
     in_error: bool
     first: PastFault | None
     now_ns: int
+    confirmed: bool = False
+    by: LatchedBy | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,5 +345,8 @@ AxisEvent = (
     | StopUnconfirmed
     | StopConfirmed
     | LatchRecalled
+    | LatchNamed
+    | StopDue
+    | StopOverdue
     | ResetDone
 )

@@ -54,7 +54,12 @@ def check_not_latched(axis: AxisTracker) -> None:
 
 def check_stop_confirmed(axis: AxisTracker) -> None:
     """Refuse while the drive has not confirmed a stop; what latches counts from the instant at which it is sent."""
-    if axis.status.stop_pending or (axis.status.stop and axis.status.stop_latched):
+    if axis.status.stop_due or (axis.status.stop and axis.status.stop_latched):
+        if axis.status.stop_due and not axis.status.stop_pending:
+            unread = "is" if axis.status.was_read else "was not read yet, and is"
+            raise StopNotConfirmed(
+                f"axis {axis.name}: the drive {unread} sent its stop first", axis=axis.name, remedy="wait a moment"
+            )
         away = axis.status.link is LinkState.DOWN
         raise StopNotConfirmed(
             f"axis {axis.name}: the drive has not confirmed a stop yet",

@@ -90,7 +90,15 @@ class KeptLatch(Frozen):
     stopped: bool = False
     """A stop is latched."""
     again: StopMode | None = None
-    """How it is to be stopped again, because no drive has confirmed that."""
+    """How it is to be stopped, because its drive has not confirmed that, or was not read since."""
+    confirmed: bool = False
+    """No stop was asked for in vain; false in a file of an earlier version, which does not say."""
+    since: int | None = None
+    """When the stop was latched, UTC in ns since 1970; null where that is not known."""
+    client: str | None = None
+    """Who has latched it, as it calls itself."""
+    login: str | None = None
+    """Common name of the certificate of its link."""
     in_error: bool = False
     """It is in error_stop."""
     first_fault: PastFault | None = None
@@ -182,7 +190,11 @@ class KeptFiles:
 
         def write() -> None:
             now = reference.model_copy(update={"on_disk": time.time_ns()})
-            durable.replace(path, now.model_dump_json())
+            try:
+                durable.replace(path, now.model_dump_json())
+            except OSError:
+                durable.keep_room(path, 0)  # a full disk takes a draft without a text, by which the next start knows
+                raise
 
         with self._noted(path):
             await self._in_thread(write)
@@ -196,6 +208,14 @@ class KeptFiles:
         path = self._path("references", axis)
         with self._noted(path):
             await self._in_thread(lambda: durable.remove(path))
+
+    async def is_unwritten(self, axis: str) -> bool:
+        """Tell whether the disk has not taken the latest reference of an axis."""
+        path = self._path("references", axis)
+        try:
+            return await self._in_thread(lambda: durable.has_draft(path))
+        except OSError:
+            return False
 
     async def faults(self, axis: str) -> tuple[PastFault, ...]:
         """Return the faults that are kept of an axis, oldest first.

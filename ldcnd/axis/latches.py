@@ -9,11 +9,14 @@ is latched.
 import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from typing import Protocol
 
 from ldcnd.axis.events import LatchRecalled
 from ldcnd.axis.kept import KeptFiles, KeptLatch
-from ldcnd.axis.status import AxisStatus
+from ldcnd.axis.status import AxisStatus, LatchedBy
 from ldcnd.axis.tracker import AxisTracker
+from ldcnd.contract.events import LATCH, CommandStatus
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.driver import StopMode
 from ldcnd.durable import DamagedFile
@@ -24,6 +27,15 @@ WITHIN_S = 0.5
 RETRY_S = 5.0
 """Delay before latches are written again that could not be, seconds."""
 log = get_logger("latches")
+
+
+class NoteOfClient(Protocol):
+    """Takes an event of an axis, and whose doing it was."""
+
+    def __call__(
+        self, axis: str, verb: str, status: CommandStatus, reason: str, *, client: str | None, login: str | None
+    ) -> None:
+        """Enter it."""
 
 
 class LatchKeeper:
@@ -43,10 +55,11 @@ class LatchKeeper:
         self._writing = asyncio.Lock()
         self._on_disk: Mapping[str, KeptLatch] | None = {}  # None: not known
         self._others: dict[str, KeptLatch] = {}  # of axes that are not configured now
+        self._recalled: dict[str, KeptLatch] = {}
         if files is None:
             return
         for tracker in trackers.values():
-            tracker.watch(self._watch, "stop_latched", "stop", "state")
+            tracker.watch(self._watch, "stop_latched", "latched_by", "stop", "state")
         try:
             kept = files.latches()
         except DamagedFile as error:
@@ -59,13 +72,26 @@ class LatchKeeper:
         for name in kept.keys() & trackers.keys():
             latch = kept[name]
             again = latch.again or (StopMode.SMOOTH if latch.stopped else None)
-            trackers[name].take(LatchRecalled(latch.stopped, again, latch.in_error, latch.first_fault, now_ns()))
+            by = None if latch.since is None else LatchedBy(latch.since, latch.client, latch.login)
+            trackers[name].take(
+                LatchRecalled(
+                    latch.stopped, again, latch.in_error, latch.first_fault, now_ns(), confirmed=latch.confirmed, by=by
+                )
+            )
+            self._recalled[name] = latch
             log.warning("latched since an earlier daemon", axis=name, stopped=latch.stopped, in_error=latch.in_error)
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
         in_error = AxisState.ERROR_STOP in (before.state, after.state)
-        if in_error or after.stop_latched is not before.stop_latched or after.stop is not before.stop:
+        fields = ("stop_latched", "latched_by", "stop")
+        if in_error or any(getattr(after, name) is not getattr(before, name) for name in fields):
             self._changed.set()  # perhaps in vain: what is kept is compared before it is written
+
+    def tell(self, note: NoteOfClient) -> None:
+        """Enter into the events what was taken up, with who has latched it as far as that was kept."""
+        for name, latch in sorted(self._recalled.items()):
+            if latch.stopped:
+                note(name, LATCH, CommandStatus.DONE, _in_words(latch), client=latch.client, login=latch.login)
 
     async def run(self) -> None:
         """Keep what comes and goes until cancelled; without a place for it there is nothing to do."""
@@ -107,15 +133,28 @@ class LatchKeeper:
             return True
 
 
+def _in_words(latch: KeptLatch) -> str:
+    """Return what is known of a latch that an earlier daemon has kept."""
+    at = None if latch.since is None else datetime.fromtimestamp(latch.since / 1e9, UTC)
+    since = f" since {at.isoformat(timespec='milliseconds')}" if at else ""
+    known = "its drive had confirmed it" if latch.confirmed else "its drive is not known to have confirmed it"
+    return f"a stop is latched{since}, from an earlier run of the daemon: {known}"
+
+
 def _latch_of(status: AxisStatus) -> KeptLatch | None:
     """Return what is to be kept of an axis; None while nothing forbids it to move."""
-    again = status.stop.mode if status.stop and status.stop_pending else None
+    stop, by = status.stop, status.latched_by
+    again = stop.mode if stop and status.stop_due else None
     in_error, first = status.state is AxisState.ERROR_STOP, status.first_fault
     if not (status.stop_latched or again or in_error):
         return None
     return KeptLatch(
         stopped=status.stop_latched,
         again=again,
+        confirmed=stop is None or (stop.unread and stop.fault is None),
+        since=by.t if by else None,
+        client=by.client if by else None,
+        login=by.login if by else None,
         in_error=in_error,
         first_fault=first.past if first and in_error else None,
     )

@@ -48,11 +48,13 @@ class Arrival:
         position: as clients see it.
         following_error: target minus position; without a target what the drive reports, None where it does not.
         settled: whether the axis came to rest within its window in time; None for what has no target.
+        last_position: that was read last, of a command that no reading has ended; None where one has.
     """
 
     position: float | None
     following_error: float | None
     settled: bool | None
+    last_position: float | None = None
 
 
 OnEnded = Callable[[CommandEnd, Arrival | None], None]
@@ -176,7 +178,7 @@ class AxisReadings:
     def judge(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> bool:
         """Take a reading if the drive can have got there; true when it has to be read again first."""
         tracker, status = self._tracker, self._tracker.status
-        if status.stop and status.stop_pending:
+        if status.stop and status.stop_due:
             self._stops.wanted.set()  # it replies again, whatever it says
         if not self._proof.holds:
             self._count_miss()  # from its drive: who answers was not identified
@@ -324,8 +326,10 @@ class AxisReadings:
         end, reading = after.last_end, self._digested
         if end is None:
             return
-        if reading is None:  # nothing shows where
-            self._on_ended(end, None)
+        if reading is None:  # nothing shows where it comes to rest
+            last = self._tracker.reading
+            seen = None if last is None else after.scale.shown_at(last.position_counts)
+            self._on_ended(end, Arrival(None, None, None, seen))
         else:
             self._over = end, arrival_of(end, reading, after.scale)
 

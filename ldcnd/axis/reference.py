@@ -25,6 +25,7 @@ LEAST_MARK = 100
 """A mark nearer to 0 could be a coincidence: a reset leaves 0."""
 NEAR_COUNTS = 32
 """Largest displacement of an axis at rest besides its settle window, counts: loops hunt, shafts relax."""
+UNWRITTEN = "what the earlier daemon wrote since did not get onto the disk, see `not kept on disk` in its log"
 AS_AFTER_RESET = 2
 """Largest count, either side of 0, of a counter that may have been reset."""
 REST_S = 0.5
@@ -41,26 +42,31 @@ STOPPING_S = 0.05
 log = get_logger("axis")
 
 
-def contradiction(kept: KeptReference, shown: Evidence, near_counts: float) -> str:
+def contradiction(kept: KeptReference, shown: Evidence, near_counts: float, *, unwritten: bool = False) -> str:
     """Return in words the value of a drive that contradicts a reference; empty when none does.
 
     Args:
         kept: the reference.
         shown: what the drive shows now.
         near_counts: how far it may be from where it was.
+        unwritten: something later could not be written: what differs may be the daemon's own doing.
     """
+    since = UNWRITTEN if unwritten else ""
     if shown.mark != kept.mark:
-        return f"its mark is {shown.mark} and was {kept.mark}: it was reset, or another program has used it"
+        since = since or "it was reset, another program has used it, or this reference could not be removed"
+        return f"its mark is {shown.mark} and was {kept.mark}: {since}"
     if abs(shown.counter) <= AS_AFTER_RESET:
         return f"its counter reads {shown.counter}, as after a reset"
     if shown.position_lost:
         return "it may have missed counts"
     if shown.enabled is not kept.enabled:
         now, was = ("closed", "open") if shown.enabled else ("open", "closed")
-        return f"its loop is {now} and was {was}: a fault or another program has switched it"
+        since = since or "a fault, another program or a daemon that could not keep that has switched it"
+        return f"its loop is {now} and was {was}: {since}"
     if not kept.low - near_counts <= shown.counter <= kept.high + near_counts:
         off = shown.counter - (kept.high if shown.counter > kept.high else kept.low)
-        return f"it is {off} counts from where it was left: it was moved while no daemon watched it"
+        since = since or "it was moved while no daemon watched it, or could keep that"
+        return f"it is {off} counts from where it was left: {since}"
     return ""
 
 
@@ -100,6 +106,7 @@ class ReferenceKeeper:
         self._files = files
         self._kept: KeptReference | None = None  # as it is on the disk
         self._on_disk = False  # something may be there
+        self._unwritten = False  # an earlier daemon could not write what came later
         self._proof: ReferenceEvidence | None = None
         self._generation = 0  # of origins: what was read under an earlier one is not written
         self._faults_kept = 0
@@ -185,9 +192,10 @@ class ReferenceKeeper:
             kept = await self._files.reference(self._config.name)
         except (OSError, ValueError) as error:
             return None, f"it cannot be read: {in_words(error)}"
+        self._unwritten = await self._files.is_unwritten(self._config.name)
         if kept is None:
-            self._on_disk = False
-            return None, ""
+            self._on_disk = self._unwritten
+            return None, UNWRITTEN if self._unwritten else ""
         refusal = interrupted or self._proof.differs(kept)
         if not refusal:
             refusal, shown = await self._examined(self._drive, kept)
@@ -204,7 +212,7 @@ class ReferenceKeeper:
             except LdcndError as error:
                 refusal = f"the drive could not be read: {error.message}"
                 continue
-            refusal = contradiction(kept, shown, self._near_counts)
+            refusal = contradiction(kept, shown, self._near_counts, unwritten=self._unwritten)
             if not refusal:
                 return "", shown
         return refusal, shown
@@ -318,12 +326,11 @@ class ReferenceKeeper:
     async def _write(self, reference: KeptReference, generation: int) -> None:
         if self._files is None or generation != self._generation:
             return  # read under another origin
-        # before the disk has it: who forgets meanwhile is to remove it behind this
-        was_there, self._on_disk = self._on_disk, True
+        # before the disk has it: who forgets meanwhile is to remove it behind this, also what a failure leaves there
+        self._on_disk = True
         try:
             await self._files.keep_reference(self._config.name, reference)
-        except OSError as error:
-            self._on_disk = was_there or isinstance(error, TimeoutError)  # then it may be written later
+        except OSError:
             return
         if generation == self._generation:
             self._kept = reference

@@ -112,6 +112,11 @@ class ActiveCommand:
     settling: Settling | None = None
     way: Way | None = None
 
+    @property
+    def goal(self) -> float | None:
+        """Where it is to come to rest, in axis units; None of one that somebody is to end."""
+        return None if self.state is AxisState.CONTINUOUS_MOTION else self.target
+
 
 @dataclass(frozen=True, slots=True)
 class CommandEnd:
@@ -165,14 +170,32 @@ class OpenStop:
 
     Attributes:
         mode: the strongest of those that were sent or are to be.
-        fault: what is published of it, from when on it was sent in vain, or is yet to be sent: nothing moves then until
-            it is confirmed. None while it is on its way for the first time.
+        fault: what is published of it, from when on it was asked for in vain: nothing moves then until it is confirmed.
+            None while it is on its way for the first time.
         asked: the commands that asked for it, in their order; each has an event under its own name.
+        unread: it is to be sent as well, because its drive was not read yet; without a fault none is known to have
+            failed.
     """
 
     mode: StopMode
     fault: FaultEntry | None = None
     asked: tuple[AskedStop, ...] = ()
+    unread: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class LatchedBy:
+    """Who has latched a stop.
+
+    Attributes:
+        t: when, UTC in ns since 1970.
+        client: as it calls itself; None where it did not say.
+        login: whose link it came over; None where that has no certificate.
+    """
+
+    t: int
+    client: str | None = None
+    login: str | None = None
 
 
 PUBLISHED = tuple(name for name in StateSample.model_fields if name not in {"t", "t_error_ns", "seq"})
@@ -199,6 +222,7 @@ class AxisStatus:
             another one.
         position_lost: a fault says that what the drive counts is not where the axis is.
         stop_latched: a stop is latched; only a reset clears it.
+        latched_by: who has latched it; None where that is not known.
         stop: the stop that the drive has not confirmed; None without one.
         braking: the stop that it has confirmed and that readings are yet to show; None without one.
         driven_open: its motor may have voltage while its loop is open: from a raw duty on until a reading shows a
@@ -244,6 +268,7 @@ class AxisStatus:
     refused: str = ""
     position_lost: bool = False
     stop_latched: bool = False
+    latched_by: LatchedBy | None = None
     stop: OpenStop | None = None
     braking: Braking | None = None
     driven_open: bool = False
@@ -289,8 +314,13 @@ class AxisStatus:
         return (self.braking is not None or self.off_again) and self.link is not LinkState.DOWN
 
     @property
+    def stop_due(self) -> bool:
+        """Whether the line is to send a stop: nothing moves until the drive confirms it."""
+        return self.stop is not None and (self.stop.unread or self.stop.fault is not None)
+
+    @property
     def stop_pending(self) -> bool:
-        """Whether a stop was sent in vain, or is yet to be sent: nothing moves until the drive confirms it."""
+        """Whether a stop that is due was asked for in vain, and not only for want of a reading."""
         return self.stop is not None and self.stop.fault is not None
 
     @property

@@ -19,6 +19,7 @@ from ldcnd.axis.events import (
     ControlChanged,
     DriveLost,
     FaultFound,
+    LatchNamed,
     LatchRecalled,
     LimitsSet,
     LookTaken,
@@ -38,7 +39,9 @@ from ldcnd.axis.events import (
     SpeedOverridden,
     StopAcknowledged,
     StopConfirmed,
+    StopDue,
     StopLatch,
+    StopOverdue,
     StopSent,
     StopUnconfirmed,
 )
@@ -81,6 +84,7 @@ NAMED_STOPS = frozenset({Verb.HALT, Verb.QUICK_STOP})
 """Commands that are under way while a drive brakes, and that are sent again by their own name."""
 WENT_ON = "sent again, because the drive went on after it was confirmed: a late reply was taken for its own"
 STRAYED = "sent because the axis was not on the way to its target"
+LEFT = "sent before the drive was read: what it did while no daemon read it is not known"
 OUTRUN = "sent because the axis stayed faster than it was told"
 
 
@@ -347,8 +351,10 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         last_error = None
     elif before.command_id != command.command_id:
         status = _abort(status, command.verb, command.command_id)
-        # what takes a motion over goes on with it as another command's
-        last_error = status.last_error if command.state is AxisState.STOPPING else None
+        if command.state is not AxisState.STOPPING:  # what takes a motion over goes on with it as another command's
+            last_error = None
+        elif before.state is not AxisState.STOPPING:  # a stop that gives way to another one has not failed
+            last_error = status.last_error
     return replace(
         status,
         command=command,
@@ -441,6 +447,10 @@ def _latch(status: AxisStatus, _event: StopLatch) -> AxisStatus:
     return status if status.stop_latched else replace(status, stop_latched=True)
 
 
+def _name_latch(status: AxisStatus, event: LatchNamed) -> AxisStatus:
+    return replace(status, latched_by=event.by) if status.stop_latched and status.latched_by is None else status
+
+
 def _send_stop(status: AxisStatus, event: StopSent) -> AxisStatus:
     stop, asked = status.stop or OpenStop(event.mode), AskedStop(event.verb, event.mode)
     known = next((each for each in stop.asked if each.verb is event.verb), None)
@@ -457,8 +467,27 @@ def _keep_stop(status: AxisStatus, event: StopUnconfirmed) -> AxisStatus:
         return status
     # the fault keeps the instant from which the stop was wanted
     fault = stop.fault or entry_of(STOP_UNCONFIRMED, event.now_ns)
-    asked = tuple(each if each.how else replace(each, how=event.how) for each in stop.asked)
-    return replace(status, stop=OpenStop(stop.mode, fault, asked))
+    return replace(status, stop=replace(stop, fault=fault, asked=_with_how(stop.asked, event.how)))
+
+
+def _take_due_stop(status: AxisStatus, event: StopDue) -> AxisStatus:
+    status = _send_stop(status, StopSent(event.mode, event.verb))
+    stop = status.stop
+    if stop is None:
+        return status
+    return _with(status, stop=replace(stop, unread=True, asked=_with_how(stop.asked, event.how)))
+
+
+def _with_how(asked: tuple[AskedStop, ...], how: str) -> tuple[AskedStop, ...]:
+    """Return what was asked for, with why it is sent where that is not known yet."""
+    return tuple(each if each.how else replace(each, how=how) for each in asked)
+
+
+def _note_overdue(status: AxisStatus, event: StopOverdue) -> AxisStatus:
+    stop = status.stop
+    if stop is None or not stop.unread or stop.fault:
+        return status
+    return replace(status, stop=replace(stop, fault=entry_of(STOP_UNCONFIRMED, event.now_ns)))
 
 
 def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus:
@@ -476,8 +505,11 @@ def _confirm_stop(status: AxisStatus, event: StopConfirmed) -> AxisStatus:
 
 
 def _recall_latch(status: AxisStatus, event: LatchRecalled) -> AxisStatus:
-    status = replace(status, stop_latched=event.stopped)
-    if event.again is not None:
+    status = replace(status, stop_latched=event.stopped, latched_by=event.by)
+    if event.again is not None and event.confirmed:
+        # it may have been moved since: that is not known, and no failure of a stop
+        status = _take_due_stop(status, StopDue(event.again, LEFT))
+    elif event.again is not None:
         status = _keep_stop(status, StopUnconfirmed(event.now_ns, event.again))
     if not event.in_error:
         return status
@@ -492,6 +524,7 @@ def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
         # a reading that was asked for before still shows what was reset
         effective_from_s=event.now_s,
         stop_latched=False,
+        latched_by=None,
         position_lost=False,
         own=(),
         faults=(),
@@ -525,9 +558,12 @@ STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType
         SpeedOverridden: _override_speed,
         ControlChanged: _change_control,
         StopLatch: _latch,
+        LatchNamed: _name_latch,
         StopSent: _send_stop,
         StopAcknowledged: _acknowledge_stop,
         StopUnconfirmed: _keep_stop,
+        StopDue: _take_due_stop,
+        StopOverdue: _note_overdue,
         StopConfirmed: _confirm_stop,
         LatchRecalled: _recall_latch,
         ResetDone: _reset,
@@ -596,7 +632,8 @@ def _abort(status: AxisStatus, by: Verb, command_id: str | None) -> AxisStatus:
     if by is Verb.HALT and status.command and status.command.verb is Verb.JOG and not status.failure:
         return _end(status, CommandStatus.DONE)  # MC_Jog: a jog has no other end than to be let go
     when = " while it settled: its profile was over" if status.settle else ""
-    why = f": {status.failure}" if status.failure else ""
+    failing = f"; it was failing already: {status.failure}" if status.failure else ""
+    why = f", because of interlock {status.interlock}" if failing and status.interlock else failing
     return _end(
         status,
         CommandStatus.ABORTED,

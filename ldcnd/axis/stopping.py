@@ -6,15 +6,25 @@ to be sent: its line sends it again, before anything else to this drive.
 """
 
 import asyncio
+import math
 from collections.abc import Callable
 
 from ldcnd.axis.commands import AxisCommands
-from ldcnd.axis.events import PowerSwitched, StopConfirmed, StopLatch, StopSent, StopUnconfirmed
+from ldcnd.axis.events import (
+    PowerSwitched,
+    StopConfirmed,
+    StopDue,
+    StopLatch,
+    StopOverdue,
+    StopSent,
+    StopUnconfirmed,
+)
 from ldcnd.axis.latches import LatchKeeper
 from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Gate, Permit
 from ldcnd.axis.rest import REST_COUNTS
-from ldcnd.axis.status import AskedStop, AxisStatus
+from ldcnd.axis.status import AskedStop, AxisStatus, OpenStop
+from ldcnd.axis.step import LEFT
 from ldcnd.axis.telemetry import Note
 from ldcnd.axis.turns import CommandQueue
 from ldcnd.contract.commands import AxisCommand, CommandReply, Halt, Power, QuickStop, Stop, Verb
@@ -30,6 +40,9 @@ log = get_logger("axis")
 
 STOP_ROUNDS = 5
 """Rounds of the bus's own attempts before a stop that is not confirmed is reported as such."""
+READ_WITHIN_S = 5.0
+"""Time in which a drive that was not read yet is to confirm what it is sent first, seconds; after that it counts as not
+confirmed. A line that is searched at its rate after reset first, and then at its own, takes one or two."""
 SETTLES_WITHIN_S = 0.25
 """Time within which a shaft follows its finished profile, seconds."""
 FOUND_OPEN = "switched off when its line was taken over"
@@ -93,6 +106,7 @@ class AxisStops:
         self._note = note
         self._acknowledged = motion.stop_acknowledged
         motion.tracker.watch(self._watch, "stop", "off_again")
+        self._due_since_s = math.inf
         self._done: tuple[float, int, bool] | None = None  # since when, where, and whether it had time to settle
 
     async def stop(self, mode: StopMode, verb: Verb = Verb.STOP) -> bool:
@@ -129,7 +143,7 @@ class AxisStops:
         """
         if not self.possible:
             return False
-        name, verb = verb or BY_MODE[mode], verb or Verb.HALT
+        wanted, name, verb = verb, verb or BY_MODE[mode], verb or Verb.HALT
         # before its packet: whatever comes to its turn from here on finds that it is void
         overtaken = self.overtake(by, by.verb if by else OVERTAKES.get(verb, verb))
         stop = self._tracker.take(StopSent(mode, name)).stop
@@ -142,7 +156,11 @@ class AxisStops:
         finally:
             # also when this is cancelled: what is not confirmed by now its line sends again
             if still := self._tracker.status.stop:
-                self.require(still.mode, still.asked[0].verb if still.asked else name)
+                first = still.asked[0].verb if still.asked else name
+                if wanted or self._tracker.status.was_read:
+                    self.require(still.mode, first)
+                else:  # nobody has asked for it: the daemon does not know what the drive does
+                    self._tracker.take(StopDue(still.mode, LEFT, first))
             self._publish()
 
     def overtake(self, by: Permit | None, cause: str) -> StopLatched | CommandAborted:
@@ -171,13 +189,20 @@ class AxisStops:
             if self._tracker.status.off_again and not await self._send(StopMode.OFF, Verb.STOP, rounds=1):
                 self.require(StopMode.OFF)
             return
-        await self._send(stop.mode, stop.asked[0].verb if stop.asked else Verb.STOP, rounds=1)
+        confirmed = await self._send(stop.mode, stop.asked[0].verb if stop.asked else Verb.STOP, rounds=1)
+        if not confirmed and self._tracker.status.was_read:  # it answers at this rate, and does not confirm
+            self._tracker.take(StopOverdue(self._clock.now_ns()))
         self._publish()
+
+    def note_overdue(self) -> None:
+        """Have a stop counted as not confirmed that was to be sent to a drive which was not read in time."""
+        if self._clock.now_s() - self._due_since_s >= READ_WITHIN_S:
+            self._tracker.take(StopOverdue(self._clock.now_ns()))
 
     def switch_off(self) -> None:
         """Have the motor switched off by the first packet to its drive."""
         if self.possible:
-            self._tracker.take(StopUnconfirmed(self._clock.now_ns(), StopMode.OFF, FOUND_OPEN))
+            self._tracker.take(StopDue(StopMode.OFF, FOUND_OPEN))
 
     def inherit(self) -> None:
         """Its drive is as another host has left it: what moves in it without an end is to be brought to rest."""
@@ -237,20 +262,24 @@ class AxisStops:
             if not stands:
                 self._acknowledged(mode)
             before, after = tracker.status.stop, tracker.take(StopConfirmed(mode)).stop
-            self._tell_late(before.asked if before else (), after.asked if after else ())
+            if before:
+                self._tell_late(before, after.asked if after else ())
             return True
         return False
 
-    def _tell_late(self, before: tuple[AskedStop, ...], after: tuple[AskedStop, ...]) -> None:
+    def _tell_late(self, before: OpenStop, after: tuple[AskedStop, ...]) -> None:
         """Tell of each command by its own name that its drive has not confirmed at first, and does now."""
-        for asked in before:
+        for asked in before.asked:
             if asked.how and asked not in after:
-                log.warning("confirmed late", axis=self._name, verb=asked.verb.value, how=asked.how)
+                tell, what = (log.warning, "confirmed late") if before.fault else (log.info, "confirmed")
+                tell(what, axis=self._name, verb=asked.verb.value, how=asked.how)
                 self._note(self._name, asked.verb, CommandStatus.DONE, asked.how, None)
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
-        """Have a stop sent that readings call for."""
-        if (after.stop_pending and not before.stop_pending) or (after.off_again and not before.off_again):
+        """Have a stop sent that is due, such as one that readings call for."""
+        if after.stop_due is not before.stop_due:
+            self._due_since_s = self._clock.now_s() if after.stop_due else math.inf
+        if (after.stop_due and not before.stop_due) or (after.off_again and not before.off_again):
             self.wanted.set()
 
     def _publish(self) -> None:

@@ -107,7 +107,9 @@ def _missing(known_from: Beginning, since: int | None, left_out: int) -> Iterato
 def _line(row: HistoryRow) -> str:
     at = clock_time(row.t)
     who = f" by {row.who}" if row.who else ""
-    where = "" if row.position is None else f" at {row.position:.6g}"
-    named = f" ({row.command_id})" if row.command_id and row.kind not in (HistoryKind.DRIVE, HistoryKind.FAULT) else ""
+    where = "" if row.target is None else f" to {row.target:.6g}"
+    where += "" if row.position is None else f" at {row.position:.6g}"
+    where += "" if row.last_position is None else f" last read at {row.last_position:.6g}"
+    named = f" ({row.command_id})" if row.command_id and row.how else ""
     why = f": {row.why}" if row.why else ""
     return f"{at} {row.kind:8}{row.axis:8} {row.what:16} {row.how:10}{who}{where}{named}{why}"

@@ -10,6 +10,7 @@ from ldcnd.contract.events import (
     ALARM_HISTORY,
     DRIVE_CHANGED,
     INTERLOCK,
+    LATCH,
     LINK_BACK,
     LINK_LOST,
     REFERENCE,
@@ -36,7 +37,7 @@ class HistoryKind(StrEnum):
     FAULT = "fault"
     """A fault was seen, or the loss of a line or of an I/O module."""
     DAEMON = "daemon"
-    """The daemon was started: what an earlier run of it has seen is not known any more, but for faults."""
+    """The daemon was started: of what an earlier run of it has seen only faults and latched stops are known."""
     DRIVE = "drive"
     """A drive did something that no command of the daemon explains; what was lost answers again."""
 
@@ -60,8 +61,12 @@ class HistoryRow(Frozen):
     """The reason, or what the fault means."""
     code: str | None = None
     """The error code of what was refused or failed."""
+    target: float | None = None
+    """Where a motion was to come to rest, in axis units."""
     position: float | None = None
     """Where a motion ended, in axis units."""
+    last_position: float | None = None
+    """Where the axis was read last when a motion ended otherwise; it may have moved on."""
     command_id: str | None = None
     """The command."""
     line: str | None = None
@@ -75,6 +80,8 @@ def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
     kind = HistoryKind.COMMAND
     if event.verb in CONTROL:
         kind = HistoryKind.CONTROL
+    elif event.verb == LATCH:
+        kind = HistoryKind.DAEMON
     elif event.verb == LINK_LOST:
         kind = HistoryKind.FAULT
     elif event.verb in BY_ITSELF:
@@ -85,11 +92,13 @@ def row_of(event: CommandEvent, line: str | None) -> HistoryRow:
         kind=kind,
         axis=event.axis,
         what=event.verb if event.on is None else f"{event.verb} {'on' if event.on else 'off'}",
-        how="" if kind in (HistoryKind.DRIVE, HistoryKind.FAULT) else event.status.value,
+        how="" if kind in (HistoryKind.DAEMON, HistoryKind.DRIVE, HistoryKind.FAULT) else event.status.value,
         who=f"{event.client or ''}{login}".strip(),
         why=event.reason or "",
         code=event.code,
+        target=event.target,
         position=event.position,
+        last_position=event.last_position,
         command_id=event.command_id,
         line=line,
     )

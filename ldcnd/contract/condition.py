@@ -294,6 +294,7 @@ _REFERENCE_LOST = Trouble(
 _NOT_HOMED = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "not homed: its position is not known", "not homed")
 _HOMING = Trouble(TroubleKind.NOT_HOMED, _NOTICE, "it is being homed: its position is not known yet", "homing")
 _LATCHED = Trouble(TroubleKind.STOP_LATCHED, _NOTICE, "a stop is latched: nothing moves before reset", "stop latched")
+_LATCHED_UNREAD = replace(_LATCHED, text="a stop is latched; the drive was not read yet")
 _MAY_MOVE = Trouble(
     TroubleKind.HIDDEN,
     _WRONG,
@@ -435,7 +436,8 @@ def assess(
     gone = _unreachable(state, faults, silence=silence, line_up=line_up)
     pending = (_NOT_CONFIRMED,) if state.stop_pending else ()
     if gone:
-        latched = (_LATCHED,) if state.stop_latched and not state.stop_pending and not silence else ()
+        known = _LATCHED if state.was_read else _LATCHED_UNREAD
+        latched = (known,) if state.stop_latched and not state.stop_pending and not silence else ()
         silent = _unanswered(last, (*pending, gone, *latched), gone.short)
         return replace(silent, holder=holder, control=control, moves=state.state.is_motion)
     place, mark = _place(state, faults, is_old=_is_old(state, age_s, health))
@@ -448,9 +450,11 @@ def assess(
 
 def _last_known(state: KnownState) -> str:
     """Return the state of an axis that does not answer, in words."""
+    if not state.was_read:
+        return "unknown"
     if state.link is LinkState.DOWN and state.state is AxisState.ERROR_STOP:  # that only says that it is lost
         return "unknown, may move"
-    return f"unknown, was {state.state.words}" if state.was_read else "unknown"
+    return f"unknown, was {state.state.words}"
 
 
 def _unanswered(state: str, troubles: tuple[Trouble, ...], mark: str) -> Condition:

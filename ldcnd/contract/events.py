@@ -9,6 +9,8 @@ from ldcnd.contract.frozen import LARGEST_INTEGER, Frozen
 
 ALARM_HISTORY = "alarm_history"
 """The verb of an event that no command has caused: a drive has entered an alarm in its own history."""
+LATCH = "latch"
+"""The verb of an event of the start: a stop is latched that an earlier daemon has kept."""
 REFERENCE = "reference"
 """The verb of an event of the start: the reference that an earlier daemon has kept holds, or was refused."""
 DRIVE_CHANGED = "drive_changed"
@@ -71,10 +73,10 @@ class CommandEvent(Frozen):
     """Id of the command."""
     verb: str
     """The verb; `alarm_history` for an alarm that the drive has entered in its own history, `unsettled` for a
-    motion that did not settle, `reference` for what became of a kept reference, `drive_changed` for a drive that was
-    reset or that another program has changed, `interlock` for a motion that an interlock has ended, `link_lost` and
-    `link_back` for what has stopped answering and answers again, and of an I/O module the situation for which its
-    outputs were set, or `output_differs`: these have no request."""
+    motion that did not settle, `reference` for what became of a kept reference, `latch` for a stop that an earlier
+    daemon has kept, `drive_changed` for a drive that was reset or that another program has changed, `interlock` for a
+    motion that an interlock has ended, `link_lost` and `link_back` for what has stopped answering and answers again,
+    and of an I/O module the situation for which its outputs were set, or `output_differs`: these have no request."""
     on: bool | None = None
     """Direction of `power`: true to close the loop, false to open it; null of every other verb."""
     client: str | None
@@ -88,8 +90,14 @@ class CommandEvent(Frozen):
     """Why, when it did not end as requested; of one that moves nothing and is done, the values that it has set."""
     code: str | None = None
     """The error code, when there is one."""
+    target: float | None = None
+    """Position at which the motion is to come to rest, in axis units; null of what names none before it has begun, and
+    of a motion that somebody is to end."""
     position: float | None = None
     """Position at the end of a motion, in axis units, measured after it; null where none was measured."""
+    last_position: float | None = None
+    """Position that was read last when a motion ended otherwise than by coming to rest, such as one that was aborted,
+    in axis units: the axis may have moved on. Null where `position` is known, and where it was never read."""
     following_error: float | None = None
     """Target minus that position, in axis units; without a target what the drive reports, null where it does not."""
     settled: bool | None = None

@@ -313,7 +313,8 @@ class StateSample(Sample):
     stop_latched: bool
     """A stop is latched; only reset clears it."""
     stop_pending: bool = False
-    """A stop was requested and the drive has not confirmed it: it is sent again until it does, and nothing moves."""
+    """A stop was requested and the drive has not confirmed it: it is sent again until it does, and nothing moves. One
+    that it had confirmed to an earlier daemon is sent again as well, and is pending only if it is not in 5 s."""
     command: CurrentCommand | None
     """The command under way."""
     last_error: str | None = None

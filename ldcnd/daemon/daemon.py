@@ -167,6 +167,7 @@ class Daemon:
                     group.create_task(bus.run(self._guarded), name=f"line {bus.bus.settings.name}")
                     for bus in self.rig.buses
                 ]
+                self._latches.tell(self._dispatcher.events.note)
                 for each in self.rig.axes.values():
                     each.show()  # what is latched and what no drive has confirmed is known before any drive is read
                 await self._declare(declared, requests)
@@ -268,11 +269,13 @@ class Daemon:
         for name, axis in self.rig.axes.items():
             if axis.tracker.status.stop_pending:
                 log.error("stop not confirmed at the end of the daemon, the axis may move", axis=name)
+            elif axis.tracker.status.stop_due:
+                log.warning("ended before the drive was read: what it does is not known", axis=name)
 
     async def _bring_to_rest(self, axis: AxisService) -> None:
         await apply_policy(axis, axis.config.loss.daemon, "the daemon ends")
         # as long as there is time for it, and until it is seen: after that nothing sends it again
-        while axis.tracker.status.stop_pending or axis.tracker.status.is_braking:
+        while axis.tracker.status.stop_due or axis.tracker.status.is_braking:
             await axis.send_pending_stop()
             await asyncio.sleep(STOP_AGAIN_S)
         # behind the stop, since it opens the loop of an axis that holds lent gains

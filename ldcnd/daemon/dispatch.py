@@ -12,9 +12,10 @@ from functools import partial
 
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.events import StopLatch
+from ldcnd.axis.events import LatchNamed, StopLatch
 from ldcnd.axis.kept import LATCHES
 from ldcnd.axis.permit import UNCONDITIONAL, Permit, Right
+from ldcnd.axis.status import LatchedBy
 from ldcnd.config.interlocks import InterlockConfig
 from ldcnd.contract.catalogue import BY_VERB, RENAMED
 from ldcnd.contract.codec import decode, encode, reply_encoding, to_json, understand
@@ -28,7 +29,9 @@ from ldcnd.contract.commands import (
     Ends,
     Jog,
     Move,
+    MoveAbsolute,
     Power,
+    QuickStop,
     Stop,
     StopReply,
 )
@@ -283,8 +286,10 @@ class Requests:
         for axis in (self._rig.axes[name] for name in names):
             if axis.stops.possible:
                 axis.tracker.take(StopLatch())  # at once, for requests of this same loop iteration
-        own: asyncio.Future[tuple[str, ...]] = asyncio.get_running_loop().create_future()
+        loop = asyncio.get_running_loop()
+        own: asyncio.Future[tuple[str, ...]] = loop.create_future()
         under_way.append(own)
+        loop.call_later(0, self._name_latches, names, query)  # behind the packets, which wait for nothing
         try:
             confirmed = await self._rig.stop(names)
         except BaseException:
@@ -302,13 +307,13 @@ class Requests:
     def _enter_stop(self, query: Query, names: tuple[str, ...], confirmed: tuple[str, ...]) -> None:
         """Record the requester of a stop in the events, as far as that can be read; nothing has waited for this."""
         try:
-            request = decode(Stop, query.payload, query.encoding)
-        except LdcndError:
-            request = Stop()
-        try:
-            self._dispatcher.stopped(names, confirmed, request, query.login)
+            self._dispatcher.stopped(names, confirmed, _request_of(query), query.login)
         except Exception:
             log.exception("stop not entered into the events", key=query.key)
+
+    def _name_latches(self, names: tuple[str, ...], query: Query) -> None:
+        """Keep the requester of a stop with its latches."""
+        self._dispatcher.name_latches(names, _request_of(query).client, query.login)
 
     def _are_latched(self, names: tuple[str, ...]) -> bool:
         axes = (self._rig.axes[name] for name in names)
@@ -320,6 +325,14 @@ class Requests:
         if (fields := self._refusals_logged.admit()) is not None:
             log.info("refused", key=query.key, code=error.code.value, reason=error.message, **fields)
         query.refuse(error)
+
+
+def _request_of(query: Query) -> Stop:
+    """Return what a stop says of itself; nothing where that cannot be read."""
+    try:
+        return decode(Stop, query.payload, query.encoding)
+    except LdcndError:
+        return Stop()
 
 
 def _command_class(address: CommandAddress) -> type[Command[Frozen]]:
@@ -460,7 +473,8 @@ class Dispatcher:
         if hold:
             right = right.also(lambda: hold.check(self._clock.now_s()))
         permit = axis.permit(command_id, command.verb, right)
-        self._enter(LedgerEntry(command_id, axis_name, command, client, login))
+        target = command.position if isinstance(command, MoveAbsolute) else None
+        self._enter(LedgerEntry(command_id, axis_name, command, client, login, target=target))
         over = self._under_way[command_id] = asyncio.Event()
         try:
             if isinstance(command, Move) and command.buffer_mode is not BufferMode.REFUSE:
@@ -497,14 +511,17 @@ class Dispatcher:
             if not entry.command.takes_energy_out:
                 raise
             log.exception("command not entered", axis=entry.axis, verb=entry.verb)  # it is carried out all the same
+        if isinstance(entry.command, Stop | QuickStop):  # once it is latched, which is at once
+            asyncio.get_running_loop().call_soon(self.name_latches, (entry.axis,), entry.client, entry.login)
 
     async def _start(self, axis: AxisService, command: AxisCommand[CommandReply], permit: Permit) -> CommandReply:
         reply = await axis.execute(command, permit)
         # a reading may have ended it while its reply was on the way: then its end is entered already
-        moving = axis.tracker.status.is_at(permit.command_id)
+        begun = axis.tracker.status.command
+        moving = begun is not None and begun.command_id == permit.command_id
         ends_later = command.ends is Ends.BY_READING and moving
         status = CommandStatus.EXECUTING if ends_later else CommandStatus.DONE
-        self._ledger.answered(permit.command_id, reply, status)
+        self._ledger.answered(permit.command_id, reply, status, begun.goal if begun and moving else None)
         return reply
 
     def stopped(self, names: tuple[str, ...], confirmed: tuple[str, ...], command: Stop, login: str | None) -> None:
@@ -527,6 +544,12 @@ class Dispatcher:
                 )
             command_id = self.events.next_command_id()
             self._ledger.open(LedgerEntry(command_id, name, command, command.client, login, status, reason))
+
+    def name_latches(self, names: tuple[str, ...], client: str | None, login: str | None) -> None:
+        """Keep with the latches of axes who has stopped them."""
+        by = LatchedBy(self._clock.now_ns(), client, login)
+        for name in names:
+            self._rig.axes[name].tracker.take(LatchNamed(by))
 
     async def _answer_again(self, entry: LedgerEntry) -> CommandReply:
         """Answer a repeated id as the first time, once there is an answer."""

@@ -101,7 +101,7 @@ class Heartbeat:
                 await loop.run_in_executor(thread, output.set, self._level)
                 self._changes += 1
             stops = (axis.tracker.status for line in self._lines for axis in line.axes if axis.tracker.status.stop)
-            is_soon_over = bool(self._why) and any(not status.stop_pending for status in stops)
+            is_soon_over = bool(self._why) and any(not status.stop_due for status in stops)
             await asyncio.sleep(HELD_S if is_soon_over else self._config.half_period_ms / 1000)
 
     def _trouble(self, now_s: float) -> str:

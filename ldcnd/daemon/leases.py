@@ -457,7 +457,7 @@ async def apply_policy(axis: AxisService, policy: LossPolicy, cause: str) -> str
     Returns what was done, in words; empty when nothing was to be done.
     """
     tracker = axis.tracker
-    if tracker.status.stop_pending:
+    if tracker.status.stop_due:
         return ""  # it is sent again until the drive confirms it, whatever the policy
     if policy is LossPolicy.RUN_TO_TARGET and (tracker.status.stop_latched or tracker.status.driven_open):
         policy = LossPolicy.HALT  # a raw duty has no target, and no drive ends it

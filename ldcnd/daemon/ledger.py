@@ -58,6 +58,7 @@ class LedgerEntry:
         reason: why it did not end as requested.
         answer: the reply to the caller, once sent.
         arrival: where its motion has ended.
+        target: where it is to come to rest, in axis units; None where that is not known, or it has none.
     """
 
     command_id: str
@@ -69,6 +70,7 @@ class LedgerEntry:
     reason: str | None = None
     answer: CommandReply | LdcndError | None = None
     arrival: Arrival | None = None
+    target: float | None = None
 
     @property
     def verb(self) -> Verb:
@@ -177,14 +179,16 @@ class Ledger:
         self._entries[command_id] = replace(entry, answer=reply)
         return reply
 
-    def answered(self, command_id: str, answer: CommandReply | LdcndError, status: CommandStatus) -> None:
-        """Record the reply to the caller."""
+    def answered(
+        self, command_id: str, answer: CommandReply | LdcndError, status: CommandStatus, target: float | None = None
+    ) -> None:
+        """Record the reply to the caller, and where the motion is to come to rest that has begun."""
         entry = self._entries.get(command_id)
         if entry is None:
             return
         error = answer if isinstance(answer, LdcndError) else None
         reason = error.message if error else _changed_by(entry.command) if status is CommandStatus.DONE else None
-        self._reached(entry, answer, status, reason, error)
+        self._reached(entry, answer, status, reason, error, target=target)
 
     def ended(self, end: CommandEnd, arrival: Arrival | None) -> None:
         """Take from an axis that a command is over; a final status is kept."""
@@ -193,7 +197,7 @@ class Ledger:
             reason = end.told(other.client or other.login if other else None)
             if status is CommandStatus.DONE and isinstance(entry.answer, CommandReply) and entry.answer.ends:
                 reason = f"came to its own end: it {entry.answer.ends}"
-            self._reached(entry, entry.answer, status, reason, None, arrival)
+            self._reached(entry, entry.answer, status, reason, None, arrival, end.command.goal)
 
     def _reached(
         self,
@@ -203,6 +207,7 @@ class Ledger:
         reason: str | None,
         error: LdcndError | None,
         arrival: Arrival | None = None,
+        target: float | None = None,
     ) -> None:
         news = entry.status not in FINAL and entry.status is not status
         if not news:
@@ -218,6 +223,7 @@ class Ledger:
             reason=reason,
             answer=answer,
             arrival=arrival,
+            target=entry.target if target is None else target,
         )
         if news:
             self._changed(entry, error)
@@ -379,7 +385,9 @@ class EventLog:
             status=entry.status,
             reason=entry.reason,
             code=error.code.value if error else None,
+            target=entry.target,
             position=arrival.position if arrival else None,
+            last_position=arrival.last_position if arrival else None,
             following_error=arrival.following_error if arrival else None,
             settled=arrival.settled if arrival else None,
         )

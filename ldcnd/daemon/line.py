@@ -238,7 +238,7 @@ class BusService:
         """Send what no drive has confirmed, to all axes that wait for it at once."""
         # before the look: a stop that comes while these are sent is not lost
         self._stop_wanted.clear()
-        waiting = [axis for axis in self.axes if axis.tracker.status.stop_pending or axis.tracker.status.off_again]
+        waiting = [axis for axis in self.axes if axis.tracker.status.stop_due or axis.tracker.status.off_again]
         if not waiting:
             return
         await each({f"pending stop {axis.config.name}": axis.send_pending_stop() for axis in waiting})
@@ -278,7 +278,7 @@ class BusService:
             await self._send_pending_stops()
             # nothing is to be repeated: only who needs a stop ends the wait
             pause_s = None
-            if any(axis.tracker.status.stop_pending for axis in self.axes):
+            if any(axis.tracker.status.stop_due for axis in self.axes):
                 # polls of a mute drive come ever more seldom: one that hears again gets its stop before them
                 took_s = loop.time() - began_s
                 # where each lost answer takes long, the search, which brings it back, still gets the most of the line

@@ -235,7 +235,25 @@ async def test_a_motion_is_ended_when_a_requirement_is_lost(reaction):
         (said,) = await events(rig, "interlock")
         assert said == f"axis rotor: {both}; reaction: {reaction}"
         (*_, ended) = await events(rig, "move_velocity")
-        assert ended.endswith(f": axis rotor: {both}"), ended
+        assert ended.endswith(f", because of {both}"), ended
+        verb = {"halt": "halt", "quick_stop": "quick_stop", "power_off": "power"}[reaction]
+        assert state.last_error == f"move_velocity: aborted by {verb}, because of {both}"
+
+
+async def test_a_stop_under_way_that_an_interlock_takes_over_has_not_failed():
+    async with running_machine(machine(DOOR_SHUT)) as rig:
+        await spinning(rig)
+        await rig.client.stop("rotor")
+        rig.door(closed=False)
+        await rig.until("rotor", lambda state: bool(state.interlock))
+        braking = await rig.client.state("rotor")
+        state = await rig.until("rotor", lambda state: state.moving == "no")
+        told = await events(rig, "interlock")
+
+    assert braking.state is AxisState.STOPPING
+    assert len(told) == 1
+    assert state.interlock == "door_shut: input door_closed is false; input door_open is true"
+    assert state.last_error == "move_velocity: aborted by stop"
 
 
 @pytest.mark.long

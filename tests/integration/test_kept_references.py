@@ -29,6 +29,7 @@ from ldcnd.durable import DISK_TIME_S
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
+from tests.support.small_disk import fill, small_disk
 
 COUNTS = 1000
 """Of x, in a millimetre."""
@@ -327,7 +328,7 @@ async def test_an_axis_that_was_pushed_has_no_reference(tmp_path):
         state, said = await up(rig, "x"), await refusals(rig)
 
     assert not state.referenced
-    assert "it was moved while no daemon watched it" in said[0]
+    assert "it was moved while no daemon watched it, or could keep that" in said[0]
 
 
 @pytest.mark.parametrize(
@@ -504,6 +505,62 @@ async def test_a_reference_that_cannot_be_removed_from_the_disk_is_made_void_in_
     assert there.value == pytest.approx(-4.0, abs=0.01)
     assert not state.referenced
     assert re.search("its mark is 36... and was 3...:", said[0])
+
+
+@pytest.mark.parametrize("what", ["moved", "set", "switched off"])
+async def test_a_reference_that_a_full_disk_has_cost_is_refused_for_that(tmp_path, what):
+    with small_disk(tmp_path / "state", 256 * 1024) as disk:
+        chain, config = chain_of(), keeping(disk)
+        async with rig_on(chain, config) as rig:
+            await set_out(rig)
+            await asyncio.sleep(2.0)
+            fill(disk)
+            if what == "moved":
+                await ended(rig, "x", MoveAbsolute(position=12.0))
+            elif what == "set":
+                await rig.client.command("x", SetPosition(position=1.0))
+                fill(disk)  # what it has removed has made room
+            else:
+                await rig.client.command("x", Power(on=False))
+            await asyncio.sleep(15.0)  # virtual: until it has tried to keep it
+            await rig.kill()
+        async with rig_on(chain, config) as rig:
+            state, said = await up(rig, "x"), await refusals(rig)
+            # a reference that was refused is not looked at again
+            await rig.kill()
+        async with rig_on(chain, config) as rig:
+            await up(rig, "x")
+            again = await refusals(rig)
+
+    assert not state.referenced
+    assert [each for each in said if "the disk did not take" not in each] == []
+    assert len(said) == 1
+    assert "another program" not in said[0]
+    assert "no daemon watched" not in said[0]
+    assert again == []
+
+
+@pytest.mark.parametrize("kill", [False, True])
+async def test_a_disk_that_was_full_for_a_while_costs_no_reference(tmp_path, kill):
+    with small_disk(tmp_path / "state", 256 * 1024) as disk:
+        chain, config = chain_of(), keeping(disk)
+        async with rig_on(chain, config) as rig:
+            await set_out(rig)
+            await asyncio.sleep(2.0)
+            fill(disk)
+            await ended(rig, "x", MoveAbsolute(position=12.0))
+            await asyncio.sleep(2.0)
+            (disk / "ballast").unlink()
+            await asyncio.sleep(12.0)  # virtual: it is tried again every 10 s
+            if kill:
+                await rig.kill()
+        async with rig_on(chain, config) as rig:
+            state, said = await up(rig, "x"), await refusals(rig)
+            there = await position_of(rig)
+
+    assert state.referenced
+    assert said == [""]
+    assert there.value == pytest.approx(12.0, abs=0.05)
 
 
 @pytest.mark.promise("kept-reference")

@@ -1,5 +1,6 @@
 """What happened on a rig is told in one order: by whom, with what result, faults and what drives did by themselves."""
 
+import asyncio
 import csv
 import json
 
@@ -89,3 +90,40 @@ def test_who_switched_off_and_when_the_daemon_was_started_can_be_told(rig):
     ]
     assert (found[0]["kind"], found[0]["what"]) == ("daemon", "started")
     assert f"run {rig.wait(rig.rig.client.daemon()).instance}" in found[0]["why"]
+
+
+def go_on(rig):
+    """Take the stop of the fixture back."""
+    rig.wait(rig.rig.until("x", lambda state: state.moving == "no"))
+    rig.run("reset")
+    rig.run("power on x")
+
+
+def test_an_aborted_move_is_told_with_its_target_and_where_the_axis_was_read_last(rig):
+    go_on(rig)
+    rig.run("move x 60 --velocity 5")
+    while rig.wait(rig.rig.client.position("x")).value < 6:
+        rig.wait(asyncio.sleep(0.1))  # virtual
+    rig.run("halt x --wait")
+
+    rig.wait(rig.rig.until("x", lambda state: state.moving == "no"))
+    move, halt = rows(rig, "--axis x --kind command")[-2:]
+    assert (move["what"], move["how"], halt["what"], halt["how"]) == ("move_absolute", "aborted", "halt", "done")
+    assert (move["target"], move["position"], halt["target"]) == (60.0, None, None)
+    assert 4.9 < move["last_position"] <= halt["position"] < 60.0
+    line = rig.run("log --axis x --kind command").printed.splitlines()[-2]
+    assert f"to 60 last read at {move['last_position']:.6g}" in line
+
+
+def test_a_move_to_a_distance_is_told_with_the_place_and_a_motion_at_a_velocity_without_one(rig):
+    go_on(rig)
+    rig.run("move x 2 --relative --wait")
+    rig.run("move x 1 --at-velocity")
+    rig.run("halt x --wait")
+
+    rig.wait(rig.rig.until("x", lambda state: state.moving == "no"))
+    told = {row["what"]: row for row in rows(rig, "--axis x --kind command")}
+    assert told["move_relative"]["target"] == pytest.approx(7.0, abs=0.02)
+    assert told["move_relative"]["position"] == pytest.approx(7.0, abs=0.02)
+    assert told["move_velocity"]["target"] is None
+    assert told["move_velocity"]["last_position"] is not None

@@ -15,7 +15,7 @@ from ldcnd.axis import events, faults, guards
 from ldcnd.axis.course import Way
 from ldcnd.axis.rest import Settling
 from ldcnd.axis.scale import AxisScale
-from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, Completion, new_faults
+from ldcnd.axis.status import STRENGTH, ActiveCommand, AxisStatus, Completion, LatchedBy, new_faults
 from ldcnd.axis.step import step
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import LdcndError
@@ -59,6 +59,7 @@ class History:
                 self._speed, self._failing, self._over, self._power, self._loop, self._override, self._latch,
                 self._sent, self._unconfirmed, self._confirmed, self._reset, self._unusable, self._contradicted,
                 self._found, self._refused, self._placed, self._unplaced, self._look, self._seen_loop, self._recalled,
+                self._named, self._due, self._overdue,
             ]  # fmt: skip
         self._kinds = kinds
 
@@ -177,7 +178,18 @@ class History:
     def _recalled(self) -> events.AxisEvent:
         dice = self.dice
         again = dice.choice((None, *StopMode))
-        return events.LatchRecalled(dice.random() < 0.5, again, dice.random() < 0.5, FIRST, self._now_ns)
+        return events.LatchRecalled(
+            dice.random() < 0.5, again, dice.random() < 0.5, FIRST, self._now_ns, confirmed=dice.random() < 0.5
+        )
+
+    def _named(self) -> events.AxisEvent:
+        return events.LatchNamed(LatchedBy(self._now_ns, self.dice.choice((None, "panel"))))
+
+    def _due(self) -> events.AxisEvent:
+        return events.StopDue(self.dice.choice(list(StopMode)), "sent first")
+
+    def _overdue(self) -> events.AxisEvent:
+        return events.StopOverdue(self._now_ns)
 
 
 @pytest.fixture(params=range(HISTORIES), ids=lambda seed: f"seed {seed}")
@@ -206,7 +218,8 @@ def test_a_latch_outranks_everything_and_only_a_reset_ends_it(history):
     for before, event, after in lives(history):
         if before.stop_latched and not isinstance(event, events.LatchRecalled):
             assert after.stop_latched or isinstance(event, events.ResetDone)
-        if after.stop_latched or after.stop_pending:
+        assert after.stop_latched or after.latched_by is None or isinstance(event, events.LatchRecalled)
+        if after.stop_latched or after.stop_due:
             assert all(refused(after, verb) for verb in (Verb.MOVE_ABSOLUTE, Verb.JOG, Verb.POWER))
 
 
@@ -217,6 +230,7 @@ def test_a_stop_stays_to_be_sent_until_its_drive_confirms_one_as_strong(history)
             assert after.stop
             assert STRENGTH[after.stop.mode] >= STRENGTH[before.stop.mode]
             assert after.stop_pending or not before.stop_pending
+            assert after.stop_due or not before.stop_due
         if before.stop and isinstance(event, events.StopConfirmed):
             assert (after.stop is None) is (STRENGTH[event.mode] >= STRENGTH[before.stop.mode])
         codes = [entry.code for entry in after.active_faults]
@@ -340,6 +354,19 @@ def test_what_is_recalled_is_as_it_was_kept():
     assert (status.state, status.first_fault.past) == (AxisState.ERROR_STOP, FIRST)
     assert isinstance(status.active_faults[0], FaultEntry)
     assert status.active_faults[0].since == 7
+
+
+def test_a_recalled_stop_that_was_confirmed_is_due_and_no_fault_before_it_is_overdue():
+    kept = events.LatchRecalled(
+        stopped=True, again=StopMode.SMOOTH, in_error=False, first=None, now_ns=7, confirmed=True
+    )
+    recalled = step(AxisStatus("x", SCALE), kept)
+    overdue = step(recalled, events.StopOverdue(now_ns=9))
+
+    assert (recalled.stop_latched, recalled.stop_due, recalled.stop_pending) == (True, True, False)
+    assert recalled.active_faults == ()
+    assert [(fault.code, fault.since) for fault in overdue.active_faults] == [("stop_unconfirmed", 9)]
+    assert step(overdue, events.StopConfirmed(StopMode.SMOOTH)).stop is None
 
 
 def test_where_a_closed_loop_comes_to_rest_without_a_command_is_its_target():

@@ -257,7 +257,8 @@ async def test_a_line_that_is_taken_over_again_changes_nothing_that_was_seen():
 async def test_a_motor_that_must_be_off_first_is_switched_off():
     async with axis_bench() as bench:
         bench.axis.stops.switch_off()
-        assert bench.tracker.status.stop_pending
+        status = bench.tracker.status
+        assert (status.stop_due, status.stop_pending) == (True, False)  # nobody has asked for it in vain
 
         await bench.axis.send_pending_stop()
 

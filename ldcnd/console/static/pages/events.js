@@ -57,7 +57,7 @@ function Row({ rig, event }) {
     <td>${!event.axis ? rig.name : !rig.axes.get(event.axis)?.info ? event.axis : html`<a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a>`}</td>
     <td>${whatOf(event)}</td><td><${Mark}
       level=${LEVELS[event.status] ?? ""}>${event.status}<//></td><td>${event.client ?? "–"}</td>
-    <td>${event.reason ?? arrival(event)}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;
+    <td>${[event.reason, way(event)].filter(Boolean).join("; ")}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;
 }
 
 /** What it was, in words: of `power`, which way. */
@@ -88,10 +88,16 @@ function startOf({ daemon }) {
   return [{ t: daemon.started, axis: "", verb: "daemon", status: "started", reason: `ldcnd ${daemon.version}, run ${daemon.instance}` }];
 }
 
-function arrival({ position, following_error: off, settled }) {
-  if (position == null) return "";
+/** Where a motion was to go, and where the axis came to rest or was read last. */
+function way({ target, position, last_position: last, following_error: off, settled }) {
   const rest = settled == null || off == null ? "" : `, ${Number(off.toPrecision(3))} off its target`;
-  return `at ${Number(position.toPrecision(7))}${rest}${settled === false ? ", not settled" : ""}`;
+  return [
+    target != null && `to ${Number(target.toPrecision(7))}`,
+    position != null && `at ${Number(position.toPrecision(7))}${rest}${settled === false ? ", not settled" : ""}`,
+    last != null && `last read at ${Number(last.toPrecision(7))}`,
+  ]
+    .filter(Boolean)
+    .join(", ");
 }
 
 function matches({ rig, event }, { axis, status, text }) {
@@ -116,9 +122,12 @@ function csvOf(found) {
       event.reason,
       event.code,
       event.command_id,
+      event.target,
+      event.position,
+      event.last_position,
     ]
       .map(cell)
       .join(),
   );
-  return `${["when,rig,axis,command,status,client,reason,code,command_id", ...rows].join("\n")}\n`;
+  return `${["when,rig,axis,command,status,client,reason,code,command_id,target,position,last_position", ...rows].join("\n")}\n`;
 }

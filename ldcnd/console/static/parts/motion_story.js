@@ -15,10 +15,15 @@ export function ordinary(reason) {
 /** How a motion ended; `event` is its last event. */
 export function EndOfMotion({ axis, event }) {
   const { status, verb, reason, following_error: off, settled } = event;
+  const sameUnit = event.t >= (axis.unitChange?.since ?? 0);
   const position = restOf(axis, event);
   const decimals = decimalsOf(axis.info);
-  const place = position == null ? "" : html` at ${number(position, decimals)} <span class="unit">${axis.info.unit}</span>`;
-  const target = settled == null || off == null || position == null ? "" : ` to ${number(position + off, decimals)}`;
+  const last = sameUnit ? event.last_position : null;
+  const shown = position ?? last;
+  const place = shown == null ? ""
+    : html`${position == null ? ", last read" : ""} at ${number(shown, decimals)} <span class="unit">${axis.info.unit}</span>`;
+  const goal = event.target ?? (settled == null || off == null || position == null ? null : position + off);
+  const target = goal == null || !sameUnit ? "" : ` to ${number(goal, decimals)}`;
   const at = html` <span class="quiet">${clock(event.t).slice(0, -4)}</span>`;
   if (status === "done") {
     const tookS = axis.settlingS(event);

@@ -85,7 +85,9 @@ function StopsOf({ rig }) {
   const axes = [...rig.axes.values()].filter((axis) => axis.info && axis.state?.stop_latched);
   const pending = axes.filter(({ state }) => state.stop_pending);
   const latched = axes.filter(({ state }) => !state.stop_pending);
-  const [moving, stopped] = [true, false].map((is) => latched.filter(({ state }) => (state.moving === "yes") === is));
+  const unread = latched.filter(({ state }) => state.was_read === false);
+  const read = latched.filter(({ state }) => state.was_read !== false);
+  const [moving, stopped] = [true, false].map((is) => read.filter(({ state }) => (state.moving === "yes") === is));
   if (!axes.length) return null;
   // what no stop reaches goes on beside those that are latched
   const all = [...rig.axes.values()].filter((axis) => axis.info);
@@ -97,6 +99,7 @@ function StopsOf({ rig }) {
   return html`<p class="notice mark stops" data-level=${pending.length || going.length ? "bad" : "warn"}>
     ${pending.length > 0 && html`<span>${of}stop NOT confirmed by ${named(pending)}: use the machine’s emergency stop.</span> `}
     ${moving.length > 0 && html`<span>${of}stop latched, moving still: ${named(moving)}.</span> `}
+    ${unread.length > 0 && html`<span>${of}stop latched, drive not read yet: ${named(unread)}.</span> `}
     ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}.${axes.length < all.length ? "" : " Nothing moves before Reset."}</span> `}
     ${free.length > 0 && html`<span>No stop reaches ${named(free)}${going.length ? `; ${named(going)} may move: emergency stop` : ""}.</span> `}
     ${ready.length > 0 && html`<${Action} act=${reset}>Reset stopped axes<//>`}
