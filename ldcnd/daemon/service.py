@@ -19,8 +19,18 @@ from typing import NamedTuple
 
 from ldcnd import systemd
 from ldcnd.axis.status import AxisStatus
+from ldcnd.certificate import watch_certificate
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.condition import OWN, Condition, TroubleKind, assess, assess_module, disk_troubles, line_troubles
+from ldcnd.contract.condition import (
+    OWN,
+    Condition,
+    TroubleKind,
+    assess,
+    assess_module,
+    certificate_troubles,
+    disk_troubles,
+    line_troubles,
+)
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.rig_commands import Reload, ReloadReply
 from ldcnd.contract.samples import FaultEntry, LinkState
@@ -193,7 +203,11 @@ class Service:
     async def run(self) -> None:
         """Serve until `end` is called or the caller is cancelled."""
         async with asyncio.TaskGroup() as group:
-            beside = [group.create_task(self._reload_when_asked(), name="reload")]
+            certificate = watch_certificate(self._daemon.rig.certificate, _tell_of_certificate)
+            beside = [
+                group.create_task(self._reload_when_asked(), name="reload"),
+                group.create_task(certificate, name="end of the certificate"),
+            ]
             if self._notifier.is_heard:
                 beside.append(group.create_task(self._report(), name="service manager"))
             try:
@@ -235,7 +249,7 @@ class Service:
         if self._ending:
             return "stopping: axes come to rest"
         stuck = [f"bus {name} has missed its deadline" for name in self._stuck]
-        return "; ".join(filter(None, [describe(self._daemon.rig), *stuck, self._remark]))
+        return "; ".join(filter(None, [describe(self._daemon.rig, time.time_ns()), *stuck, self._remark]))
 
     # -- reloading ---------------------------------------------------------------------------------------------------
 
@@ -269,10 +283,18 @@ def _remark(refused: Sequence[str]) -> str:
     return f"restart needed for {', '.join(refused)}" if refused else ""
 
 
-def describe(rig: OwnedRig) -> str:
+def _tell_of_certificate(trouble: str | None) -> None:
+    (log.warning if trouble else log.info)("certificate", problem=trouble)
+
+
+def describe(rig: OwnedRig, t: int) -> str:
     """Return in one line what of a rig works and what does not; what is true of several is said once.
 
     Polls that a drive missed are left out: a status is for what lasts.
+
+    Args:
+        rig: what to describe.
+        t: the present, UTC in ns since 1970.
     """
     wrong: dict[str, list[str]] = {}
     for bus in rig.buses:
@@ -289,7 +311,7 @@ def describe(rig: OwnedRig) -> str:
     buses_up = sum(bus.report is not None for bus in rig.buses)
     axes_up = sum(axis.tracker.status.link is not LinkState.DOWN for axis in rig.axes.values())
     parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {axes_up}/{len(rig.axes)} axes up"]
-    parts += disk_troubles(rig.not_kept_in_words)
+    parts += (*disk_troubles(rig.not_kept_in_words), *certificate_troubles(rig.certificate, t))
     return "; ".join(parts + [f"{', '.join(names)}: {text}" for text, names in wrong.items()])
 
 
