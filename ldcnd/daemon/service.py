@@ -248,8 +248,10 @@ class Service:
     def _status(self) -> str:
         if self._ending:
             return "stopping: axes come to rest"
+        rig = self._daemon.rig
+        ends = certificate_troubles(rig.certificate, time.time_ns())
         stuck = [f"bus {name} has missed its deadline" for name in self._stuck]
-        return "; ".join(filter(None, [describe(self._daemon.rig, time.time_ns()), *stuck, self._remark]))
+        return "; ".join(filter(None, [describe(rig), *ends, *stuck, self._remark]))
 
     # -- reloading ---------------------------------------------------------------------------------------------------
 
@@ -287,14 +289,10 @@ def _tell_of_certificate(trouble: str | None) -> None:
     (log.warning if trouble else log.info)("certificate", problem=trouble)
 
 
-def describe(rig: OwnedRig, t: int) -> str:
+def describe(rig: OwnedRig) -> str:
     """Return in one line what of a rig works and what does not; what is true of several is said once.
 
     Polls that a drive missed are left out: a status is for what lasts.
-
-    Args:
-        rig: what to describe.
-        t: the present, UTC in ns since 1970.
     """
     wrong: dict[str, list[str]] = {}
     for bus in rig.buses:
@@ -311,7 +309,7 @@ def describe(rig: OwnedRig, t: int) -> str:
     buses_up = sum(bus.report is not None for bus in rig.buses)
     axes_up = sum(axis.tracker.status.link is not LinkState.DOWN for axis in rig.axes.values())
     parts = [f"rig {rig.name}: {buses_up}/{len(rig.buses)} buses, {axes_up}/{len(rig.axes)} axes up"]
-    parts += (*disk_troubles(rig.not_kept_in_words), *certificate_troubles(rig.certificate, t))
+    parts += disk_troubles(rig.not_kept_in_words)
     return "; ".join(parts + [f"{', '.join(names)}: {text}" for text, names in wrong.items()])
 
 
