@@ -26,7 +26,14 @@ from ldcnd.lab.metrics import SHADOW_FRESH_S, HealthCollector
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
 DAEMON = DaemonHealth(
-    t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=8, waiting_queries=3, dropped=9, version="0.0.9",
+    t=1,
+    seq=0,
+    loop_lag_s=0.002,
+    published=700,
+    missed_reports=8,
+    waiting_queries=3,
+    dropped=9,
+    version="0.0.9",
     certificate=CertificateHealth(name="bench", ends=1_800_000_000 * 10**9),
 )
 BUS = BusHealth(
