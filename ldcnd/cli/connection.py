@@ -140,7 +140,7 @@ class Serving:
             yield
         except BaseException as error:
             for leaf in leaves_of(error):
-                if isinstance(leaf, LdcndError | OSError):
+                if isinstance(leaf, LdcndError | OSError | click.ClickException):
                     self._beside.lacks(getattr(leaf, "message", str(leaf)))
             raise
 

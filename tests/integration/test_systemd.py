@@ -305,7 +305,10 @@ def test_a_recorder_says_that_its_disk_is_full_leaves_nothing_and_goes_on_when_i
     try:
         service.must("dd", "if=/dev/zero", f"of={RECORDINGS}/full", "bs=1k", "count=64")
         service.run("systemctl", "start", unit)
-        service.until_shown(unit, "StatusText", lambda text: "No space left on device" in text)
+        service.until_shown(
+            unit, "StatusText", lambda text: f"No space left on device; make room in {RECORDINGS}: " in text
+        )
+        assert f"make room in {RECORDINGS}: " in log_of(service, unit)
         service.until_shown(unit, "NRestarts", lambda restarts: int(restarts) >= 2)
         assert service.must("ls", RECORDINGS).split() == ["full"]
         service.must("mount", "-o", "remount,size=64m", RECORDINGS)
