@@ -13,6 +13,7 @@ import pytest
 
 from tests.support.booted_machine import Machine, booted_machine, eventually, why_no_machine
 from tests.support.package import ROOT, build, package, snapshot, why_no_package
+from tests.support.pages import broken_links
 
 DEPLOY = ROOT / "deploy"
 EXPOSURE_LIMIT = "15"
@@ -108,6 +109,16 @@ def test_package_holds_what_the_service_needs_and_touches_nothing_else(deb: Path
         "./usr/share/man/man1/ldcnd-axis.1.gz",
     } <= set(files)
     assert [path for path in files if path.startswith("./etc/")] == ["./etc/ldcnd/ldcnd.env"]  # no configuration
+
+
+@packaged
+def test_every_link_of_a_page_that_a_package_ships_leads_somewhere(deb: Path, tmp_path: Path):
+    for each in deb.parent.glob("*.deb"):
+        told("dpkg-deb", "--extract", str(each), str(tmp_path))
+    pages = sorted((tmp_path / "usr/share/doc").rglob("*.md"))
+
+    assert len(pages) > 60
+    assert broken_links(pages) == []
 
 
 @packaged
