@@ -52,7 +52,7 @@ unit() { # FILE PROGRAM DESCRIPTION ROOT: a program beside the daemon
     mkdir -p "$place/${name}ldcnd.service.d"
     sed -e "s/@NAME@/$2/g; s/@OPTIONS@/${2^^}/g; s/@WHAT@/$3/" "$1" | sandboxed > "$place/$name.service"
     # the rig of ldcnd.service is /etc/ldcnd/ldcnd.toml, so what is beside it is the instance `ldcnd`
-    printf '[Unit]\nAfter=ldcnd.service\nStopPropagatedFrom=ldcnd.service\n\n[Install]\nWantedBy=ldcnd.service\n' \
+    printf '[Unit]\nAfter=ldcnd.service\n\n[Install]\nWantedBy=ldcnd.service\n' \
         > "$place/${name}ldcnd.service.d/ldcnd.conf"
 }
 

@@ -414,16 +414,43 @@ def test_console_recording_and_metrics_run_beside_the_daemon(service: Machine):
         service.until_shown(UNIT, "StatusText", lambda text: "4/4 axes up" in text)
         assert [service.show(unit, "MainPID") for unit in beside] == pids
 
-        service.must("systemctl", "stop", UNIT)
+        service.must("systemctl", "stop", *beside)
         for unit in beside:
             service.until_shown(unit, "ActiveState", lambda state: state == "inactive")
         assert all(name.endswith(".mcap") for name in service.must("ls", RECORDINGS).split())  # none cut off
-        service.must("systemctl", "start", UNIT)
+        service.must("systemctl", "restart", UNIT)
         eventually(lambda: fetched(service, METRICS), lambda text: 'axis="x"' in text, 20.0)
         for unit in beside:
             service.until_shown(unit, "ActiveState", lambda state: state == "active")
     finally:
         service.run("systemctl", "disable", "--now", *beside)
+
+
+@pytest.mark.parametrize("wrong", [True, False])
+def test_what_is_beside_a_daemon_outlives_it_and_serves_when_it_is_back(service: Machine, wrong: bool):  # noqa: FBT001
+    beside = [f"ldcnd-{name}@ldcnd.service" for name in ("console", "record", "metrics")]
+    try:
+        service.must("systemctl", "start", *beside)
+        pids = [service.show(unit, "MainPID") for unit in beside]
+        if wrong:
+            service.write(CONFIG, "rig = 1\n")
+            service.run("systemctl", "restart", UNIT)
+            assert service.show(UNIT, "ExecMainStatus") == "78"
+        else:
+            service.must("systemctl", "stop", UNIT)
+
+        for unit in beside:
+            service.until_shown(unit, "StatusText", lambda text: "no daemon" in text or "cannot connect" in text)
+        eventually(lambda: fetched(service, METRICS), lambda text: 'ldcnd_daemon_up{rig="sim"} 0.0' in text, 20.0)
+        service.write(CONFIG, SIMULATED)
+        service.must("systemctl", "restart", UNIT)
+        for unit, serves in zip(beside, ("console on", "recording rig sim", "metrics on"), strict=True):
+            service.until_shown(unit, "StatusText", lambda text, serves=serves: text.startswith(serves))  # type: ignore[misc]
+        eventually(lambda: fetched(service, METRICS), lambda text: 'axis="x"' in text, 20.0)
+        assert [service.show(unit, "MainPID") for unit in beside] == pids
+    finally:
+        service.write(CONFIG, SIMULATED)
+        service.run("systemctl", "stop", *beside)
 
 
 def test_units_are_understood_whole(machine: Machine):
