@@ -33,7 +33,7 @@ from ldcnd.contract.condition import (
 )
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.rig_commands import Reload, ReloadReply
-from ldcnd.contract.samples import FaultEntry, LinkState
+from ldcnd.contract.samples import FaultEntry, LinkState, Moving
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.reload import Reloader
 from ldcnd.daemon.rig import OwnedRig
@@ -215,6 +215,7 @@ class Service:
             finally:
                 for task in beside:
                     task.cancel()
+                self._notifier.tell(systemd.status(_end_in_words(self._daemon.moving_at_end)))
 
     async def _report(self) -> None:
         await self._daemon.wait_serving()
@@ -283,6 +284,22 @@ class Service:
 
 def _remark(refused: Sequence[str]) -> str:
     return f"restart needed for {', '.join(refused)}" if refused else ""
+
+
+def _end_in_words(moving: Mapping[str, Moving] | None) -> str:
+    """Return in one line how a daemon has left its axes.
+
+    Args:
+        moving: of each, as its drive has said last; None where none was asked any more.
+    """
+    if moving is None:
+        return "ended; it is not known whether axes move"
+    named = {
+        state: ", ".join(name for name, now in moving.items() if now is state) for state in (Moving.YES, Moving.UNKNOWN)
+    }
+    parts = [f"still moving: {named[Moving.YES]}"] if named[Moving.YES] else []
+    parts += [f"not known whether it moves: {named[Moving.UNKNOWN]}"] if named[Moving.UNKNOWN] else []
+    return "; ".join(("stopped", *(parts or ["all axes at rest"])))
 
 
 def _tell_of_certificate(trouble: str | None) -> None:
