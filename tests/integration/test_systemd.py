@@ -438,6 +438,7 @@ def test_what_is_beside_a_daemon_outlives_it_and_serves_when_it_is_back(service:
             assert service.show(UNIT, "ExecMainStatus") == "78"
         else:
             service.must("systemctl", "stop", UNIT)
+            assert service.show(UNIT, "StatusText") == "stopped; all axes at rest"
 
         for unit in beside:
             service.until_shown(unit, "StatusText", lambda text: "no daemon" in text or "cannot connect" in text)
