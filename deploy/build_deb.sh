@@ -52,7 +52,7 @@ unit() { # FILE PROGRAM DESCRIPTION ROOT: a program beside the daemon
     mkdir -p "$place/${name}ldcnd.service.d"
     sed -e "s/@NAME@/$2/g; s/@OPTIONS@/${2^^}/g; s/@WHAT@/$3/" "$1" | sandboxed > "$place/$name.service"
     # the rig of ldcnd.service is /etc/ldcnd/ldcnd.toml, so what is beside it is the instance `ldcnd`
-    printf '[Unit]\nAfter=ldcnd.service\nStopPropagatedFrom=ldcnd.service\n\n[Install]\nWantedBy=ldcnd.service\n' \
+    printf '[Unit]\nAfter=ldcnd.service\n\n[Install]\nWantedBy=ldcnd.service\n' \
         > "$place/${name}ldcnd.service.d/ldcnd.conf"
 }
 
@@ -117,10 +117,14 @@ main_package() {
     install -Dm644 -t "$doc/examples" "$here/drop-ins/"{realtime,nice,lan,single-line}.conf "$source"/config/*.toml
     install -Dm644 -t "$doc/examples/grafana" "$here"/grafana/*
     (cd "$source/config" && find zenoh -type f -exec install -Dm644 {} "$doc/examples/{}" \;)
+    (cd "$source" && find examples -type f ! -name '*.pyc' -exec install -Dm644 {} "$doc/{}" \;)
+    ln -s examples "$doc/config" # as pages find it
     install -Dm644 -t "$doc" "$here/INSTALL.md"
-    # without what only a built site needs: its indices, and the copies that it makes
-    (cd "$source" && find docs -type f ! -name conf.py ! -name index.md ! -name fault-index.md ! -name install.md \
-        ! -path 'docs/faults/*' -exec install -Dm644 {} "$doc/{}" \;)
+    # without what only a built site needs: its index; the copies that it makes are made here, too, for the pages' links
+    (cd "$source" && find docs -type f ! -name conf.py ! -name index.md ! -name install.md ! -path 'docs/faults/*' \
+        -exec install -Dm644 {} "$doc/{}" \;)
+    install -Dm644 -t "$doc/docs/faults" "$source"/ldcnd/contract/fault_pages/*.md
+    ln -s ../../INSTALL.md "$doc/docs/how-to/install.md"
     gzip -9nc "$source/CHANGELOG.md" > "$doc/CHANGELOG.md.gz"
     ln -s /opt/ldcnd/bin/ldcnd "$root/usr/bin/ldcnd"
     (cd "$source" && "$opt/bin/python" -m tools man "$root/usr/share/man/man1")

@@ -76,15 +76,35 @@ class Beside:
     def __init__(self, notifier: Notifier | None = None) -> None:
         self._notifier = notifier or Notifier()
         self._serves = ""
+        self._lacks: str | None = None
+        self._remarks: dict[str, str] = {}
 
     def serves(self, what: str) -> None:
         """Say that the program serves now, and what: whoever has started it may use it."""
         self._serves = what
-        self._notifier.tell(READY, status(what), wait_s=BUSY_S)
+        self._tell(READY)
 
     def lacks(self, problem: str | None) -> None:
         """Say what is missing, or None once nothing is."""
-        self._notifier.tell(status(problem or self._serves), wait_s=BUSY_S)
+        self._lacks = problem
+        self._tell()
+
+    def remarks(self, remark: str | None, about: str = "login") -> None:
+        """Say what is to be seen to though nothing is missing, or None once that is done.
+
+        Args:
+            remark: in words.
+            about: what of the program it is about, of which there is one remark.
+        """
+        if remark:
+            self._remarks[about] = remark
+        else:
+            self._remarks.pop(about, None)
+        self._tell()
+
+    def _tell(self, *messages: str) -> None:
+        said = (self._lacks or self._serves, *self._remarks.values())
+        self._notifier.tell(*messages, status("; ".join(filter(None, said))), wait_s=BUSY_S)
 
 
 def _watchdog_s(environment: Mapping[str, str], pid: int) -> float | None:

@@ -16,6 +16,7 @@ from click.core import ParameterSource
 from click.shell_completion import CompletionItem
 from pydantic import ValidationError
 
+from ldcnd.certificate import watch_certificate
 from ldcnd.cli.names import OPTIONS_TYPED
 from ldcnd.cli.output import leaves_of, show_lines
 from ldcnd.cli.typed import CONFIGURATION
@@ -96,6 +97,21 @@ def _say(problem: str | None) -> None:
     show_lines(problem or "a daemon is heard again", err=True)
 
 
+def _remark(remark: str | None) -> None:
+    if remark:
+        show_lines(remark, err=True)
+
+
+@asynccontextmanager
+async def _certificate_watched(session: Session, remark: Callable[[str | None], None]) -> AsyncIterator[None]:
+    """Say what is the matter with the certificate of a session, for as long as the context lasts."""
+    watching = asyncio.create_task(watch_certificate(session.certificate, remark), name="end of the certificate")
+    try:
+        yield
+    finally:
+        watching.cancel()
+
+
 class Serving:
     """What a program that serves others says of itself: to its service manager, and in its journal or terminal."""
 
@@ -112,6 +128,11 @@ class Serving:
         _say(problem)
         self._beside.lacks(problem)
 
+    def remarks(self, remark: str | None) -> None:
+        """Say what is to be seen to though nothing is missing, or None once that is done."""
+        _remark(remark)
+        self._beside.remarks(remark)
+
     @contextmanager
     def last_words(self) -> Iterator[None]:
         """Leave behind what has ended the program: its journal has that from who prints the error."""
@@ -119,7 +140,7 @@ class Serving:
             yield
         except BaseException as error:
             for leaf in leaves_of(error):
-                if isinstance(leaf, LdcndError | OSError):
+                if isinstance(leaf, LdcndError | OSError | click.ClickException):
                     self._beside.lacks(getattr(leaf, "message", str(leaf)))
             raise
 
@@ -158,17 +179,24 @@ class Target:
             return cls(connect or (reached_at(daemon.zenoh.listen),), listen, None, rig or daemon.rig, as_json)
         return cls(connect, listen, config, rig, as_json)
 
-    def run(self, work: Callable[[RigClient], Awaitable[ResultT]]) -> ResultT:
+    def run(
+        self, work: Callable[[RigClient], Awaitable[ResultT]], remark: Callable[[str | None], None] = _remark
+    ) -> ResultT:
         """Open a session, find the rig, do the work, and close."""
 
         async def within() -> ResultT:
-            async with open_rig(self._settings(), self.rig) as client:
+            async with open_rig(self._settings(), self.rig) as client, _certificate_watched(client.session, remark):
                 client.watch_rivals(lambda: click.echo(client.rivals, err=True))
                 return await work(client)
 
         return asyncio.run(within())
 
-    def follow(self, work: Callable[[RigClient], Awaitable[None]], say: Callable[[str | None], None] = _say) -> None:
+    def follow(
+        self,
+        work: Callable[[RigClient], Awaitable[None]],
+        say: Callable[[str | None], None] = _say,
+        remark: Callable[[str | None], None] = _remark,
+    ) -> None:
         """Do the same for a command that goes on until it is ended; it says when no daemon is heard any more."""
 
         async def watch(client: RigClient) -> None:
@@ -182,13 +210,13 @@ class Target:
             finally:
                 watching.cancel()
 
-        self.run(within)
+        self.run(within, remark)
 
     def serve(self, work: Callable[[RigClient, Serving], Awaitable[None]]) -> None:
         """Do the same for a program that serves others until it is ended; it says when it does, and what it lacks."""
         service = Serving()
         with service.last_words():
-            self.follow(lambda client: work(client, service), service.lacks)
+            self.follow(lambda client: work(client, service), service.lacks, service.remarks)
 
     def run_on_each(self, work: Callable[[RigClient], Awaitable[ResultT]]) -> dict[str, ResultT | LdcndError]:
         """Do the same with the rig that is named, unsearched, or with every one that can be reached.
@@ -217,7 +245,7 @@ class Target:
         """Open a session, do the work with it, and close; no rig needs to be there."""
 
         async def within() -> ResultT:
-            async with open_zenoh_session(self._settings()) as session:
+            async with open_zenoh_session(self._settings()) as session, _certificate_watched(session, _remark):
                 return await work(session)
 
         return asyncio.run(within())

@@ -14,11 +14,11 @@ from ldcnd.cli.names import typed
 from ldcnd.cli.quantities import decimals, sample_text
 from ldcnd.cli.typed import Finite, WholeNumber, axis_of, check_there
 from ldcnd.client.fleet import AxisReport, RigReport, survey
-from ldcnd.client.overview import AxisNow, AxisSeen, modules_now, overview
+from ldcnd.client.overview import AxisNow, AxisSeen, last_health, modules_now, overview
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.codec import remedy_of
 from ldcnd.contract.commands import Verb
-from ldcnd.contract.condition import SILENT_S, Condition, assess, explained_as
+from ldcnd.contract.condition import SILENT_S, Condition, assess, daemon_troubles, explained_as
 from ldcnd.contract.errors import LdcndError, NotSupported, SessionError
 from ldcnd.contract.fault_pages import codes, page_text
 from ldcnd.contract.meta import AxisInfo
@@ -56,15 +56,17 @@ def list_axes(target: Target) -> None:
     A position in brackets does not say where the axis is; the words behind it say why.
     """
 
-    async def work(client: RigClient) -> tuple[list[AxisNow], dict[str, tuple[str, Condition]]]:
-        return await overview(client), await modules_now(client)
+    async def work(client: RigClient) -> tuple[list[AxisNow], dict[str, tuple[str, Condition]], tuple[str, ...]]:
+        return await overview(client), await modules_now(client), daemon_troubles(await last_health(client))
 
-    axes, modules = target.run(work)
+    axes, modules, troubles = target.run(work)
     for now, line in zip(axes, axes_table(axes), strict=True):
         target.show(row(now), line)
     for name, (bus, condition) in modules.items():
         if not target.as_json:  # there a row is an axis
             click.echo(f"{name}  I/O module  {bus}  {condition.summary}")
+    for trouble in troubles:
+        click.echo(f"! {trouble}", err=True)
 
 
 def axes_table(axes: list[AxisNow]) -> list[str]:

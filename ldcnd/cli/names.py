@@ -185,6 +185,7 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "pki": "init ./pki",
     "pki add": "./pki ada --role operator",
     "pki init": "./pki",
+    "pki list": "./pki",
     "pki renew": "./pki ada",
     "pki revoke": "./pki ada",
 }

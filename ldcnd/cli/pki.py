@@ -1,6 +1,7 @@
 """`ldcnd pki`: certificates for mutual TLS, and the access rules that go with them."""
 
 import datetime as dt
+import json
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import click
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.typed import WholeNumber
 from ldcnd.contract.commands import Role
+from ldcnd.contract.condition import certificate_end, certificate_troubles
 from ldcnd.parts import require
 
 FOLDER = click.argument("folder", type=click.Path(path_type=Path, file_okay=False))
@@ -71,6 +73,35 @@ def renew(folder: Path, name: str, days: int) -> None:
 
     file = Site(folder).renew(name, _now(), days)
     click.echo(f"{file}: put it in the place of the one before, and restart what uses it")
+
+
+@command.command("list")
+@FOLDER
+@click.option("--json", "as_json", is_flag=True, help="Print JSON lines.")
+def list_(folder: Path, *, as_json: bool) -> None:
+    """Show until when the newest certificates of FOLDER are good, the authority's first; revoked ones are left out.
+
+    What runs may use an older one: `ldcnd list` shows that of a daemon from a month before its end on.
+    """
+    require("cryptography")
+    from ldcnd.ops.pki.site import Site  # noqa: PLC0415 - needs an optional package
+
+    now = _now()
+    t = int(now.timestamp()) * 10**9
+    for role, certificate in Site(folder).certificates():
+        troubles = certificate_troubles(certificate, t)
+        if as_json:
+            ends = dt.datetime.fromtimestamp(certificate.ends // 10**9, dt.UTC)
+            about = {
+                "name": certificate.name,
+                "role": role,
+                "ends": ends.isoformat(),
+                "problem": next(iter(troubles), None),
+            }
+            click.echo(json.dumps(about, separators=(",", ":")))
+        else:
+            mark = "  !" if troubles else ""
+            click.echo(f"{certificate.name:20} {role:10} {certificate_end(certificate, t)}{mark}")
 
 
 @command.command()

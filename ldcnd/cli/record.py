@@ -1,5 +1,6 @@
 """Commands on recordings: make, recover, convert and draw them."""
 
+import errno
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -50,6 +51,7 @@ def utc(t_ns: int) -> str:
     return datetime.fromtimestamp(t_ns / 1e9, UTC).isoformat(timespec="milliseconds")
 
 
+FULL = frozenset({errno.ENOSPC, errno.EDQUOT})
 FILE = click.Path(path_type=Path, dir_okay=False)
 
 
@@ -70,10 +72,7 @@ def record(target: Target, out: Path | None, rotate_mb: int) -> None:
         raise click.UsageError("--out is missing")
     require("mcap")
     out = dated(out, datetime.now(UTC))
-    try:
-        target.serve(lambda client, service: _record(client, service, out, rotate_mb * 1_000_000))
-    except OSError as error:
-        raise click.ClickException(f"{error.filename or out}: cannot be written: {error.strerror}") from error
+    target.serve(lambda client, service: _record(client, service, out, rotate_mb * 1_000_000))
 
 
 @record.command("recover")
@@ -119,15 +118,27 @@ async def _record(client: RigClient, service: Serving, out: Path, rotate_bytes: 
     def tell(path: Path) -> None:
         click.echo(f"the daemon was restarted with another configuration: recording goes on in {path}", err=True)
 
-    recorder = Recorder(out, await client.descriptions(), time.time_ns, rotate_bytes, client.descriptions, tell)
-    on_end(recorder.end)
+    descriptions = await client.descriptions()
+    path = out
     try:
-        with recorder:
-            async with client.published(recorder.take, KEPT_SAMPLES, LINGER_S) as gave_way:
-                service.serves(f"recording rig {client.rig} to {out}", err=True)
-                await recorder.run(gave_way)
-    finally:
-        click.echo(recorder.summary, err=True)  # only now: until the subscriptions are gone, more is recorded
+        recorder = Recorder(out, descriptions, time.time_ns, rotate_bytes, client.descriptions, tell)
+        on_end(recorder.end)
+        try:
+            with recorder:
+                async with client.published(recorder.take, KEPT_SAMPLES, LINGER_S) as gave_way:
+                    service.serves(f"recording rig {client.rig} to {out}", err=True)
+                    await recorder.run(gave_way)
+        finally:
+            path = recorder.path
+            click.echo(recorder.summary, err=True)  # only now: until the subscriptions are gone, more is recorded
+    except OSError as error:
+        raise click.ClickException(_not_written(path, error)) from error
+
+
+def _not_written(path: Path, error: OSError) -> str:
+    """Return in words that a recording cannot be written, and what to do; a full disk has no name in its error."""
+    room = f"; make room in {path.absolute().parent}: recordings stay there until they are deleted"
+    return f"{error.filename or path}: cannot be written: {error.strerror}{room if error.errno in FULL else ''}"
 
 
 NS_PER_S = 1e9

@@ -6,6 +6,7 @@ import json
 import shlex
 import signal
 import sys
+import time
 from asyncio.subprocess import PIPE, Process
 from collections.abc import AsyncIterator, Callable
 from functools import partial
@@ -18,6 +19,7 @@ from ldcnd.cli.output import Terminal, show_lines
 from ldcnd.cli.typed import CONFIGURATION, CONSOLE_ADDRESS, parsed_address
 from ldcnd.config.plan import plan_rig, require_plan
 from ldcnd.config.rig import RigConfig, example, load_config, single_line
+from ldcnd.contract.condition import certificate_troubles
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import build_models
 from ldcnd.contract.plan import BusPlan
@@ -26,7 +28,7 @@ from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 from ldcnd.log import configure_logging, get_logger
-from ldcnd.net.zenoh_config import zenoh_config
+from ldcnd.net.zenoh_config import certificate_in_use, zenoh_config
 from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, reached_at
 from ldcnd.net.zenoh_threads import senders_wait
 from ldcnd.systemd import Notifier
@@ -234,16 +236,20 @@ def check_config(config: Path, *, as_json: bool) -> None:
     try:
         rig = load_config(config)
         require_plan(rig)
-        zenoh_config(session_settings(rig))
+        certificate = certificate_in_use(zenoh_config(session_settings(rig)))
     except ConfigError as error:
         if not as_json:
             raise
         print(json.dumps({"valid": False, "errors": error.message.splitlines()}))
         sys.exit(78)
     axes = [axis.name for bus in rig.bus for axis in bus.axis]
+    warnings = certificate_troubles(certificate, time.time_ns())
     if as_json:
-        print(json.dumps({"valid": True, "rig": rig.rig, "buses": [bus.name for bus in rig.bus], "axes": axes}))
+        buses = [bus.name for bus in rig.bus]
+        print(json.dumps({"valid": True, "rig": rig.rig, "buses": buses, "axes": axes, "warnings": warnings}))
     else:
+        for each in warnings:
+            show_lines(f"warning: {each}", err=True)
         print(f"{config}: rig {rig.rig}, {len(rig.bus)} bus(es), axes {', '.join(axes)}: valid")
 
 

@@ -4,7 +4,14 @@ import asyncio
 
 from ldcnd.client.overview import last_bus_health, last_health
 from ldcnd.client.rig_client import RigClient, daemons, find_rigs
-from ldcnd.contract.condition import OWN, Condition, assess, assess_module, disk_troubles, line_troubles
+from ldcnd.contract.condition import (
+    OWN,
+    Condition,
+    assess,
+    assess_module,
+    daemon_troubles,
+    line_troubles,
+)
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth
@@ -134,7 +141,7 @@ def _problems(health: DaemonHealth | None, buses: tuple[BusHealth, ...], axes: t
     problems = []
     if health and health.loop_lag_s > LATE_S:
         problems.append(f"the daemon is late by {health.loop_lag_s:.2f} s")
-    problems += disk_troubles(health.not_kept) if health else ()
+    problems += daemon_troubles(health)
     problems += [f"{bus.bus}: {trouble.text}" for bus in buses for trouble in line_troubles(up=bus.up)]
     down = {bus.bus for bus in buses if not bus.up}
     problems += [

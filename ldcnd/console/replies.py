@@ -17,6 +17,8 @@ class RigReply(Frozen):
     """Its daemon is there."""
     problem: str | None
     """The problem of the connection, in words."""
+    attention: str = ""
+    """What is to be seen to of the daemon itself, in words, though it works."""
     daemon: DaemonInfo | None = None
     """None before it was ever there; the others likewise."""
     axes: tuple[AxisInfo, ...] = ()

@@ -11,8 +11,10 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.console.latest_values import LatestValues, as_msgpack
 from ldcnd.console.replies import RigReply
-from ldcnd.contract.codec import Encoding
+from ldcnd.contract.codec import Encoding, decode_received
+from ldcnd.contract.condition import daemon_troubles
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
+from ldcnd.contract.health import DaemonHealth
 from ldcnd.contract.meta import CommandList
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.questions import Why
@@ -140,7 +142,15 @@ class RigWatch:
         if sample.key.endswith((f"/{TelemetryItem.STATE}", f"/{TelemetryItem.FAULT}")) and self._is_other(sample):
             self.want_why(sample.key.split("/")[-2])
         self._values.take(sample)
+        self._take_condition(sample)
+
+    def _take_condition(self, sample: Publication) -> None:
         self._conditions.take(sample)
+        if sample.key == self.client.keys.health and sample.kind is SampleKind.PUT:
+            with suppress(LdcndError):  # of a daemon of another version
+                health = decode_received(DaemonHealth, sample.payload, sample.encoding)
+                self._reply = self._reply.model_copy(update={"attention": "; ".join(daemon_troubles(health))})
+                self._tell()
 
     def _is_other(self, sample: Publication) -> bool:
         """Tell whether a state or fault sample says something else than the one before: most are signs of life only."""
@@ -190,7 +200,7 @@ class RigWatch:
             await self._describe()
             published = await self.client.last_published()
             for sample in published:
-                self._conditions.take(sample)
+                self._take_condition(sample)
             self._values.settle(rig, published)
             self._conditions.show_again()
         except LdcndError as error:
@@ -228,7 +238,17 @@ class RigWatch:
         connected = bool(self._instances) and connected
         self._reply = self._reply.model_copy(update={"connected": connected, "problem": problem})
         self._conditions.silence = "" if connected else problem or "its daemon has not been seen yet"
-        told = {"connected": connected, "problem": problem, "instance": self.instance}
+        self._tell()
+
+    def _tell(self) -> None:
+        """Tell pages how the rig itself is, when that is another."""
+        now = self._reply
+        told = {
+            "connected": now.connected,
+            "problem": now.problem,
+            "attention": now.attention,
+            "instance": self.instance,
+        }
         if told != self._told:
             self._told = told
             log.info("rig", rig=self.client.rig, **told)

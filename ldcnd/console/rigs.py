@@ -5,6 +5,7 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from functools import partial
 
+from ldcnd.certificate import watch_certificate
 from ldcnd.client.network import Session, ZenohSettings, open_session
 from ldcnd.client.presence import tell_absence
 from ldcnd.client.rig_client import RigClient, daemons
@@ -41,16 +42,22 @@ class Rigs:
         values: takes what they publish.
         wanted: these only; none means all.
         lacks: called with the reason why an endpoint cannot be shown, and with None once it can.
+        remarks: called with what is to be seen to of the console's login, and with None once it is done.
 
     Attributes:
         lease_of: gives the lease under which a page controls an axis of a rig, or None.
     """
 
     def __init__(
-        self, values: LatestValues, wanted: Collection[str] = (), lacks: Callable[[str | None], None] = lambda _: None
+        self,
+        values: LatestValues,
+        wanted: Collection[str] = (),
+        lacks: Callable[[str | None], None] = lambda _: None,
+        remarks: Callable[[str | None], None] = lambda _: None,
     ) -> None:
         self._values = values
         self._lacks = lacks
+        self._remarks = remarks
         self._wanted = frozenset(wanted)
         self.lease_of: Callable[[str, str], str | None] = lambda _rig, _axis: None
         self._watches: dict[str, RigWatch] = {}
@@ -105,6 +112,9 @@ class Rigs:
             try:
                 async with open_session(endpoint.settings) as session, asyncio.TaskGroup() as group:
                     group.create_task(self._follow_absence(session, endpoint), name=f"daemons at {endpoint.name}")
+                    group.create_task(
+                        watch_certificate(session.certificate, self._remarks), name=f"certificate for {endpoint.name}"
+                    )
                     await self.watch(session, endpoint)
             except (SessionError, ConfigError) as error:
                 self._note(endpoint, problem=error.message)

@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from urllib.parse import urlsplit
 
 import click
@@ -19,6 +20,7 @@ from starlette.routing import BaseRoute, Mount, Route
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
+from ldcnd.certificate import first_to_end, watch_certificate
 from ldcnd.client.network import check_settings
 from ldcnd.console.commands import command_routes
 from ldcnd.console.connections import HANDSHAKE_TIME_S, BoundedH11
@@ -35,9 +37,14 @@ from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import LINK_S, Visitors
 from ldcnd.contract.errors import ConfigError
 from ldcnd.listen_address import ListenAddress
+from ldcnd.log import get_logger
 from ldcnd.parts import ENDS, on_end_of_input, on_signals
 from ldcnd.systemd import Beside
 
+log = get_logger("console")
+
+RENEW = "put another in its place, and restart the console"
+"""What to do about a certificate for pages; who made it is not known here."""
 END_TIME_S = 1.0
 """Time for open pages to close when the console ends, seconds; then their connections are aborted."""
 ABORT_TIME_S = 2
@@ -97,7 +104,12 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
     loop = asyncio.get_running_loop()
     values = LatestValues()
     beside = Beside()
-    rigs = Rigs(values, settings.rigs, beside.lacks)
+
+    def remark(problem: str | None, about: str = "login") -> None:
+        (log.warning if problem else log.info)("certificate", about=about, problem=problem)
+        beside.remarks(problem, about)
+
+    rigs = Rigs(values, settings.rigs, beside.lacks, remark)
     visitors = Visitors(loop.time, settings.token, page_key())
     listening = _listen(settings.address)
     host, port = listening.getsockname()[:2]
@@ -121,6 +133,10 @@ async def serve(settings: ConsoleSettings, commissioning: MoreRoutes | None = No
         watching = [
             group.create_task(rigs.run(endpoint), name=f"endpoint {endpoint.name}") for endpoint in settings.endpoints
         ]
+        if settings.certificate:
+            served = first_to_end(settings.certificate.read_text(encoding="ascii", errors="replace"))
+            ending = watch_certificate(served, partial(remark, about="pages"), remedy=RENEW)
+            watching.append(group.create_task(ending, name="end of the certificate for pages"))
         show_link(give_link(), as_json=settings.as_json)
         beside.serves(f"console on {settings.scheme}://{settings.shown_host}:{port}")
         await server.serve(sockets=[listening])

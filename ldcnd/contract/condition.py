@@ -4,13 +4,14 @@ Every face shows what this module decides: command line, console, gateways, metr
 sentence of its own; the console's pages get the result from the console's server.
 """
 
+import datetime as dt
 import re
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum, auto
 from typing import Protocol
 
-from ldcnd.contract.health import AxisHealth, ModuleHealth
+from ldcnd.contract.health import AxisHealth, CertificateHealth, DaemonHealth, ModuleHealth
 from ldcnd.contract.samples import (
     UNKNOWN_HOLDER,
     AxisState,
@@ -38,6 +39,9 @@ MISSED_PERIODS = 2
 SILENT_S = 3.0
 """Time without anything from a daemon after which nothing that it said counts as known, seconds; each axis gives a sign
 of life every second. The same in each face."""
+SOON_DAYS = 30
+"""Time before the end of a certificate from which it is said, days: most plants have a day of maintenance each month,
+and a new certificate wants a restart."""
 FULL_SPEED = 100.0
 """Speed override at which nothing is slowed, percent."""
 
@@ -265,6 +269,7 @@ class Faults(Protocol):
         """The one that came first."""
 
 
+_DAY_NS = 86_400 * 10**9
 _FLOATS, _NO_DATA, _DAEMON_SILENT, _POSITION_LOST = "outputs float", "no data", "daemon silent", "position lost"
 _BY_INTERLOCK, _ERROR_STOP, _OVERRIDE, _SLOW = "ended by interlock", "error stop", "speed override", "slow"
 _WRONG, _NOTICE, _FINE = Severity.WRONG, Severity.NOTICE, Severity.FINE
@@ -359,6 +364,13 @@ def line_troubles(*, up: bool, problem: str = "") -> tuple[Trouble, ...]:
     return () if up else (Trouble(TroubleKind.LINE_DOWN, _WRONG, text, _ON_DEAD_LINE.short),)
 
 
+def daemon_troubles(health: DaemonHealth | None) -> tuple[str, ...]:
+    """Return in words what is to be seen to of a daemon itself; empty where that is nothing, or nothing is known."""
+    if health is None:
+        return ()
+    return (*disk_troubles(health.not_kept), *certificate_troubles(health.certificate, health.t))
+
+
 def disk_troubles(not_kept: Sequence[str]) -> tuple[str, ...]:
     """Return in words what is wrong with the state directory of a daemon; empty while all of it can be written.
 
@@ -369,6 +381,42 @@ def disk_troubles(not_kept: Sequence[str]) -> tuple[str, ...]:
         return ()
     more = f", and {len(not_kept) - 1} more" if len(not_kept) > 1 else ""
     return (f"not kept over a restart, {not_kept[0]}{more}: make room in state_dir, or mend its disk",)
+
+
+def certificate_soon_ns(certificate: CertificateHealth) -> int:
+    """Return from when on the end of a certificate is to be spoken of, UTC in ns since 1970."""
+    return certificate.ends - SOON_DAYS * _DAY_NS
+
+
+def certificate_troubles(certificate: CertificateHealth | None, t: int, remedy: str | None = None) -> tuple[str, ...]:
+    """Return in words that a certificate ends soon or has ended, and what to do; empty while neither is so.
+
+    Args:
+        certificate: the one in use, as in a `DaemonHealth`; None where there is none.
+        t: the present, UTC in ns since 1970, by the clock of the program that uses it.
+        remedy: what to do, where the certificate is none that `ldcnd pki` makes.
+    """
+    if certificate is None or t < certificate_soon_ns(certificate):
+        return ()
+    whose = "the authority" if certificate.authority else "the certificate of"
+    if remedy is None:
+        remedy = (
+            "`ldcnd pki init` begins a new site, whose logins replace all of this one"
+            if certificate.authority
+            else f"`ldcnd pki renew SITE {certificate.name}`, put its file in place, and restart what uses it"
+        )
+    ended = t >= certificate.ends
+    consequence = ", and what connects anew is refused" if ended else ""
+    return (f"{whose} {certificate.name} {certificate_end(certificate, t)}{consequence}: {remedy}",)
+
+
+def certificate_end(certificate: CertificateHealth, t: int) -> str:
+    """Return in words until when a certificate is good, seen from an instant, UTC in ns since 1970."""
+    end = dt.datetime.fromtimestamp(certificate.ends // 10**9, dt.UTC).strftime("%Y-%m-%d %H:%M UTC")
+    if t >= certificate.ends:
+        return f"has ended on {end}"
+    days = -((t - certificate.ends) // _DAY_NS)  # one that has begun counts
+    return f"ends on {end}, within {f'{days} days' if days > 1 else 'a day'}"
 
 
 def assess_module(health: ModuleHealth, *, line_up: bool = True, silence: str = "") -> Condition:

@@ -166,6 +166,17 @@ class HeartbeatHealth(Frozen):
     """How often it has changed since the daemon started."""
 
 
+class CertificateHealth(Frozen):
+    """A certificate and until when it is good."""
+
+    name: str
+    """Its common name, as the login of `ldcnd pki`."""
+    ends: int
+    """Its end, UTC in ns since 1970."""
+    authority: bool = False
+    """It is the authority's, which has signed all others of the site."""
+
+
 class DaemonHealth(Frozen):
     """The daemon's process: published each second on `meta/health`."""
 
@@ -185,6 +196,8 @@ class DaemonHealth(Frozen):
     """Queries that were refused for being too many, and lost changes of clients' presence, since the daemon started."""
     not_kept: tuple[str, ...] = ()
     """Files of the `state_dir` that cannot be written, each with the reason: what they hold is lost with the daemon."""
+    certificate: CertificateHealth | None = None
+    """The one that ends first of those that the daemon has used since its start; None where it uses none."""
     heartbeat: HeartbeatHealth | None = None
     """The heartbeat; None where none is configured."""
     version: str = ""

@@ -126,7 +126,7 @@ def build_daemon(
         for bus in buses
         for driver in bus.network.io.values()
     )
-    rig = OwnedRig(config.rig, buses, groups, modules, kept.troubles if kept else {})
+    rig = OwnedRig(config.rig, buses, groups, modules, kept.troubles if kept else {}, session.certificate)
     latches = LatchKeeper(
         kept, {name: axis.tracker for name, axis in rig.axes.items() if axis.stops.possible}, clock.now_ns
     )

@@ -2,7 +2,7 @@
 
 import asyncio
 import contextlib
-from collections.abc import Awaitable, Callable, Coroutine, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
 from typing import Any
 
 from ldcnd.axis.axis import AxisService
@@ -17,7 +17,7 @@ from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import API, DaemonInfo
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.rig_commands import Reload
-from ldcnd.contract.samples import LinkState
+from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.daemon.capture import CaptureStore, CaptureWatch, Run, capture_of, snapshot_of
 from ldcnd.daemon.dispatch import Dispatcher, EarlyStops, Requests
 from ldcnd.daemon.health import HealthWatch
@@ -51,6 +51,7 @@ class Daemon:
     Attributes:
         rig: what it serves.
         captures: writes captures when something goes wrong; None where there is no place for them.
+        moving_at_end: whether each axis moved when the daemon was done with it; None before, and where it was not.
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class Daemon:
         self._run = Run(instance, clock.now_ns(), clock)
         self._serving = asyncio.Event()
         self._ending = asyncio.Event()
+        self.moving_at_end: Mapping[str, Moving] | None = None
         self._failure: BaseException | None = None  # the first; a panic inside Zenoh is no Exception
         self.captures = _capture_watch(self, self._run)
         self._declarations: list[Declaration] = []
@@ -193,6 +195,8 @@ class Daemon:
                 await self._leave_outputs()
                 # behind them, too: a reference is kept of an axis that stands
                 await self._keep_references()
+                # before the lines close: after that nothing is known
+                self.moving_at_end = {name: axis.tracker.status.moving for name, axis in self.rig.axes.items()}
                 await self._latches.settled()
                 if self._failure:
                     raise self._failure

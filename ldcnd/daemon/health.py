@@ -153,6 +153,7 @@ class HealthWatch:
                 waiting_queries=load.waiting,
                 dropped=load.lost,
                 not_kept=self._rig.not_kept_in_words,
+                certificate=self._rig.certificate,
                 heartbeat=self.heartbeat(),
                 version=version(),
             )

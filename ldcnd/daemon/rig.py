@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 
 from ldcnd.config.ports import GuestView
 from ldcnd.contract.errors import LdcndError, UnknownAxis, ValueOutOfRange
+from ldcnd.contract.health import CertificateHealth
 from ldcnd.daemon.line import BusService
 from ldcnd.daemon.modules import ModuleService
 from ldcnd.drives.driver import StopMode
@@ -43,6 +44,7 @@ class OwnedRig:
         lines: by name; raises `ValueOutOfRange` for another one.
         modules: the I/O modules by name; likewise.
         not_kept: why files of the state directory cannot be written, by name.
+        certificate: the one in use that ends first; None without one.
     """
 
     def __init__(
@@ -52,8 +54,10 @@ class OwnedRig:
         groups: Mapping[str, tuple[str, ...]],
         modules: tuple[ModuleService, ...] = (),
         not_kept: Mapping[str, str] = MappingProxyType({}),
+        certificate: CertificateHealth | None = None,
     ) -> None:
         self.name = name
+        self.certificate = certificate
         self.not_kept = not_kept
         self.buses = buses
         self.groups = groups

@@ -19,11 +19,21 @@ from typing import NamedTuple
 
 from ldcnd import systemd
 from ldcnd.axis.status import AxisStatus
+from ldcnd.certificate import watch_certificate
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.condition import OWN, Condition, TroubleKind, assess, assess_module, disk_troubles, line_troubles
+from ldcnd.contract.condition import (
+    OWN,
+    Condition,
+    TroubleKind,
+    assess,
+    assess_module,
+    certificate_troubles,
+    disk_troubles,
+    line_troubles,
+)
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.rig_commands import Reload, ReloadReply
-from ldcnd.contract.samples import FaultEntry, LinkState
+from ldcnd.contract.samples import FaultEntry, LinkState, Moving
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.reload import Reloader
 from ldcnd.daemon.rig import OwnedRig
@@ -193,7 +203,11 @@ class Service:
     async def run(self) -> None:
         """Serve until `end` is called or the caller is cancelled."""
         async with asyncio.TaskGroup() as group:
-            beside = [group.create_task(self._reload_when_asked(), name="reload")]
+            certificate = watch_certificate(self._daemon.rig.certificate, _tell_of_certificate)
+            beside = [
+                group.create_task(self._reload_when_asked(), name="reload"),
+                group.create_task(certificate, name="end of the certificate"),
+            ]
             if self._notifier.is_heard:
                 beside.append(group.create_task(self._report(), name="service manager"))
             try:
@@ -201,6 +215,7 @@ class Service:
             finally:
                 for task in beside:
                     task.cancel()
+                self._notifier.tell(systemd.status(_end_in_words(self._daemon.moving_at_end)))
 
     async def _report(self) -> None:
         await self._daemon.wait_serving()
@@ -234,8 +249,10 @@ class Service:
     def _status(self) -> str:
         if self._ending:
             return "stopping: axes come to rest"
+        rig = self._daemon.rig
+        ends = certificate_troubles(rig.certificate, time.time_ns())
         stuck = [f"bus {name} has missed its deadline" for name in self._stuck]
-        return "; ".join(filter(None, [describe(self._daemon.rig), *stuck, self._remark]))
+        return "; ".join(filter(None, [describe(rig), *ends, *stuck, self._remark]))
 
     # -- reloading ---------------------------------------------------------------------------------------------------
 
@@ -267,6 +284,26 @@ class Service:
 
 def _remark(refused: Sequence[str]) -> str:
     return f"restart needed for {', '.join(refused)}" if refused else ""
+
+
+def _end_in_words(moving: Mapping[str, Moving] | None) -> str:
+    """Return in one line how a daemon has left its axes.
+
+    Args:
+        moving: of each, as its drive has said last; None where none was asked any more.
+    """
+    if moving is None:
+        return "ended; it is not known whether axes move"
+    named = {
+        state: ", ".join(name for name, now in moving.items() if now is state) for state in (Moving.YES, Moving.UNKNOWN)
+    }
+    parts = [f"still moving: {named[Moving.YES]}"] if named[Moving.YES] else []
+    parts += [f"not known whether it moves: {named[Moving.UNKNOWN]}"] if named[Moving.UNKNOWN] else []
+    return "; ".join(("stopped", *(parts or ["all axes at rest"])))
+
+
+def _tell_of_certificate(trouble: str | None) -> None:
+    (log.warning if trouble else log.info)("certificate", problem=trouble)
 
 
 def describe(rig: OwnedRig) -> str:

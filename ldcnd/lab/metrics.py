@@ -108,6 +108,13 @@ class HealthCollector(Collector):
         waiting = GaugeMetricFamily("ldcnd_waiting_queries", "Queries without an answer yet", labels=["rig"])
         dropped = CounterMetricFamily("ldcnd_dropped", "Queries refused for being too many, news lost", labels=["rig"])
         lost = GaugeMetricFamily("ldcnd_files_not_kept", "State files that cannot be written", labels=["rig"])
+        ends = GaugeMetricFamily(
+            "ldcnd_certificate_expiry_timestamp_seconds",
+            "When the first of the certificates that the daemon uses ends, UTC since 1970",
+            labels=["rig", "certificate"],
+        )
+        if daemon and daemon.certificate:
+            ends.add_metric([self._rig, daemon.certificate.name], daemon.certificate.ends / 1e9)
         if daemon:
             lost.add_metric([self._rig], len(daemon.not_kept))
             lag.add_metric([self._rig], daemon.loop_lag_s)
@@ -115,7 +122,7 @@ class HealthCollector(Collector):
             missed.add_metric([self._rig], daemon.missed_reports)
             waiting.add_metric([self._rig], daemon.waiting_queries)
             dropped.add_metric([self._rig], daemon.dropped)
-        yield from (lag, published, missed, waiting, dropped, lost)
+        yield from (lag, published, missed, waiting, dropped, lost, ends)
 
     def _of_buses(self, buses: list[BusHealth]) -> Iterator[Metric]:
         labels = ["rig", "bus"]

@@ -11,6 +11,7 @@ from enum import StrEnum
 from types import MappingProxyType
 from typing import NamedTuple
 
+from ldcnd.contract.health import CertificateHealth
 from ldcnd.net.hand_over import Answer, Load, OnQuery, OnRead, OnToken, no_key
 
 UNDELIVERED_SAMPLES = 64
@@ -84,7 +85,12 @@ class Session(ABC):
     """One participant in the network. Closing it undeclares everything that it has declared.
 
     After `close` every other method raises `SessionError`.
+
+    Attributes:
+        certificate: the one that it was opened with and that ends first; None where it uses none.
     """
+
+    certificate: CertificateHealth | None = None
 
     @abstractmethod
     def publish(

@@ -8,7 +8,9 @@ from typing import Literal
 
 import zenoh
 
+from ldcnd.certificate import first_to_end, read_certificates
 from ldcnd.contract.errors import SessionError
+from ldcnd.contract.health import CertificateHealth
 from ldcnd.net import zenoh_failures
 from ldcnd.net.zenoh_settings import ZenohSettings
 
@@ -67,14 +69,35 @@ def endpoints(config: zenoh.Config, what: Literal["listen", "connect"]) -> tuple
 
 def root_certificate(config: zenoh.Config) -> str | None:
     """Return the certificates that a configuration trusts, in PEM, as far as they can be read."""
-    inline = json.loads(config.get_json(f"{TLS}/root_ca_certificate_base64"))
-    if isinstance(inline, str):
-        return base64.b64decode(inline).decode("ascii", errors="replace")
-    file = json.loads(config.get_json(f"{TLS}/root_ca_certificate"))
+    return _pem(config, "root_ca_certificate")
+
+
+def certificate_in_use(config: zenoh.Config) -> CertificateHealth | None:
+    """Return which certificate of a configuration ends first; None without one, or where none can be read.
+
+    Of several authorities that are trusted the last one counts: it may be the one that has signed.
+    """
+    own = [first_to_end(_pem(config, name) or "") for name in ("listen_certificate", "connect_certificate")]
+    found = [each for each in own if each]
     try:
+        authorities = read_certificates(root_certificate(config) or "")
+    except ValueError:
+        authorities = ()
+    if authorities:
+        last = max(authorities, key=lambda each: each.ends)
+        found.append(last.model_copy(update={"authority": True}))
+    return min(found, key=lambda each: each.ends, default=None)
+
+
+def _pem(config: zenoh.Config, name: str) -> str | None:
+    inline = json.loads(config.get_json(f"{TLS}/{name}_base64"))
+    try:
+        if isinstance(inline, str):
+            return base64.b64decode(inline).decode("ascii", errors="replace")
+        file = json.loads(config.get_json(f"{TLS}/{name}"))
         return Path(file).read_text(encoding="ascii") if isinstance(file, str) else None
-    except (OSError, UnicodeError):
-        return None  # Zenoh has complained about it
+    except (OSError, ValueError):
+        return None  # Zenoh complains about it
 
 
 def share_sockets(listen: Sequence[str]) -> None:

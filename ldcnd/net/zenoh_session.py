@@ -51,7 +51,7 @@ from ldcnd.net.session import (
     Session,
 )
 from ldcnd.net.workers import Workers
-from ldcnd.net.zenoh_config import endpoints, root_certificate, share_sockets, zenoh_config
+from ldcnd.net.zenoh_config import certificate_in_use, endpoints, root_certificate, share_sockets, zenoh_config
 from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.net.zenoh_threads import provide_threads
 from ldcnd.net.zenoh_values import TRAVEL, Stamps, to_answers, to_sample, to_stamp
@@ -104,6 +104,9 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
             remedy="use `rig.client` there, or run a program that blocks by `await rig.run_blocking(program)`",
         )
     config = zenoh_config(settings)
+    certificate = certificate_in_use(
+        config
+    )  # before Zenoh reads it: a file that is replaced then counts as the old one
     listen, connect = endpoints(config, "listen"), endpoints(config, "connect")
     # only who listens serves many: a client that connects keeps Zenoh's single sending thread
     if listen:
@@ -122,6 +125,7 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
     finally:
         await workers.stop(DRAIN_TIME_S)
     session = ZenohSession(entity)
+    session.certificate = certificate
     try:
         share_sockets(listen)
         yield session

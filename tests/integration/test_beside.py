@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.process import LDCND, ROOT, answering, free_port, process
+from tests.support.small_disk import fill, small_disk
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time, pytest.mark.timeout(120)]
 
@@ -114,3 +115,19 @@ async def test_a_program_that_cannot_begin_says_why(name: str, tmp_path: Path) -
 
     assert why == f"STATUS=cannot connect to {endpoint}"
     assert manager.program.returncode == 3
+
+
+async def test_a_recorder_without_room_names_the_place_and_what_to_do(tmp_path: Path) -> None:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with small_disk(tmp_path / "disk", 64 * 1024) as disk:
+        fill(disk)
+        async with process("run", "--config", SIMULATED, "--listen", endpoint) as daemon:
+            await answering(daemon, endpoint)
+            async with managed(tmp_path, "record", "-e", endpoint, "--out", str(disk / "run.mcap")) as manager:
+                told = await manager.until(lambda message: message.startswith("STATUS="))
+                said, _ = await manager.program.communicate()
+
+    assert f"No space left on device; make room in {disk}" in told
+    assert f"{disk}/run.mcap" in told
+    assert told.removeprefix("STATUS=") in said.decode()
+    assert manager.program.returncode == 1

@@ -13,6 +13,7 @@ import pytest
 
 from tests.support.booted_machine import Machine, booted_machine, eventually, why_no_machine
 from tests.support.package import ROOT, build, package, snapshot, why_no_package
+from tests.support.pages import broken_links
 
 DEPLOY = ROOT / "deploy"
 EXPOSURE_LIMIT = "15"
@@ -111,6 +112,16 @@ def test_package_holds_what_the_service_needs_and_touches_nothing_else(deb: Path
 
 
 @packaged
+def test_every_link_of_a_page_that_a_package_ships_leads_somewhere(deb: Path, tmp_path: Path):
+    for each in deb.parent.glob("*.deb"):
+        told("dpkg-deb", "--extract", str(each), str(tmp_path))
+    pages = sorted((tmp_path / "usr/share/doc").rglob("*.md"))
+
+    assert len(pages) > 60
+    assert broken_links(pages) == []
+
+
+@packaged
 def test_program_runs_wherever_the_package_is_unpacked(deb: Path, tmp_path: Path):
     told("dpkg-deb", "--extract", str(deb), str(tmp_path))
 
@@ -164,6 +175,8 @@ def test_every_command_of_the_guide_works(deb: Path):
             (machine.root / "root" / each.name).write_bytes(each.read_bytes())
         for command in commands:
             machine.must("sh", "-euxc", f"umask 022\ncd /root\n{command}", timeout_s=40)
+            if "pages.pem" in command:
+                require_pages_over_https(machine)
             if "ldcnd list --config site/monitor.json5" in command:
                 require_helpers_to_serve(machine)
 
@@ -171,6 +184,22 @@ def test_every_command_of_the_guide_works(deb: Path):
         assert left.split() == []
         assert machine.run("ldcnd", "--version").returncode != 0
         assert (machine.root / "etc/ldcnd/ldcnd.toml").exists()
+
+
+def require_pages_over_https(machine: Machine) -> None:
+    """Check that the console serves under its name to who trusts its certificate, and lets in whom its link names."""
+    machine.until_shown("ldcnd-console@ldcnd", "StatusText", lambda text: text.startswith("console on https://"))
+    asked = """
+import socket, ssl
+trusting = ssl.create_default_context(cafile="/etc/ldcnd/pages.pem")
+token = open("/etc/ldcnd/token").read().strip()
+for path in ("/", f"/?link={token}"):
+    with trusting.wrap_socket(socket.create_connection(("127.0.0.1", 8470)), server_hostname="bench.example") as link:
+        link.sendall(f"GET {path} HTTP/1.1\\r\\nHost: bench.example:8470\\r\\nConnection: close\\r\\n\\r\\n".encode())
+        print(link.recv(4096).split()[1].decode())
+"""
+    refused, let_in = machine.must("/opt/ldcnd/bin/python", "-c", asked).split()
+    assert (refused, let_in) == ("401", "303")
 
 
 def require_helpers_to_serve(machine: Machine) -> None:

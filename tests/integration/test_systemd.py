@@ -305,7 +305,10 @@ def test_a_recorder_says_that_its_disk_is_full_leaves_nothing_and_goes_on_when_i
     try:
         service.must("dd", "if=/dev/zero", f"of={RECORDINGS}/full", "bs=1k", "count=64")
         service.run("systemctl", "start", unit)
-        service.until_shown(unit, "StatusText", lambda text: "No space left on device" in text)
+        service.until_shown(
+            unit, "StatusText", lambda text: f"No space left on device; make room in {RECORDINGS}: " in text
+        )
+        assert f"make room in {RECORDINGS}: " in log_of(service, unit)
         service.until_shown(unit, "NRestarts", lambda restarts: int(restarts) >= 2)
         assert service.must("ls", RECORDINGS).split() == ["full"]
         service.must("mount", "-o", "remount,size=64m", RECORDINGS)
@@ -411,16 +414,44 @@ def test_console_recording_and_metrics_run_beside_the_daemon(service: Machine):
         service.until_shown(UNIT, "StatusText", lambda text: "4/4 axes up" in text)
         assert [service.show(unit, "MainPID") for unit in beside] == pids
 
-        service.must("systemctl", "stop", UNIT)
+        service.must("systemctl", "stop", *beside)
         for unit in beside:
             service.until_shown(unit, "ActiveState", lambda state: state == "inactive")
         assert all(name.endswith(".mcap") for name in service.must("ls", RECORDINGS).split())  # none cut off
-        service.must("systemctl", "start", UNIT)
+        service.must("systemctl", "restart", UNIT)
         eventually(lambda: fetched(service, METRICS), lambda text: 'axis="x"' in text, 20.0)
         for unit in beside:
             service.until_shown(unit, "ActiveState", lambda state: state == "active")
     finally:
         service.run("systemctl", "disable", "--now", *beside)
+
+
+@pytest.mark.parametrize("wrong", [True, False])
+def test_what_is_beside_a_daemon_outlives_it_and_serves_when_it_is_back(service: Machine, wrong: bool):  # noqa: FBT001
+    beside = [f"ldcnd-{name}@ldcnd.service" for name in ("console", "record", "metrics")]
+    try:
+        service.must("systemctl", "start", *beside)
+        pids = [service.show(unit, "MainPID") for unit in beside]
+        if wrong:
+            service.write(CONFIG, "rig = 1\n")
+            service.run("systemctl", "restart", UNIT)
+            assert service.show(UNIT, "ExecMainStatus") == "78"
+        else:
+            service.must("systemctl", "stop", UNIT)
+            assert service.show(UNIT, "StatusText") == "stopped; all axes at rest"
+
+        for unit in beside:
+            service.until_shown(unit, "StatusText", lambda text: "no daemon" in text or "cannot connect" in text)
+        eventually(lambda: fetched(service, METRICS), lambda text: 'ldcnd_daemon_up{rig="sim"} 0.0' in text, 20.0)
+        service.write(CONFIG, SIMULATED)
+        service.must("systemctl", "restart", UNIT)
+        for unit, serves in zip(beside, ("console on", "recording rig sim", "metrics on"), strict=True):
+            service.until_shown(unit, "StatusText", lambda text, serves=serves: text.startswith(serves))  # type: ignore[misc]
+        eventually(lambda: fetched(service, METRICS), lambda text: 'axis="x"' in text, 20.0)
+        assert [service.show(unit, "MainPID") for unit in beside] == pids
+    finally:
+        service.write(CONFIG, SIMULATED)
+        service.run("systemctl", "stop", *beside)
 
 
 def test_units_are_understood_whole(machine: Machine):

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-PARTS = ("ldcnd", "schemas", "tools", "deploy", "config", "docs", "pyproject.toml", "constraints.txt")
+PARTS = ("ldcnd", "schemas", "tools", "deploy", "config", "docs", "examples", "pyproject.toml", "constraints.txt")
 PAGES = ("README.md", "LICENSE", "CHANGELOG.md")
 BUILD_TIME_S = 180.0
 """For a build by itself; the first one on a machine fetches packages."""

@@ -2,6 +2,7 @@
 
 import re
 import shlex
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -45,6 +46,18 @@ def pages() -> list[Path]:
     found = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "deploy").glob("*.md"))]
     docs = sorted((ROOT / "docs").rglob("*.md"))
     return found + [page for page in docs if not any(page.is_relative_to(copy) for copy in GENERATED)]
+
+
+def broken_links(found: Iterable[Path]) -> list[str]:
+    """Return the links of pages that lead to no file beside them, each with its page."""
+    broken = []
+    for page in found:
+        text = re.sub(r"(?ms)^```.*?^```$|`[^`]*`", "", page.read_text(encoding="utf-8"))
+        for target in re.findall(r"\]\(([^)\s]+)\)", text):
+            place, _, _ = target.partition("#")
+            if place and "://" not in place and not (page.parent / place).exists():
+                broken.append(f"{page}: {target}")
+    return broken
 
 
 def blocks_of(page: Path) -> list[Block]:

@@ -9,11 +9,14 @@ from ldcnd.console.latest_values import LatestValues
 from ldcnd.console.rigs import MOST_RIGS, Endpoint, Rigs
 from ldcnd.contract.codec import Encoding, encode
 from ldcnd.contract.errors import UnknownAxis
+from ldcnd.contract.health import CertificateHealth, DaemonHealth
 from ldcnd.contract.keys import Keys
 from ldcnd.contract.meta import DaemonInfo
+from ldcnd.net.session import Qos
 from ldcnd.net.zenoh_settings import ZenohSettings
 from ldcnd.testing.memory_session import MemoryBroker
 
+DAY_NS = 86_400 * 10**9
 HERE, THERE = Endpoint("here", ZenohSettings()), Endpoint("there", ZenohSettings())
 
 
@@ -98,6 +101,24 @@ async def test_two_daemons_of_one_rig_are_a_problem_until_one_goes():
         async with asyncio.timeout(30):
             while (await site.shown("sim", connected=True)).problem:
                 await asyncio.sleep(0.05)
+
+
+async def test_what_is_to_be_seen_to_of_a_daemon_is_told_until_it_is_done():
+    ends = CertificateHealth(name="bench", ends=5 * DAY_NS)
+    report = DaemonHealth(t=0, seq=0, loop_lag_s=0, published=0, missed_reports=0, certificate=ends)
+    full = report.model_copy(update={"not_kept": ("latches.json: No space left on device",), "certificate": None})
+    told = []
+    async with watching() as site, site.daemon("sim") as session:
+        await site.shown("sim", connected=True)
+        for health in (report, full, report.model_copy(update={"certificate": None})):
+            payload, encoding = encode(health, Encoding.MSGPACK)
+            session.publish(Keys("sim").health, payload, encoding=encoding, qos=Qos.EVENT)
+            await asyncio.sleep(1)
+            told.append((await site.shown("sim", connected=True)).attention)
+
+    assert "certificate of bench ends on 1970-01-06" in told[0]
+    assert "latches.json" in told[1]
+    assert told[2] == ""
 
 
 async def test_a_daemon_that_does_not_answer_is_asked_again_until_it_does():

@@ -11,7 +11,7 @@ import pytest
 import yaml
 from prometheus_client import CollectorRegistry, generate_latest
 
-from ldcnd.contract.health import AxisHealth, BusHealth, DaemonHealth, LaneHealth, StopWaitHealth
+from ldcnd.contract.health import AxisHealth, BusHealth, CertificateHealth, DaemonHealth, LaneHealth, StopWaitHealth
 from ldcnd.contract.samples import (
     AxisState,
     LinkState,
@@ -26,7 +26,15 @@ from ldcnd.lab.metrics import SHADOW_FRESH_S, HealthCollector
 
 GRAFANA = Path(__file__).parents[2] / "deploy" / "grafana"
 DAEMON = DaemonHealth(
-    t=1, seq=0, loop_lag_s=0.002, published=700, missed_reports=8, waiting_queries=3, dropped=9, version="0.0.9"
+    t=1,
+    seq=0,
+    loop_lag_s=0.002,
+    published=700,
+    missed_reports=8,
+    waiting_queries=3,
+    dropped=9,
+    version="0.0.9",
+    certificate=CertificateHealth(name="bench", ends=1_800_000_000 * 10**9),
 )
 BUS = BusHealth(
     t=1, seq=0, bus="line0", up=True, utilisation=0.25, exchanges=1000, timeouts=3, corrupt_replies=2,
@@ -114,6 +122,7 @@ def registry(clock) -> CollectorRegistry:
         ("ldcnd_bus_errors_total", {"bus": "line0", "kind": "stray_bytes"}, 6.0),
         ("ldcnd_missed_reports_total", {}, 8.0),
         ("ldcnd_waiting_queries", {}, 3.0),
+        ("ldcnd_certificate_expiry_timestamp_seconds", {"certificate": "bench"}, 1.8e9),
         ("ldcnd_dropped_total", {}, 9.0),
         ("ldcnd_lane_waiting", {"bus": "line0", "lane": "poll"}, 7.0),
         ("ldcnd_lane_latency_seconds_bucket", {"bus": "line0", "lane": "poll", "le": "6.4e-05"}, 0.0),

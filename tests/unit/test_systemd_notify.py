@@ -21,7 +21,7 @@ from ldcnd.contract.sequences import NamedPosition
 from ldcnd.daemon.assembly import build_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.service import Service, describe
-from ldcnd.drives.axis_config import AxisConfig
+from ldcnd.drives.axis_config import AxisConfig, LossConfig, LossPolicy
 from ldcnd.line.line import Phase
 from ldcnd.systemd import Notifier, reloading, status
 from ldcnd.testing.memory_session import MemoryBroker
@@ -151,7 +151,7 @@ async def test_ready_comes_first_and_stopping_last(manager: Manager):
     messages += manager.heard()
     assert messages[0].startswith("READY=1\nSTATUS=rig sim: 0/1 buses, 0/4 axes up; line0: the line is not up: ")
     assert any("STATUS=rig sim: 1/1 buses, 4/4 axes up" in message for message in messages)
-    assert messages[-1] == "STOPPING=1\nSTATUS=stopping: axes come to rest"
+    assert messages[-2:] == ["STOPPING=1\nSTATUS=stopping: axes come to rest", "STATUS=stopped; all axes at rest"]
 
 
 @pytest.mark.long
@@ -219,13 +219,39 @@ async def test_end_brings_a_moving_axis_to_rest(manager: Manager):
         await asyncio.sleep(1)
         await client.command("x", Power(on=True))
         await client.command("x", MoveAbsolute(position=90))
-        await asyncio.sleep(1)
+        await manager.listen(1)
         assert daemon.rig.axes["x"].tracker.status.state is AxisState.DISCRETE_MOTION
 
         service.end()
-        await asyncio.sleep(3)
+        said = await manager.listen(3)
 
         assert daemon.rig.axes["x"].tracker.status.state is not AxisState.DISCRETE_MOTION
+        assert said[-1] == "STATUS=stopped; all axes at rest"
+
+
+async def test_the_last_word_names_what_was_left_moving(manager: Manager):
+    loss = LossConfig(daemon=LossPolicy.RUN_TO_TARGET)
+    async with service_of(manager, config=with_axis(load_config(SIMULATED), "x", loss=loss)) as (
+        service,
+        daemon,
+        client,
+    ):
+        await daemon.wait_up()
+        await manager.listen(2)
+        await client.command("x", Power(on=True))
+        await client.command("x", MoveAbsolute(position=90))
+        await manager.listen(1)
+        service.end()
+
+        assert (await manager.listen(5))[-1] == "STATUS=stopped; still moving: x"
+
+
+async def test_the_last_word_claims_nothing_of_drives_that_did_not_answer(manager: Manager):
+    async with service_of(manager) as (service, daemon, _client):
+        await daemon.wait_serving()
+        service.end()
+
+        assert (await manager.listen(5))[-1] == "STATUS=stopped; not known whether it moves: x, y, z, c"
 
 
 # -- reloading -------------------------------------------------------------------------------------------------------

@@ -72,7 +72,7 @@ def headline(glance: RigGlance) -> str:
     """Return the rig in one line: who it is, and how much of it is wrong."""
     version = f"ldcnd {glance.version}" if glance.version else "no daemon"
     count = f"axes: {len(glance.axes)}, lines: {len(glance.buses)}"
-    return "  ·  ".join((glance.rig, version, count, _verdict(glance)))
+    return "  ·  ".join((glance.rig, version, count, _verdict(glance), *glance.attention))
 
 
 def _verdict(glance: RigGlance) -> str:

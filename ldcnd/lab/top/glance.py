@@ -86,6 +86,8 @@ class RigGlance(Frozen):
     """Of its daemon; null when none answers."""
     trouble: str
     """Troubles of the rig as a whole; empty when there are none."""
+    attention: tuple[str, ...] = ()
+    """What is to be seen to of the daemon itself, though it works."""
     axes: tuple[AxisGlance, ...]
     """All of them."""
     buses: tuple[BusGlance, ...]

@@ -17,6 +17,7 @@ from ldcnd.contract.condition import (
     Trouble,
     TroubleKind,
     assess_module,
+    daemon_troubles,
     line_troubles,
 )
 from ldcnd.contract.frozen import Frozen
@@ -106,6 +107,7 @@ class RigView:
             rig=self._keys.rig,
             version=description.daemon.version if description else None,
             trouble=trouble,
+            attention=daemon_troubles(self._latest(self._keys.health, DaemonHealth)),
             axes=tuple(sorted(rows, key=lambda row: -row.severity)),
             buses=tuple(sorted(lines, key=lambda line: -line.severity)),
             modules=tuple(sorted(modules, key=lambda module: -module.severity)),

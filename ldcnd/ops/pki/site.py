@@ -14,10 +14,12 @@ from typing import Annotated
 
 from pydantic import Field, ValidationError
 
+from ldcnd.certificate import first_to_end
 from ldcnd.client.network import LEASE_MS, RETRY_MS
 from ldcnd.contract.commands import Role
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
+from ldcnd.contract.health import CertificateHealth
 from ldcnd.ops.pki.access import PERMITTED_AT_ROUTER, PERMITTED_BEHIND_ROUTER, Rule, Subject, access_control
 from ldcnd.ops.pki.certificates import Credentials, issue_client, issue_daemon, new_authority
 
@@ -163,6 +165,23 @@ class Site:
         self._keep(self._roster.with_login(login.model_copy(update={"revoked": True})))
         for suffix in ("json5", "pem", "key"):
             (self._folder / f"{name}.{suffix}").unlink(missing_ok=True)
+
+    def certificates(self) -> tuple[tuple[str, CertificateHealth], ...]:
+        """Return the newest certificate of the authority and of each login that is not revoked, each after its role.
+
+        Raises:
+            ConfigError: a file is gone, or is no certificate.
+        """
+        authority = self._certificate(AUTHORITY).model_copy(update={"authority": True})
+        present = (login for login in self._roster.logins if not login.revoked)
+        logins = tuple((login.role.value, self._certificate(login.name)) for login in present)
+        return (("authority", authority), *logins)
+
+    def _certificate(self, name: str) -> CertificateHealth:
+        found = first_to_end(self._credentials(name).certificate.decode(errors="replace"))
+        if found is None:
+            raise ConfigError(f"{self._folder / name}.pem: is no certificate")
+        return found
 
     def listener_files(self) -> tuple[Path, ...]:
         """Return the configurations of the daemons and routers, which hold the access rules."""

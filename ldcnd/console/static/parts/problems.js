@@ -29,6 +29,7 @@ function* ofRig(rig) {
     return; // nothing below it is known
   }
   if (rig.problem) yield { level: "bad", where: rig.name, text: rig.problem, link };
+  if (rig.attention) yield { level: "warn", where: rig.name, text: rig.attention, link };
   if (rig.plan && !rig.plan.holds) {
     yield { level: "warn", where: rig.name, text: "A line is asked for more than it can carry.", link: "#/network" };
   }

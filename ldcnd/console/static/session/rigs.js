@@ -262,6 +262,8 @@ export class Bus {
 export class Rig {
   connected = false;
   problem = null;
+  /** What is to be seen to of its daemon, as the console process has decided. */
+  attention = "";
   endpoint = "";
   daemon = null;
   plan = null;
@@ -307,6 +309,7 @@ export class Rig {
     this.endpoint = told.endpoint;
     this.connected = told.connected;
     this.problem = told.problem;
+    this.attention = told.attention;
     if (told.daemon?.instance !== this.daemon?.instance) this.#newest = { ns: 0, atMs: 0 }; // its clock may be another
     this.daemon = told.daemon ?? this.daemon;
     this.plan = told.plan ?? this.plan;
@@ -496,9 +499,9 @@ function rigNamed(name) {
   return rigs.get(name);
 }
 
-function joined(rig, { connected, problem }) {
+function joined(rig, { connected, problem, attention }) {
   const came = connected && !rig.connected;
-  Object.assign(rig, { connected, problem });
+  Object.assign(rig, { connected, problem, attention });
   if (came) describe(); // another run of the daemon may have other axes
 }
 
