@@ -244,8 +244,10 @@ class Interlocks:
         if what == "input":
             return Lack(f"input {name}", "is not known" if value is None else f"is {'false' if wanted else 'true'}")
         level, other = ("high", "low") if wanted else ("low", "high")
-        lines = {level: (name,)}
-        sets = step("set_io", f"set output {name} {level}", module=module.name, **lines)
+        lines = {key: each for key, each in module.lines_to_set(name, high=wanted).items() if each}
+        others = [f"{each} {key}" for key, named in lines.items() for each in named if each != name]
+        beside = f", at once {', '.join(others)}" if others else ""
+        sets = step("set_io", f"set output {name} {level}{beside}", module=module.name, **lines)
         if value is None:
             why = module.why_unknown(name)
             return Lack(f"output {name}", "is not known", why, None if why else sets)

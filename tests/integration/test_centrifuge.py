@@ -472,6 +472,31 @@ def test_an_output_that_is_written_the_level_that_it_has_stays_known():
     assert operated(writes)
 
 
+def test_why_names_the_outputs_of_a_cabinet_that_was_taken_over_in_one_command_that_sets_them(tmp_path, monkeypatch):
+    file, text = tmp_path / "rig.toml", (ROOT / "config" / "centrifuge.toml").read_text(encoding="utf-8")
+    file.write_text(text.replace("baud = 115200", 'baud = 115200\nstart = "adopt"\nadopt_fallback = "reset"'), encoding="utf-8")
+    with virtual_rig(monkeypatch, load_config(file)) as machine:
+        machine.wait(asyncio.sleep(1))
+        _, io = machine.rig.lives.lines["line0"].modules
+        for each in ("bus set-io cabinet pin=low door=low unlock=low", "power on rotor"):
+            assert machine.run(each).code == 0
+        levels = io.outputs & io.latch
+        machine.wait(machine.rig.begin_anew(1.0, killed=True))
+        machine.wait(asyncio.sleep(2))
+        assert machine.run("power on rotor").code == 0
+        why = machine.run("why rotor move_velocity").printed
+        print(why)
+        (command,) = set(re.findall(r"ldcnd (bus set-io cabinet [a-z= ]+[a-z])", why))
+        done = machine.run(command)
+        machine.wait(asyncio.sleep(1))
+        after = machine.run("why rotor move_velocity").printed
+
+    assert done.code == 0
+    assert io.outputs & io.latch == levels
+    assert "is not known" in why
+    assert "is not known" not in after
+
+
 @pytest.mark.long
 def test_of_a_spin_and_an_unlocking_at_one_instant_at_most_one_passes():
     async def race(machine):
