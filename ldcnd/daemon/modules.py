@@ -250,7 +250,7 @@ class ModuleService:
         written = self._driver.written(self._outputs[output].line)
         return "" if written is None else f"it was set {_word(written)} and its pin shows {_word(not written)}"
 
-    def lines_to_set(self, output: str, *, high: bool) -> Mapping[str, tuple[str | int, ...]]:
+    def lines_to_set(self, output: str, *, high: bool) -> Mapping[str, tuple[str, ...]]:
         """Return the lines that `set_io` is to name for an output to get a level, as its `high` and its `low`.
 
         After a take-over none is set without the others: they are named with the levels of their pins, and keep them.
@@ -259,9 +259,8 @@ class ModuleService:
         if (reading := self._reading) is not None:
             unknown = (name for name, each in self._outputs.items() if self._driver.written(each.line) is None)
             levels = {name: reading.levels[self._outputs[name].line - 1] for name in unknown} | levels
-        named = {name: int(name) if name.isdigit() else name for name in levels}
         found = {"high": True, "low": False}
-        return {key: tuple(named[name] for name, at in levels.items() if at is level) for key, level in found.items()}
+        return {key: tuple(name for name, at in levels.items() if at is level) for key, level in found.items()}
 
     # -- commands ----------------------------------------------------------------------------------------------------
 

@@ -474,7 +474,9 @@ def test_an_output_that_is_written_the_level_that_it_has_stays_known():
 
 def test_why_names_the_outputs_of_a_cabinet_that_was_taken_over_in_one_command_that_sets_them(tmp_path, monkeypatch):
     file, text = tmp_path / "rig.toml", (ROOT / "config" / "centrifuge.toml").read_text(encoding="utf-8")
-    file.write_text(text.replace("baud = 115200", 'baud = 115200\nstart = "adopt"\nadopt_fallback = "reset"'), encoding="utf-8")
+    file.write_text(
+        text.replace("baud = 115200", 'baud = 115200\nstart = "adopt"\nadopt_fallback = "reset"'), encoding="utf-8"
+    )
     with virtual_rig(monkeypatch, load_config(file)) as machine:
         machine.wait(asyncio.sleep(1))
         _, io = machine.rig.lives.lines["line0"].modules
