@@ -55,21 +55,23 @@ class LatchKeeper:
         self._writing = asyncio.Lock()
         self._on_disk: Mapping[str, KeptLatch] | None = {}  # None: not known
         self._others: dict[str, KeptLatch] = {}  # of axes that are not configured now
-        self._recalled: dict[str, KeptLatch] = {}
+        self._recalled: dict[str, tuple[KeptLatch, str]] = {}  # with what is said of it
         if files is None:
             return
         for tracker in trackers.values():
             tracker.watch(self._watch, "stop_latched", "latched_by", "stop", "state")
+        damage = ""
         try:
             kept = files.latches()
         except DamagedFile as error:
             log.error("kept latches are not to be trusted: every axis is latched, send reset", reason=str(error))
+            damage = f"latched, because the kept latches are not to be trusted: {error}"
             kept, self._on_disk = dict.fromkeys(trackers, KeptLatch(stopped=True)), None
         else:
             self._on_disk = kept  # a directory without a file of them gets one, by which a backup is known later
             kept = kept or {}
         self._others = {name: latch for name, latch in kept.items() if name not in trackers}
-        for name in kept.keys() & trackers.keys():
+        for name in sorted(kept.keys() & trackers.keys()):
             latch = kept[name]
             again = latch.again or (StopMode.SMOOTH if latch.stopped else None)
             by = None if latch.since is None else LatchedBy(latch.since, latch.client, latch.login)
@@ -78,7 +80,7 @@ class LatchKeeper:
                     latch.stopped, again, latch.in_error, latch.first_fault, now_ns(), confirmed=latch.confirmed, by=by
                 )
             )
-            self._recalled[name] = latch
+            self._recalled[name] = latch, damage or _in_words(latch)
             log.warning("latched since an earlier daemon", axis=name, stopped=latch.stopped, in_error=latch.in_error)
 
     def _watch(self, before: AxisStatus, after: AxisStatus) -> None:
@@ -89,9 +91,9 @@ class LatchKeeper:
 
     def tell(self, note: NoteOfClient) -> None:
         """Enter into the events what was taken up, with who has latched it as far as that was kept."""
-        for name, latch in sorted(self._recalled.items()):
+        for name, (latch, said) in self._recalled.items():
             if latch.stopped:
-                note(name, LATCH, CommandStatus.DONE, _in_words(latch), client=latch.client, login=latch.login)
+                note(name, LATCH, CommandStatus.DONE, said, client=latch.client, login=latch.login)
 
     async def run(self) -> None:
         """Keep what comes and goes until cancelled; without a place for it there is nothing to do."""

@@ -161,6 +161,7 @@ class AxisStops:
                     self.require(still.mode, first)
                 else:  # nobody has asked for it: the daemon does not know what the drive does
                     self._tracker.take(StopDue(still.mode, LEFT, first))
+                    self.wanted.set()
             self._publish()
 
     def overtake(self, by: Permit | None, cause: str) -> StopLatched | CommandAborted:

@@ -187,6 +187,15 @@ async def test_quick_restarts_claim_of_no_disabled_axis_that_a_stop_has_failed(t
     assert alarms(line["event"] for line in logs) == []
 
 
+async def test_the_log_names_a_damaged_file_as_what_has_latched_an_axis(tmp_path):
+    (tmp_path / "latches.json").write_text("?")
+    async with rig_on(chain_of(), keeping(tmp_path)) as rig:
+        (told,) = [row for row in await logged(rig) if " latch " in row]
+
+    assert "because the kept latches are not to be trusted" in told
+    assert " by " not in told
+
+
 async def test_a_line_that_never_comes_up_makes_a_stop_an_alarm_within_seconds(tmp_path):
     chain, config = chain_of(), keeping(tmp_path)
     await latched(chain, tmp_path)
