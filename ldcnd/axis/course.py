@@ -1,4 +1,4 @@
-"""Whether a shaft does what its drive was told: brakes, goes towards its target, is as slow as it should be. Pure.
+"""Whether a shaft does what its drive was told: moves, brakes, goes to its target, is as slow as it should be. Pure.
 
 A reply has no number: one that comes late to something older can pass for the acknowledgement of a packet that was
 lost. So what a drive has acknowledged is believed once readings show it.
@@ -20,6 +20,10 @@ UNKNOWN_BRAKING_S = 1.0
 """A shaft whose deceleration is not known is given as long at its velocity, seconds."""
 AGAIN_S = 0.25
 """A motor that may be driven with its loop open is switched off again after this time while it turns, seconds."""
+BRAKES_SHARE = 1.5
+"""Most that a deceleration is taken for of what a profile has: shafts swing."""
+FOLLOWS_WITHIN_S = 1.0
+"""Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
 PACE_S = 0.2
 """A speed is measured over this time: positions are exact, and the velocity of a status packet is coarse."""
 PACE_SHARE = 1.1
@@ -102,6 +106,107 @@ def room_to_rest(reading: AxisReading, deceleration_counts_per_s2: float | None)
     speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
     braking_s = speed / (2 * deceleration_counts_per_s2) if deceleration_counts_per_s2 else UNKNOWN_BRAKING_S
     return ROOM_SHARE * speed * braking_s + speed * LAG_S + ROOM_COUNTS
+
+
+@dataclass(frozen=True, slots=True)
+class Following:
+    """Whether an encoder counts while the profile of its motion goes on: one that stands still looks like rest.
+
+    So does a jam: in both a closed loop pushes a shaft that does not go where it was sent. What tells it is not how far
+    it lags, which is the drive's to limit, but that a part of a profile has left it where it was, to a few counts.
+
+    Attributes:
+        command_id: of the motion.
+        velocity_counts_per_s: of the profile.
+        acceleration_counts_per_s2: of the profile.
+        way_counts: of the whole profile; infinite for one without an end.
+        least_counts: part of a profile in which a shaft must have been seen to begin to move, and once it has, twice
+            as much in which it must have been seen to go on.
+        since_s: since when the shaft is where it is, in loop time; before it was seen to move, when the drive had the
+            motion: its profile runs from then on, if not before.
+        counted: the shaft was seen to move.
+        speed_counts_per_s: that it was seen to have when it was first seen there: it goes on for a braking distance.
+        error_counts: following error when it was first seen there, or before; None where its drive does not tell.
+        gone_counts: the least way that the profile has gone since, or goes; or has in an earlier motion of the command.
+        until_s: when the shaft must have been seen to move again; infinite while the profile runs.
+        low: lowest position since; infinite before the first.
+        high: highest.
+    """
+
+    command_id: str
+    velocity_counts_per_s: float
+    acceleration_counts_per_s2: float
+    way_counts: float
+    least_counts: float
+    since_s: float
+    counted: bool = False
+    speed_counts_per_s: float = 0.0
+    error_counts: int | None = None
+    gone_counts: float = 0.0
+    until_s: float = math.inf
+    low: float = math.inf
+    high: float = -math.inf
+
+    @property
+    def is_missed(self) -> bool:
+        """Whether a part of the profile is over in which the shaft was to move, and was not seen to."""
+        return self.until_s < math.inf
+
+    def after(self, before: "Following | None") -> "Following":
+        """Return it behind an earlier motion of its command, in which the shaft was perhaps not seen to move."""
+        if before is None or before.command_id != self.command_id or before.counted:
+            return self
+        return replace(self, gone_counts=before.gone_counts, low=before.low, high=before.high)
+
+    def observe(self, reading: AxisReading, at_s: float) -> "Following | bool":
+        """Take a reading; return what is awaited, True while the shaft has moved as it was to, or False: it has not."""
+        position, error = reading.position_counts, reading.following_error_counts
+        low, high = min(self.low, position), max(self.high, position)
+        runs = reading.enabled and not reading.profile_done
+        if high - low > REST_COUNTS:
+            speed = max(0.0, abs(reading.velocity_counts_per_s) - reading.velocity_resolution_counts_per_s)
+            if runs:  # it may have ceased to count since: a profile brakes no faster than this
+                braked = BRAKES_SHARE * self.acceleration_counts_per_s2 * (at_s - self.since_s)
+                speed = max(speed, self.speed_counts_per_s - braked)
+            return Following(
+                self.command_id,
+                self.velocity_counts_per_s,
+                self.acceleration_counts_per_s2,
+                self.way_counts,
+                self.least_counts,
+                at_s,
+                counted=True,
+                speed_counts_per_s=speed,
+                error_counts=self.error_counts if error is None else error,
+                gone_counts=speed**2 / (4 * self.acceleration_counts_per_s2),  # half of what it needs to brake
+                low=position,
+                high=position,
+            )
+        gone = max(self.gone_counts, self._gone_counts(at_s) if runs else 0.0)
+        first = error if self.error_counts is None else self.error_counts
+        if first is not None and error is not None:
+            gone = max(gone, abs(error) - abs(first))
+        until_s = math.inf
+        if not reading.enabled:  # nothing pushes a shaft any more that has never moved; another may stop at once
+            return self.counted or gone < self.least_counts
+        soon = 0 < (at_s - self.since_s) * self.speed_counts_per_s < 4 * REST_COUNTS  # it had no time to go on
+        if not runs and not soon:
+            if gone < self.least_counts * (2 if self.counted else 1):
+                return True
+            until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
+            if at_s >= until_s:
+                return False
+        return replace(self, error_counts=first, gone_counts=gone, until_s=until_s, low=low, high=high)
+
+    def _gone_counts(self, at_s: float) -> float:
+        """Return the least way of a profile that runs since the shaft is where it is."""
+        ran_s, speed, rate = max(0.0, at_s - self.since_s), self.velocity_counts_per_s, self.acceleration_counts_per_s2
+        ramp_s = speed / rate
+        if not self.counted:  # from its beginning
+            way = rate * ran_s**2 / 2 if ran_s < ramp_s else speed * (ran_s - ramp_s / 2)
+            return min(way, self.way_counts / 2)  # behind its middle it brakes
+        # anywhere in it: slowest where it begins and ends meanwhile
+        return rate * ran_s**2 / 4 if ran_s < 2 * ramp_s else speed * (ran_s - ramp_s)
 
 
 @dataclass(frozen=True, slots=True)

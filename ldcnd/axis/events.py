@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ldcnd.axis.course import Pace
+from ldcnd.axis.course import Following, Pace
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, LatchedBy, SoftLimits, Unsure
 from ldcnd.contract.commands import Verb
@@ -143,6 +143,7 @@ class MotionStarted:
         approached: it comes from the side that the configuration names.
         pace: of one that another motion goes over into; None for one that begins at rest.
         unsure: why it is not known whether it has begun; None when the drive shows it.
+        following: by what its encoder is to be seen to count; None where nothing says how far its profile goes.
     """
 
     now_s: float
@@ -150,6 +151,7 @@ class MotionStarted:
     approached: bool = False
     pace: Pace | None = None
     unsure: Unsure | None = None
+    following: Following | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -26,6 +26,13 @@ NOT_SETTLED = Fault(
     " then send reset",
     hides_motion=True,
 )
+NOT_FOLLOWED = Fault(
+    "not_followed",
+    "the profile of a motion has run and the encoder has not counted: the shaft is jammed, or turns unseen; its motor"
+    " was switched off; look at the machine, check encoder, cable and coupling, then send reset and home",
+    loses_position=True,
+    hides_motion=True,
+)
 JUMPED = Fault(
     "position_jump",
     "the position has changed by more than the axis can have moved; check the encoder, its cable and the coupling,"
@@ -73,6 +80,7 @@ OF_DAEMON = (
     LINK_LOST,
     LOOP_OPENED,
     JUMPED,
+    NOT_FOLLOWED,
     NOT_IDENTIFIED,
     NOT_SETTLED,
     OUTSIDE_LIMITS,

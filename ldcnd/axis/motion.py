@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.course import Pace, Way, pace_of
+from ldcnd.axis.course import Following, Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
 from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
 from ldcnd.axis.permit import Permit
@@ -41,6 +41,10 @@ COUNTER_SHARE = 0.99
 """Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
 LATENCY_S = 0.2
 """Longest time from a reading to the packet that follows it; what is gone meanwhile must not reach a software limit."""
+LEAST_FOLLOWED_COUNTS = 30.0
+"""Way of a profile behind which a shaft was seen to move, whatever its settle window: friction holds it for less."""
+LEAST_HOMING_COUNTS = 12.0
+"""The same of a search for a mark: what is found makes a reference."""
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
 
@@ -514,8 +518,18 @@ class AxisMotion:
         *,
         opens_loop: bool = False,
         plan: MotionPlan | None = None,
+        follows: bool = True,
     ) -> None:
-        """Start what was loaded, if that is still permitted; the state says so before the drive does."""
+        """Start what was loaded, if that is still permitted; the state says so before the drive does.
+
+        Args:
+            permit: of the command.
+            state: the axis state while it runs.
+            completion: what ends it.
+            opens_loop: it runs or ends with the position loop open.
+            plan: with its target.
+            follows: its shaft is to be seen to move; false for one that may run onto a stop that it stands at.
+        """
         permit.ask_to_move()
         in_motion = self.tracker.status.command is not None and not self.tracker.status.at_rest
         self.begin(permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan)
@@ -538,7 +552,32 @@ class AxisMotion:
         target_counts = plan.motion.target_counts if plan and ends else None
         approached = state is AxisState.DISCRETE_MOTION
         pace = self.pace(permit) if in_motion else None
-        self.tracker.take(MotionStarted(self.clock.now_s(), target_counts, approached, pace))
+        self.tracker.take(
+            MotionStarted(
+                self.clock.now_s(),
+                target_counts,
+                approached,
+                pace,
+                following=self._following(permit) if follows else None,
+            )
+        )
+
+    def _following(self, permit: Permit) -> Following | None:
+        """Return by what the encoder is to be seen to count in the motion that a permit has loaded."""
+        reading, motion = self.tracker.reading, permit.loaded
+        if reading is None or not isinstance(motion, CountsMotion):
+            return None
+        least = max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS)
+        target = motion.target_counts
+        return Following(
+            permit.command_id,
+            abs(motion.velocity_counts_per_s),
+            motion.acceleration_counts_per_s2,
+            way_counts=math.inf if target is None else abs(target - reading.position_counts),
+            # a mark that is found makes a reference: it is not believed of an encoder that does not count
+            least_counts=LEAST_HOMING_COUNTS if permit.verb is Verb.HOME else least,
+            since_s=self.clock.now_s(),
+        )
 
     def pace(self, permit: Permit) -> Pace | None:
         """Return how fast the axis may be whose motion was given the speed of a permit; None if that is not known."""

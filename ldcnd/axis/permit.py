@@ -82,6 +82,7 @@ class Permit:
         verb: what it is.
         by_s: latest instant, in loop time, to send a packet of its next motion: it goes on from another one, and later
             it could not turn within the software limits.
+        loaded: the motion that it has loaded last, or is about to.
     """
 
     def __init__(self, gate: "Gate", command_id: str, verb: Verb, right: Right) -> None:
@@ -93,7 +94,8 @@ class Permit:
         self._number = gate.next_number()
         self._begun = False
         self._kind = InterlockKind(kind_of(verb))
-        self._counts_per_s = 0.0  # of what it has last loaded, or is about to
+        self.loaded: CountsMotion | AnalogMotion | PwmOutput | None = None
+        self._counts_per_s = 0.0
 
     @property
     def most_counts_per_s(self) -> float:
@@ -188,6 +190,7 @@ class Permit:
 
     def _about_to(self, motion: CountsMotion | AnalogMotion | PwmOutput) -> None:
         """Take how fast the next motion may become: interlocks may bind only fast ones."""
+        self.loaded = motion
         self._counts_per_s = abs(motion.velocity_counts_per_s) if isinstance(motion, CountsMotion) else math.inf
 
     def ask_to_open_loop(self) -> None:

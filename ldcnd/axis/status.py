@@ -11,8 +11,8 @@ from enum import Enum
 from operator import attrgetter
 from typing import Any
 
-from ldcnd.axis.course import Braking, Pace, Way
-from ldcnd.axis.faults import READINGS_CONTRADICT, REPLIES_UNUSABLE
+from ldcnd.axis.course import Braking, Following, Pace, Way
+from ldcnd.axis.faults import NOT_FOLLOWED, READINGS_CONTRADICT, REPLIES_UNUSABLE
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling, window_counts
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb
@@ -236,6 +236,7 @@ class AxisStatus:
         command: what is under way.
         failure: why that will fail once the axis has come to rest.
         way: where it may be until then; None before the first reading, and without a target.
+        following: by what its encoder is to be seen to count in a motion; None once it has.
         pace: how fast it may be, once it has taken a new speed or target in motion; None otherwise.
         settle: how far it has settled; None before the end of its profile, and without a target.
         ends_at_s: when its profile should end, in loop time.
@@ -281,6 +282,7 @@ class AxisStatus:
     command: ActiveCommand | None = None
     failure: str | None = None
     way: Way | None = None
+    following: Following | None = None
     pace: Pace | None = None
     settle: SettleProgress | None = None
     ends_at_s: float | None = None
@@ -338,6 +340,8 @@ class AxisStatus:
     def motion_hidden_by(self) -> str:
         """Code of the fault behind which readings do not prove that the axis stands; empty without one."""
         first = self.first_fault
+        if self.following and self.following.is_missed:
+            return NOT_FOLLOWED.code
         if not self.faults and first is None:
             return ""
         entries = self.faults if first is None else (*self.faults, first)
@@ -369,8 +373,8 @@ class AxisStatus:
 
     @property
     def at_rest(self) -> bool:
-        """Whether the readings prove that nothing moves."""
-        return self.rest.rests is True
+        """Whether the readings show that nothing moves; a fault may hide motion, see `moving`."""
+        return self.rest.rests is True and not (self.following and self.following.is_missed)
 
     @property
     def coasts(self) -> bool:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from ldcnd.axis.course import Braking, Pace, Way
+from ldcnd.axis.course import Braking, Following, Pace, Way
 from ldcnd.axis.events import (
     AxisEvent,
     CommandBegun,
@@ -50,6 +50,7 @@ from ldcnd.axis.faults import (
     LINK_BLOCKED,
     LINK_LOST,
     LOOP_OPENED,
+    NOT_FOLLOWED,
     NOT_IDENTIFIED,
     NOT_SETTLED,
     OUTSIDE_LIMITS,
@@ -85,6 +86,7 @@ NAMED_STOPS = frozenset({Verb.HALT, Verb.QUICK_STOP})
 WENT_ON = "sent again, because the drive went on after it was confirmed: a late reply was taken for its own"
 STRAYED = "sent because the axis was not on the way to its target"
 LEFT = "sent before the drive was read: what it did while no daemon read it is not known"
+UNFOLLOWED = "sent because the profile of a motion has run and the encoder has not counted"
 OUTRUN = "sent because the axis stayed faster than it was told"
 
 
@@ -151,6 +153,11 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     # nothing holds it there any more
     if not enabled and status.target is not None:
         status = replace(status, target=None)
+    if following := status.following:
+        before = status
+        status = _watch_following(status, following, event, faults)
+        if status.state is not before.state or status.own is not before.own:
+            return status
     if faults and any(fault.stops for fault in faults):
         lost = "; its position is lost" if status.position_lost else ""
         return _fail(status, f"the drive reports a fault{lost}")
@@ -167,6 +174,26 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
         return status
     return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
+
+
+def _watch_following(
+    status: AxisStatus, following: Following, event: ReadingTaken, faults: tuple[Fault, ...]
+) -> AxisStatus:
+    """Have a motor switched off whose encoder has not counted behind a motion."""
+    # its drive knows more of it, and has switched the motor off
+    tripped = any(fault.stops for fault in event.reading.faults)
+    seen = tripped or following.observe(event.reading, event.sent_at_s)
+    if isinstance(seen, Following):
+        return status if seen is following else replace(status, following=seen)
+    if seen and status.command and not tripped:
+        return status  # at a velocity that it has reached its drive says that its profile is done
+    status = replace(status, following=None)
+    if seen:
+        return status
+    if status.energised:  # its loop pushes on, against a jam or unseen, as far as it can
+        status = _keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNFOLLOWED))
+    status = replace(_place_lost(status), own=_own_and(status, NOT_FOLLOWED), position_lost=True, target=None)
+    return _fail(_with_faults(status, (*faults, NOT_FOLLOWED), event.now_ns), NOT_FOLLOWED.text)
 
 
 def _watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
@@ -207,6 +234,8 @@ def _outrun(status: AxisStatus, pace: Pace, event: ReadingTaken) -> AxisStatus:
 def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
     """Take a reading of a closed loop that nothing has stopped; `faults` are warnings."""
     command, rests, reading = status.command, status.rest.rests, event.reading
+    if status.following and status.following.is_missed:
+        rests = None
     if command is None:
         # nothing but a reset leads out of error_stop, and what is not known to rest or to move changes nothing
         if status.state is AxisState.ERROR_STOP or (rests is None and status.state is not AxisState.DISABLED):
@@ -387,6 +416,7 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
         effective_from_s=event.now_s,
         ends_at_s=ends_at_s,
         pace=event.pace,
+        following=_next_following(status, event),
         unsure=event.unsure,
         driven_open=status.driven_open or (command is not None and command.opens_loop),
         rest=RestEvidence(rests=False, commanded=True),
@@ -394,6 +424,16 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
     if event.target_counts is None:
         return status
     return replace(status, target_counts=event.target_counts, approached=event.approached)
+
+
+def _next_following(status: AxisStatus, event: MotionStarted) -> Following | None:
+    if event.following:
+        return event.following.after(status.following)
+    before, command = status.following, status.command
+    if before is None or command is None or command.opens_loop or event.unsure:
+        return None
+    # what brings a motion to rest goes on with its profile
+    return before if command.state is AxisState.STOPPING or command.command_id == before.command_id else None
 
 
 def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
@@ -423,6 +463,7 @@ def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
         effective_from_s=event.now_s,
         target_counts=None,
         braking=None,
+        following=None if on else status.following,
         # a loop that closes holds the shaft; one that is let go may coast, or fall
         rest=RestEvidence(rests=True if on else None, commanded=on),
     )
@@ -492,7 +533,9 @@ def _note_overdue(status: AxisStatus, event: StopOverdue) -> AxisStatus:
 
 def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus:
     braking = Braking(event.mode, event.now_s, event.deceleration_counts_per_s2)
-    return replace(status, braking=braking, off_again=False)
+    # a profile that ends at once has no way in which the shaft was to be seen to move
+    following = None if event.mode is StopMode.ABRUPT else status.following
+    return replace(status, braking=braking, off_again=False, following=following)
 
 
 def _confirm_stop(status: AxisStatus, event: StopConfirmed) -> AxisStatus:
@@ -526,6 +569,7 @@ def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
         stop_latched=False,
         latched_by=None,
         position_lost=False,
+        following=None,
         own=(),
         faults=(),
         first_fault=None,

@@ -388,6 +388,76 @@ def test_a_counter_that_stands_still_in_a_spin_opens_no_lock(after_s):
     assert alone(freezes) == []
 
 
+async def jogged(rotor):
+    async with rotor.jogging(0.2):
+        await asyncio.sleep(0.6)
+    return await rotor.halt()
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        lambda rotor: rotor.home(),
+        lambda rotor: rotor.move_relative(0.05),
+        lambda rotor: rotor.move_relative(-0.3),
+        lambda rotor: rotor.move_velocity(0.2, acceleration=1, duration_s=0.8),
+        jogged,
+    ],
+    ids=["home", "a short move", "a move", "velocity", "jog"],
+)
+@pytest.mark.parametrize("unsettled", ["fault", "report"])
+@pytest.mark.sweep(3)
+def test_a_motion_in_which_no_count_is_seen_ends_with_the_motor_off_and_proves_no_rest(sent, unsettled):
+    (line,) = CENTRIFUGE.bus
+    settle = line.axis[0].settle.model_copy(update={"unsettled": unsettled})
+    axis = line.axis[0].model_copy(update={"settle": settle})
+    config = CENTRIFUGE.model_copy(update={"bus": (line.model_copy(update={"axis": (axis,)}),)})
+
+    async def program():
+        async with simulated_rig(config) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                rig.faults.encoder_stuck("rotor")
+                with suppress(LdcndError):
+                    await (await sent(rotor)).done()
+                await asyncio.sleep(4)
+                before = machine.speed
+                opened = []
+                for output in ("unlock", "pin"):
+                    with suppress(LdcndError):
+                        await machine.high(output)
+                        opened.append(output)
+                state = rotor.state.sample
+                await asyncio.sleep(2)
+                slows_down = machine.speed < max(before, CREEPS)
+                return slows_down, state.enabled, state.moving, state.referenced, opened
+
+    assert run(program()) == (True, False, Moving.UNKNOWN, False, [])
+
+
+@pytest.mark.parametrize("stop", ["halt", "stop", "the end of a run"])
+@pytest.mark.parametrize("speed", [8.0, 5.0, 2.0, 1.0])
+@pytest.mark.sweep(3)
+def test_a_counter_that_stands_still_while_the_rotor_brakes_opens_no_lock(stop, speed):
+    async def freezes(machine):
+        await machine.rotor.move_velocity(FAST, acceleration=10, duration_s=1 if stop == "the end of a run" else 60)
+        await machine.rig.until(lambda: machine.speed > FAST - 0.5)
+        if stop != "the end of a run":
+            await getattr(machine.rotor, stop)()
+        await machine.rig.until(lambda: machine.speed < speed)
+        machine.rig.faults.encoder_stuck("rotor")
+        written_at = []
+        for _ in range(80):
+            with suppress(LdcndError):
+                await machine.high("unlock")
+                written_at.append(machine.speed)
+            await asyncio.sleep(0.1)
+        state = machine.rotor.state.sample
+        return [each for each in written_at if each > CREEPS], state.enabled, state.moving
+
+    assert alone(freezes) == ([], False, Moving.UNKNOWN)
+
+
 def test_a_rotor_whose_counter_stands_still_may_move_on_every_face_until_somebody_has_looked(monkeypatch):
     with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
         machine.wait(asyncio.sleep(1))

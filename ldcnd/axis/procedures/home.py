@@ -27,6 +27,7 @@ from ldcnd.log import get_logger
 log = get_logger("axis")
 
 STOPS = {HomeStop.SMOOTH: StopMode.SMOOTH, HomeStop.ABRUPT: StopMode.ABRUPT, HomeStop.OFF: StopMode.OFF}
+ONTO_A_STOP = frozenset({HomeMethod.POSITION_ERROR, HomeMethod.CURRENT})
 REBOUND_S = 1.0
 """Longest time for which a shaft may still turn after it has run onto its stop, seconds."""
 BEYOND = 1.1
@@ -176,7 +177,11 @@ class HomeSequence(Procedure):
         # before the start: if that is not confirmed the search ends all the same
         self.deadline_s = motion.clock.now_s() + search.timeout_s
         await motion.start(
-            self.permit, AxisState.HOMING, Completion.PROCEDURE, opens_loop=opens_loop and leg is Leg.SEARCH
+            self.permit,
+            AxisState.HOMING,
+            Completion.PROCEDURE,
+            opens_loop=opens_loop and leg is Leg.SEARCH,
+            follows=search.method not in ONTO_A_STOP,
         )
 
     def _end_of_leg(self, plan: MotionPlan) -> int:
