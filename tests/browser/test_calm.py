@@ -122,6 +122,24 @@ async def test_what_a_line_has_remarked_at_its_start_needs_no_attention_once_it_
         await playwright.expect(desk.page.get_by_text("not taken over")).to_have_count(0)
 
 
+async def test_what_is_to_be_seen_to_of_a_daemon_needs_attention_as_a_warning(house):
+    words = "the certificate of bench ends on 2026-12-04 10:20 UTC, within 5 days"
+
+    async def ending(route):
+        answer = await route.fetch()
+        told = await answer.json()
+        rigs = [rig | {"attention": words if rig["name"] == "sim" else ""} for rig in told["rigs"]]
+        await route.fulfill(response=answer, json=told | {"rigs": rigs})
+
+    async with house.desk() as desk:
+        await desk.page.route("**/api/rigs", ending)
+        await desk.open("rig")
+        told = desk.page.locator(".attention li").filter(has_text=words)
+        await playwright.expect(told).to_have_count(1)
+        await playwright.expect(told).to_have_attribute("data-level", "warn")
+        await playwright.expect(told).to_contain_text("sim")
+
+
 async def remarked(route):
     """Answer with a remark on every line."""
     answer = await route.fetch()

@@ -28,7 +28,7 @@ async def test_a_page_sees_rig_health_and_axes_at_once(console):
     async with page(console.app, console.browser) as socket:
         first = dict(await told(socket))
 
-    assert first["sim/rig"] == {"connected": True, "problem": None, "instance": "run1"}
+    assert first["sim/rig"] == {"connected": True, "problem": None, "attention": "", "instance": "run1"}
     assert first["sim/meta/health/line0"]["up"] is True
     assert {f"sim/tele/{axis}/{item}" for axis in "xyzc" for item in ("position", "state", "fault")} <= first.keys()
 

@@ -11,6 +11,7 @@ import pytest
 import yaml
 from prometheus_client import CollectorRegistry, generate_latest
 
+from ldcnd.contract.condition import SOON_DAYS
 from ldcnd.contract.health import AxisHealth, BusHealth, CertificateHealth, DaemonHealth, LaneHealth, StopWaitHealth
 from ldcnd.contract.samples import (
     AxisState,
@@ -287,3 +288,15 @@ def test_the_dashboard_is_a_document_whose_panels_do_not_overlap():
     cells = [(panel["gridPos"]["x"], panel["gridPos"]["y"]) for panel in panels]
     assert len(set(cells)) == len(panels) > 8
     assert all(target["expr"] for panel in panels for target in panel["targets"])
+
+
+def test_the_alert_of_a_certificate_comes_as_early_as_the_other_faces_tell_of_it():
+    (rule,) = [
+        each
+        for group in yaml.safe_load((GRAFANA / "alerts.yml").read_text())["groups"]
+        for each in group["rules"]
+        if each["alert"] == "LdcndCertificateEnds"
+    ]
+    days, seconds = map(int, rule["expr"].partition("<")[2].split("*"))
+
+    assert days * seconds == SOON_DAYS * 86_400
