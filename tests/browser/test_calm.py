@@ -187,11 +187,11 @@ async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_t
             await desk.button("Move").click()
             await playwright.expect(story).to_contain_text("x moves to 80.000 mm.")
             await house.alpha.rig.stop("x")
-            await playwright.expect(story).to_contain_text("move absolute, stopped at")
-            await playwright.expect(desk.panel("Now")).to_contain_text("move absolute, stopped at")
+            await playwright.expect(story).to_contain_text("move absolute to 80.000, stopped at")
+            await playwright.expect(desk.panel("Now")).to_contain_text("move absolute to 80.000, stopped at")
             async with house.desk() as another:  # it was not there when that happened
                 await another.open("axis/alpha/x")
-                await playwright.expect(another.panel("Now")).to_contain_text("move absolute, stopped at")
+                await playwright.expect(another.panel("Now")).to_contain_text("move absolute to 80.000, stopped at")
             await desk.button("Reset").click()
 
             await house.alpha.until("x", lambda state: not state.stop_latched)
@@ -208,7 +208,7 @@ async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_t
             )
             await house.alpha.start()
             await playwright.expect(story).not_to_contain_text("x moves to")
-            await playwright.expect(desk.panel("Now")).to_contain_text("move absolute, halted")
+            await playwright.expect(desk.panel("Now")).to_contain_text("move absolute to 70.000, halted")
 
             await desk.button("Take control").click()
             await desk.button("Enable").click()

@@ -236,7 +236,7 @@ async def test_a_motion_is_ended_when_a_requirement_is_lost(reaction):
         assert said == f"axis rotor: {both}; reaction: {reaction}"
         (*_, ended) = await events(rig, "move_velocity")
         assert ended.endswith(f", because of {both}"), ended
-        verb = {"halt": "halt", "quick_stop": "quick_stop", "power_off": "power"}[reaction]
+        verb = "power" if reaction == "power_off" else "halt"
         assert state.last_error == f"move_velocity: aborted by {verb}, because of {both}"
 
 

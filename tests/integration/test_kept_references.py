@@ -480,7 +480,7 @@ async def test_a_full_disk_costs_the_reference_and_nothing_else(tmp_path, monkey
 
     assert not state.referenced
     assert there.value == pytest.approx(2.0, abs=0.01)
-    assert not (tmp_path / "references").exists()
+    assert not (tmp_path / "references" / "x.json").exists()
 
 
 @pytest.mark.long
