@@ -533,7 +533,7 @@ async def test_a_reference_that_a_full_disk_has_cost_is_refused_for_that(tmp_pat
             again = await refusals(rig)
 
     assert not state.referenced
-    assert [each for each in said if "the disk did not take" not in each] == []
+    assert [each for each in said if "did not get onto the disk" not in each] == []
     assert len(said) == 1
     assert "another program" not in said[0]
     assert "no daemon watched" not in said[0]
