@@ -1,5 +1,6 @@
 """The commands of one axis: check, plan, send to the drive, update the tracker."""
 
+import math
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import replace
@@ -30,7 +31,7 @@ from ldcnd.axis.procedures.pwm import PwmRun
 from ldcnd.axis.procedures.track import SetPoint
 from ldcnd.axis.procedures.velocity import VelocityChange
 from ldcnd.axis.status import Completion
-from ldcnd.axis.trapezoid import rest_of_profile_s
+from ldcnd.axis.trapezoid import braking_way, rest_of_profile_s
 from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
@@ -107,7 +108,7 @@ class AxisCommands:
         self.procedure: Procedure | None = None
         self.holds = Holds(motion.config.name)
         self.gains = AxisGains(motion)
-        self._moved: tuple[Permit, CountsMotion, float] | None = (
+        self._moved: tuple[Permit, CountsMotion, float, int | None] | None = (
             None  # the last trapezoid, and the speed share of its plan
         )
         self._retry_s: float | None = None  # when the step that was not taken is taken again
@@ -425,7 +426,7 @@ class AxisCommands:
         state: AxisState,
         completion: Completion = Completion.PROFILE,
     ) -> CommandReply:
-        self._moved = permit, plan.motion, self._tracker.status.speed_share
+        self._moved = permit, plan.motion, self._tracker.status.speed_share, plan.motion.target_counts
         await permit.load(plan.motion)
         await self._motion.start(permit, state, completion, plan=plan)
         return self._motion.reply(permit, plan)
@@ -446,25 +447,42 @@ class AxisCommands:
             return self.step_due
         if self._moved is None or not self._driver.retargets or command is None or share <= 0:
             return False
-        permit, motion, before = self._moved
+        permit, motion, before, farthest = self._moved
         if command.command_id != permit.command_id or command.completion is not Completion.PROFILE or share == before:
             return False
         changed = self._motion.quantise(
             replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / before)
         )
-        # with the goal of before: what is lost on the way changes the speed or nothing
+        if command.state is AxisState.CONTINUOUS_MOTION and farthest is not None:
+            changed = self._that_ends_in_time(changed, farthest)
+        # a motion to a position keeps its goal, and another ends sooner: what is lost on the way turns nothing round
         await permit.load(changed)
         if tracker.status.command is not command:
             return False  # it has ended meanwhile: what was loaded is not started
         await permit.start()
-        self._moved = permit, changed, share
+        self._moved = permit, changed, share, farthest
         way = abs((changed.target_counts or 0) - self._motion.latest().position_counts)
         rest_s = rest_of_profile_s(
             way, motion.velocity_counts_per_s, changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
         )
         clock, pace = self._motion.clock, self._motion.pace(permit)
-        tracker.take(SpeedChanged(rest_s, clock.now_s(), clock.now_ns(), pace))
+        tracker.take(SpeedChanged(rest_s, clock.now_s(), clock.now_ns(), pace, changed.target_counts))
         return True
+
+    def _that_ends_in_time(self, motion: CountsMotion, farthest: int) -> CountsMotion:
+        """Return a motion at a velocity with an end for its new speed: it was given a time, and not a way.
+
+        Args:
+            motion: with its new speed.
+            farthest: where it was to end at the speed that it was asked for, counts.
+        """
+        reading, rest_s = self._motion.latest(), (self._tracker.status.ends_at_s or 0.0) - self._motion.clock.now_s()
+        speed, rate = motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
+        braking = braking_way(abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s, rate)
+        way = max(speed * rest_s - speed**2 / (2 * rate), 2 * braking)
+        left = farthest - reading.position_counts
+        end = reading.position_counts + math.copysign(min(way, abs(left)), left)
+        return replace(motion, target_counts=round(end))
 
     # -- registers ---------------------------------------------------------------------------------------------------
 

@@ -24,6 +24,12 @@ BRAKES_SHARE = 1.5
 """Most that a deceleration is taken for of what a profile has: shafts swing."""
 FOLLOWS_WITHIN_S = 1.0
 """Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
+LEAST_COAST_S = 0.01
+"""Readings that follow each other sooner tell nothing of how a shaft slows down."""
+SUDDEN_COUNTS = 100
+"""A shaft that goes less than this within `REST_S` may stand at once."""
+SUDDEN_SHARE = 5.0
+"""How much faster than before a shaft may slow down in the end: friction grows, up to the force that sticks."""
 PACE_S = 0.2
 """A speed is measured over this time: positions are exact, and the velocity of a status packet is coarse."""
 PACE_SHARE = 1.1
@@ -207,6 +213,35 @@ class Following:
             return min(way, self.way_counts / 2)  # behind its middle it brakes
         # anywhere in it: slowest where it begins and ends meanwhile
         return rate * ran_s**2 / 4 if ran_s < 2 * ramp_s else speed * (ran_s - ramp_s)
+
+
+@dataclass(frozen=True, slots=True)
+class Coast:
+    """How a shaft slows down whose motor is off: an encoder that ceases to count looks like a shaft that stands at once.
+
+    So does a brake that closes, or a crash; which of them it was only a look at the machine tells.
+
+    Attributes:
+        at_s: when the shaft was read last, in loop time.
+        speed_counts_per_s: that it had.
+        slowing_counts_per_s2: how it has slowed down until then; None before two readings.
+    """
+
+    at_s: float
+    speed_counts_per_s: float
+    slowing_counts_per_s2: float | None = None
+
+    def observe(self, reading: AxisReading, at_s: float) -> "Coast | bool":
+        """Take a reading; return how it goes on, True once the shaft stands, or False: it stands all too suddenly."""
+        took_s, speed = at_s - self.at_s, abs(reading.velocity_counts_per_s)
+        if took_s < LEAST_COAST_S:
+            return self
+        if speed > reading.velocity_resolution_counts_per_s:
+            return Coast(at_s, speed, max(0.0, (self.speed_counts_per_s - speed) / took_s))
+        if self.slowing_counts_per_s2 is None or self.speed_counts_per_s * REST_S < SUDDEN_COUNTS:
+            return True
+        lost = SUDDEN_SHARE * self.slowing_counts_per_s2 * took_s
+        return lost > self.speed_counts_per_s / 2
 
 
 @dataclass(frozen=True, slots=True)

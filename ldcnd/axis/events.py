@@ -156,12 +156,16 @@ class MotionStarted:
 
 @dataclass(frozen=True, slots=True)
 class SpeedChanged:
-    """The motion under way goes on at another speed, and ends after `rest_s`; `pace` is what is to be seen of it."""
+    """The motion under way goes on at another speed, and ends after `rest_s`; `pace` is what is to be seen of it.
+
+    `target_counts` is where it ends then; None where that stays.
+    """
 
     rest_s: float
     now_s: float
     now_ns: int
     pace: Pace | None = None
+    target_counts: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

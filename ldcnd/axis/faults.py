@@ -33,6 +33,13 @@ NOT_FOLLOWED = Fault(
     loses_position=True,
     hides_motion=True,
 )
+STOOD_AT_ONCE = Fault(
+    "stood_at_once",
+    "the shaft turned with its motor off and stood from one reading to the next: a brake or a crash, or an encoder that"
+    " does not count any more; look at the machine, then send reset",
+    stops=False,
+    hides_motion=True,
+)
 JUMPED = Fault(
     "position_jump",
     "the position has changed by more than the axis can have moved; check the encoder, its cable and the coupling,"
@@ -87,6 +94,7 @@ OF_DAEMON = (
     READINGS_CONTRADICT,
     REFERENCE_REFUSED,
     REPLIES_UNUSABLE,
+    STOOD_AT_ONCE,
     STOP_UNCONFIRMED,
 )
 OF_DAEMON_CODES = frozenset(fault.code for fault in OF_DAEMON)

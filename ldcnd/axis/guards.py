@@ -105,6 +105,13 @@ def check_does_not_coast(axis: AxisTracker) -> None:
     A shaft turns when its drive shows a velocity, which is more than a count in a servo cycle: one that creeps, as a
     load that sinks, can be caught.
     """
+    if axis.status.motion_hidden_by and not axis.status.enabled:
+        raise WrongState(
+            f"axis {axis.name} may turn with its motor off, and its readings do not prove that it does not",
+            axis=axis.name,
+            value=axis.status.motion_hidden_by,
+            remedy=Remedy("look whether it stands, then {}", step("reset")),
+        )
     if axis.status.coasts:
         raise WrongState(
             f"axis {axis.name} turns with its motor off: its drive would hold it at once, whatever its speed",

@@ -11,7 +11,7 @@ from enum import Enum
 from operator import attrgetter
 from typing import Any
 
-from ldcnd.axis.course import Braking, Following, Pace, Way
+from ldcnd.axis.course import Braking, Coast, Following, Pace, Way
 from ldcnd.axis.faults import NOT_FOLLOWED, READINGS_CONTRADICT, REPLIES_UNUSABLE
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling, window_counts
 from ldcnd.axis.scale import AxisScale
@@ -237,6 +237,7 @@ class AxisStatus:
         failure: why that will fail once the axis has come to rest.
         way: where it may be until then; None before the first reading, and without a target.
         following: by what its encoder is to be seen to count in a motion; None once it has.
+        coast: how it slows down while its motor is off; None while it does not turn.
         pace: how fast it may be, once it has taken a new speed or target in motion; None otherwise.
         settle: how far it has settled; None before the end of its profile, and without a target.
         ends_at_s: when its profile should end, in loop time.
@@ -283,6 +284,7 @@ class AxisStatus:
     failure: str | None = None
     way: Way | None = None
     following: Following | None = None
+    coast: Coast | None = None
     pace: Pace | None = None
     settle: SettleProgress | None = None
     ends_at_s: float | None = None

@@ -10,7 +10,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from ldcnd.axis.course import Braking, Following, Pace, Way
+from ldcnd.axis.course import Braking, Coast, Following, Pace, Way
 from ldcnd.axis.events import (
     AxisEvent,
     CommandBegun,
@@ -57,6 +57,7 @@ from ldcnd.axis.faults import (
     READINGS_CONTRADICT,
     REFERENCE_REFUSED,
     REPLIES_UNUSABLE,
+    STOOD_AT_ONCE,
     STOP_UNCONFIRMED,
     entry_again,
     entry_of,
@@ -83,7 +84,7 @@ which what it does is not understood."""
 
 NAMED_STOPS = frozenset({Verb.HALT, Verb.QUICK_STOP})
 """Commands that are under way while a drive brakes, and that are sent again by their own name."""
-WENT_ON = "sent again, because the drive went on after it was confirmed: a late reply was taken for its own"
+WENT_ON = "sent again, because the axis went on for longer than it should need to come to rest"
 STRAYED = "sent because the axis was not on the way to its target"
 LEFT = "sent before the drive was read: what it did while no daemon read it is not known"
 UNFOLLOWED = "sent because the profile of a motion has run and the encoder has not counted"
@@ -158,7 +159,10 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         status = _watch_following(status, following, event, faults)
         if status.state is not before.state or status.own is not before.own:
             return status
+    if enabled and status.coast:
+        status = replace(status, coast=None)
     if faults and any(fault.stops for fault in faults):
+        status = status if enabled else _watch_coast(status, event, faults)
         lost = "; its position is lost" if status.position_lost else ""
         return _fail(status, f"the drive reports a fault{lost}")
     if enabled:
@@ -170,6 +174,7 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
             status = _watch_course(status, event)
         # a stop that this reading has called for has ended the command, and the axis is in error_stop
         return _take_enabled(status, event, faults) if status.stop is before.stop else status
+    status = _watch_coast(status, event, faults)
     # an open loop is no failure where it was asked for, or is known already
     if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
         return status
@@ -194,6 +199,24 @@ def _watch_following(
         status = _keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNFOLLOWED))
     status = replace(_place_lost(status), own=_own_and(status, NOT_FOLLOWED), position_lost=True, target=None)
     return _fail(_with_faults(status, (*faults, NOT_FOLLOWED), event.now_ns), NOT_FOLLOWED.text)
+
+
+def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
+    """Find a shaft that turned with its motor off, and stands so suddenly that it may only seem to."""
+    reading, at_s, coast = event.reading, event.sent_at_s, status.coast
+    if status.command and status.command.opens_loop:
+        return status if coast is None else replace(status, coast=None)
+    if coast is None:
+        turns = shows_velocity(reading)
+        return replace(status, coast=Coast(at_s, abs(reading.velocity_counts_per_s))) if turns else status
+    seen = coast.observe(reading, at_s)
+    if isinstance(seen, Coast):
+        return status if seen is coast else replace(status, coast=seen)
+    status = replace(status, coast=None)
+    if seen or STOOD_AT_ONCE in status.own:
+        return status
+    status = replace(status, own=_own_and(status, STOOD_AT_ONCE))
+    return _with_faults(status, (*faults, STOOD_AT_ONCE), event.now_ns)
 
 
 def _watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
@@ -442,8 +465,12 @@ def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
         return status
     # of the whole motion, a part of which lies behind it
     duration_s = (event.now_ns - command.since_ns) / 1e9 + event.rest_s
-    command = replace(command, duration_s=duration_s)
-    return replace(status, command=command, ends_at_s=event.now_s + event.rest_s, pace=event.pace)
+    command, way, target = replace(command, duration_s=duration_s), status.way, event.target_counts
+    if target is not None and command.settling and command.settling.target_counts != target:
+        settling = replace(command.settling, target_counts=target)
+        shown = None if command.target is None else status.scale.shown_at(target)
+        command, way = replace(command, settling=settling, target=shown), way and replace(way, target_counts=target)
+    return replace(status, command=command, ends_at_s=event.now_s + event.rest_s, pace=event.pace, way=way)
 
 
 def _note_failure(status: AxisStatus, event: CommandFailing) -> AxisStatus:

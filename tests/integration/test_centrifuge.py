@@ -458,6 +458,31 @@ def test_a_counter_that_stands_still_while_the_rotor_brakes_opens_no_lock(stop, 
     assert alone(freezes) == ([], False, Moving.UNKNOWN)
 
 
+@pytest.mark.parametrize("speed", [9.0, 5.0, 2.0])
+@pytest.mark.sweep(3)
+def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed):
+    async def freezes(machine):
+        await machine.spin()
+        await machine.rotor.power(on=False)
+        await machine.rig.until(lambda: machine.speed < speed)
+        machine.rig.faults.encoder_stuck("rotor")
+        written_at = []
+        for _ in range(40):
+            with suppress(LdcndError):
+                await machine.high("unlock")
+                written_at.append(machine.speed)
+            await asyncio.sleep(0.1)
+        with pytest.raises(LdcndError, match="may turn with its motor off"):
+            await machine.rotor.power(on=True)
+        moving = machine.rotor.state.sample.moving
+        await machine.rig.until(lambda: machine.speed < CREEPS)
+        await machine.rotor.reset()
+        await machine.rotor.power(on=True)
+        return written_at, moving
+
+    assert alone(freezes) == ([], Moving.UNKNOWN)
+
+
 def test_a_rotor_whose_counter_stands_still_may_move_on_every_face_until_somebody_has_looked(monkeypatch):
     with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
         machine.wait(asyncio.sleep(1))

@@ -9,6 +9,7 @@ from ldcnd.contract.commands import BufferMode, Halt, MoveVelocity, Power, SetPo
 from ldcnd.contract.errors import PositionLimit, ValueOutOfRange
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.questions import Preview
+from ldcnd.contract.rig_commands import SetSpeedOverride
 from ldcnd.contract.samples import AxisState
 from ldcnd.testing import simulated_rig
 from tests.support.chain_rig import rig_on
@@ -32,6 +33,27 @@ async def test_a_motion_lasts_as_long_as_it_is_asked_to_and_ends_with_a_ramp():
         assert 0.2 < rig.speed() < 4.9  # it ramps down
         await rig.until("rotor", lambda state: state.state is AxisState.STANDSTILL, within_s=2.0)
         assert (reply.duration_s, reply.position) == (pytest.approx(20.5, rel=1e-3), pytest.approx(101.25, rel=1e-3))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("shares", [(50, 50), (25, 100), (50, 75)])
+@pytest.mark.sweep(2)
+async def test_a_motion_ends_in_its_time_at_whatever_speed_override(shares):
+    async with running_machine(machine(axis=LONG)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        await rig.client.command("rotor", SPIN)
+        begun_s = asyncio.get_running_loop().time()
+        for percent in shares:
+            await asyncio.sleep(5)
+            await rig.client.ask(SetSpeedOverride(percent=percent))
+        await asyncio.sleep(2)
+        assert rig.speed() == pytest.approx(5.0 * shares[-1] / 100, rel=0.05)
+        state = await rig.until("rotor", lambda state: state.command is None)
+        took_s = asyncio.get_running_loop().time() - begun_s
+
+    assert took_s == pytest.approx(20.5, abs=1.0)
+    assert state.last_error is None
+    assert state.state is AxisState.STANDSTILL
 
 
 @pytest.mark.long
