@@ -26,8 +26,10 @@ FOLLOWS_WITHIN_S = 1.0
 """Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
 LEAST_COAST_S = 0.01
 """Readings that follow each other sooner tell nothing of how a shaft slows down."""
-SUDDEN_COUNTS = 100
-"""A shaft that goes less than this within `REST_S` may stand at once."""
+COASTS_S = 0.3
+"""Time after which it is known how a shaft slows down, seconds: just switched off, it may brake at first."""
+SLOW_SHARE, SLOW_COUNTS_PER_S = 3.0, 200.0
+"""Below this share of the resolution of its velocity, and this speed, a shaft may stand at once."""
 SUDDEN_SHARE = 5.0
 """How much faster than before a shaft may slow down in the end: friction grows, up to the force that sticks."""
 PACE_S = 0.2
@@ -135,8 +137,10 @@ class Following:
         error_counts: following error when it was first seen there, or before; None where its drive does not tell.
         gone_counts: the least way that the profile has gone since, or goes; or has in an earlier motion of the command.
         until_s: when the shaft must have been seen to move again; infinite while the profile runs.
+        given_up: it was not seen in time.
         low: lowest position since; infinite before the first.
         high: highest.
+        faults: it is a fault then; else the axis may only move unseen, until its encoder counts again.
     """
 
     command_id: str
@@ -150,8 +154,10 @@ class Following:
     error_counts: int | None = None
     gone_counts: float = 0.0
     until_s: float = math.inf
+    given_up: bool = False
     low: float = math.inf
     high: float = -math.inf
+    faults: bool = True
 
     @property
     def is_missed(self) -> bool:
@@ -187,12 +193,13 @@ class Following:
                 gone_counts=speed**2 / (4 * self.acceleration_counts_per_s2),  # half of what it needs to brake
                 low=position,
                 high=position,
+                faults=self.faults,
             )
         gone = max(self.gone_counts, self._gone_counts(at_s) if runs else 0.0)
         first = error if self.error_counts is None else self.error_counts
         if first is not None and error is not None:
             gone = max(gone, abs(error) - abs(first))
-        until_s = math.inf
+        until_s, given_up = math.inf, False
         if not reading.enabled:  # nothing pushes a shaft any more that has never moved; another may stop at once
             return self.counted or gone < self.least_counts
         soon = 0 < (at_s - self.since_s) * self.speed_counts_per_s < 4 * REST_COUNTS  # it had no time to go on
@@ -200,9 +207,14 @@ class Following:
             if gone < self.least_counts * (2 if self.counted else 1):
                 return True
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
-            if at_s >= until_s:
+            given_up = at_s >= until_s
+            if given_up and self.faults:
                 return False
-        return replace(self, error_counts=first, gone_counts=gone, until_s=until_s, low=low, high=high)
+            if given_up is self.given_up and self.is_missed:
+                return self
+        return replace(
+            self, error_counts=first, gone_counts=gone, until_s=until_s, given_up=given_up, low=low, high=high
+        )
 
     def _gone_counts(self, at_s: float) -> float:
         """Return the least way of a profile that runs since the shaft is where it is."""
@@ -217,31 +229,35 @@ class Following:
 
 @dataclass(frozen=True, slots=True)
 class Coast:
-    """How a shaft slows down whose motor is off: an encoder that ceases to count looks like a shaft that stands at once.
+    """How a shaft slows down whose motor is off: an encoder that ceases to count looks like rest.
 
     So does a brake that closes, or a crash; which of them it was only a look at the machine tells.
 
     Attributes:
-        at_s: when the shaft was read last, in loop time.
-        speed_counts_per_s: that it had.
-        slowing_counts_per_s2: how it has slowed down until then; None before two readings.
+        since_s: since when it coasts, in loop time.
+        from_counts_per_s: speed that it had then.
+        at_s: when the shaft was read last.
+        speed_counts_per_s: that it had then.
     """
 
+    since_s: float
+    from_counts_per_s: float
     at_s: float
     speed_counts_per_s: float
-    slowing_counts_per_s2: float | None = None
 
     def observe(self, reading: AxisReading, at_s: float) -> "Coast | bool":
         """Take a reading; return how it goes on, True once the shaft stands, or False: it stands all too suddenly."""
         took_s, speed = at_s - self.at_s, abs(reading.velocity_counts_per_s)
         if took_s < LEAST_COAST_S:
             return self
-        if speed > reading.velocity_resolution_counts_per_s:
-            return Coast(at_s, speed, max(0.0, (self.speed_counts_per_s - speed) / took_s))
-        if self.slowing_counts_per_s2 is None or self.speed_counts_per_s * REST_S < SUDDEN_COUNTS:
+        step = reading.velocity_resolution_counts_per_s
+        if speed > step:
+            return Coast(self.since_s, self.from_counts_per_s, at_s, speed)
+        coasted_s = self.at_s - self.since_s
+        if coasted_s < COASTS_S or self.speed_counts_per_s < SLOW_SHARE * step + SLOW_COUNTS_PER_S:
             return True
-        lost = SUDDEN_SHARE * self.slowing_counts_per_s2 * took_s
-        return lost > self.speed_counts_per_s / 2
+        slowing = (max(0.0, self.from_counts_per_s - self.speed_counts_per_s) + step) / coasted_s
+        return SUDDEN_SHARE * slowing * took_s > self.speed_counts_per_s / 2
 
 
 @dataclass(frozen=True, slots=True)

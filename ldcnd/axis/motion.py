@@ -43,8 +43,6 @@ LATENCY_S = 0.2
 """Longest time from a reading to the packet that follows it; what is gone meanwhile must not reach a software limit."""
 LEAST_FOLLOWED_COUNTS = 30.0
 """Way of a profile behind which a shaft was seen to move, whatever its settle window: friction holds it for less."""
-LEAST_HOMING_COUNTS = 12.0
-"""The same of a search for a mark: what is found makes a reference."""
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
 
@@ -558,7 +556,7 @@ class AxisMotion:
                 target_counts,
                 approached,
                 pace,
-                following=self._following(permit) if follows else None,
+                following=self._following(permit) if follows and not in_motion else None,
             )
         )
 
@@ -567,16 +565,16 @@ class AxisMotion:
         reading, motion = self.tracker.reading, permit.loaded
         if reading is None or not isinstance(motion, CountsMotion):
             return None
-        least = max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS)
         target = motion.target_counts
         return Following(
             permit.command_id,
             abs(motion.velocity_counts_per_s),
             motion.acceleration_counts_per_s2,
             way_counts=math.inf if target is None else abs(target - reading.position_counts),
-            # a mark that is found makes a reference: it is not believed of an encoder that does not count
-            least_counts=LEAST_HOMING_COUNTS if permit.verb is Verb.HOME else least,
+            least_counts=max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
             since_s=self.clock.now_s(),
+            # what a search finds makes a reference: of an encoder that does not count it is none
+            faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
         )
 
     def pace(self, permit: Permit) -> Pace | None:

@@ -154,15 +154,10 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     # nothing holds it there any more
     if not enabled and status.target is not None:
         status = replace(status, target=None)
-    if following := status.following:
-        before = status
-        status = _watch_following(status, following, event, faults)
-        if status.state is not before.state or status.own is not before.own:
-            return status
-    if enabled and status.coast:
-        status = replace(status, coast=None)
+    before, status = status, _watch_encoder(status, event, faults)
+    if status.own is not before.own and NOT_FOLLOWED in status.own:
+        return status
     if faults and any(fault.stops for fault in faults):
-        status = status if enabled else _watch_coast(status, event, faults)
         lost = "; its position is lost" if status.position_lost else ""
         return _fail(status, f"the drive reports a fault{lost}")
     if enabled:
@@ -174,11 +169,19 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
             status = _watch_course(status, event)
         # a stop that this reading has called for has ended the command, and the axis is in error_stop
         return _take_enabled(status, event, faults) if status.stop is before.stop else status
-    status = _watch_coast(status, event, faults)
     # an open loop is no failure where it was asked for, or is known already
     if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
         return status
     return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
+
+
+def _watch_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
+    """Find an encoder that may have ceased to count: in a motion, and while a shaft coasts."""
+    if status.following:
+        status = _watch_following(status, status.following, event, faults)
+    if event.reading.enabled and status.coast is None:
+        return status
+    return _watch_coast(status, event, faults)
 
 
 def _watch_following(
@@ -204,11 +207,11 @@ def _watch_following(
 def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
     """Find a shaft that turned with its motor off, and stands so suddenly that it may only seem to."""
     reading, at_s, coast = event.reading, event.sent_at_s, status.coast
-    if status.command and status.command.opens_loop:
+    if reading.enabled or (status.command and status.command.opens_loop):
         return status if coast is None else replace(status, coast=None)
     if coast is None:
-        turns = shows_velocity(reading)
-        return replace(status, coast=Coast(at_s, abs(reading.velocity_counts_per_s))) if turns else status
+        speed = abs(reading.velocity_counts_per_s)
+        return replace(status, coast=Coast(at_s, speed, at_s, speed)) if shows_velocity(reading) else status
     seen = coast.observe(reading, at_s)
     if isinstance(seen, Coast):
         return status if seen is coast else replace(status, coast=seen)
@@ -257,7 +260,7 @@ def _outrun(status: AxisStatus, pace: Pace, event: ReadingTaken) -> AxisStatus:
 def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
     """Take a reading of a closed loop that nothing has stopped; `faults` are warnings."""
     command, rests, reading = status.command, status.rest.rests, event.reading
-    if status.following and status.following.is_missed:
+    if status.following and status.following.is_missed and not status.following.given_up:
         rests = None
     if command is None:
         # nothing but a reset leads out of error_stop, and what is not known to rest or to move changes nothing
@@ -338,7 +341,7 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
     if not was_up and not event.another and not event.asked:
         return status
     # a counter that is not read may have been set, so what it shows later is no place
-    status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=NOTHING_SEEN)
+    status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=NOTHING_SEEN, coast=None)
     status = _with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again
     return _fail(status, "the drive did not answer") if was_up and status.state is not AxisState.DISABLED else status
@@ -561,7 +564,9 @@ def _note_overdue(status: AxisStatus, event: StopOverdue) -> AxisStatus:
 def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus:
     braking = Braking(event.mode, event.now_s, event.deceleration_counts_per_s2)
     # a profile that ends at once has no way in which the shaft was to be seen to move
-    following = None if event.mode is StopMode.ABRUPT else status.following
+    following = status.following
+    if event.mode is StopMode.ABRUPT and not (following and following.gone_counts >= 4 * following.least_counts):
+        following = None
     return replace(status, braking=braking, off_again=False, following=following)
 
 

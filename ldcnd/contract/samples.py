@@ -322,8 +322,8 @@ class StateSample(Sample):
     interlock: str = ""
     """The interlock that has ended it and what that lacks, for as long; empty where none has."""
     motion_hidden_by: str = ""
-    """Code of a fault in which shaft and encoder did not go where they were sent, so that readings do not prove that
-    the axis stands; empty without one, and again after reset."""
+    """Code that says why readings do not prove that the axis stands: shaft and encoder did not go where they were sent,
+    or ceased to move too suddenly. Empty while they do, and again after reset."""
     has_reference: bool = True
     """Whether its drive can have a reference; false where `home` and `set_position` are not among its commands."""
     reference_lost: bool = False
