@@ -251,7 +251,8 @@ class ReferenceKeeper:
                     await self._keep()
                 await self._keep_faults()
         except TimeoutError:
-            log.warning("reference not kept at the end", axis=self._config.name)
+            # what was kept of its motion says how far it may go
+            log.warning("not at rest in time: kept as it moved", axis=self._config.name)
 
     async def _woken_within(self, pause_s: float) -> None:
         with contextlib.suppress(TimeoutError):
