@@ -358,7 +358,9 @@ class AxisStatus:
         rests = self.rest.rests
         if rests is False or (self.command and self.state.is_motion):
             return Moving.YES
-        return Moving.NO if rests and not self.motion_hidden_by else Moving.UNKNOWN
+        # every poll passes here: asked only where there may be an answer
+        hidden = (self.faults or self.first_fault or self.following) and self.motion_hidden_by
+        return Moving.NO if rests and not hidden else Moving.UNKNOWN
 
     @property
     def to_be_stopped(self) -> bool:
@@ -370,8 +372,8 @@ class AxisStatus:
     def quality(self) -> Quality:
         """Quality of a value read just now: whether the drive counts it; `referenced` tells whether it is a place."""
         link = self.link
-        doubtful = link is LinkState.UP and (self.position_lost or self.motion_hidden_by)
-        return Quality.UNCERTAIN if doubtful else QUALITIES[link]
+        hidden = (self.faults or self.first_fault or self.following) and self.motion_hidden_by
+        return Quality.UNCERTAIN if link is LinkState.UP and (self.position_lost or hidden) else QUALITIES[link]
 
     @property
     def at_rest(self) -> bool:

@@ -154,9 +154,10 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     # nothing holds it there any more
     if not enabled and status.target is not None:
         status = replace(status, target=None)
-    before, status = status, _watch_encoder(status, event, faults)
-    if status.own is not before.own and NOT_FOLLOWED in status.own:
-        return status
+    if status.following or status.coast or (rest.turns and not enabled):
+        before, status = status, _watch_encoder(status, event, faults)
+        if status.own is not before.own and NOT_FOLLOWED in status.own:
+            return status
     if faults and any(fault.stops for fault in faults):
         lost = "; its position is lost" if status.position_lost else ""
         return _fail(status, f"the drive reports a fault{lost}")
@@ -179,8 +180,6 @@ def _watch_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault,
     """Find an encoder that may have ceased to count: in a motion, and while a shaft coasts."""
     if status.following:
         status = _watch_following(status, status.following, event, faults)
-    if event.reading.enabled and status.coast is None:
-        return status
     return _watch_coast(status, event, faults)
 
 
