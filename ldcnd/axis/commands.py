@@ -466,7 +466,8 @@ class AxisCommands:
             way, motion.velocity_counts_per_s, changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
         )
         clock, pace = self._motion.clock, self._motion.pace(permit)
-        tracker.take(SpeedChanged(rest_s, clock.now_s(), clock.now_ns(), pace, changed.target_counts))
+        profile = changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
+        tracker.take(SpeedChanged(rest_s, clock.now_s(), clock.now_ns(), pace, changed.target_counts, profile))
         return True
 
     def _that_ends_in_time(self, motion: CountsMotion, farthest: int) -> CountsMotion:

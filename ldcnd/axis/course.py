@@ -170,6 +170,12 @@ class Following:
             return self
         return replace(self, gone_counts=before.gone_counts, low=before.low, high=before.high)
 
+    def going_on(self, velocity_counts_per_s: float, acceleration_counts_per_s2: float) -> "Following | None":
+        """Return it for a profile that goes over into another one; None where that slows down otherwise."""
+        if acceleration_counts_per_s2 != self.acceleration_counts_per_s2:
+            return None
+        return replace(self, velocity_counts_per_s=min(self.velocity_counts_per_s, velocity_counts_per_s))
+
     def observe(self, reading: AxisReading, at_s: float) -> "Following | bool":
         """Take a reading; return what is awaited, True while the shaft has moved as it was to, or False: it has not."""
         position, error = reading.position_counts, reading.following_error_counts

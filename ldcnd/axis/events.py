@@ -144,6 +144,7 @@ class MotionStarted:
         pace: of one that another motion goes over into; None for one that begins at rest.
         unsure: why it is not known whether it has begun; None when the drive shows it.
         following: by what its encoder is to be seen to count; None where nothing says how far its profile goes.
+        profile: speed and acceleration of one that goes on from another motion, in counts; None of others.
     """
 
     now_s: float
@@ -152,13 +153,14 @@ class MotionStarted:
     pace: Pace | None = None
     unsure: Unsure | None = None
     following: Following | None = None
+    profile: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedChanged:
     """The motion under way goes on at another speed, and ends after `rest_s`; `pace` is what is to be seen of it.
 
-    `target_counts` is where it ends then; None where that stays.
+    `target_counts` is where it ends then; None where that stays. `profile` is its speed and acceleration, in counts.
     """
 
     rest_s: float
@@ -166,6 +168,7 @@ class SpeedChanged:
     now_ns: int
     pace: Pace | None = None
     target_counts: int | None = None
+    profile: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -550,20 +550,22 @@ class AxisMotion:
         target_counts = plan.motion.target_counts if plan and ends else None
         approached = state is AxisState.DISCRETE_MOTION
         pace = self.pace(permit) if in_motion else None
+        loaded = permit.loaded if isinstance(permit.loaded, CountsMotion) else None
         self.tracker.take(
             MotionStarted(
                 self.clock.now_s(),
                 target_counts,
                 approached,
                 pace,
-                following=self._following(permit) if follows and not in_motion else None,
+                following=self._following(permit, loaded) if loaded and follows and not in_motion else None,
+                profile=(abs(loaded.velocity_counts_per_s), loaded.acceleration_counts_per_s2) if loaded else None,
             )
         )
 
-    def _following(self, permit: Permit) -> Following | None:
+    def _following(self, permit: Permit, motion: CountsMotion) -> Following | None:
         """Return by what the encoder is to be seen to count in the motion that a permit has loaded."""
-        reading, motion = self.tracker.reading, permit.loaded
-        if reading is None or not isinstance(motion, CountsMotion):
+        reading = self.tracker.reading
+        if reading is None:
             return None
         target = motion.target_counts
         return Following(

@@ -458,7 +458,9 @@ def _next_following(status: AxisStatus, event: MotionStarted) -> Following | Non
     if before is None or command is None or command.opens_loop or event.unsure:
         return None
     # what brings a motion to rest goes on with its profile
-    return before if command.state is AxisState.STOPPING or command.command_id == before.command_id else None
+    if command.state is not AxisState.STOPPING and command.command_id != before.command_id:
+        return None
+    return before.going_on(*event.profile) if event.profile else before
 
 
 def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
@@ -472,7 +474,9 @@ def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
         settling = replace(command.settling, target_counts=target)
         shown = None if command.target is None else status.scale.shown_at(target)
         command, way = replace(command, settling=settling, target=shown), way and replace(way, target_counts=target)
-    return replace(status, command=command, ends_at_s=event.now_s + event.rest_s, pace=event.pace, way=way)
+    following = status.following and event.profile and status.following.going_on(*event.profile)
+    ends_at_s = event.now_s + event.rest_s
+    return replace(status, command=command, ends_at_s=ends_at_s, pace=event.pace, way=way, following=following or None)
 
 
 def _note_failure(status: AxisStatus, event: CommandFailing) -> AxisStatus:

@@ -5,12 +5,12 @@ import asyncio
 import pytest
 
 from ldcnd.config.rig import load_config
-from ldcnd.contract.commands import BufferMode, Halt, MoveVelocity, Power, SetPosition
+from ldcnd.contract.commands import BufferMode, Halt, Jog, MoveRelative, MoveVelocity, Power, SetPosition
 from ldcnd.contract.errors import PositionLimit, ValueOutOfRange
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.questions import Preview
 from ldcnd.contract.rig_commands import SetSpeedOverride
-from ldcnd.contract.samples import AxisState
+from ldcnd.contract.samples import AxisState, Moving
 from ldcnd.testing import simulated_rig
 from tests.support.chain_rig import rig_on
 from tests.support.machine_rig import COUNTS, chain_of_machine, machine, running_machine
@@ -36,6 +36,30 @@ async def test_a_motion_lasts_as_long_as_it_is_asked_to_and_ends_with_a_ramp():
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("percent", [0.5, 2, 10])
+@pytest.mark.parametrize("kind", ["move", "jog", "velocity"])
+@pytest.mark.sweep(3)
+async def test_a_healthy_axis_that_is_slowed_down_in_mid_motion_has_no_fault(kind, percent):
+    unsettled = {"settle": {"window": 0.01, "unsettled": "fault"}}
+    async with running_machine(machine(axis=LONG | unsettled)) as rig:
+        await rig.client.command("rotor", Power(on=True))
+        commands = {
+            "move": MoveRelative(distance=1.2, velocity=1.0),
+            "jog": Jog(velocity=1.0, hold_s=1.0),
+            "velocity": MoveVelocity(velocity=1.0, duration_s=3.0),
+        }
+        await rig.client.command("rotor", commands[kind])
+        await asyncio.sleep(0.8)
+        await rig.client.ask(SetSpeedOverride(percent=percent))
+        await asyncio.sleep(3)
+        await rig.client.command("rotor", Halt())
+        state = await rig.until("rotor", lambda state: state.command is None)
+        await asyncio.sleep(2)
+        later = await rig.client.state("rotor")
+
+    assert (state.state, later.state, later.moving) == (AxisState.STANDSTILL, AxisState.STANDSTILL, Moving.NO)
+
+
 @pytest.mark.parametrize("shares", [(50, 50), (25, 100), (50, 75)])
 @pytest.mark.sweep(2)
 async def test_a_motion_ends_in_its_time_at_whatever_speed_override(shares):
