@@ -342,12 +342,18 @@ class AxisStatus:
     def motion_hidden_by(self) -> str:
         """Code of the fault behind which readings do not prove that the axis stands; empty without one."""
         first = self.first_fault
-        if self.following and self.following.is_missed:
+        if self.following and self.following.given_up:
             return NOT_FOLLOWED.code
         if not self.faults and first is None:
             return ""
         entries = self.faults if first is None else (*self.faults, first)
         return next((entry.code for entry in entries if entry.hides_motion), "")
+
+    @property
+    def rest_unproven_by(self) -> str:
+        """The same, also of a motion whose profile is over and whose shaft is yet to be seen to have moved."""
+        missed = self.following is not None and self.following.is_missed
+        return NOT_FOLLOWED.code if missed else self.motion_hidden_by
 
     @property
     def moving(self) -> Moving:
@@ -359,7 +365,7 @@ class AxisStatus:
         if rests is False or (self.command and self.state.is_motion):
             return Moving.YES
         # every poll passes here: asked only where there may be an answer
-        hidden = (self.faults or self.first_fault or self.following) and self.motion_hidden_by
+        hidden = (self.faults or self.first_fault or self.following) and self.rest_unproven_by
         return Moving.NO if rests and not hidden else Moving.UNKNOWN
 
     @property

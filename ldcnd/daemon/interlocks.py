@@ -275,7 +275,7 @@ class Interlocks:
         ):
             return "is not known: its drive does not answer"
         # a counter that stands still beside a shaft that turns looks like rest, as a jam does
-        if (each.standstill or each.below is not None) and (fault := status.motion_hidden_by):
+        if (each.standstill or each.below is not None) and (fault := status.rest_unproven_by):
             return f"may move: after fault {fault} its encoder does not prove that it stands; look, then reset the axis"
         if each.standstill and not (status.rest.rests is True and not _commanded(status)):
             return "does not stand, or is not known to"
