@@ -149,7 +149,9 @@ class PlausibilityGate:
         counts, limits = abs(config.signed_counts_per_unit), config.limits
         self._speed = SPEEDS * counts * max(config.velocity, limits.velocity or 0.0)
         self._turned_by_hand = OPEN_LOOP_SPEEDS / SPEEDS * self._speed
-        self._step_counts = STEP_OF_EL * config.gains.el if config.gains else 0.0
+        # by the loosest of its loops: which of them holds it may change in the middle of a motion
+        limits_of_error = [each.el for each in (config.gains, *config.gain_sets.values()) if each]
+        self._step_counts = STEP_OF_EL * max(limits_of_error, default=0)
 
     def expect(self, motion: CountsMotion | AnalogMotion | PwmOutput, *, anywhere: bool = False) -> None:
         """Take a motion that is about to be loaded: from now on it explains what the axis does.

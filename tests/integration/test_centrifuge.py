@@ -461,6 +461,22 @@ def test_a_counter_that_stands_still_while_the_rotor_brakes_opens_no_lock(stop, 
     assert alone(freezes) == ([], False, Moving.UNKNOWN)
 
 
+@pytest.mark.parametrize("rpm", [300, 1200, 2400, 3000])
+@pytest.mark.parametrize("ended", ["quick_stop", "halt", "stop"])
+@pytest.mark.sweep(3)
+def test_a_healthy_rotor_that_is_stopped_at_speed_has_no_fault(rpm, ended):
+    async def stops(machine):
+        await machine.rotor.move_velocity(rpm / 60, acceleration=10, duration_s=60)
+        await machine.rig.until(lambda: machine.speed > 0.98 * rpm / 60)
+        with suppress(LdcndError):
+            await getattr(machine.rotor, ended)()
+        await machine.rig.until(lambda: machine.rotor.state.sample.moving is Moving.NO)
+        faults = await machine.rig.client.client.last("rotor", "fault")
+        return faults.active
+
+    assert not alone(stops)
+
+
 @pytest.mark.parametrize("speed", [6.0, 4.0, 2.0])
 @pytest.mark.sweep(3)
 def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed):
