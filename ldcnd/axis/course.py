@@ -251,19 +251,29 @@ class Coast:
     at_s: float
     speed_counts_per_s: float
 
-    def observe(self, reading: AxisReading, at_s: float) -> "Coast | bool":
-        """Take a reading; return how it goes on, True once the shaft stands, or False: it stands all too suddenly."""
+    def observe(self, reading: AxisReading, at_s: float, most_counts_per_s2: float | None = None) -> "Coast | bool":
+        """Take a reading; return how it goes on, True once the shaft stands, or False: it stands all too suddenly.
+
+        Args:
+            reading: of the shaft.
+            at_s: when it was requested, in loop time.
+            most_counts_per_s2: how fast it slows down at most; None where that is not known.
+        """
         took_s, speed = at_s - self.at_s, abs(reading.velocity_counts_per_s)
         if took_s < LEAST_COAST_S:
             return self
         step = reading.velocity_resolution_counts_per_s
         if speed > step:
             return Coast(self.since_s, self.from_counts_per_s, at_s, speed)
-        coasted_s = self.at_s - self.since_s
-        if coasted_s < COASTS_S or self.speed_counts_per_s < SLOW_SHARE * step + SLOW_COUNTS_PER_S:
+        coasted_s, most = self.at_s - self.since_s, most_counts_per_s2
+        if self.speed_counts_per_s < SLOW_SHARE * step + SLOW_COUNTS_PER_S:
             return True
-        slowing = (max(0.0, self.from_counts_per_s - self.speed_counts_per_s) + step) / coasted_s
-        return SUDDEN_SHARE * slowing * took_s > self.speed_counts_per_s / 2
+        if most is None and coasted_s < COASTS_S:
+            return True
+        if most is None:
+            slowing = (max(0.0, self.from_counts_per_s - self.speed_counts_per_s) + step) / coasted_s
+            most = SUDDEN_SHARE * slowing
+        return most * took_s > self.speed_counts_per_s / 2
 
 
 @dataclass(frozen=True, slots=True)

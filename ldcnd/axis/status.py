@@ -43,23 +43,31 @@ class Completion(Enum):
 
 @dataclass(frozen=True, slots=True)
 class SoftLimits:
-    """The software limits of a position, as readings are judged by them.
+    """The limits of an axis by which its readings are judged.
 
     Attributes:
         low: lowest position, in axis units; minus infinity without one.
         high: highest position; infinity without one.
         window_counts: how far beyond them an axis may stand that was sent to one, in counts.
+        slowing_counts_per_s2: how fast its shaft slows down at most with its motor off; None where that is not known.
     """
 
     low: float = -math.inf
     high: float = math.inf
     window_counts: float = 0.0
+    slowing_counts_per_s2: float | None = None
 
     @classmethod
     def of(cls, config: AxisConfig) -> "SoftLimits":
         """Return those that an axis is configured with."""
         low, high = config.limits.position_min, config.limits.position_max
-        return cls(-math.inf if low is None else low, math.inf if high is None else high, window_counts(config))
+        speed = abs(config.signed_counts_per_unit) * (config.limits.velocity or config.velocity)
+        return cls(
+            -math.inf if low is None else low,
+            math.inf if high is None else high,
+            window_counts(config),
+            speed / config.coast_s if config.coast_s else None,
+        )
 
     def span(self, scale: AxisScale) -> tuple[float, float]:
         """Return the lowest and the highest count of a drive that they allow."""

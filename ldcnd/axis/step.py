@@ -178,8 +178,13 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
 
 def _watch_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
     """Find an encoder that may have ceased to count: in a motion, and while a shaft coasts."""
-    if status.following:
-        status = _watch_following(status, status.following, event, faults)
+    following = status.following
+    if following and following.speed_counts_per_s and status.coast is None and not event.reading.enabled:
+        # it turned when its loop opened
+        since_s, speed = following.since_s, following.speed_counts_per_s
+        status = replace(status, coast=Coast(since_s, speed, since_s, speed))
+    if following:
+        status = _watch_following(status, following, event, faults)
     return _watch_coast(status, event, faults)
 
 
@@ -211,7 +216,7 @@ def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, .
     if coast is None:
         speed = abs(reading.velocity_counts_per_s)
         return replace(status, coast=Coast(at_s, speed, at_s, speed)) if shows_velocity(reading) else status
-    seen = coast.observe(reading, at_s)
+    seen = coast.observe(reading, at_s, status.limits.slowing_counts_per_s2)
     if isinstance(seen, Coast):
         return status if seen is coast else replace(status, coast=seen)
     status = replace(status, coast=None)

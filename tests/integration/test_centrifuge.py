@@ -477,13 +477,15 @@ def test_a_healthy_rotor_that_is_stopped_at_speed_has_no_fault(rpm, ended):
     assert not alone(stops)
 
 
-@pytest.mark.parametrize("speed", [6.0, 4.0, 2.0])
+@pytest.mark.parametrize("after_s", [0.0, 0.03, 0.06, 0.1, 0.3, 1.0])
+@pytest.mark.parametrize("speed", [10.0, 3.0])
 @pytest.mark.sweep(3)
-def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed):
+def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed, after_s):
     async def freezes(machine):
-        await machine.spin()
+        await machine.rotor.move_velocity(speed, acceleration=10, duration_s=60)
+        await machine.rig.until(lambda: machine.speed > 0.95 * speed)
         await machine.rotor.power(on=False)
-        await machine.rig.until(lambda: machine.speed < speed)
+        await asyncio.sleep(after_s)
         machine.rig.faults.encoder_stuck("rotor")
         written_at = []
         for _ in range(40):
