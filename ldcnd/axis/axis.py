@@ -593,7 +593,8 @@ class AxisService:
                     self.tracker.take(LoopSeen(reading.enabled))
         except LdcndError as error:
             if not self.readings.seen:  # a stop that comes now withdraws the reading, and is sent itself
-                log.warning("stop not sent again", axis=self.config.name, reason=error.message)
+                tell = log.warning if self.tracker.status.stop_pending else log.info
+                tell("not read yet, its stop waits", axis=self.config.name, reason=error.message)
                 return
             log.debug("stop sent to a drive that cannot be read", axis=self.config.name, reason=error.message)
         await self.stops.send_pending()

@@ -45,7 +45,7 @@ READ_WITHIN_S = 5.0
 confirmed. A line that is searched at its rate after reset first, and then at its own, takes one or two."""
 SETTLES_WITHIN_S = 0.25
 """Time within which a shaft follows its finished profile, seconds."""
-FOUND_OPEN = "switched off when its line was taken over"
+FOUND_OPEN = "sent because its loop was open when its line was taken over"
 OVERTAKES = {Verb.POWER: "power off"}
 """What is said of a command that overtakes others, where it is not its name."""
 BY_MODE = {StopMode.SMOOTH: Verb.HALT, StopMode.ABRUPT: Verb.QUICK_STOP, StopMode.OFF: Verb.POWER}

@@ -202,6 +202,7 @@ class Service:
 
     async def run(self) -> None:
         """Serve until `end` is called or the caller is cancelled."""
+        self._notifier.tell(systemd.status("starting"))  # else that of the run before is shown
         async with asyncio.TaskGroup() as group:
             certificate = watch_certificate(self._daemon.rig.certificate, _tell_of_certificate)
             beside = [

@@ -149,7 +149,8 @@ async def test_ready_comes_first_and_stopping_last(manager: Manager):
         messages = await manager.listen(2)
 
     messages += manager.heard()
-    assert messages[0].startswith("READY=1\nSTATUS=rig sim: 0/1 buses, 0/4 axes up; line0: the line is not up: ")
+    assert messages[0] == "STATUS=starting"
+    assert messages[1].startswith("READY=1\nSTATUS=rig sim: 0/1 buses, 0/4 axes up; line0: the line is not up: ")
     assert any("STATUS=rig sim: 1/1 buses, 4/4 axes up" in message for message in messages)
     assert messages[-2:] == ["STOPPING=1\nSTATUS=stopping: axes come to rest", "STATUS=stopped; all axes at rest"]
 
