@@ -141,6 +141,7 @@ class Following:
         low: lowest position since; infinite before the first.
         high: highest.
         faults: it is a fault then; else the axis may only move unseen, until its encoder counts again.
+        window_counts: how far from the end of its profile a shaft may stay; infinite where it need not settle.
     """
 
     command_id: str
@@ -158,6 +159,7 @@ class Following:
     low: float = math.inf
     high: float = -math.inf
     faults: bool = True
+    window_counts: float = math.inf
 
     @property
     def is_missed(self) -> bool:
@@ -200,16 +202,21 @@ class Following:
                 low=position,
                 high=position,
                 faults=self.faults,
+                window_counts=self.window_counts,
             )
         gone = max(self.gone_counts, self._gone_counts(at_s) if runs else 0.0)
         first = error if self.error_counts is None else self.error_counts
         if first is not None and error is not None:
             gone = max(gone, abs(error) - abs(first))
+            if not runs and abs(error) > self.window_counts:
+                gone = max(gone, 2 * self.least_counts)
         until_s, given_up = math.inf, False
         if not reading.enabled:  # nothing pushes a shaft any more that has never moved; another may stop at once
             return self.counted or gone < self.least_counts
         soon = 0 < (at_s - self.since_s) * self.speed_counts_per_s < 4 * REST_COUNTS  # it had no time to go on
-        if not runs and not soon:
+        # its drive tells the error, in another reading
+        awaited = error is None and first is not None and self.window_counts < math.inf
+        if not runs and not soon and not (awaited and gone < self.least_counts):
             if gone < self.least_counts * (2 if self.counted else 1):
                 return True
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)

@@ -504,6 +504,23 @@ def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed,
     assert alone(freezes) == ([], Moving.UNKNOWN)
 
 
+@pytest.mark.parametrize("acceleration", [1.0, 5.0])
+@pytest.mark.parametrize("share", [0.8, 0.5, 0.35])
+@pytest.mark.sweep(3)
+def test_a_counter_that_stands_still_while_a_slow_rotor_brakes_is_found(acceleration, share):
+    async def freezes(machine):
+        await machine.rotor.move_velocity(0.5, acceleration=acceleration, duration_s=60)
+        await asyncio.sleep(2)
+        await machine.rotor.halt()
+        await machine.rig.until(lambda: machine.speed < 0.5 * share)
+        machine.rig.faults.encoder_stuck("rotor")
+        await asyncio.sleep(4)
+        state = machine.rotor.state.sample
+        return machine.speed > CREEPS and state.moving is not Moving.UNKNOWN
+
+    assert not alone(freezes)
+
+
 def test_a_rotor_whose_counter_stands_still_may_move_on_every_face_until_somebody_has_looked(monkeypatch):
     with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
         machine.wait(asyncio.sleep(1))
