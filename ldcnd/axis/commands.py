@@ -31,7 +31,7 @@ from ldcnd.axis.procedures.pwm import PwmRun
 from ldcnd.axis.procedures.track import SetPoint
 from ldcnd.axis.procedures.velocity import VelocityChange
 from ldcnd.axis.status import Completion
-from ldcnd.axis.trapezoid import braking_way, rest_of_profile_s
+from ldcnd.axis.trapezoid import braking_way, duration_from_s, way_within
 from ldcnd.contract.commands import (
     AxisCommand,
     BufferMode,
@@ -461,9 +461,13 @@ class AxisCommands:
             return False  # it has ended meanwhile: what was loaded is not started
         await permit.start()
         self._moved = permit, changed, share, farthest
-        way = abs((changed.target_counts or 0) - self._motion.latest().position_counts)
-        rest_s = rest_of_profile_s(
-            way, motion.velocity_counts_per_s, changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
+        reading = self._motion.latest()
+        way = abs((changed.target_counts or 0) - reading.position_counts)
+        rest_s = duration_from_s(
+            way,
+            abs(reading.velocity_counts_per_s),
+            changed.velocity_counts_per_s,
+            changed.acceleration_counts_per_s2,
         )
         clock, pace = self._motion.clock, self._motion.pace(permit)
         profile = changed.velocity_counts_per_s, changed.acceleration_counts_per_s2
@@ -478,11 +482,12 @@ class AxisCommands:
             farthest: where it was to end at the speed that it was asked for, counts.
         """
         reading, rest_s = self._motion.latest(), (self._tracker.status.ends_at_s or 0.0) - self._motion.clock.now_s()
-        speed, rate = motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
-        braking = braking_way(abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s, rate)
-        way = max(speed * rest_s - speed**2 / (2 * rate), 2 * braking)
+        speed = abs(reading.velocity_counts_per_s)
+        way = way_within(rest_s, speed, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
+        # where it is by now it is a little farther
+        least = 2 * braking_way(speed, motion.acceleration_counts_per_s2)
         left = farthest - reading.position_counts
-        end = reading.position_counts + math.copysign(min(way, abs(left)), left)
+        end = reading.position_counts + math.copysign(min(max(way, least), abs(left)), left)
         return replace(motion, target_counts=round(end))
 
     # -- registers ---------------------------------------------------------------------------------------------------

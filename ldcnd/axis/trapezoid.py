@@ -21,6 +21,21 @@ def rest_of_profile_s(way: float, before: float, after: float, acceleration: flo
     return way / after + after / (2 * acceleration) + change_s * abs(after - before) / (2 * after)
 
 
+def way_within(lasts_s: float, before: float, velocity: float, acceleration: float) -> float:
+    """Return the way of a trapezoid that begins at a velocity and ends at rest after a time, or as soon as it can.
+
+    Args:
+        lasts_s: that time.
+        before: velocity at its beginning, from 0 upwards.
+        velocity: highest one of the trapezoid, once it has slewed, above 0.
+        acceleration: of the trapezoid, above 0.
+    """
+    held = min(velocity, max(before / 2, (acceleration * lasts_s + before) / 2))
+    slew_s = abs(held - before) / acceleration
+    slewing = (held + before) / 2 * slew_s
+    return slewing + held * max(0.0, lasts_s - slew_s - held / acceleration) + braking_way(held, acceleration)
+
+
 def duration_from_s(way: float, before: float, velocity: float, acceleration: float) -> float:
     """Return how long a trapezoid takes that begins at a velocity; any consistent units.
 

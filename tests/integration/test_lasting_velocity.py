@@ -60,24 +60,34 @@ async def test_a_healthy_axis_that_is_slowed_down_in_mid_motion_has_no_fault(kin
     assert (state.state, later.state, later.moving) == (AxisState.STANDSTILL, AxisState.STANDSTILL, Moving.NO)
 
 
-@pytest.mark.parametrize("shares", [(50, 50), (25, 100), (50, 75)])
-@pytest.mark.sweep(2)
-async def test_a_motion_ends_in_its_time_at_whatever_speed_override(shares):
+@pytest.mark.parametrize(
+    ("acceleration", "changes"),
+    [
+        (10.0, [(5, 50)]),
+        (10.0, [(5, 25), (10, 100)]),
+        (10.0, [(5, 50), (10, 75)]),
+        (1.0, [(2, 10), (4, 100)]),
+        (1.0, [(0.5, 50), (8, 100)]),
+        (2.0, [(1, 10), (3, 100), (6, 20), (14, 100)]),
+    ],
+)
+@pytest.mark.sweep(3)
+async def test_a_motion_ends_in_its_time_at_whatever_speed_override(acceleration, changes):
     async with running_machine(machine(axis=LONG)) as rig:
         await rig.client.command("rotor", Power(on=True))
-        await rig.client.command("rotor", SPIN)
         begun_s = asyncio.get_running_loop().time()
-        for percent in shares:
-            await asyncio.sleep(5)
+        await rig.client.command("rotor", SPIN.model_copy(update={"acceleration": acceleration}))
+        for at_s, percent in changes:
+            await asyncio.sleep(begun_s + at_s - asyncio.get_running_loop().time())
             await rig.client.ask(SetSpeedOverride(percent=percent))
-        await asyncio.sleep(2)
-        assert rig.speed() == pytest.approx(5.0 * shares[-1] / 100, rel=0.05)
+        await asyncio.sleep(begun_s + 19.0 - asyncio.get_running_loop().time())
+        speed = rig.speed()
         state = await rig.until("rotor", lambda state: state.command is None)
         took_s = asyncio.get_running_loop().time() - begun_s
 
-    assert took_s == pytest.approx(20.5, abs=1.0)
-    assert state.last_error is None
-    assert state.state is AxisState.STANDSTILL
+    assert speed == pytest.approx(5.0 * changes[-1][1] / 100, rel=0.2)
+    assert took_s == pytest.approx(20.0 + 2 * 5.0 / acceleration, abs=0.6)
+    assert (state.last_error, state.state) == (None, AxisState.STANDSTILL)
 
 
 @pytest.mark.long
