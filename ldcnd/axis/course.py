@@ -166,6 +166,12 @@ class Following:
         """Whether a part of the profile is over in which the shaft was to move, and was not seen to."""
         return self.until_s < math.inf
 
+    @property
+    def is_unseen(self) -> bool:
+        """Whether a part of the profile has gone, or is over, in which the shaft was not seen to move."""
+        coming = self.speed_counts_per_s**2 / (4 * self.acceleration_counts_per_s2)
+        return self.is_missed or self.gone_counts >= 2 * self.least_counts + coming
+
     def after(self, before: "Following | None") -> "Following":
         """Return it behind an earlier motion of its command, in which the shaft was perhaps not seen to move."""
         if before is None or before.command_id != self.command_id or before.counted:

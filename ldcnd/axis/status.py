@@ -359,9 +359,9 @@ class AxisStatus:
 
     @property
     def rest_unproven_by(self) -> str:
-        """The same, also of a motion whose profile is over and whose shaft is yet to be seen to have moved."""
-        missed = self.following is not None and self.following.is_missed
-        return NOT_FOLLOWED.code if missed else self.motion_hidden_by
+        """The same, also of a motion in which the shaft is yet to be seen to move."""
+        unseen = self.following is not None and self.following.is_unseen
+        return NOT_FOLLOWED.code if unseen else self.motion_hidden_by
 
     @property
     def moving(self) -> Moving:

@@ -460,7 +460,7 @@ def _next_following(status: AxisStatus, event: MotionStarted) -> Following | Non
     if event.following:
         return event.following.after(status.following)
     before, command = status.following, status.command
-    if before is None or command is None or command.opens_loop or event.unsure:
+    if before is None or command is None or command.opens_loop:
         return None
     # what brings a motion to rest goes on with its profile
     if command.state is not AxisState.STOPPING and command.command_id != before.command_id:

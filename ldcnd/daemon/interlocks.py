@@ -116,9 +116,11 @@ class BoundRule:
     def violation(self, what: str, lacks: Sequence[Lack]) -> InterlockViolated:
         """Return the refusal of what it binds."""
         name = self.config.name
-        steps = tuple(each.step for each in lacks if each.step)
+        found = [each.step for each in lacks if each.step]
+        # one command may be what several of them lack
+        steps = tuple({frozenset(each.arguments.items()): each for each in reversed(found)}.values())[::-1]
         ways = [each.said for each in steps]
-        if len(steps) < len(lacks):
+        if len(found) < len(lacks):
             ways.append(f"see to it that {'the rest' if steps else 'this'} holds")
         return InterlockViolated(
             f"{what}: interlock {name}: {in_words(lacks)}",

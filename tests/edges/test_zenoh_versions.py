@@ -79,6 +79,8 @@ async def test_a_client_with_nothing_but_the_keys_moves_watches_and_stops_an_axi
             assert "accepted" in told
             assert abs((await rig.position("x")).value - 10.0) < 0.05
 
+            while (await rig.state("x")).command:  # it has arrived, and may settle
+                await asyncio.sleep(0.05)
             await rig.command("x", MoveAbsolute(position=-50.0))
             stopped = await run(zenoh, "-c", STOP, endpoint)
             while (state := await rig.state("x")).moving is not Moving.NO:

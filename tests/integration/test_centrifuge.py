@@ -394,6 +394,13 @@ async def jogged(rotor):
     return await rotor.halt()
 
 
+async def jogged_on(rotor):
+    async with rotor.jogging(0.5) as jog:
+        for _ in range(15):
+            await asyncio.sleep(0.2)
+            await jog.held()
+
+
 @pytest.mark.parametrize(
     "sent",
     [
@@ -402,8 +409,9 @@ async def jogged(rotor):
         lambda rotor: rotor.move_relative(-0.3),
         lambda rotor: rotor.move_velocity(0.2, acceleration=1, duration_s=0.8),
         jogged,
+        jogged_on,
     ],
-    ids=["home", "a short move", "a move", "velocity", "jog"],
+    ids=["home", "a short move", "a move", "velocity", "jog", "a long jog"],
 )
 @pytest.mark.parametrize("unsettled", ["fault", "report"])
 @pytest.mark.sweep(3)
@@ -502,6 +510,22 @@ def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed,
         return written_at, moving
 
     assert alone(freezes) == ([], Moving.UNKNOWN)
+
+
+@pytest.mark.parametrize("rpm", [3.0, 5.5])
+def test_a_counter_that_stands_still_in_a_slow_motion_opens_no_lock(rpm):
+    async def creeps(machine):
+        machine.rig.faults.encoder_stuck("rotor")
+        await machine.rotor.move_velocity(rpm / 60, acceleration=1, duration_s=60)
+        written_at = []
+        for _ in range(60):
+            await asyncio.sleep(0.1)
+            with suppress(LdcndError):
+                await machine.high("unlock")
+                written_at.append(machine.speed)
+        return [each for each in written_at if each > 1.0]
+
+    assert alone(creeps) == []
 
 
 @pytest.mark.parametrize("acceleration", [1.0, 5.0])
