@@ -7,7 +7,9 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
+from ldcnd.contract.condition import certificate_troubles
 from ldcnd.contract.errors import ConfigError, LdcndError, OutcomeUnknown, SessionError
+from ldcnd.contract.health import CertificateHealth
 
 _SOURCE_LOCATION = re.compile(r",? at /\S+\.rs:\d+\.?")
 
@@ -25,9 +27,19 @@ def no_answer(key: str, timeout_s: float) -> OutcomeUnknown:
     return OutcomeUnknown(f"{key}: no answer within {timeout_s:g} s; it may be carried out all the same")
 
 
-def login_refused(refusals: Sequence[str]) -> SessionError:
-    """Return the error for a session that the other side did not let in."""
+def login_refused(refusals: Sequence[str], certificate: CertificateHealth | None, t: int) -> SessionError:
+    """Return the error for a session that the other side did not let in.
+
+    Args:
+        refusals: what is known of why, by endpoint.
+        certificate: the login's own; None where there is none.
+        t: the present, UTC in ns since 1970.
+    """
     reason = "; ".join(refusals)
+    if certificate and certificate.ends <= t:
+        (trouble,) = certificate_troubles(certificate, t)
+        ended, _, remedy = trouble.partition(": ")
+        return SessionError(f"{reason}: {ended}", remedy=remedy)
     if "expired" in reason:
         return SessionError(
             reason, remedy="renew the certificate that has ended, this login's or the daemon's: pki renew"

@@ -104,9 +104,8 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
             remedy="use `rig.client` there, or run a program that blocks by `await rig.run_blocking(program)`",
         )
     config = zenoh_config(settings)
-    certificate = certificate_in_use(
-        config
-    )  # before Zenoh reads it: a file that is replaced then counts as the old one
+    # before Zenoh reads it: a file that is replaced then counts as the old one
+    certificate = certificate_in_use(config)
     listen, connect = endpoints(config, "listen"), endpoints(config, "connect")
     # only who listens serves many: a client that connects keeps Zenoh's single sending thread
     if listen:
@@ -117,7 +116,7 @@ async def open_zenoh_session(settings: ZenohSettings) -> AsyncIterator[Session]:
     except zenoh.ZError as error:
         about_connecting = zenoh_failures.is_about_connecting(str(error))
         if about_connecting and (refused := await refusals(connect, root_certificate(config))):
-            raise zenoh_failures.login_refused(refused) from error
+            raise zenoh_failures.login_refused(refused, certificate, time.time_ns()) from error
         unknown = await unresolved(connect) if about_connecting else ()
         raise zenoh_failures.opening_failed(str(error), listen, connect, unknown) from error
     except TimeoutError:

@@ -146,7 +146,10 @@ async def test_an_operator_of_another_authority_is_refused_and_says_so(rig: Secu
 async def test_a_certificate_that_has_ended_is_refused_and_says_so(rig: SecuredRig, tmp_path: Path) -> None:
     Site(rig.folder).add(new_login("late", Role.OPERATOR, ()), NOW - dt.timedelta(days=9), 1)
 
-    assert "one that has ended" in (await refused(rig, rig.folder / "late.json5")).message
+    told = await refused(rig, rig.folder / "late.json5")
+
+    assert "the certificate of late has ended on" in told.message
+    assert told.remedy == "`ldcnd pki renew SITE late`, put its file in place, and restart what uses it"
 
 
 async def test_plain_tcp_is_refused_and_says_so(rig: SecuredRig, tmp_path: Path) -> None:
