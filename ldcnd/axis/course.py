@@ -190,26 +190,7 @@ class Following:
         low, high = min(self.low, position), max(self.high, position)
         runs = reading.enabled and not reading.profile_done
         if high - low > REST_COUNTS:
-            speed = max(0.0, abs(reading.velocity_counts_per_s) - reading.velocity_resolution_counts_per_s)
-            if runs:  # it may have ceased to count since: a profile brakes no faster than this
-                braked = BRAKES_SHARE * self.acceleration_counts_per_s2 * (at_s - self.since_s)
-                speed = max(speed, self.speed_counts_per_s - braked)
-            return Following(
-                self.command_id,
-                self.velocity_counts_per_s,
-                self.acceleration_counts_per_s2,
-                self.way_counts,
-                self.least_counts,
-                at_s,
-                counted=True,
-                speed_counts_per_s=speed,
-                error_counts=self.error_counts if error is None else error,
-                gone_counts=speed**2 / (4 * self.acceleration_counts_per_s2),  # half of what it needs to brake
-                low=position,
-                high=position,
-                faults=self.faults,
-                window_counts=self.window_counts,
-            )
+            return self._seen_to_move(reading, at_s, runs=runs)
         gone = max(self.gone_counts, self._gone_counts(at_s) if runs else 0.0)
         first = error if self.error_counts is None else self.error_counts
         if first is not None and error is not None:
@@ -220,12 +201,16 @@ class Following:
         if not reading.enabled:  # nothing pushes a shaft any more that has never moved; another may stop at once
             return self.counted or gone < self.least_counts
         soon = 0 < (at_s - self.since_s) * self.speed_counts_per_s < 4 * REST_COUNTS  # it had no time to go on
-        # its drive tells the error, in another reading
-        awaited = error is None and first is not None and self.window_counts < math.inf
-        if not runs and not soon and not (awaited and gone < self.least_counts):
-            if gone < self.least_counts * (2 if self.counted else 1):
-                return True
+        if runs:
+            if self.faults and self.is_unseen and at_s - self.since_s >= FOLLOWS_WITHIN_S:
+                return False
+        elif not soon:
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
+            if gone < self.least_counts * (2 if self.counted else 1):
+                # its drive may tell the error in another reading
+                if error is None and first is not None and self.window_counts < math.inf and at_s < until_s:
+                    return self if self.is_missed else replace(self, until_s=until_s)
+                return True
             given_up = at_s >= until_s
             if given_up and self.faults:
                 return False
@@ -233,6 +218,29 @@ class Following:
                 return self
         return replace(
             self, error_counts=first, gone_counts=gone, until_s=until_s, given_up=given_up, low=low, high=high
+        )
+
+    def _seen_to_move(self, reading: AxisReading, at_s: float, *, runs: bool) -> "Following":
+        speed = max(0.0, abs(reading.velocity_counts_per_s) - reading.velocity_resolution_counts_per_s)
+        if runs:  # it may have ceased to count since: a profile brakes no faster than this
+            braked = BRAKES_SHARE * self.acceleration_counts_per_s2 * (at_s - self.since_s)
+            speed = max(speed, self.speed_counts_per_s - braked)
+        error = reading.following_error_counts
+        return Following(
+            self.command_id,
+            self.velocity_counts_per_s,
+            self.acceleration_counts_per_s2,
+            self.way_counts,
+            self.least_counts,
+            at_s,
+            counted=True,
+            speed_counts_per_s=speed,
+            error_counts=self.error_counts if error is None else error,
+            gone_counts=speed**2 / (4 * self.acceleration_counts_per_s2),  # half of what it needs to brake
+            low=reading.position_counts,
+            high=reading.position_counts,
+            faults=self.faults,
+            window_counts=self.window_counts,
         )
 
     def _gone_counts(self, at_s: float) -> float:

@@ -198,7 +198,8 @@ def _watch_following(
     if isinstance(seen, Following):
         return status if seen is following else replace(status, following=seen)
     if seen and status.command and not tripped:
-        return status  # at a velocity that it has reached its drive says that its profile is done
+        # at a velocity that it has reached its drive says that its profile is done
+        return replace(status, following=replace(following, until_s=math.inf)) if following.is_missed else status
     status = replace(status, following=None)
     if seen:
         return status

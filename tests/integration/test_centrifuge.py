@@ -512,6 +512,23 @@ def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed,
     assert alone(freezes) == ([], Moving.UNKNOWN)
 
 
+@pytest.mark.parametrize("rpm", [10.0, 60.0])
+def test_a_motor_is_switched_off_that_runs_away_beside_a_slow_motion(rpm):
+    async def runs_away(machine):
+        machine.rig.faults.encoder_stuck("rotor")
+        await machine.rotor.move_velocity(rpm / 60, acceleration=1, duration_s=60)
+        await machine.rig.until(lambda: not machine.rotor.state.sample.enabled)
+        begun_s = asyncio.get_running_loop().time()
+        await machine.rig.until(lambda: machine.rotor.state.sample.motion_hidden_by)
+        return begun_s
+
+    async def timed(machine):
+        at_s = asyncio.get_running_loop().time()
+        return await runs_away(machine) - at_s
+
+    assert alone(timed) < 2.5
+
+
 @pytest.mark.parametrize("rpm", [3.0, 5.5])
 def test_a_counter_that_stands_still_in_a_slow_motion_opens_no_lock(rpm):
     async def creeps(machine):
