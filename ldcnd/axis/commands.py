@@ -17,7 +17,7 @@ from ldcnd.axis.events import (
     SpeedChanged,
 )
 from ldcnd.axis.gains import AxisGains
-from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.motion import LATENCY_S, AxisMotion, MotionPlan
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.analog import AnalogMove
@@ -72,6 +72,8 @@ STEP_RETRY_S = 0.2
 """Delay before a step whose packets were lost is taken again, seconds,"""
 BLIND_RETRY_S = 1.0
 """and the delay while the drive does not reply at all."""
+BRAKING_ROOM = 1.1
+"""Least way to a new end in mid-motion, as a multiple of what it needs to brake."""
 MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
 """Trapezoids in the drive."""
 
@@ -108,6 +110,7 @@ class AxisCommands:
         self.procedure: Procedure | None = None
         self.holds = Holds(motion.config.name)
         self.gains = AxisGains(motion)
+        self._ends_at_s = 0.0  # when the motion was to end that has been sent last, in loop time
         self._moved: tuple[Permit, CountsMotion, float, int | None] | None = (
             None  # the last trapezoid, and the speed share of its plan
         )
@@ -429,6 +432,7 @@ class AxisCommands:
         self._moved = permit, plan.motion, self._tracker.status.speed_share, plan.motion.target_counts
         await permit.load(plan.motion)
         await self._motion.start(permit, state, completion, plan=plan)
+        self._ends_at_s = self._tracker.status.ends_at_s or 0.0
         return self._motion.reply(permit, plan)
 
     async def change_speed(self) -> bool:
@@ -481,11 +485,11 @@ class AxisCommands:
             motion: with its new speed.
             farthest: where it was to end at the speed that it was asked for, counts.
         """
-        reading, rest_s = self._motion.latest(), (self._tracker.status.ends_at_s or 0.0) - self._motion.clock.now_s()
+        reading, rest_s = self._motion.latest(), self._ends_at_s - self._motion.clock.now_s()
         speed = abs(reading.velocity_counts_per_s)
         way = way_within(rest_s, speed, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
-        # where it is by now it is a little farther
-        least = 2 * braking_way(speed, motion.acceleration_counts_per_s2)
+        # by the time at which the drive has it, it is a little farther
+        least = BRAKING_ROOM * braking_way(speed, motion.acceleration_counts_per_s2) + speed * LATENCY_S
         left = farthest - reading.position_counts
         end = reading.position_counts + math.copysign(min(max(way, least), abs(left)), left)
         return replace(motion, target_counts=round(end))

