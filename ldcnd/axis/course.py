@@ -141,7 +141,6 @@ class Following:
         low: lowest position since; infinite before the first.
         high: highest.
         faults: it is a fault then; else the axis may only move unseen, until its encoder counts again.
-        window_counts: how far from the end of its profile a shaft may stay; infinite where it need not settle.
     """
 
     command_id: str
@@ -159,7 +158,6 @@ class Following:
     low: float = math.inf
     high: float = -math.inf
     faults: bool = True
-    window_counts: float = math.inf
 
     @property
     def is_missed(self) -> bool:
@@ -195,8 +193,6 @@ class Following:
         first = error if self.error_counts is None else self.error_counts
         if first is not None and error is not None:
             gone = max(gone, abs(error) - abs(first))
-            if not runs and abs(error) > self.window_counts:
-                gone = max(gone, 2 * self.least_counts)
         until_s, given_up = math.inf, False
         if not reading.enabled:  # nothing pushes a shaft any more that has never moved; another may stop at once
             return self.counted or gone < self.least_counts
@@ -207,9 +203,6 @@ class Following:
         elif not soon:
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
             if gone < self.least_counts * (2 if self.counted else 1):
-                # its drive may tell the error in another reading
-                if error is None and first is not None and self.window_counts < math.inf and at_s < until_s:
-                    return self if self.is_missed else replace(self, until_s=until_s)
                 return True
             given_up = at_s >= until_s
             if given_up and self.faults:
@@ -240,7 +233,6 @@ class Following:
             low=reading.position_counts,
             high=reading.position_counts,
             faults=self.faults,
-            window_counts=self.window_counts,
         )
 
     def _gone_counts(self, at_s: float) -> float:

@@ -577,7 +577,6 @@ class AxisMotion:
             since_s=self.clock.now_s(),
             # what a search finds makes a reference: of an encoder that does not count it is none
             faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
-            window_counts=self.window_counts if self.config.settle.unsettled == "fault" else math.inf,
         )
 
     def pace(self, permit: Permit) -> Pace | None:
