@@ -356,7 +356,7 @@ class AxisService:
         first = [error for error, guard in found if guard in (guards.check_reachable, guards.check_not_latched)]
         # a warning keeps nothing from moving
         faults = [each for each in self.tracker.status.active_faults if each.source == "drive" and each.stops]
-        causes = [(error, False) for error in (*first, *(guards.fault(name, each) for each in faults))]
+        causes = [(error, False) for error in (*first, *(guards.fault(self.tracker, each) for each in faults))]
         for error, guard in found:
             if guard is guards.check_not_in_error:
                 causes.append((guards.error_stop(self.tracker, faults), False))

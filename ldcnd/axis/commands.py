@@ -3,7 +3,7 @@
 import math
 from collections.abc import Awaitable, Callable, Mapping
 from contextlib import nullcontext
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 from ldcnd.axis import guards
@@ -78,6 +78,25 @@ MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})
 """Trapezoids in the drive."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Moved:
+    """The trapezoid that was sent last, as the speed override may change it on its way.
+
+    Attributes:
+        permit: of its command.
+        motion: as the drive has it.
+        share: of its velocity, that the override leaves.
+        farthest_counts: where it was to end as it began; None without an end.
+        ends_at_s: when, in loop time; infinite without one.
+    """
+
+    permit: Permit
+    motion: CountsMotion
+    share: float
+    farthest_counts: int | None
+    ends_at_s: float
+
+
 Carry = Callable[[Any, Permit, Any], Awaitable[CommandReply]]
 """Carries out one kind of command; takes the `AxisCommands`, the permit and the request."""
 
@@ -110,10 +129,7 @@ class AxisCommands:
         self.procedure: Procedure | None = None
         self.holds = Holds(motion.config.name)
         self.gains = AxisGains(motion)
-        self._ends_at_s = 0.0  # when the motion was to end that has been sent last, in loop time
-        self._moved: tuple[Permit, CountsMotion, float, int | None] | None = (
-            None  # the last trapezoid, and the speed share of its plan
-        )
+        self._moved: _Moved | None = None  # the last trapezoid, and the speed share of its plan
         self._retry_s: float | None = None  # when the step that was not taken is taken again
         self._blind = False  # that step was tried while the drive did not answer
 
@@ -429,10 +445,12 @@ class AxisCommands:
         state: AxisState,
         completion: Completion = Completion.PROFILE,
     ) -> CommandReply:
-        self._moved = permit, plan.motion, self._tracker.status.speed_share, plan.motion.target_counts
+        share = self._tracker.status.speed_share
+        self._moved = _Moved(permit, plan.motion, share, plan.motion.target_counts, math.inf)
         await permit.load(plan.motion)
         await self._motion.start(permit, state, completion, plan=plan)
-        self._ends_at_s = self._tracker.status.ends_at_s or 0.0
+        ends_at_s = self._tracker.status.ends_at_s or math.inf
+        self._moved = _Moved(permit, plan.motion, share, plan.motion.target_counts, ends_at_s)
         return self._motion.reply(permit, plan)
 
     async def change_speed(self) -> bool:
@@ -451,20 +469,24 @@ class AxisCommands:
             return self.step_due
         if self._moved is None or not self._driver.retargets or command is None or share <= 0:
             return False
-        permit, motion, before, farthest = self._moved
-        if command.command_id != permit.command_id or command.completion is not Completion.PROFILE or share == before:
+        moved, permit, motion = self._moved, self._moved.permit, self._moved.motion
+        if (
+            command.command_id != permit.command_id
+            or command.completion is not Completion.PROFILE
+            or share == moved.share
+        ):
             return False
         changed = self._motion.quantise(
-            replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / before)
+            replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / moved.share)
         )
-        if command.state is AxisState.CONTINUOUS_MOTION and farthest is not None:
-            changed = self._that_ends_in_time(changed, farthest)
+        if command.state is AxisState.CONTINUOUS_MOTION and moved.farthest_counts is not None:
+            changed = self._that_ends_in_time(changed, moved.farthest_counts, moved.ends_at_s)
         # a motion to a position keeps its goal, and another ends sooner: what is lost on the way turns nothing round
         await permit.load(changed)
         if tracker.status.command is not command:
             return False  # it has ended meanwhile: what was loaded is not started
         await permit.start()
-        self._moved = permit, changed, share, farthest
+        self._moved = replace(moved, motion=changed, share=share)
         reading = self._motion.latest()
         way = abs((changed.target_counts or 0) - reading.position_counts)
         rest_s = duration_from_s(
@@ -478,14 +500,15 @@ class AxisCommands:
         tracker.take(SpeedChanged(rest_s, clock.now_s(), clock.now_ns(), pace, changed.target_counts, profile))
         return True
 
-    def _that_ends_in_time(self, motion: CountsMotion, farthest: int) -> CountsMotion:
+    def _that_ends_in_time(self, motion: CountsMotion, farthest: int, ends_at_s: float) -> CountsMotion:
         """Return a motion at a velocity with an end for its new speed: it was given a time, and not a way.
 
         Args:
             motion: with its new speed.
             farthest: where it was to end at the speed that it was asked for, counts.
+            ends_at_s: when it was to, in loop time.
         """
-        reading, rest_s = self._motion.latest(), self._ends_at_s - self._motion.clock.now_s()
+        reading, rest_s = self._motion.latest(), ends_at_s - self._motion.clock.now_s()
         speed = abs(reading.velocity_counts_per_s)
         way = way_within(rest_s, speed, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
         # by the time at which the drive has it, it is a little farther

@@ -220,15 +220,12 @@ def check_speed(axis: AxisTracker) -> None:
 def check_not_forced(axis: AxisTracker) -> None:
     """Refuse to reset a faulted axis whose motor has voltage and turns, or may, whatever the state says."""
     if axis.status.state is AxisState.ERROR_STOP and axis.status.energised and axis.status.moving is not Moving.NO:
-        off = step("power", 'send power {"on": false}', on=False)
+        waits = Remedy("{}, wait until it stands, then {}", step("halt"), step("reset"))
         raise WrongState(
             f"axis {axis.name} still moves, or may: a reset would switch its motor off at speed",
             axis=axis.name,
             value=axis.status.moving.value,
-            # of what readings cannot tell only a person can know that it stands
-            remedy=Remedy("{}, look that it stands, then {}", off, step("reset"))
-            if axis.status.motion_hidden_by
-            else Remedy("{}, wait until it stands, then {}", step("halt"), step("reset")),
+            remedy=_way_out(axis.status) if axis.status.motion_hidden_by else waits,
         )
 
 
@@ -242,15 +239,20 @@ def check_has_gains(drive: QuietDrive) -> None:
         )
 
 
-def fault(axis: str, entry: FaultEntry) -> DriveFault:
+def fault(axis: AxisTracker, entry: FaultEntry) -> DriveFault:
     """Return a fault of a drive as what keeps its axis from moving."""
-    looks = "look at it, for it may move unseen; " if entry.hides_motion else ""
-    return DriveFault(
-        f"axis {axis}: {entry.text}",
-        axis=axis,
-        value=entry.code,
-        remedy=Remedy(f"{looks}remove the cause, then {{}}", step("reset")),
-    )
+    return DriveFault(f"axis {axis.name}: {entry.text}", axis=axis.name, value=entry.code, remedy=_way_out(axis.status))
+
+
+def _way_out(status: AxisStatus) -> Remedy:
+    """Return the way out of a fault: where only a look tells whether the shaft stands, its motor is off before."""
+    clear = "remove the cause, then {}"
+    if not status.motion_hidden_by:
+        return Remedy(clear, step("reset"))
+    looks = f"look at it, for it may move unseen; {clear}"
+    if not status.energised:
+        return Remedy(looks, step("reset"))
+    return Remedy(f"{{}}; {looks}", step("power", 'send power {"on": false}', on=False), step("reset"))
 
 
 def error_stop(axis: AxisTracker, said: Collection[FaultEntry] = ()) -> WrongState:
@@ -262,7 +264,7 @@ def error_stop(axis: AxisTracker, said: Collection[FaultEntry] = ()) -> WrongSta
         causes = _said(axis, said) or ("" if said else "a command ended badly")
         text, remedy = (
             f"{in_error}: {causes}" if causes else in_error,
-            Remedy("remove the cause, then {}", step("reset")),
+            _way_out(status),
         )
     return WrongState(text, axis=axis.name, value=status.state, remedy=remedy)
 

@@ -122,7 +122,7 @@ class ActiveCommand:
 
     @property
     def goal(self) -> float | None:
-        """Where it is to come to rest, in axis units; None of one that somebody is to end."""
+        """Where it is to come to rest, in axis units; None of a motion that a command is to end."""
         return None if self.state is AxisState.CONTINUOUS_MOTION else self.target
 
 

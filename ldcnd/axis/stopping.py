@@ -159,7 +159,7 @@ class AxisStops:
                 first = still.asked[0].verb if still.asked else name
                 if wanted or self._tracker.status.was_read:
                     self.require(still.mode, first)
-                else:  # nobody has asked for it: the daemon does not know what the drive does
+                else:  # no client has asked for it: the daemon does not know what the drive does
                     self._tracker.take(StopDue(still.mode, LEFT, first))
                     self.wanted.set()
             self._publish()

@@ -27,7 +27,7 @@ async def until_at_rest(
         state: returns the last one.
         news: returns once something has come from the axis.
         within_s: longest wait, in seconds; without one as long as anything comes from it.
-        watched: somebody is at the machine: what may move unseen counts as standing once its readings rest.
+        watched: an operator is at the machine: what may move unseen counts as standing once its readings rest.
 
     Raises:
         OutcomeUnknown: the drive does not answer, nothing comes any more, or its readings prove no rest.
@@ -41,7 +41,7 @@ async def until_at_rest(
                 if last and last.has_ended:
                     if watched:
                         break
-                    raise motion_hidden(axis, last.motion_hidden_by)
+                    raise motion_hidden(axis, last)
                 try:
                     async with asyncio.timeout(PATIENCE_S):
                         await news()
@@ -61,13 +61,16 @@ def drive_silent(axis: str) -> OutcomeUnknown:
     return OutcomeUnknown(f"axis {axis}: the drive does not answer any more", axis=axis)
 
 
-def motion_hidden(axis: str, fault: str) -> OutcomeUnknown:
+def motion_hidden(axis: str, state: StateSample) -> OutcomeUnknown:
     """Return the error for an axis whose readings do not prove that it stands."""
+    off, fault = step("power", 'send power {"on": false}', on=False), state.motion_hidden_by
+    look = "look whether it stands, then {}"
     return OutcomeUnknown(
-        f"axis {axis}: it is not known whether it stands: after fault {fault} its encoder does not prove it",
+        f"axis {axis}: it is not known whether it stands: after {fault} its encoder does not prove it",
         axis=axis,
         value=fault,
-        remedy=Remedy("look at the machine, then {}", step("reset")),
+        # a reset of a motor under voltage is refused
+        remedy=Remedy(f"{{}}, {look}", off, step("reset")) if state.enabled else Remedy(look, step("reset")),
     )
 
 

@@ -303,8 +303,8 @@ _LATCHED_UNREAD = replace(_LATCHED, text="a stop is latched; the drive was not r
 _MAY_MOVE = Trouble(
     TroubleKind.HIDDEN,
     _WRONG,
-    "it may move: readings do not prove that it stands, because shaft and encoder did not go where they were sent; look"
-    " at the machine, then reset the axis",
+    "it may move: readings do not prove that it stands, because shaft and encoder did not go where they were sent;"
+    " switch its motor off, look at the machine, then reset it",
     "may move",
 )
 _UNCOMMANDED = Trouble(

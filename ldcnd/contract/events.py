@@ -92,7 +92,7 @@ class CommandEvent(Frozen):
     """The error code, when there is one."""
     target: float | None = None
     """Position at which the motion is to come to rest, in axis units; null of what names none before it has begun, and
-    of a motion that somebody is to end."""
+    of a motion that a command is to end."""
     position: float | None = None
     """Position at the end of a motion, in axis units, measured after it; null where none was measured."""
     last_position: float | None = None

@@ -14,6 +14,7 @@ from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import Halt, MoveAbsolute, MoveRelative, MoveVelocity, Power, Reset, Stop
 from ldcnd.contract.errors import DriveFault, WrongState
 from ldcnd.contract.events import CommandEvent, CommandStatus, ReadEvents, ReadOutcome
+from ldcnd.contract.questions import Why
 from ldcnd.contract.samples import AxisState, FaultSample, PositionSample, TelemetryItem
 from ldcnd.drives.axis_config import RatesConfig, SettleConfig
 from tests.support.rig import SIMULATED, RunningRig, running_rig
@@ -134,8 +135,12 @@ async def test_a_move_that_does_not_settle_is_a_fault_where_the_configuration_sa
         failed = await moved(rig, "x", 5.0)
         fault = await rig.client.last("x", TelemetryItem.FAULT)
         state = await rig.client.state("x")
-        with pytest.raises(WrongState, match="still moves, or may"):
+        why = await rig.client.ask(Why(), "x")
+        with pytest.raises(WrongState, match="still moves, or may") as refusal:
             await rig.client.command("x", Reset())
+        assert {why.causes[0].remedy, refusal.value.remedy} == {
+            'send power {"on": false}; look at it, for it may move unseen; remove the cause, then send reset'
+        }
         await rig.client.command("x", Power(on=False))
         await rig.client.command("x", Reset())
 
