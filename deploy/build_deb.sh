@@ -173,6 +173,12 @@ POSTRM
     chmod 755 "$root"/DEBIAN/{postinst,prerm,postrm}
 }
 
+# In KiB as Debian's policy counts it: how large a folder itself is depends on the file system that it was built on
+installed_size() { # ROOT
+    find "$1" -path "$1/DEBIAN" -prune -o -type f -printf '%s\n' -o -printf '1\n' |
+        awk '{ size += int(($1 + 1023) / 1024) } END { print size }'
+}
+
 pack() { # PACKAGE DEPENDS SUMMARY
     local root=$stage/$1 package
     mkdir -p "$root/DEBIAN"
@@ -184,7 +190,7 @@ Depends: $2
 Maintainer: ldcnd maintainers <ldcnd@localhost>
 Section: electronics
 Priority: optional
-Installed-Size: $(du -sk --apparent-size "$root" | cut -f1)
+Installed-Size: $(installed_size "$root")
 Description: $3
  ldcnd owns RS-485 lines of Logosol LDCN, J R Kerr NMC and OMRON SmartStep
  drives and lets clients watch and move them over Zenoh.
