@@ -112,6 +112,14 @@ def check_does_not_coast(axis: AxisTracker) -> None:
             value=axis.status.motion_hidden_by,
             remedy=Remedy("look whether it stands, then {}", step("reset")),
         )
+    if axis.status.may_coast:
+        raise WrongState(
+            f"axis {axis.name} may turn with its motor off: it was not read while it moved, and its encoder has not"
+            f" counted since; it stands once it has not counted for {axis.status.rest.unseen_s:g} s",
+            axis=axis.name,
+            limit=axis.status.rest.unseen_s,
+            remedy=Remedy("wait until it stands, then {}", step("power", 'send power {"on": true}', on=True)),
+        )
     if axis.status.coasts:
         raise WrongState(
             f"axis {axis.name} turns with its motor off: its drive would hold it at once, whatever its speed",

@@ -35,6 +35,8 @@ class RestEvidence:
         low: lowest of these positions, counts.
         high: highest of them.
         quiet_s: for how long they must.
+        unseen_s: for how long at least with the motor off, because the shaft may turn unseen; 0 once its encoder has
+            counted, or held its place.
     """
 
     rests: bool | None = None
@@ -44,6 +46,12 @@ class RestEvidence:
     low: int = 0
     high: int = 0
     quiet_s: float = REST_S
+    unseen_s: float = 0.0
+
+    @property
+    def is_unseen(self) -> bool:
+        """Whether a shaft that coasts with a dead encoder would look the same."""
+        return self.unseen_s > 0 and not self.rests
 
     def observe(self, reading: AxisReading, at_s: float) -> "RestEvidence":
         """Return the evidence with a reading that was requested at an instant, in loop time."""
@@ -61,8 +69,9 @@ class RestEvidence:
         low, high, held_s = min(self.low, position), max(self.high, position), at_s - self.since_s
         if high - low > REST_COUNTS:
             quiet_s = min(max(2 * held_s, REST_S), MOST_REST_S)
-            return replace(self, rests=False, quiet_s=quiet_s, since_s=at_s, low=position, high=position)
-        rests = True if held_s >= self.quiet_s else self.rests
+            return replace(self, rests=False, quiet_s=quiet_s, unseen_s=0.0, since_s=at_s, low=position, high=position)
+        least_s = self.quiet_s if reading.enabled else max(self.quiet_s, self.unseen_s)
+        rests = True if held_s >= least_s else self.rests
         if rests is self.rests and low == self.low and high == self.high:
             return self
         return replace(self, rests=rests, low=low, high=high)

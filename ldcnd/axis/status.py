@@ -50,12 +50,14 @@ class SoftLimits:
         high: highest position; infinity without one.
         window_counts: how far beyond them an axis may stand that was sent to one, in counts.
         slowing_counts_per_s2: how fast its shaft slows down at most with its motor off; None where that is not known.
+        unseen: what is known of the rest of its shaft before it is first read.
     """
 
     low: float = -math.inf
     high: float = math.inf
     window_counts: float = 0.0
     slowing_counts_per_s2: float | None = None
+    unseen: RestEvidence = NOTHING_SEEN
 
     @classmethod
     def of(cls, config: AxisConfig) -> "SoftLimits":
@@ -67,6 +69,7 @@ class SoftLimits:
             math.inf if high is None else high,
             window_counts(config),
             speed / config.coast_s if config.coast_s else None,
+            RestEvidence(unseen_s=UNSEEN_SHARE * config.coast_s) if config.coast_s else NOTHING_SEEN,
         )
 
     def span(self, scale: AxisScale) -> tuple[float, float]:
@@ -77,6 +80,8 @@ class SoftLimits:
 
 
 UNLIMITED = SoftLimits()
+UNSEEN_SHARE = 2.0
+"""Longest coasting as a multiple of `coast_s`, which is the shortest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -399,6 +404,11 @@ class AxisStatus:
     def coasts(self) -> bool:
         """Whether the shaft is seen to turn while the motor is off."""
         return self.rest.turns and not self.enabled
+
+    @property
+    def may_coast(self) -> bool:
+        """Whether the shaft may turn while the motor is off, and nobody would have seen it."""
+        return self.rest.is_unseen and not self.enabled
 
     @property
     def energised(self) -> bool:

@@ -346,7 +346,10 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
     if not was_up and not event.another and not event.asked:
         return status
     # a counter that is not read may have been set, so what it shows later is no place
-    status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=NOTHING_SEEN, coast=None)
+    # what stood goes on standing: only a motor that has power turns a shaft, and that the next reading shows
+    stood = status.at_rest and not status.rest_unproven_by
+    rest = NOTHING_SEEN if stood else status.limits.unseen
+    status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=rest, coast=None)
     status = _with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again
     return _fail(status, "the drive did not answer") if was_up and status.state is not AxisState.DISABLED else status
@@ -379,7 +382,9 @@ def _refuse_reference(status: AxisStatus, event: ReferenceRefused) -> AxisStatus
         return status  # there is another one
     text = f"{REFERENCE_REFUSED.text}: {event.reason}; home the axis, or set its position"
     own = _own_and(status, replace(REFERENCE_REFUSED, text=text))
-    return replace(status, refused=event.reason, reference_lost=True, own=own)
+    # it was left in a motion, or something has moved it since: it may turn still, and its encoder may be dead
+    rest = status.rest if status.rest.turns or status.enabled else status.limits.unseen
+    return replace(status, refused=event.reason, reference_lost=True, own=own, rest=rest)
 
 
 def _know_place(status: AxisStatus, event: PlaceKnown) -> AxisStatus:

@@ -279,6 +279,9 @@ class Interlocks:
         # a counter that stands still beside a shaft that turns looks like rest, as a jam does
         if (each.standstill or each.below is not None) and (fault := status.rest_unproven_by):
             return f"may move: after fault {fault} its encoder does not prove that it stands; look, then reset the axis"
+        if (each.standstill or each.below is not None) and status.may_coast:
+            seconds = f"{status.rest.unseen_s:g} s"
+            return f"may coast: it was not read while it moved, and stands once it has not counted for {seconds}"
         if each.standstill and not (status.rest.rests is True and not _commanded(status)):
             return "does not stand, or is not known to"
         if each.below is not None and (speed := _speed(axis)) >= each.below:

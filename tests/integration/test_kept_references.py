@@ -21,13 +21,14 @@ from ldcnd.config.rig import RigConfig
 from ldcnd.contract.commands import Halt, Home, MoveAbsolute, MoveRelative, Power, Reset, SetPosition
 from ldcnd.contract.errors import LdcndError, NotReferenced, ReplyTimeout, RequestRefused, WrongState
 from ldcnd.contract.events import CommandStatus, ReadEvents
-from ldcnd.contract.samples import FaultSample, LinkState, PositionSample, StateSample, TelemetryItem
+from ldcnd.contract.samples import FaultSample, LinkState, Moving, PositionSample, StateSample, TelemetryItem
 from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.received import PlainCommand, ResetPosition
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.durable import DISK_TIME_S
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.chain_rig import ChainRig, drive, rig_on, simulated_config
 from tests.support.small_disk import fill, small_disk
 
@@ -48,8 +49,12 @@ def keeping(folder: Path, axes: dict[str, object] | None = None, **bus: object) 
 
 
 async def up(rig: ChainRig, axis: str) -> StateSample:
-    """Wait until an axis answers, and is known to stand or to move."""
-    return await rig.until(axis, lambda state: state.link is LinkState.UP and state.moving != "unknown")
+    """Wait until an axis answers, and is known to stand or to move, or a fault hides it."""
+
+    def is_up(state: StateSample) -> bool:
+        return state.link is LinkState.UP and (state.moving is not Moving.UNKNOWN or bool(state.motion_hidden_by))
+
+    return await rig.until(axis, is_up)
 
 
 async def set_out(rig: ChainRig, axis: str = "x", position: float = 40.0, at: float = 7.0) -> None:
@@ -418,6 +423,37 @@ async def test_a_refused_reference_is_seen_where_an_operator_looks_and_stays_ref
     assert fault.first is None
     assert (again.referenced, said) == (False, [])
     assert (cleared.referenced, later.active) == (True, ())
+
+
+async def test_a_shaft_that_was_let_go_of_in_motion_under_an_earlier_daemon_may_turn_until_that_time_is_over(tmp_path):
+    # an encoder that has died beside the daemon looks like rest
+    chain, config = chain_of(), keeping(tmp_path, {"coast_s": 4.0})
+    async with rig_on(chain, config) as rig:
+        await set_out(rig)
+        await rig.client.command("x", MoveAbsolute(position=90.0, velocity=10.0))
+        await asyncio.sleep(1.0)
+        await rig.client.command("x", Power(on=False))
+        await rig.kill()
+    now_s = asyncio.get_running_loop().time()
+    drive(chain, 1).set_condition(FaultCondition.ENCODER_STUCK, present=True, at_s=now_s)
+    async with rig_on(chain, config) as rig:
+        begun_s = asyncio.get_running_loop().time()
+        state = await rig.until("x", lambda state: state.link is LinkState.UP)
+        with pytest.raises(WrongState, match="may turn with its motor off: it was not read while it moved"):
+            await rig.client.command("x", Power(on=True))
+        await rig.until("x", lambda state: state.moving is Moving.NO)
+        unseen_s = asyncio.get_running_loop().time() - begun_s
+        await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", SetPosition(position=7.0))
+        await asyncio.sleep(2.0)
+    async with rig_on(chain, config) as rig:  # it stood
+        begun_s = asyncio.get_running_loop().time()
+        await rig.until("x", lambda state: state.moving is Moving.NO)
+        seen_s = asyncio.get_running_loop().time() - begun_s
+
+    assert state.moving is Moving.UNKNOWN
+    assert 8.0 <= unseen_s < 9.0
+    assert seen_s < 1.0
 
 
 # -- a crash between what happens and what is written ------------------------
