@@ -5,7 +5,7 @@ from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from ldcnd.client.own_samples import Origin
 from ldcnd.client.rest import REST_S, drive_silent, until_at_rest
@@ -52,6 +52,10 @@ TAKING_CONTROL = "acquire"
 """The verb after which commands are meant for the daemon that runs then."""
 CHECK_PERIOD_S = 0.2
 """Longest time between two queries for the outcome of a command that its axis does not name, seconds."""
+UNHEARD_S = 3.0
+"""How long what takes energy out is sent again while nobody hears it, seconds: a link is made anew within two."""
+ASK_AGAIN_S = 0.1
+"""Pause between two such queries, seconds."""
 KEPT_SAMPLES = 256
 """Maximum number of samples kept for a slow watcher; the oldest are dropped."""
 
@@ -256,7 +260,7 @@ class RigClient:
                 the same.
             SessionError: no daemon serves this rig, or access control does not let this login command it.
         """
-        if self._instance is None:
+        if self._instance is None and not command.takes_energy_out:
             await self.meet(f"axis {axis}: {command.verb}")
         meant = command if command.instance else command.model_copy(update={"instance": self._instance})
         try:
@@ -294,6 +298,19 @@ class RigClient:
             self._instance = None  # control is of the daemon that runs now, restarted or not
         return reply
 
+    async def _queried_until_heard(self, key: str, payload: bytes, *, timeout_s: float, **how: Any) -> list[Answer]:
+        """Query what takes energy out, and again while nobody hears it: a link that broke is made anew in a moment.
+
+        Sent twice it does what it does once. Where a daemon has answered nothing is sent again.
+        """
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + min(timeout_s, UNHEARD_S)
+        while True:
+            answers = await self.session.query(key, payload, timeout_s=timeout_s, **how)
+            if answers or loop.time() + ASK_AGAIN_S > until_s:
+                return answers
+            await asyncio.sleep(ASK_AGAIN_S)
+
     async def _of_all_axes(self, item: TelemetryItem, model: type[ModelT]) -> dict[str, ModelT]:
         answers = await self._values(self.keys.telemetry_pattern("*", item))
         return {self.keys.parse_telemetry(answer.key).axis: self._decoded(answer, model) for answer in answers}
@@ -306,7 +323,8 @@ class RigClient:
         payload, encoding = encode(command, Encoding.MSGPACK)
         key = self.keys.command(axis, command.verb)
         longest_s = command.answer_s if timeout_s is None else timeout_s
-        answers = await self.session.query(
+        query = self._queried_until_heard if command.takes_energy_out else self.session.query
+        answers = await query(
             key,
             payload,
             encoding=encoding,
@@ -325,7 +343,7 @@ class RigClient:
         """Stop one axis, or the whole rig; the events tell the first 64 characters of `client` as who it was."""
         request = Stop(client=client[:LONGEST_NAME] if client else None)
         payload, encoding = encode(request, Encoding.MSGPACK)
-        answers = await self.session.query(
+        answers = await self._queried_until_heard(
             self.keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True, everyone=True
         )
         replies = [self._decoded(answer, StopReply) for answer in answers if not answer.is_error]

@@ -15,6 +15,7 @@ from ldcnd.contract.events import CommandStatus, ReadEvents
 from ldcnd.contract.samples import AxisState, PositionSample, StateSample, TelemetryItem
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
+from tests.support.browser import console, entries, feed
 from tests.support.process import ROOT, answering, client, daemon, free_port, process
 
 pytestmark = [pytest.mark.system, pytest.mark.real_time]
@@ -111,6 +112,23 @@ async def test_a_frozen_daemon_does_not_carry_out_what_its_client_gave_up():
 async def _take(samples, count):
     for _ in range(count):
         yield await anext(samples)
+
+
+@pytest.mark.parametrize("path", ["/api/stop", "/api/rigs/sim/stop", "/api/rigs/sim/axes/x/halt"])
+async def test_a_stop_that_a_page_sent_to_a_frozen_console_is_carried_out_when_that_goes_on(path):
+    async with daemon(RIG) as endpoint, client(endpoint) as rig, console("-e", endpoint) as running:
+        browser = await running.stranger.enter(running.link)
+        await rig.command("x", Power(on=True))
+        async with feed(browser) as page:
+            while not any(topic == "tele/x/state" for _, topic, _ in await entries(page)):
+                pass
+            running.process.send_signal(signal.SIGSTOP)
+            stop = asyncio.create_task(browser.post(path))
+            await asyncio.sleep(2 * FROZEN_S)  # the freeze itself is what is tested: it costs the console its link
+            running.process.send_signal(signal.SIGCONT)
+            reply = (await stop).document
+
+    assert {"stopping", "accepted"} & {reply.get("status"), reply.get("rigs", {}).get("sim", {}).get("status")}, reply
 
 
 async def test_the_events_of_a_refused_move_reach_those_who_ask_later():

@@ -3,6 +3,7 @@
 import json
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 
@@ -11,7 +12,7 @@ from ldcnd.client.rig_client import RigClient, find_rigs
 from ldcnd.contract.commands import Power
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown, SessionError
 from ldcnd.contract.samples import PositionSample
-from ldcnd.net.hand_over import Query
+from ldcnd.net.hand_over import Answer, Query
 from ldcnd.net.session import Declaration, Publication, Qos, SampleKind
 from ldcnd.testing.memory_session import MemoryBroker, MemorySession
 from tests.support.session_pair import JSON, KEYS, POSITION
@@ -155,6 +156,24 @@ async def test_a_command_whose_daemon_has_disappeared_has_an_unknown_outcome(new
 
     with pytest.raises(OutcomeUnknown, match="no daemon serves rig bench1"):
         await newer.client.command("x", POWER)
+
+
+async def test_a_stop_that_nobody_heard_is_sent_again_until_a_daemon_answers(newer: Newer, monkeypatch) -> None:
+    query, sent = newer.client_session.query, []
+
+    async def unheard_once(key: str, *args: Any, **how: Any) -> list[Answer]:
+        answers = await query(key, *args, **how)
+        sent.append(key)
+        if len(sent) == 1:  # as behind a link that is made anew
+            await newer.answers(key, lambda query: query.reply(text({"axes": ["x"], "confirmed": ["x"]}), JSON))
+        return answers
+
+    monkeypatch.setattr(newer.client_session, "query", unheard_once)
+
+    reply = await newer.client.stop()
+
+    assert reply.confirmed == ("x",)
+    assert sent == [KEYS.stop()] * 2
 
 
 async def test_other_sessions_without_number_take_no_memory_without_end() -> None:
