@@ -5,7 +5,8 @@ from collections import deque
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping, Sequence
 from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from difflib import get_close_matches
-from typing import TYPE_CHECKING, Any, TypeVar
+from functools import partial
+from typing import TYPE_CHECKING, TypeVar
 
 from ldcnd.client.own_samples import Origin
 from ldcnd.client.rest import REST_S, drive_silent, until_at_rest
@@ -298,19 +299,6 @@ class RigClient:
             self._instance = None  # control is of the daemon that runs now, restarted or not
         return reply
 
-    async def _queried_until_heard(self, key: str, payload: bytes, *, timeout_s: float, **how: Any) -> list[Answer]:
-        """Query what takes energy out, and again while nobody hears it: a link that broke is made anew in a moment.
-
-        Sent twice it does what it does once. Where a daemon has answered nothing is sent again.
-        """
-        loop = asyncio.get_running_loop()
-        until_s = loop.time() + min(timeout_s, UNHEARD_S)
-        while True:
-            answers = await self.session.query(key, payload, timeout_s=timeout_s, **how)
-            if answers or loop.time() + ASK_AGAIN_S > until_s:
-                return answers
-            await asyncio.sleep(ASK_AGAIN_S)
-
     async def _of_all_axes(self, item: TelemetryItem, model: type[ModelT]) -> dict[str, ModelT]:
         answers = await self._values(self.keys.telemetry_pattern("*", item))
         return {self.keys.parse_telemetry(answer.key).axis: self._decoded(answer, model) for answer in answers}
@@ -323,8 +311,8 @@ class RigClient:
         payload, encoding = encode(command, Encoding.MSGPACK)
         key = self.keys.command(axis, command.verb)
         longest_s = command.answer_s if timeout_s is None else timeout_s
-        query = self._queried_until_heard if command.takes_energy_out else self.session.query
-        answers = await query(
+        ask = partial(
+            self.session.query,
             key,
             payload,
             encoding=encoding,
@@ -332,6 +320,7 @@ class RigClient:
             everyone=command.takes_energy_out,  # is for every daemon of the rig: only one has the line
             in_order=command.effect is Effect.MOTION or bool(getattr(command, "sequence", None)),
         )
+        answers = await (_until_heard(ask, longest_s) if command.takes_energy_out else ask())
         if not answers:
             whose = "" if axis == RIG_ITSELF else f"axis {axis}: "
             raise await self._unanswered(f"{whose}{command.verb}")
@@ -343,9 +332,9 @@ class RigClient:
         """Stop one axis, or the whole rig; the events tell the first 64 characters of `client` as who it was."""
         request = Stop(client=client[:LONGEST_NAME] if client else None)
         payload, encoding = encode(request, Encoding.MSGPACK)
-        answers = await self._queried_until_heard(
-            self.keys.stop(axis), payload, encoding=encoding, timeout_s=timeout_s, urgent=True, everyone=True
-        )
+        key, query = self.keys.stop(axis), self.session.query
+        ask = partial(query, key, payload, encoding=encoding, timeout_s=timeout_s, urgent=True, everyone=True)
+        answers = await _until_heard(ask, timeout_s)
         replies = [self._decoded(answer, StopReply) for answer in answers if not answer.is_error]
         if not replies:
             return self._one(answers, StopReply)
@@ -508,6 +497,20 @@ class RigClient:
         if answer.is_error:
             raise decode_error(answer.payload, answer.encoding)
         return decode_received(model, answer.payload, answer.encoding)
+
+
+async def _until_heard(ask: Callable[[], Awaitable[list[Answer]]], timeout_s: float) -> list[Answer]:
+    """Ask for what takes energy out, and again while nobody hears it: a link that broke is made anew in a moment.
+
+    Sent twice it does what it does once. Where a daemon has answered, nothing is sent again.
+    """
+    loop = asyncio.get_running_loop()
+    until_s = loop.time() + min(timeout_s, UNHEARD_S)
+    while True:
+        answers = await ask()
+        if answers or loop.time() + ASK_AGAIN_S > until_s:
+            return answers
+        await asyncio.sleep(ASK_AGAIN_S)
 
 
 def _of_everyone(answers: list[Answer]) -> Answer:
