@@ -152,7 +152,7 @@ function open() {
     endJog();
     client = null;
     nameThisPage(null);
-    for (const axis of held) noteLost(axis, "this page has lost its connection to the console. What it moved is halted within 3 s, and may move until then.");
+    for (const axis of held) noteLost(axis, "this page has lost its connection to the console. The daemon, if it still runs, halts within 3 s what the page moved.");
     held.clear();
     changed();
     setTimeout(open, OPEN_AGAIN_MS);
