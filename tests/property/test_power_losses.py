@@ -216,6 +216,11 @@ def test_a_module_that_is_deaf_while_others_are_reset_is_found_at_its_waiting_ad
 
 
 @pytest.mark.promise("address-only-of-its-place")
+def test_a_module_gets_no_address_by_the_silence_of_one_that_lost_power_after_it_was_asked() -> None:
+    assert play(2828) == ""
+
+
+@pytest.mark.promise("address-only-of-its-place")
 @pytest.mark.long
 def test_modules_behind_one_without_power_get_no_address_while_the_line_is_brought_up() -> None:
     history = History(0)

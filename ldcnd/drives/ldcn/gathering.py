@@ -11,7 +11,8 @@ What proves a place, after every module that receives was taken off address 0:
 
 * A place whose own address answers holds no waiting module. Waiting addresses that answer are held by different
   modules. If as many answer as places are silent, each is held by exactly one, and all modules have power and receive.
-* Of two silent neighbours with one waiting module it is the first: without power it would keep the second one deaf.
+* Of two silent neighbours with one waiting module it is the first: without power it would keep the second one deaf. The
+  module before them has to answer before and behind that: without power it would make the first one deaf.
 * An intact identity excludes the places that expect another one.
 * Which of several: neighbours are reset together, and then appear at address 0 in the order of the chain, as each keeps
   the next one deaf. A single one, reset by itself, makes the module behind it deaf, and no other.
@@ -344,13 +345,17 @@ class Gathering:
         The one behind it would be deaf, had the first no power: so it is the first that answers.
         """
         if len(stock.silent) == 2 and stock.neighbours and len(stock.waiting) == 1:  # noqa: PLR2004 - neighbours
+            first = stock.silent[0]
             for address, identity in stock.waiting.items():
                 if (
                     identity
-                    and self._accepts(stock.silent[0], identity)
+                    and self._accepts(first, identity)
                     and await self._speaks_alone(address, identity)
+                    # had the one before them lost its power since it was asked, the first would be deaf, and the second
+                    # not; one that answers from its place has had power ever since
+                    and (first == 0 or await self._answers(self.places[first - 1].address))
                 ):
-                    return {address: stock.silent[0]}
+                    return {address: first}
         return {}
 
     async def _by_identity(self, stock: Stock) -> dict[int, int] | None:
