@@ -36,7 +36,11 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.option(
-    "--connect", "-e", multiple=True, help=f"Zenoh endpoint of a daemon or router; repeatable [{DEFAULT_ENDPOINT}]."
+    "--connect",
+    "-e",
+    multiple=True,
+    envvar="LDCND_CONNECT",
+    help=f"Zenoh endpoint of a daemon or router; repeatable [$LDCND_CONNECT, or {DEFAULT_ENDPOINT}].",
 )
 @click.option("--config", type=CONFIGURATION, help=CONFIG_HELP)
 @click.option("--rig", multiple=True, help="Show this rig only; may be repeated.")

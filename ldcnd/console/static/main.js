@@ -81,8 +81,8 @@ function Strip({ at }) {
     <span class="moving">${moving.length
       ? moving.slice(0, MOST_MOVING).map((each) => html`<a href=${`#/axis/${each.rig.name}/${each.name}`}>${titleOf(each)}</a> <${PlaceAndTarget} axis=${each} /> `)
       : !unsure.length && html`<span class="quiet">${calm("Nothing moves")}</span>`}${moving.length > MOST_MOVING && ` and ${moving.length - MOST_MOVING} more move`}${
-      unsure.length > 0 && html` <span class="mark" data-level="bad">not known whether ${namesOf(unsure.slice(0, MOST_MOVING))}${
-        unsure.length > MOST_MOVING && ` and ${unsure.length - MOST_MOVING} more`} move</span>`}</span>
+      unsure.length > 0 && html` <span class="mark" data-level="bad">may move: ${namesOf(unsure.slice(0, MOST_MOVING))}${
+        unsure.length > MOST_MOVING && ` and ${unsure.length - MOST_MOVING} more`}</span>`}</span>
     ${worst && html`<span class="worst mark" data-level=${worst.level}>${worst.places[0].where}${worst.places.length > 1 ? ` and ${worst.places.length - 1} more` : ""}: ${worst.text}</span>`}
   </div>`;
 }
