@@ -2,7 +2,7 @@
 
 import asyncio
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import count
@@ -282,6 +282,7 @@ class ModuleService:
 
         def still_wanted() -> None:
             condition()
+            self._check_seen(named)
             for name in named:
                 self._check_newest(name, word)
 
@@ -291,6 +292,26 @@ class ModuleService:
                 del self._wanted[name]
                 log.info("level not written", module=self.name, output=name, of=wanted.situation.value, why="set since")
         return self._replied(reading)
+
+    def _check_seen(self, names: Iterable[str]) -> None:
+        """Refuse outputs of a module that has restarted and was not read since, if that will call for a level of them.
+
+        Raises:
+            CommandAborted: it will.
+        """
+        if not self._driver.restarted:
+            return
+        for name in names:
+            if self._return_as.level_of(self._outputs[name]) is not None:
+                raise CommandAborted(
+                    f"module {self.name} has restarted: its output {name} gets its level of {self._return_as} first",
+                    value=name,
+                    remedy="set it again if it is still wanted",
+                )
+
+    @property
+    def _return_as(self) -> Situation:
+        return Situation.RESET if self._seen else Situation.START
 
     def _check_newest(self, name: str, word: int) -> None:
         """Refuse what was asked of an output before a situation has called for a level of it.
@@ -400,7 +421,7 @@ class ModuleService:
             for name, level in self._floating.items():
                 if Situation.RESET.level_of(self._outputs[name]) is None:
                     self._link_events.add(f"output {name}, which was {_word(level)}, floats until it is set")
-            self.enter(Situation.RESET if self._seen else Situation.START)
+            self.enter(self._return_as)
         elif self._seen:
             self.enter(Situation.BUS)
         self._driver.restarted, self._seen = False, True

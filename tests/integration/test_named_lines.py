@@ -1,12 +1,13 @@
 """Named lines of a PIC-I/O: debounced and inverted inputs, outputs with a level for each situation, read back."""
 
 import asyncio
+import contextlib
 
 import pytest
 
 from ldcnd.client.rig import Rig
 from ldcnd.contract.commands import MoveVelocity, Power
-from ldcnd.contract.errors import InterlockViolated, ValueOutOfRange
+from ldcnd.contract.errors import InterlockViolated, LdcndError, ValueOutOfRange
 from ldcnd.contract.events import LINK_BACK, LINK_LOST, ReadEvents
 from ldcnd.contract.leases import Acquire, Release
 from ldcnd.contract.rig_commands import SetIo
@@ -94,6 +95,27 @@ async def test_an_output_has_its_level_at_the_start_and_after_a_loss_of_power():
             ("start", "output lock high, its level of start"),
             ("reset", "output lock low, its level of reset"),
         ]
+
+
+async def test_an_output_that_is_set_as_soon_as_its_module_is_back_keeps_what_it_was_set_to():
+    # first the levels of a situation, then those of commands, whichever instant a command finds
+    async with running_machine(machine(module=with_lock(start="low", reset="low") | {"rate": 2})) as rig:
+        await rig.named(lock=False)
+        address = rig.io.address
+        for off_s in (0.1, 0.23, 0.41, 0.57):
+            rig.io.power(on=False, at_s=asyncio.get_running_loop().time())
+            await asyncio.sleep(off_s)
+            rig.io.power(on=True, at_s=asyncio.get_running_loop().time())
+            async with asyncio.timeout(30):
+                while rig.io.address != address:
+                    await asyncio.sleep(0.002)
+                while True:
+                    with contextlib.suppress(LdcndError):
+                        await rig.client.ask(SetIo(module="cabinet", high=("lock",)))
+                        break
+                    await asyncio.sleep(0.01)
+            await asyncio.sleep(3.0)
+            assert driven(rig) == HIGH, off_s
 
 
 async def adopted(chain: Chain, **levels: object) -> int | None:
