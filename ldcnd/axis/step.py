@@ -500,6 +500,8 @@ def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:
 
 def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
     on = event.on
+    # a loop that closes holds the shaft; one that is let go may coast, or fall; what was off before is as it was
+    rest = RestEvidence(rests=True if on else None, commanded=on) if on or status.enabled else status.rest
     return replace(
         _abort(status, Verb.POWER, event.by),
         state=_state_at_rest(status, enabled=on),
@@ -508,8 +510,7 @@ def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
         target_counts=None,
         braking=None,
         following=None if on else status.following,
-        # a loop that closes holds the shaft; one that is let go may coast, or fall
-        rest=RestEvidence(rests=True if on else None, commanded=on),
+        rest=rest,
     )
 
 

@@ -441,6 +441,7 @@ async def test_a_shaft_that_was_let_go_of_in_motion_under_an_earlier_daemon_may_
         state = await rig.until("x", lambda state: state.link is LinkState.UP)
         with pytest.raises(WrongState, match="may turn with its motor off: it was not read while it moved"):
             await rig.client.command("x", Power(on=True))
+        await rig.client.command("x", Power(on=False))
         await rig.until("x", lambda state: state.moving is Moving.NO)
         unseen_s = asyncio.get_running_loop().time() - begun_s
         await rig.client.command("x", Power(on=True))
