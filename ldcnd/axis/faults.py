@@ -36,8 +36,9 @@ NOT_FOLLOWED = Fault(
 STOOD_AT_ONCE = Fault(
     "stood_at_once",
     "the shaft turned with its motor off and stood from one reading to the next: a brake or a crash, or an encoder that"
-    " does not count any more; look at the machine, then send reset",
+    " does not count any more; look at the machine, then send reset and home",
     stops=False,
+    loses_position=True,
     hides_motion=True,
 )
 JUMPED = Fault(

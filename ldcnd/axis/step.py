@@ -117,7 +117,7 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     if status.braking:
         status = _watch_braking(status, status.braking, event)
     if faults or status.faults or status.stop:
-        lost = any(fault.loses_position for fault in faults)
+        lost = any(fault.loses_position for fault in faults) or _parted(status, event, faults)
         status = _with(_with_faults(status, faults, now_ns), position_lost=lost)
         if lost:
             status = _with(_place_lost(status), target=None)
@@ -126,6 +126,12 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     if status.target is None and status.enabled and _came_to_rest(status):
         return replace(status, target=status.scale.shown_at(reading.position_counts))
     return status
+
+
+def _parted(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> bool:
+    """Tell whether a shaft that cannot stand at once has left its encoder behind, which has missed counts then."""
+    coasts_on = status.limits.slowing_counts_per_s2 is not None
+    return coasts_on and not event.reading.enabled and any(fault.hides_motion for fault in faults)
 
 
 def _watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) -> AxisStatus:

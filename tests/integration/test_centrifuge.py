@@ -11,7 +11,7 @@ import pytest
 
 from ldcnd.client.events import latest_events
 from ldcnd.config.rig import load_config
-from ldcnd.contract.errors import ErrorCode, InterlockViolated, LdcndError, LeaseExpired
+from ldcnd.contract.errors import ErrorCode, InterlockViolated, LdcndError, LeaseExpired, NotReferenced
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import OverrideInterlock
 from ldcnd.contract.samples import Moving, Quality
@@ -510,6 +510,31 @@ def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed,
         return written_at, moving
 
     assert alone(freezes) == ([], Moving.UNKNOWN)
+
+
+@pytest.mark.parametrize(("speed", "cut_s"), [(50.0, 0.15), (50.0, 1.0), (5.0, 1.0)])
+def test_an_encoder_that_was_cut_for_a_while_in_a_spin_costs_the_reference(speed, cut_s):
+    async def cut(machine):
+        await machine.rotor.move_velocity(speed, acceleration=10, duration_s=60)
+        await machine.rig.until(lambda: machine.speed > 0.95 * speed)
+        fault = machine.rig.faults.encoder_stuck("rotor")
+        await asyncio.sleep(cut_s)
+        fault.end()
+        await machine.rig.until(lambda: machine.speed < CREEPS)
+        await asyncio.sleep(1.0)
+        with suppress(LdcndError):
+            await machine.rotor.power(on=False)
+        while (await machine.rotor.why()).causes and not machine.rotor.state.sample.enabled:
+            with suppress(LdcndError):
+                await machine.rotor.reset()
+            with suppress(LdcndError):
+                await machine.rotor.power(on=True)
+            await asyncio.sleep(0.5)
+        with pytest.raises(NotReferenced):
+            await machine.rotor.move_absolute(0.1)
+        return machine.rotor.state.sample.referenced
+
+    assert alone(cut) is False
 
 
 @pytest.mark.parametrize("rpm", [10.0, 60.0])
