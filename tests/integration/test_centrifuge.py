@@ -601,6 +601,7 @@ def test_a_rotor_whose_counter_stands_still_may_move_on_every_face_until_somebod
         halted = machine.run("halt rotor --wait")
         reset = machine.run("reset rotor")
         machine.wait(machine.rig.until("rotor", lambda state: state.moving is Moving.NO))
+        machine.wait(asyncio.sleep(0.2))  # a position comes ten times a second
         after = json.loads(machine.run("list --json").printed)
 
     assert speed > CREEPS
