@@ -24,12 +24,20 @@ START_TIME_S = 90.0
 END_TIME_S = 15.0
 
 
+_kept: list[int] = []
+
+
 def free_port() -> int:
-    """Return a TCP port of the loopback interface that nobody uses at this moment."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """Return a TCP port of the loopback interface that nobody uses, and that nobody else gets while this process lives.
+
+    A client may wait a whole run for a daemon that is down: another test's would answer it there.
+    """
+    probe = socket.socket()
+    probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # whoever wants it by number can listen there
+    probe.bind(("127.0.0.1", 0))
+    port: int = probe.getsockname()[1]
+    _kept.append(probe.detach())
+    return port
 
 
 @asynccontextmanager

@@ -1,7 +1,6 @@
 """Two sessions that meet, and how a test waits for them."""
 
 import asyncio
-import socket
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 
@@ -10,6 +9,7 @@ from ldcnd.contract.commands import ErrorReply
 from ldcnd.contract.keys import Keys
 from ldcnd.net.hand_over import Answer, Query
 from ldcnd.net.session import Publication, Qos, Session
+from tests.support.process import free_port
 
 KEYS = Keys("bench1")
 JSON = Encoding.JSON.value
@@ -26,10 +26,8 @@ class Pair:
 
 
 def free_endpoint() -> str:
-    """Return a Zenoh endpoint on a TCP port that nobody has at the moment."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    """Return a Zenoh endpoint on a TCP port that nobody else gets."""
+    return f"tcp/127.0.0.1:{free_port()}"
 
 
 async def until(ready: Callable[[], Awaitable[bool]]) -> None:
