@@ -91,12 +91,14 @@ class DaemonUnderTest:
 
     async def until(self, axis: str, wanted: Callable[[StateSample], bool]) -> StateSample:
         """Wait for a state of an axis, as the daemon tells it."""
-        async with asyncio.timeout(PATIENCE_S):
-            while True:
-                state = await self.rig.state(axis)
-                if state and wanted(state):
-                    return state
-                await asyncio.sleep(LOOKED_EACH_S)
+        state = None
+        try:
+            async with asyncio.timeout(PATIENCE_S):
+                while not (state := await self.rig.state(axis)) or not wanted(state):
+                    await asyncio.sleep(LOOKED_EACH_S)
+        except TimeoutError:
+            raise TimeoutError(f"{axis} has stayed at {state!r}") from None
+        return state
 
     async def reaches(self, axis: str, position: float, within: float) -> None:
         """Wait until an axis stands at a position, as the daemon tells it."""
@@ -116,22 +118,27 @@ class DaemonUnderTest:
         info = next(each for each in await self.rig.axes() if each.axis == axis)
         return {each.name: each.value for each in info.registers}
 
-    async def _is_reset(self, held: Control, axis: str) -> bool:
-        await self.until(axis, lambda state: state.moving == "no")
-        try:
-            await held.command(axis, Reset())
-        except StopLatched:
-            return False  # the stop of a page that has gone is on its way
-        return True
-
     async def quiet(self, *axes: str) -> None:
-        """Leave axes disabled, without a latch, a fault or a holder, whatever was done to them before."""
+        """Leave axes at rest and disabled, without a latch, a fault or a holder, whatever was done to them before."""
         async with control(self.rig, "the test", *axes, lease_s=60, force=True) as held:
             for axis in axes:
                 await held.command(axis, Halt())
-                while not await self._is_reset(held, axis):
-                    await asyncio.sleep(LOOKED_EACH_S)
+                # behind a fault that hides motion none is seen to stand before a reset, and that wants its motor off
+                await self.until(axis, lambda state: state.moving == "no" or state.motion_hidden_by)
                 await held.command(axis, Power(on=False))
+                while not await is_reset(held, axis):
+                    await asyncio.sleep(LOOKED_EACH_S)
+            for axis in axes:
+                await self.until(axis, lambda state: state.moving == "no" and not state.motion_hidden_by)
+
+
+async def is_reset(held: Control, axis: str) -> bool:
+    """Reset an axis; return whether it was: the stop of a page that has gone may be on its way."""
+    try:
+        await held.command(axis, Reset())
+    except StopLatched:
+        return False
+    return True
 
 
 @dataclass

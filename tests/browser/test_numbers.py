@@ -96,13 +96,13 @@ async def type_over(window, text):
 
 @asynccontextmanager
 async def moving(house, *axes):
-    """Let axes run for as long as the context lasts."""
+    """Let axes run for as long as the context lasts, each towards its middle: one after another leads to no stop."""
     await house.sim.quiet(*axes)
     async with control(house.sim.rig, "the test", *axes, lease_s=60, force=True) as held:
         for axis in axes:
-            await held.command(axis, SetPosition(position=0.0))
+            velocity = -0.05 if await house.sim.position(axis) > 0 else 0.05
             await held.command(axis, Power(on=True))
-            await held.command(axis, MoveVelocity(velocity=0.05))
+            await held.command(axis, MoveVelocity(velocity=velocity))
         yield
     await house.sim.quiet(*axes)
 

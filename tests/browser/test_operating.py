@@ -4,7 +4,7 @@ import re
 
 import pytest
 
-from ldcnd.contract.commands import MoveRelative, MoveVelocity, Power, SetPosition
+from ldcnd.contract.commands import MoveRelative, MoveVelocity, Power, SetGains, SetPosition
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.parameters import ReadParameter
@@ -199,6 +199,20 @@ async def test_a_fault_is_shown_with_its_remedy_and_the_remedy_helps(house):
         await expect(desk.page.get_by_role("row", name=re.compile("sim daemon started"))).to_have_count(1)
 
 
+async def test_what_comes_after_a_fault_that_hides_motion_finds_the_axis_at_rest_and_without_it(house):
+    await house.sim.quiet("z")
+    usual = (await house.sim.registers("z"))["el"]
+    await house.sim.rig.command("z", SetGains(el=5))
+    await running(house.sim, "z", 1)
+    await house.sim.until("z", lambda state: state.motion_hidden_by == "position_error")
+
+    await house.sim.quiet("z")
+
+    state = await house.sim.rig.state("z")
+    assert (state.moving, state.enabled, state.motion_hidden_by) == ("no", False, "")
+    await house.sim.rig.command("z", SetGains(el=usual))
+
+
 WATCH_VELOCITY = """() => {
   window.seen = [];
   const look = () => window.seen.push([document.querySelector(".now-state .state").textContent,
@@ -300,7 +314,10 @@ async def test_gains_are_written_by_a_click_only(house):
 
         await desk.button(f"Write kd = {wanted}").click()
 
-        await expect(desk.panel("Gains").get_by_role("row", name="kd velocity gain")).to_contain_text(f"{wanted}")
+        # the field beside it says what was typed, too
+        await expect(desk.panel("Gains").get_by_role("row", name="kd velocity gain")).to_contain_text(
+            f"{wanted} written"
+        )
         assert await house.sim.registers("c") == before | {"kd": wanted}
 
 
@@ -416,10 +433,9 @@ async def test_no_place_and_no_word_about_it_is_cut_at_1280_pixels(house):
     await house.sim.rig.command("y", SetPosition(position=-90.0))
     async with house.desk(width=1280) as desk:
         await desk.open("rig")
-        row = desk.page.locator("tr[data-axis=y]")
+        row = desk.panel("Rig sim").locator("tr[data-axis=y]")
         await expect(row.locator("td.main")).to_contain_text("90.000")
-        cut = """(words) => {
-          const row = document.querySelector("tr[data-axis=y]");
+        cut = """(row, words) => {
           const homed = row.querySelector("td.homed");
           const mark = document.createElement("span");
           homed.replaceChildren(mark);
@@ -429,4 +445,4 @@ async def test_no_place_and_no_word_about_it_is_cut_at_1280_pixels(house):
           }).concat([...row.querySelectorAll("td.number")].filter((each) => each.scrollWidth > each.clientWidth)
             .map((each) => each.textContent));
         }"""
-        assert await desk.page.evaluate(cut, ["reference lost", "not homed", "line down", "no answer"]) == []
+        assert await row.evaluate(cut, ["reference lost", "not homed", "line down", "no answer"]) == []
