@@ -213,7 +213,10 @@ async def control(
                 keeper.cancel()
                 await held.release(leave_running=leave_running)
     except BaseExceptionGroup as errors:
-        # the renewals never fail, so this is the caller's own error: it is raised as itself
-        if len(errors.exceptions) > 1:
-            raise
-        raise errors.exceptions[0] from None
+        raise told_once(errors) from None
+
+
+def told_once(errors: BaseExceptionGroup) -> BaseException:
+    """Return the error of a program that has control: where the renewals have failed with the same one, it is one."""
+    first, *others = errors.exceptions
+    return first if all(type(each) is type(first) for each in others) else errors

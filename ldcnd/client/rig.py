@@ -12,7 +12,7 @@ from typing import Generic, Literal, TypeVar, overload
 
 from ldcnd.client.axis import Axis, made
 from ldcnd.client.events import follow_events
-from ldcnd.client.lease import Control, inherited_lease, take_control
+from ldcnd.client.lease import Control, inherited_lease, take_control, told_once
 from ldcnd.client.motion import Motion
 from ldcnd.client.rig_client import RigClient, find_rig
 from ldcnd.contract.codec import valid
@@ -547,9 +547,7 @@ class Rig:
                     for axis in axes:
                         self._held.pop(axis.name, None)
         except BaseExceptionGroup as errors:
-            if len(errors.exceptions) > 1:
-                raise
-            raise errors.exceptions[0] from None
+            raise told_once(errors) from None
         finally:
             await control.release()
         await _warn_of_unfinished(unfinished)

@@ -537,6 +537,24 @@ def test_an_encoder_that_was_cut_for_a_while_in_a_spin_costs_the_reference(speed
     assert alone(cut) is False
 
 
+def test_a_program_that_waits_for_so_long_at_most_learns_of_a_killed_daemon_by_one_error():
+    async def spins(rig):
+        async with rig.client.control("rotor", client="test") as rotor:
+            await made_ready(rig, rotor)
+            motion = await rotor.move_velocity(FAST, acceleration=10, duration_s=10)
+            await asyncio.wait_for(motion.done(), 200)
+
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            spinning = asyncio.create_task(spins(rig))
+            await rig.until(lambda: abs(rig.truth("rotor").velocity) > FAST - 0.5)
+            await rig.kill_daemon()
+            with pytest.raises(LeaseExpired):
+                await spinning
+
+    run(program())
+
+
 @pytest.mark.parametrize("rpm", [10.0, 60.0])
 def test_a_motor_is_switched_off_that_runs_away_beside_a_slow_motion(rpm):
     async def runs_away(machine):
