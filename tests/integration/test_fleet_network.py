@@ -26,6 +26,7 @@ from ldcnd.client.fleet import RigReport, survey
 from ldcnd.client.lease import control
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import CommandReply, MoveRelative, MoveVelocity, Power, Reset, Role
+from ldcnd.contract.condition import SOON_DAYS
 from ldcnd.contract.errors import LeaseExpired, OutcomeUnknown, SessionError
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, PositionSample, StateSample
@@ -44,6 +45,8 @@ LINKS = (("mill", "gate1"), ("gate1", "gate2"), ("lathe", "gate2"), ("desk", "ga
 PORT = 7447
 WITHIN_S = 60.0
 """For everything that happens by itself: links end after their lease of 2 s and are looked for each second."""
+LASTS_DAYS = 3 * SOON_DAYS
+"""How long logins last: the end of a certificate that ends soon is reported, and no rig is well."""
 MOVES = 8
 STEP = 0.5
 ALL_AXES = ["x", "y", "z", "c"]
@@ -129,9 +132,9 @@ def make_logins(site: Site, network: Network) -> None:
         ("gate2", Role.ROUTER),
     ):
         addresses = tuple(address for (here, _), address in network.address.items() if here == host)
-        site.add(new_login(host, role, (*addresses, "127.0.0.1")), NOW, 10)
-    site.add(new_login("vic", Role.VIEWER, ()), NOW, 10)
-    site.add(new_login("ada", Role.OPERATOR, ()), NOW, 10)
+        site.add(new_login(host, role, (*addresses, "127.0.0.1")), NOW, LASTS_DAYS)
+    site.add(new_login("vic", Role.VIEWER, ()), NOW, LASTS_DAYS)
+    site.add(new_login("ada", Role.OPERATOR, ()), NOW, LASTS_DAYS)
 
 
 @asynccontextmanager
@@ -299,7 +302,7 @@ async def test_a_router_killed_under_load_costs_no_event_and_repeats_no_move(sit
         began = await ready(client)
 
         async def moved(number: int) -> CommandReply:
-            request = MoveRelative(distance=STEP, command_id=f"{run}-load-{number}", instance=run)
+            request = MoveRelative(distance=STEP, command_id=f"load-{run}-{number}", instance=run)
             reply = await insist(lambda: client.command("x", request, timeout_s=0.5))
             await insist(lambda: client.wait_for_end("x", reply.command_id))
             return reply
