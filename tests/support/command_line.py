@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import io
 import json
+import re
 import shlex
 import signal
 import sys
@@ -134,7 +135,11 @@ def virtual_rig(
 
 
 def run_here(*words: str, typed: str = "") -> Ran:
-    """Run one command line in this process."""
+    """Run one command line in this process.
+
+    Raises:
+        ModuleNotFoundError: the command is in a wing of ldcnd that is not there.
+    """
     printed, errors = io.StringIO(), io.StringIO()
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGHUP)}
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(printed), contextlib.redirect_stderr(errors):
@@ -145,4 +150,6 @@ def run_here(*words: str, typed: str = "") -> Ran:
     for number, handler in handlers.items():
         signal.signal(number, handler)
     assert isinstance(end.value.code, int)
+    if absent := re.search(r"this needs (ldcnd\.\S+), a part of ldcnd that is not installed", errors.getvalue()):
+        raise ModuleNotFoundError(absent[0], name=absent[1])
     return Ran(end.value.code, printed.getvalue(), errors.getvalue())

@@ -10,10 +10,10 @@ from ldcnd.cli.names import OPTIONS_TYPED, typed
 from ldcnd.contract.codec import error_reply, rebuild_error
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.errors import LeaseHeld, Remedy, step
+from tests.support.console_parts import part_of_pages
 from tests.support.pages import require_command_line
 
 SOURCES = Path(ldcnd.__file__).parent
-PRESSED = SOURCES / "console" / "static" / "parts" / "remedies.js"
 PLACEHOLDERS = {
     "AXIS": "x",
     "POSITION": "1",
@@ -45,7 +45,7 @@ def test_what_a_remedy_names_can_be_typed(verb):
 
 
 def test_what_a_remedy_names_can_be_pressed():
-    pressed = set(re.findall(r"^  (\w+): ", PRESSED.read_text(encoding="utf-8"), re.MULTILINE))
+    pressed = set(re.findall(r"^  (\w+): ", part_of_pages("remedies.js"), re.MULTILINE))
 
     assert named() <= pressed
 

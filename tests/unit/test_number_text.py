@@ -1,17 +1,15 @@
 """Numbers that people type: one table of cases for the command line's reader and for the console's."""
 
 import json
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from ldcnd.contract.number_text import NotANumber, read_number, read_whole, read_word
+from tests.support.console_parts import ask_the_pages, part_of_pages
 
 ROOT = Path(__file__).parents[2]
 CASES = json.loads((ROOT / "tests" / "vectors" / "typed_numbers.json").read_text(encoding="utf-8"))
-READER = ROOT / "ldcnd" / "console" / "static" / "parts" / "number_text.js"
 ASK_THE_PAGES = """
 const [reader, cases] = JSON.parse(require("fs").readFileSync(0, "utf8"));
 import(`data:text/javascript;base64,${Buffer.from(reader).toString("base64")}`).then(({ readNumber, Unread }) => {
@@ -42,16 +40,10 @@ def test_a_typed_number_is_taken_or_refused_in_words(case):
 
 
 def test_pages_read_every_number_as_the_command_line_does():
-    node = shutil.which("node") or _node_of_playwright()
-    if node is None:
-        pytest.skip("no node: neither on the PATH nor in playwright")
-    asked = json.dumps([READER.read_text(encoding="utf-8"), CASES])
-    told = subprocess.run(  # noqa: S603 - node, with a script of ours
-        [node, "-e", ASK_THE_PAGES], input=asked, capture_output=True, text=True, check=True, timeout=60
-    )
+    told = ask_the_pages(ASK_THE_PAGES, part_of_pages("number_text.js"), CASES)
 
     expected = [{"value": None} if case.get("value", 0) is None else read_by_python(case) for case in CASES]
-    assert json.loads(told.stdout) == expected
+    assert told == expected
 
 
 @pytest.mark.parametrize(("text", "whole"), [("5", 5), ("-12", -12), ("1e3", 1000), ("5.0", 5)])
@@ -76,9 +68,3 @@ def test_words(text, word):
 def test_what_is_no_word(text):
     with pytest.raises(NotANumber):
         read_word(text)
-
-
-def _node_of_playwright():
-    playwright = pytest.importorskip("playwright", reason="no node: neither on the PATH nor in playwright")
-    node = Path(playwright.__file__).parent / "driver" / "node"
-    return str(node) if node.exists() else None

@@ -1,9 +1,6 @@
 """Units: what is taken for an axis, and what it becomes on the network, from configuration to console."""
 
-import json
 import math
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -12,7 +9,8 @@ from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.number_text import NotANumber
 from ldcnd.contract.units import AxisUnits, Dimension, g_velocity, quantity_text, read_quantity, unit_table, units_of
-from tests.unit.test_number_text import ROOT, _node_of_playwright
+from tests.support.console_parts import ask_the_pages, part_of_pages
+from tests.unit.test_number_text import ROOT
 
 _TABLE = unit_table("rev", 8000, "rpm", "rpm/s", {"third": "1/3"})
 ROTOR = AxisUnits("rev", _TABLE, g_velocity(_TABLE, 0.1))
@@ -105,10 +103,6 @@ def test_units_of_a_centrifuge_are_taken_as_people_write_them(text, same):
 
 
 def test_pages_convert_as_the_command_line_does():
-    node = shutil.which("node") or _node_of_playwright()
-    if node is None:
-        pytest.skip("no node: neither on the PATH nor in playwright")
-    reader = (ROOT / "ldcnd/console/static/parts/number_text.js").read_text(encoding="utf-8")
     asked, expected = [], []
     more = [(ROTOR, "velocity", "1000 g", 0), (ROTOR, "velocity", "1e308 rev/s", 0)]
     for axis, dimension, text, _ in [*CASES, *REFUSED, *more]:
@@ -119,16 +113,7 @@ def test_pages_convert_as_the_command_line_does():
         except NotANumber as error:
             expected.append(str(error))
 
-    ran = subprocess.run(  # noqa: S603 - node, with a script of ours
-        [node, "-e", ASK_THE_PAGES],
-        input=json.dumps([reader, asked]),
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
-
-    assert json.loads(ran.stdout) == expected
+    assert ask_the_pages(ASK_THE_PAGES, part_of_pages("number_text.js"), asked) == expected
 
 
 def _axis_of(tmp_path: Path, *changes: tuple[str, str]):
