@@ -63,7 +63,8 @@ def drive_silent(axis: str) -> OutcomeUnknown:
 
 def motion_hidden(axis: str, state: StateSample) -> OutcomeUnknown:
     """Return the error for an axis whose readings do not prove that it stands."""
-    off, fault = step("power", 'send power {"on": false}', on=False), state.motion_hidden_by
+    fault = state.motion_hidden_by
+    off = step("power", 'send power {"on": false}', on=False)
     look = "look whether it stands, then {}"
     return OutcomeUnknown(
         f"axis {axis}: it is not known whether it stands: after {fault} its encoder does not prove it",

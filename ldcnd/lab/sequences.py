@@ -184,7 +184,7 @@ class SequenceRun:
                 f"axis {axis} has not settled at its target, it is {off} off; sequence {self._sequence.name} ends",
                 axis=axis,
                 value=end.following_error,
-                remedy=Remedy("look for a jam, at the load, the gains and the encoder"),
+                remedy="look for a jam, at the load, the gains and the encoder",
             )
 
     async def _come(self, step: SequenceStep, seen: dict[str, bool | None]) -> None:
