@@ -27,7 +27,7 @@ tests: .venv/ready
 
 # what takes long, and whole programs as people run them: browsers, systemd, packages, pages to the letter; half an hour
 test-system: .venv/ready
-	$(PY) -m pytest -m "(system or long) and not alone" -n 2 --dist worksteal --timeout 240
+	$(PY) -m pytest -m "(system or long) and not (alone or soak)" -n 2 --dist worksteal --timeout 240
 	$(PY) -m pytest -m alone
 
 check: .venv/ready
