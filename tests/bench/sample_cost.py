@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from ldcnd.contract.codec import Encoding, encode
@@ -123,7 +123,7 @@ async def _published(subscribers: int, samples: int) -> tuple[float, float]:
 async def wire_bytes(samples: int) -> float:
     """Return how many bytes a sample has on the link to a router, several in a batch."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    with program(ROUTER, endpoint), program(SUBSCRIBER, endpoint, "1"), _Relay(endpoint).running() as relay:
+    with program(ROUTER, endpoint), program(SUBSCRIBER, endpoint, "1"), Relay(endpoint).running() as relay:
         async with open_zenoh_session(ZenohSettings(mode="client", connect=(relay.endpoint,))) as session:
             publisher = Publisher(session, KEYS, Encoding.MSGPACK)
             await _publish(publisher, max(1, samples // 10))
@@ -196,41 +196,49 @@ def _resident_bytes(process: int) -> int:
     return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
 
-class _Relay:
+class Relay:
     """A TCP relay to a router that counts what is sent to it."""
 
     def __init__(self, router: str) -> None:
         self.bytes = 0
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self._router_port = int(router.rpartition(":")[2])
-        self._loop = asyncio.new_event_loop()
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._ended = asyncio.Event()
 
     @contextmanager
-    def running(self) -> "Iterator[_Relay]":
+    def running(self) -> "Iterator[Relay]":
         """Relay in a thread of its own until the context ends."""
         listening = threading.Event()
 
         async def serve() -> None:
-            async with await asyncio.start_server(self._relay, "127.0.0.1", int(self.endpoint.rpartition(":")[2])):
-                listening.set()
-                await self._ended.wait()
+            server = await asyncio.start_server(self._relay, "127.0.0.1", int(self.endpoint.rpartition(":")[2]))
+            self._loop = asyncio.get_running_loop()
+            listening.set()
+            await self._ended.wait()
+            server.close()
 
-        thread = threading.Thread(target=lambda: self._loop.run_until_complete(serve()))
+        thread = threading.Thread(target=lambda: asyncio.run(serve()))  # which ends what is still relayed
         thread.start()
         listening.wait()
+        assert self._loop
         try:
             yield self
         finally:
             self._loop.call_soon_threadsafe(self._ended.set)
             thread.join()
-            self._loop.close()
 
     async def _relay(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         there, back = await asyncio.open_connection("127.0.0.1", self._router_port)
-        async with asyncio.TaskGroup() as group:
-            group.create_task(self._copy(reader, back, counts=True), name="to router")
-            group.create_task(self._copy(there, writer, counts=False), name="from router")
+        try:
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._copy(reader, back, counts=True), name="to router")
+                group.create_task(self._copy(there, writer, counts=False), name="from router")
+        finally:
+            for each in (back, writer):
+                each.close()
+                with suppress(ConnectionError):
+                    await each.wait_closed()
 
     async def _copy(self, source: asyncio.StreamReader, sink: asyncio.StreamWriter, *, counts: bool) -> None:
         while data := await source.read(65536):

@@ -1,11 +1,12 @@
 """Every module that can be started with `-m` starts: each says what it is for, and nothing on a page is broken."""
 
 import runpy
+import socket
 import sys
 
 import pytest
 
-from tests.bench.sample_cost import payload_bytes, wire_bytes
+from tests.bench.sample_cost import Relay, payload_bytes, wire_bytes
 from tests.support.process import ROOT
 
 IN_THE_GUEST = "tests/guest/agent.py"
@@ -58,3 +59,16 @@ def test_all_that_pages_tell_readers_to_start_can_be_started():
 @pytest.mark.system
 async def test_the_cost_of_a_sample_is_measured():
     assert 0 < await payload_bytes() < await wire_bytes(20) < 1000
+
+
+def test_what_is_still_relayed_ends_with_the_relay():
+    with socket.create_server(("127.0.0.1", 0)) as router:
+        relay = Relay(f"tcp/127.0.0.1:{router.getsockname()[1]}")
+        with relay.running():
+            client = socket.create_connection(("127.0.0.1", int(relay.endpoint.rpartition(":")[2])), 5)
+            client.sendall(b"a")
+            behind, _ = router.accept()
+            assert behind.recv(9) == b"a"
+        with client, behind:
+            behind.settimeout(5)
+            assert (client.recv(9), behind.recv(9)) == (b"", b"")
