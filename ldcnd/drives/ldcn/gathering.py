@@ -295,6 +295,8 @@ class Gathering:
             else:
                 silent.append(at)
         present: dict[int, Identity | None] = {}
+        if self._empty.intersection(self._waiting):
+            await self._to_line_rate()  # once more for those of before: noise may have spoilt it twice
         for address in tuple(self._waiting):
             answer = await self._rate.listen(address)
             if answer is None and address not in self._empty:
