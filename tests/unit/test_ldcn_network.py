@@ -486,6 +486,8 @@ async def test_a_line_is_not_taken_down_again_and_again_for_a_drive_that_stays_d
         with contextlib.suppress(ReplyTimeout):
             await line.bus.execute(read_status(Node(3, PIC_SERVO_V4), StatusItem.AUX))
         assert await line.network.rejoin(lambda _: None) == {"a2"}
+        for _ in range(8):
+            assert await line.network.rejoin(lambda _: None) == set()
         seen = len(line.sent())
 
         for _ in range(8):

@@ -59,6 +59,9 @@ SPLITS = 24
 """Most attempts of one search to separate modules that share a waiting address."""
 LOOKED_FURTHER = 4
 """Further waiting addresses at which one search looks for leftovers: stops wait for the end of a bring-up."""
+TOLD_AGAIN = 6
+"""How often those at waiting addresses that do not answer are told the rate of the line once more: a line at two rates
+polls less, and not for ever."""
 CONFIRMATIONS = 3
 """Further replies that must be intact before what answers at a waiting address counts as one module there."""
 GOLDEN = 0.618034
@@ -107,6 +110,7 @@ class Gathering:
         self._taken = 0
         self._waiting: list[int] = []
         self._empty: set[int] = set()  # waiting addresses at which nothing answered the last time
+        self._told_again = 0  # how often, since something arrived at one
         self._attempt = 0
         self._looked: int | None = None  # waiting addresses at which the leftovers of another daemon were looked for
         self._sorts = False
@@ -257,6 +261,7 @@ class Gathering:
         self._waiting.append(address)
         # this lets another one hear, which may have been deaf when it was told the rate of the line
         self._empty.clear()
+        self._told_again = 0
         await self._acknowledged(at_reset, commands.set_address(UNADDRESSED, address, WAITING_GROUP))
         await self._to_line_rate()
         return address
@@ -295,7 +300,8 @@ class Gathering:
             else:
                 silent.append(at)
         present: dict[int, Identity | None] = {}
-        if self._empty.intersection(self._waiting):
+        if self._told_again < TOLD_AGAIN and self._empty.intersection(self._waiting):
+            self._told_again += 1
             await self._to_line_rate()  # once more for those of before: noise may have spoilt it twice
         for address in tuple(self._waiting):
             answer = await self._rate.listen(address)
