@@ -221,6 +221,12 @@ def test_a_module_gets_no_address_by_the_silence_of_one_that_lost_power_after_it
 
 
 @pytest.mark.promise("address-only-of-its-place")
+@pytest.mark.parametrize("seed", [14902, 17021, 17034])
+def test_modules_that_get_power_while_they_are_addressed_are_not_numbered_in_the_order_in_which_they_came(seed) -> None:
+    assert play(seed) == ""
+
+
+@pytest.mark.promise("address-only-of-its-place")
 @pytest.mark.long
 def test_modules_behind_one_without_power_get_no_address_while_the_line_is_brought_up() -> None:
     history = History(0)

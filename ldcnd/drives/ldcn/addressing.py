@@ -426,10 +426,13 @@ class Addressing:
                 them: only the right number shows that none is without power, and in a chain without any address those
                 that receive are the first ones.
         """
-        self.had_address.clear()
-        count, until_s = 0, asyncio.get_running_loop().time() + self.rate.reset_s
-        while count < expected and await self._park_expected(count + 1, until_s):
-            count += 1
+        count, late = await self._park_in_order(expected)
+        if count == expected and late:
+            # one that came late had kept the next one deaf to the reset, and what receives behind that was parked
+            # before it, out of its turn: all of them hear now, so that behind another reset none has an address
+            await self._reset_at(self.rate.at_reset, commands.RESET_SETTLE_S)
+            await self._bus.execute(nulls(DRAIN_S))
+            count, _ = await self._park_in_order(expected)
         surplus: Identity | None = None
         if not expected:
             while count < MOST_MODULES and await self._newcomer() and await self._park_expected(count + 1, 0.0):
@@ -467,8 +470,19 @@ class Addressing:
             unanswered(EVERYBODY, burst, NULLS_SETTLE_S, repeatable=False, effect=PacketEffect.ARRANGES)
         )
 
-    async def _park_expected(self, number: int, until_s: float) -> bool:
-        """Give what waits at address 0 a waiting address; tell whether there was something until that instant.
+    async def _park_in_order(self, expected: int) -> tuple[int, bool]:
+        """Park what waits at address 0, one after another; return how many there were, and whether one came late.
+
+        Late is who came behind another one: all that were reset at one instant wait for the first, and for no other.
+        """
+        self.had_address.clear()
+        count, late, until_s = 0, False, asyncio.get_running_loop().time() + self.rate.reset_s
+        while count < expected and (attempts := await self._park_expected(count + 1, until_s)):
+            count, late = count + 1, late or (count > 0 and attempts > 1)
+        return count, late
+
+    async def _park_expected(self, number: int, until_s: float) -> int:
+        """Give what waits at address 0 a waiting address; return at which attempt until that instant, 0 without one.
 
         A lost reply leaves open whether the module took the address: then it answers there.
         """
@@ -479,14 +493,14 @@ class Addressing:
             # "the host starts by sending a Set Address command to module 0": the first that receives; it "will lower
             # its ADDR_OUT signal", and the next one receives (PIC-SERVO manual, 4.1)
             if await self._set_address(UNADDRESSED, address, EVERYBODY):
-                return True
+                return attempts
             if await self.rate.who_is(address):
                 self.had_address.add(number)
-                return True
+                return attempts
             # it may be restarting: a packet that is only half received would be completed by the next one
             if attempts >= ADDRESSING_ATTEMPTS:
                 await asyncio.sleep(RESTART_PAUSE_S)
-        return False
+        return 0
 
     async def _newcomer(self) -> Identity | None:
         """Return what waits at address 0 although no module is expected there any more."""
