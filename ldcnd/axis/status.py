@@ -407,7 +407,7 @@ class AxisStatus:
 
     @property
     def may_coast(self) -> bool:
-        """Whether the shaft may turn while the motor is off, and nobody would have seen it."""
+        """Whether the shaft may turn unseen while the motor is off."""
         return self.rest.is_unseen and not self.enabled
 
     @property

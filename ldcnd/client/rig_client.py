@@ -54,7 +54,7 @@ TAKING_CONTROL = "acquire"
 CHECK_PERIOD_S = 0.2
 """Longest time between two queries for the outcome of a command that its axis does not name, seconds."""
 UNHEARD_S = 3.0
-"""How long what takes energy out is sent again while nobody hears it, seconds: a link is made anew within two."""
+"""How long what takes energy out is sent again while no daemon hears it, seconds: a link is made again within two."""
 ASK_AGAIN_S = 0.1
 """Pause between two such queries, seconds."""
 KEPT_SAMPLES = 256
@@ -500,7 +500,7 @@ class RigClient:
 
 
 async def _until_heard(ask: Callable[[], Awaitable[list[Answer]]], timeout_s: float) -> list[Answer]:
-    """Ask for what takes energy out, and again while nobody hears it: a link that broke is made anew in a moment.
+    """Ask for what takes energy out, and again while no daemon hears it: a link that broke is soon made again.
 
     Sent twice it does what it does once. Where a daemon has answered, nothing is sent again.
     """

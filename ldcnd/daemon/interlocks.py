@@ -277,11 +277,8 @@ class Interlocks:
         ):
             return "is not known: its drive does not answer"
         # a counter that stands still beside a shaft that turns looks like rest, as a jam does
-        if (each.standstill or each.below is not None) and (fault := status.rest_unproven_by):
-            return f"may move: after fault {fault} its encoder does not prove that it stands; look, then reset the axis"
-        if (each.standstill or each.below is not None) and status.may_coast:
-            seconds = f"{status.rest.unseen_s:g} s"
-            return f"may coast: it was not read while it moved, and stands once it has not counted for {seconds}"
+        if (each.standstill or each.below is not None) and (unproven := _unproven(status)):
+            return unproven
         if each.standstill and not (status.rest.rests is True and not _commanded(status)):
             return "does not stand, or is not known to"
         if each.below is not None and (speed := _speed(axis)) >= each.below:
@@ -435,6 +432,16 @@ class Interlocks:
         log.warning("interlock override", interlock=rule.config.name, reason=reason, client=client)
         reason = f"interlock {rule.config.name} {reason}"
         self._events.note(rule.holders[0], OverrideInterlock.verb, status, reason, client=client)
+
+
+def _unproven(status: AxisStatus) -> str:
+    """Return why readings do not prove how fast a shaft is; empty where they do."""
+    if fault := status.rest_unproven_by:
+        return f"may move: after fault {fault} its encoder does not prove that it stands; look, then reset the axis"
+    if status.may_coast:
+        seconds = f"{status.rest.unseen_s:g} s"
+        return f"may coast: it was not read while it moved, and stands once it has not counted for {seconds}"
+    return ""
 
 
 def _commanded(status: AxisStatus) -> bool:
