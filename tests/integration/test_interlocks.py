@@ -26,6 +26,7 @@ from ldcnd.contract.rig_commands import OverrideInterlock, SetIo
 from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.drives.ldcn.packet import CommandCode, StatusItem
 from ldcnd.sim.faults import FaultInjector, FaultyRequest
+from ldcnd.sim.ldcn.power import FaultCondition
 from tests.support.chain_rig import rig_on
 from tests.support.command_line import virtual_rig
 from tests.support.machine_rig import (
@@ -126,6 +127,28 @@ async def test_a_motion_requires_another_axis_to_be_so(requirement, why):
             await refused(rig, "rotor", SPIN, why)
             await rig.client.command("table", SetPosition(position=-1.0))
         await rig.client.command("rotor", SPIN)
+
+
+async def test_a_lock_stays_shut_beside_a_shaft_that_was_lost_in_motion_until_its_coasting_is_over():
+    # its encoder dies meanwhile, and looks like rest
+    chain = chain_of_machine()
+    async with running_machine(machine(DOOR_OPENS, axis={"coast_s": 4.0}), chain) as rig:
+        await power(rig)
+        await rig.client.ask(LOCKED)
+        await rig.client.command("rotor", SPIN)
+        await rig.until("rotor", lambda state: state.state is AxisState.CONTINUOUS_MOTION)
+        await asyncio.sleep(1.0)
+        now_s = asyncio.get_running_loop().time()
+        chain.unplug(now_s, 1.0)
+        chain.modules[0].set_condition(FaultCondition.ENCODER_STUCK, present=True, at_s=now_s)
+        await asyncio.sleep(1.0)
+        chain.modules[0].loop.open()
+        await rig.until("rotor", lambda state: state.link is LinkState.UP and not state.enabled)
+        await rig.client.command("rotor", Reset())
+        with pytest.raises(InterlockViolated, match="axis rotor may coast"):
+            await rig.client.ask(UNLOCKED)
+        await asyncio.sleep(9.0)
+        await rig.client.ask(UNLOCKED)
 
 
 async def test_a_motion_requires_another_axis_to_be_in_a_range():
