@@ -141,6 +141,8 @@ class Following:
         low: lowest position since; infinite before the first.
         high: highest.
         faults: it is a fault then; else the axis may only move unseen, until its encoder counts again.
+        coasts: the shaft cannot stand at once: where it seems to, at a speed, its encoder has missed counts.
+        least_counts_per_s: that the positions have shown when it was first seen there, if it braked meanwhile.
     """
 
     command_id: str
@@ -158,6 +160,8 @@ class Following:
     low: float = math.inf
     high: float = -math.inf
     faults: bool = True
+    coasts: bool = False
+    least_counts_per_s: float = 0.0
 
     @property
     def is_missed(self) -> bool:
@@ -182,13 +186,24 @@ class Following:
             return None
         return replace(self, velocity_counts_per_s=min(self.velocity_counts_per_s, velocity_counts_per_s))
 
-    def observe(self, reading: AxisReading, at_s: float) -> "Following | bool":
-        """Take a reading; return what is awaited, True while the shaft has moved as it was to, or False: it has not."""
+    def observe(self, reading: AxisReading, at_s: float, *, at_velocity: bool = False) -> "Following | bool":
+        """Take a reading; return what is awaited, True while the shaft has moved as it was to, or False: it has not.
+
+        Args:
+            reading: what the drive shows.
+            at_s: when it was requested, in loop time.
+            at_velocity: its profile slows down only where it is told another speed, of which `velocity_counts_per_s` is
+                the lowest.
+        """
         position, error = reading.position_counts, reading.following_error_counts
         low, high = min(self.low, position), max(self.high, position)
         runs = reading.enabled and not reading.profile_done
         if high - low > REST_COUNTS:
-            return self._seen_to_move(reading, at_s, runs=runs)
+            return self._seen_to_move(reading, at_s, runs=runs, brakes=not at_velocity)
+        if self.coasts and runs:
+            least = self._least_counts_per_s(at_s, brakes=not at_velocity)
+            if min(least, self.velocity_counts_per_s) * (at_s - self.since_s) >= 2 * self.least_counts:
+                return False
         gone = max(self.gone_counts, self._gone_counts(at_s) if runs else 0.0)
         first = error if self.error_counts is None else self.error_counts
         if first is not None and error is not None:
@@ -213,12 +228,17 @@ class Following:
             self, error_counts=first, gone_counts=gone, until_s=until_s, given_up=given_up, low=low, high=high
         )
 
-    def _seen_to_move(self, reading: AxisReading, at_s: float, *, runs: bool) -> "Following":
+    def _seen_to_move(self, reading: AxisReading, at_s: float, *, runs: bool, brakes: bool) -> "Following":
         speed = max(0.0, abs(reading.velocity_counts_per_s) - reading.velocity_resolution_counts_per_s)
-        if runs:  # it may have ceased to count since: a profile brakes no faster than this
-            braked = BRAKES_SHARE * self.acceleration_counts_per_s2 * (at_s - self.since_s)
-            speed = max(speed, self.speed_counts_per_s - braked)
-        error = reading.following_error_counts
+        if runs:  # it may have ceased to count since
+            speed = max(speed, self.speed_counts_per_s - self._braked_counts_per_s(at_s))
+        error, least = reading.following_error_counts, 0.0
+        if self.coasts and self.counted:
+            # positions are exact, where the velocity of a status packet is coarse; a new origin makes them jump
+            shown = abs(reading.position_counts - self.low) / (at_s - self.since_s) if at_s > self.since_s else 0.0
+            most = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
+            braked = self._braked_counts_per_s(at_s) if brakes else 0.0
+            least = max(0.0, min(shown, most) - braked, self._least_counts_per_s(at_s, brakes=brakes))
         return Following(
             self.command_id,
             self.velocity_counts_per_s,
@@ -233,7 +253,16 @@ class Following:
             low=reading.position_counts,
             high=reading.position_counts,
             faults=self.faults,
+            coasts=self.coasts,
+            least_counts_per_s=least,
         )
+
+    def _least_counts_per_s(self, at_s: float, *, brakes: bool) -> float:
+        return self.least_counts_per_s - (self._braked_counts_per_s(at_s) if brakes else 0.0)
+
+    def _braked_counts_per_s(self, at_s: float) -> float:
+        """Return by how much a profile makes the shaft slower at most since it is where it is."""
+        return BRAKES_SHARE * self.acceleration_counts_per_s2 * (at_s - self.since_s)
 
     def _gone_counts(self, at_s: float) -> float:
         """Return the least way of a profile that runs since the shaft is where it is."""

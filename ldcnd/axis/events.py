@@ -145,6 +145,7 @@ class MotionStarted:
         unsure: why it is not known whether it has begun; None when the drive shows it.
         following: by what its encoder is to be seen to count; None where nothing says how far its profile goes.
         profile: speed and acceleration of one that goes on from another motion, in counts; None of others.
+        onwards: it goes on in the direction in which the shaft turns.
     """
 
     now_s: float
@@ -154,6 +155,7 @@ class MotionStarted:
     unsure: Unsure | None = None
     following: Following | None = None
     profile: tuple[float, float] | None = None
+    onwards: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -559,8 +559,17 @@ class AxisMotion:
                 pace,
                 following=self._following(permit, loaded) if loaded and follows and not in_motion else None,
                 profile=(abs(loaded.velocity_counts_per_s), loaded.acceleration_counts_per_s2) if loaded else None,
+                onwards=loaded is not None and in_motion and self._turns_towards(loaded),
             )
         )
+
+    def _turns_towards(self, motion: CountsMotion) -> bool:
+        """Tell whether the shaft turns in the direction in which a motion leads."""
+        reading, target = self.tracker.reading, motion.target_counts
+        if reading is None:
+            return False
+        leads = motion.velocity_counts_per_s if target is None else target - reading.position_counts
+        return reading.velocity_counts_per_s * leads > 0
 
     def _following(self, permit: Permit, motion: CountsMotion) -> Following | None:
         """Return by what the encoder is to be seen to count in the motion that a permit has loaded."""
@@ -577,6 +586,7 @@ class AxisMotion:
             since_s=self.clock.now_s(),
             # what a search finds makes a reference: of an encoder that does not count it is none
             faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
+            coasts=self.config.coast_s is not None,
         )
 
     def pace(self, permit: Permit) -> Pace | None:

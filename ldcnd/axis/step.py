@@ -200,7 +200,9 @@ def _watch_following(
     """Have a motor switched off whose encoder has not counted behind a motion."""
     # its drive knows more of it, and has switched the motor off
     tripped = any(fault.stops for fault in event.reading.faults)
-    seen = tripped or following.observe(event.reading, event.sent_at_s)
+    command = status.command
+    goes_on = command and command.verb is Verb.MOVE_VELOCITY and command.state is AxisState.CONTINUOUS_MOTION
+    seen = tripped or following.observe(event.reading, event.sent_at_s, at_velocity=bool(goes_on))
     if isinstance(seen, Following):
         return status if seen is following else replace(status, following=seen)
     if seen and status.command and not tripped:
@@ -474,9 +476,11 @@ def _next_following(status: AxisStatus, event: MotionStarted) -> Following | Non
     before, command = status.following, status.command
     if before is None or command is None or command.opens_loop:
         return None
-    # what brings a motion to rest goes on with its profile
+    # what brings a motion to rest goes on with its profile, and so does a shaft that cannot stand at once
     if command.state is not AxisState.STOPPING and command.command_id != before.command_id:
-        return None
+        if not (before.coasts and event.onwards):
+            return None
+        before = replace(before, command_id=command.command_id)
     return before.going_on(*event.profile) if event.profile else before
 
 

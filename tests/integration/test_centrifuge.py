@@ -512,11 +512,19 @@ def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed,
     assert alone(freezes) == ([], Moving.UNKNOWN)
 
 
-@pytest.mark.parametrize(("speed", "cut_s"), [(50.0, 0.15), (50.0, 1.0), (5.0, 1.0)])
-def test_an_encoder_that_was_cut_for_a_while_in_a_spin_costs_the_reference(speed, cut_s):
+@pytest.mark.parametrize("begun_at", [None, 2.0])
+@pytest.mark.parametrize(
+    ("speed", "cut_s"), [(50.0, 0.15), (50.0, 1.0), (5.0, 1.0), (5.0, 0.12), (1.0, 0.12), (0.3, 0.3)]
+)
+@pytest.mark.sweep(3)
+def test_an_encoder_that_was_cut_for_a_while_in_a_spin_costs_the_reference(speed, cut_s, begun_at):
     async def cut(machine):
+        if begun_at is not None:
+            await machine.rotor.move_velocity(begun_at, acceleration=10, duration_s=60)
+            await machine.rig.until(lambda: machine.speed > 0.95 * begun_at)
         await machine.rotor.move_velocity(speed, acceleration=10, duration_s=60)
-        await machine.rig.until(lambda: machine.speed > 0.95 * speed)
+        await machine.rig.until(lambda: 0.95 * speed < machine.speed < 1.05 * speed)
+        await asyncio.sleep(0.5)
         fault = machine.rig.faults.encoder_stuck("rotor")
         await asyncio.sleep(cut_s)
         fault.end()
@@ -535,6 +543,28 @@ def test_an_encoder_that_was_cut_for_a_while_in_a_spin_costs_the_reference(speed
         return machine.rotor.state.sample.referenced
 
     assert alone(cut) is False
+
+
+@pytest.mark.parametrize("ramp_s", [2.0, 5.0, 12.0])
+@pytest.mark.parametrize("speed", [0.3, 1.0, 5.0, 20.0])
+@pytest.mark.sweep(3)
+def test_a_healthy_rotor_whose_speed_is_changed_time_and_again_has_no_fault(speed, ramp_s):
+    acceleration = speed / ramp_s
+
+    async def changes(machine):
+        for each in (speed, speed / 5, -speed / 3, -speed, speed / 2):
+            await machine.rotor.move_velocity(each, acceleration=acceleration, duration_s=600)
+            await machine.rig.until(lambda each=each: abs(machine.rig.truth("rotor").velocity - each) < 0.1 * abs(each))
+            for percent in (50, 10, 100):
+                await machine.rig.client.set_speed_override(percent)
+                await asyncio.sleep(ramp_s / 4)
+        await machine.rotor.halt()
+        await machine.rig.until(lambda: machine.rotor.state.sample.moving is Moving.NO)
+        assert not (await machine.rig.client.client.last("rotor", "fault")).active
+        await (await machine.rotor.move_relative(0.7, acceleration=acceleration)).done()
+        return (await machine.rig.client.client.last("rotor", "fault")).active
+
+    assert not alone(changes)
 
 
 def test_a_program_that_waits_for_so_long_at_most_learns_of_a_killed_daemon_by_one_error():
