@@ -357,15 +357,17 @@ class AxisService:
         # a warning keeps nothing from moving
         faults = [each for each in self.tracker.status.active_faults if each.source == "drive" and each.stops]
         causes = [(error, False) for error in (*first, *(guards.fault(self.tracker, each) for each in faults))]
+        forbidden = self._violations(verb, speed) if moves else []
         for error, guard in found:
             if guard is guards.check_not_in_error:
                 causes.append((guards.error_stop(self.tracker, faults), False))
             elif error not in first:
                 if guard is guards.check_enabled:
                     causes += [(each, True) for each in self._while_it_coasts()]
+                if guard is guards.check_referenced:  # what is in the way of a motion is in the way of homing, too
+                    causes, forbidden = causes + forbidden, []
                 causes.append((error, guard is guards.check_stands))
-        if moves:
-            causes += self._violations(verb, speed)
+        causes += forbidden
         if not moves:
             text = f"axis {name}: its drive takes no motion over the line"
             causes.append((NotSupported(text, axis=name, remedy=NO_COMMAND_HELPS), False))

@@ -545,6 +545,19 @@ def test_an_encoder_that_was_cut_for_a_while_in_a_spin_costs_the_reference(speed
     assert alone(cut) is False
 
 
+def test_why_names_what_is_in_the_way_of_homing_before_the_homing_that_is_wanted():
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig, rig.client.control("rotor", client="test") as rotor:
+            machine = Centrifuge(rig, rotor)
+            await machine.sees(locked=True, door_closed=True, pin=False, door=False, unlock=False)
+            await rotor.power(on=True)
+            await machine.shut_door_opens()
+            return [each.code for each in (await rotor.why()).causes]
+
+    *before, last = run(program())
+    assert ({*before}, last) == ({"interlock_violated"}, "not_referenced")
+
+
 @pytest.mark.parametrize("ramp_s", [2.0, 5.0, 12.0])
 @pytest.mark.parametrize("speed", [0.3, 1.0, 5.0, 20.0])
 @pytest.mark.sweep(3)
