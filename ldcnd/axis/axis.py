@@ -28,7 +28,7 @@ from ldcnd.axis.host_tracer import HostTracer, host_channels
 from ldcnd.axis.kept import KeptFiles
 from ldcnd.axis.motion import LATENCY_S, AxisMotion, MotionPlan
 from ldcnd.axis.parameters import Parameters
-from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right, Violations
+from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right, ToldSpeed, Violations
 from ldcnd.axis.plausibility import PlausibilityGate
 from ldcnd.axis.preview import preview
 from ldcnd.axis.procedures.group import GroupMoveRequest
@@ -293,9 +293,9 @@ class AxisService:
         self._gate.violations = violations
 
     @property
-    def commanded_counts_per_s(self) -> float:
-        """How fast the latest motion may have the drive turn, counts a second."""
-        return self._gate.counts_per_s
+    def told(self) -> ToldSpeed:
+        """What its drive was told last of how fast to turn."""
+        return self._gate.told
 
     async def _ask_to_open_loop(self, permit: Permit) -> None:
         """Bring an axis to rest that an interlock keeps from being switched off: a load would fall; nothing else does.

@@ -200,10 +200,8 @@ class Following:
         runs = reading.enabled and not reading.profile_done
         if high - low > REST_COUNTS:
             return self._seen_to_move(reading, at_s, runs=runs, brakes=not at_velocity)
-        if self.coasts and runs:
-            least = self._least_counts_per_s(at_s, brakes=not at_velocity)
-            if min(least, self.velocity_counts_per_s) * (at_s - self.since_s) >= 2 * self.least_counts:
-                return False
+        if runs and self._stands_at_once(at_s, brakes=not at_velocity):
+            return False
         gone = max(self.gone_counts, self._gone_counts(at_s) if runs else 0.0)
         first = error if self.error_counts is None else self.error_counts
         if first is not None and error is not None:
@@ -227,6 +225,15 @@ class Following:
         return replace(
             self, error_counts=first, gone_counts=gone, until_s=until_s, given_up=given_up, low=low, high=high
         )
+
+    def _stands_at_once(self, at_s: float, *, brakes: bool) -> bool:
+        """Tell whether a shaft that cannot has come to stand: its profile has left it behind since it was seen here."""
+        if not (self.coasts and self.counted):
+            return False
+        stood_s, least = at_s - self.since_s, self._least_counts_per_s(at_s, brakes=brakes)
+        if not brakes:  # on average, and half of what the profile gets faster
+            least += self.acceleration_counts_per_s2 * stood_s / 4
+        return min(least, self.velocity_counts_per_s) * stood_s >= 2 * self.least_counts
 
     def _seen_to_move(self, reading: AxisReading, at_s: float, *, runs: bool, brakes: bool) -> "Following":
         speed = max(0.0, abs(reading.velocity_counts_per_s) - reading.velocity_resolution_counts_per_s)

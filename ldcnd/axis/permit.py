@@ -212,7 +212,7 @@ class Permit:
         self.ask_to_move()
         # before its packets: part of a load may turn the shaft, and readings of that must be believed
         self._gate.expect(motion)
-        self._gate.counts_per_s = self._counts_per_s
+        self._gate.tell(self._counts_per_s)
         with only_while(self.to_move()):
             await self._gate.driver.load(motion, home=home)
 
@@ -244,14 +244,15 @@ class Permit:
         condition = self.to_move()
         self.begin()
         self._gate.expect(motion)
-        self._gate.counts_per_s = math.inf
+        self._gate.tell(math.inf)
         with only_while(condition):
             await drive.track(position_counts)
 
     async def add_points(self, steps: Sequence[int]) -> PathStatus:
         """Fill the drive's buffer of path points; see `Moves.add_points`. A motion begins only with `start_path`."""
         # how fast points are is not known here: rules for fast motions bind them
-        self._counts_per_s = self._gate.counts_per_s = math.inf
+        self._counts_per_s = math.inf
+        self._gate.tell(math.inf)
         self.ask_to_move()
         with only_while(self.to_move()):
             return await self._gate.driver.add_points(steps)
@@ -290,7 +291,7 @@ class Permit:
         """Have readings judged by a motion that the network is about to start; see `PlausibilityGate.expect`."""
         self._about_to(motion)
         self._gate.expect(motion, anywhere=anywhere)
-        self._gate.counts_per_s = self._counts_per_s
+        self._gate.tell(self._counts_per_s)
 
     def begin(self) -> None:
         """Note that the next packet begins the motion: conditions made from now on do not ask `not_after`."""
@@ -312,6 +313,26 @@ class Expect(Protocol):
         """Take a motion that is about to be loaded."""
 
 
+@dataclass(frozen=True, slots=True)
+class ToldSpeed:
+    """How fast a drive may turn its shaft at most, by what it was told.
+
+    Attributes:
+        counts_per_s: by the latest motion.
+        replaced_counts_per_s: by those before it, down to the last rest: it slows down from there.
+        at_s: when it was told the latest, in loop time.
+    """
+
+    counts_per_s: float = 0.0
+    replaced_counts_per_s: float = 0.0
+    at_s: float = -math.inf
+
+    @property
+    def most_counts_per_s(self) -> float:
+        """Speed that no motion since the last rest exceeds."""
+        return max(self.counts_per_s, self.replaced_counts_per_s)
+
+
 class Gate:
     """The gate of one axis: makes permits, and makes them void.
 
@@ -320,7 +341,7 @@ class Gate:
         tracker: of its state.
         expect: takes each motion that is about to be loaded.
         violations: yields which interlocks forbid a kind of motion at a speed in units a second, or a change of power.
-        counts_per_s: how fast the latest motion may have the drive turn.
+        told: what the drive was told last of how fast to turn.
         valid_from: the number of the first permit that is not void.
         closed: the daemon ends; no permit holds.
     """
@@ -330,11 +351,19 @@ class Gate:
         self.tracker = tracker
         self.expect = expect
         self.violations: Violations = _no_interlocks
-        self.counts_per_s = 0.0
+        self.told = ToldSpeed()
         self.valid_from = 0
         self._made = 0
         self._cause = ""
         self.closed = False
+
+    def tell(self, counts_per_s: float) -> None:
+        """Note how fast the motion may have the drive turn that it is about to be told."""
+        reading, replaced = self.tracker.reading, 0.0
+        if reading and not self.tracker.status.at_rest:
+            shown = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
+            replaced = max(self.told.counts_per_s, self.told.replaced_counts_per_s, shown)
+        self.told = ToldSpeed(counts_per_s, replaced, asyncio.get_running_loop().time())
 
     def permit(self, command_id: str, verb: Verb, right: Right = UNCONDITIONAL) -> Permit:
         """Return the permit of a command, valid until the next stop."""

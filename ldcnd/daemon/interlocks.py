@@ -454,18 +454,20 @@ def _speed(axis: AxisService) -> float:
     What a drive shows is whole counts in a servo cycle. Of a slow motion its command says more, once two positions show
     that it is not faster any more.
     """
-    tracker = axis.tracker
-    status, reading = tracker.status, tracker.reading
+    tracker, told = axis.tracker, axis.told
+    status, reading, (earlier, earlier_at_s) = tracker.status, tracker.reading, tracker.earlier
     if reading is None:
         return math.inf
     counts = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
-    if _commanded(status) and status.state is not AxisState.STOPPING:
-        commanded, (earlier, at_s) = axis.commanded_counts_per_s, tracker.earlier
-        if earlier is None:
-            return max(commanded, counts) / abs(status.scale.counts_per_unit)
-        way, took_s = abs(reading.position_counts - earlier.position_counts), tracker.read_at_s - at_s
-        slow = way <= commanded * (1 + HUNTING) * took_s + REST_COUNTS
-        counts = commanded if slow else max(commanded, counts)
+    told_s = max(told.at_s, status.effective_from_s)
+    if _commanded(status) and tracker.read_at_s < told_s:  # nothing shows yet what the drive makes of it
+        counts = max(told.most_counts_per_s, counts if status.state is AxisState.STOPPING else 0.0)
+    elif _commanded(status) and status.state is not AxisState.STOPPING:
+        counts = max(told.counts_per_s, counts)
+        if earlier and (earlier_at_s >= told_s or not told.replaced_counts_per_s):
+            way, took_s = abs(reading.position_counts - earlier.position_counts), tracker.read_at_s - earlier_at_s
+            if way <= told.counts_per_s * (1 + HUNTING) * took_s + REST_COUNTS:
+                counts = told.counts_per_s
     elif status.at_rest:
         counts = 0.0
     return counts / abs(status.scale.counts_per_unit)

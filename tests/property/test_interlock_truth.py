@@ -276,6 +276,10 @@ def test_no_history_opens_the_door_of_a_fast_rotor_or_writes_an_output_that_nobo
     live_through(range(12))
 
 
+def test_a_lock_is_not_released_by_the_speed_of_a_slow_motion_that_has_just_replaced_a_fast_one():
+    live_through(range(4170, 4171))
+
+
 @pytest.mark.soak
 @pytest.mark.timeout(3600 * 6)
 @pytest.mark.parametrize("batch", range(20))

@@ -72,7 +72,7 @@ const MOST_MOVING = 6;
 /** What moves, where, and what is wrong, in sight wherever a page is scrolled to; the axis of its page with its ends. */
 function Strip({ at }) {
   const axis = at.page === "axis" && axisNamed(at);
-  if (axis) return html`<${AxisStrip} axis=${axis} />`;
+  if (axis) return html`<${AxisStrip} key=${`${axis.rig.name} ${axis.name}`} axis=${axis} />`;
   const known = axesOf().filter((each) => each.info);
   const moving = known.filter((each) => each.condition.live && each.state?.moving === "yes");
   const unsure = known.filter((each) => !each.condition.live || each.state?.moving === "unknown");

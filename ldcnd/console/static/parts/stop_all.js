@@ -89,9 +89,10 @@ function StopsOf({ rig }) {
   const read = latched.filter(({ state }) => state.was_read !== false);
   const [moving, stopped] = [true, false].map((is) => read.filter(({ state }) => (state.moving === "yes") === is));
   if (!axes.length) return null;
-  // what no stop reaches goes on beside those that are latched
+  // what no stop reaches goes on beside the others where all of those were to stop
   const all = [...rig.axes.values()].filter((axis) => axis.info);
-  const free = all.filter((axis) => !axis.can("stop"));
+  const unreached = all.filter((axis) => !axis.can("stop"));
+  const free = axes.length + unreached.length < all.length ? [] : unreached;
   const going = free.filter((axis) => !axis.condition.live || axis.state?.moving !== "no");
   const of = rigs.size > 1 ? `${rig.name}: ` : "";
   const ready = latched.filter((axis) => obstacle(axis, "reset") === null);

@@ -5,7 +5,7 @@ import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { titleOf } from "../session/rigs.js";
 import { Action } from "./controls.js";
-import { clock, decimalsOf, number } from "./format.js";
+import { clock, decimalsOf, number, sentence } from "./format.js";
 import { Homed, Place, StateWord, TroubleWords } from "./state.js";
 import { stopAxis } from "./stop_all.js";
 
@@ -18,23 +18,33 @@ export function PlaceAndTarget({ axis }) {
 
 /** The strip of the page of an axis. Anyone may end a motion, with or without control.
  *
- * What came of that is in the state of the axis, but for a page to which nothing comes any more: that shows the answer.
+ * What came of that is in the state of the axis. For a page to which nothing comes any more the answer is shown, until
+ * the axis has told anything since; that none has come yet is shown, too.
  */
 export function AxisStrip({ axis }) {
   const toHalt = obstacle(axis, "halt");
-  const [answered, setAnswered] = useState(null);
-  const tell = (what) => (reply) => setAnswered(`${what} at ${clock(Date.now() * 1e6)}: ${came(reply)}.`);
+  const [told, setTold] = useState(null);
+  const ends = (what, act) => ({
+    act: async () => {
+      const at = clock(Date.now() * 1e6);
+      setTold({ text: `${what} sent at ${at}: no answer yet.`, state: axis.state });
+      const reply = await act();
+      setTold({ text: `${what} at ${at}: ${came(reply)}.`, state: axis.state });
+    },
+    onRefused: (error) => setTold({ text: `${what} did not get through: ${sentence(error.message)} Use the emergency stop.`, failed: true, state: axis.state }),
+  });
+  const isNews = told && (told.failed || axis.rig.worth) && told.state === axis.state;
   return html`<div class="strip of-axis">
     <span class="where"><b>${titleOf(axis)}</b> <${PlaceAndTarget} axis=${axis} /></span>
     <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /><${TroubleWords} axis=${axis} /></span>
     ${axis.can("stop") && html`<span class="endings" role="group" aria-label=${`End a motion of ${axis.name}`}>
-      <${Action} calms act=${() => command(axis, "halt")} onDone=${tell("Halt")} obstacle=${toHalt} reason="halt-way"
+      <${Action} calms ...${ends("Halt", () => command(axis, "halt"))} obstacle=${toHalt} reason="halt-way"
         title=${toHalt ?? "Decelerate and hold; no latch"}>Halt<//><span class="unseen" id="halt-way">${toHalt ?? ""}</span>
-      <${Action} calms act=${() => stopAxis(axis)} onDone=${tell("Stop")} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
-      <${Action} calms act=${() => command(axis, "quick_stop")} onDone=${tell("Quick stop")} kind="warn"
+      <${Action} calms ...${ends("Stop", () => stopAxis(axis))} kind="warn" title="Decelerate, hold, and latch until reset">Stop ${axis.name}<//>
+      <${Action} calms ...${ends("Quick stop", () => command(axis, "quick_stop"))} kind="warn"
         title="Hold at once, without a ramp, and latch until reset">Quick stop<//>
     </span>`}
-    ${answered && axis.rig.worth && html`<span role="status">${answered}</span>`}
+    ${isNews && html`<span role=${told.failed ? "alert" : "status"} class=${told.failed ? "refusal" : null}>${told.text}</span>`}
   </div>`;
 }
 
