@@ -132,7 +132,10 @@ class AxisService:
         self._note = note
         self._moves = moves = driver if isinstance(driver, Moves) else Unmoved(driver)
         proof = bus.proofs.expect(driver.spec.address, f"axis {config.name}", config.name)
-        status = AxisStatus(config.name, AxisScale.of(config), Verb.STOP in driver.capabilities, SoftLimits.of(config))
+        limits = SoftLimits.of(config)
+        status = AxisStatus(
+            config.name, AxisScale.of(config), Verb.STOP in driver.capabilities, limits, rest=limits.unseen
+        )
         self.tracker = AxisTracker(status, proof)
         self.telemetry = AxisTelemetry(publisher, config.name, driver, adc_volts=config.adc_volts)
         self._plausibility = plausibility = PlausibilityGate(config)
@@ -223,7 +226,8 @@ class AxisService:
         if origin_counts is None:
             self.tracker.take(PlaceUnknown())
         else:
-            self.tracker.take(PlaceKnown(replace(self.tracker.status.scale, origin_counts=origin_counts)))
+            scale = replace(self.tracker.status.scale, origin_counts=origin_counts)
+            self.tracker.take(PlaceKnown(scale, stood=not placed and self.reference.stood))
         self.reference.woken.set()
 
     def disconnected(self) -> None:

@@ -112,10 +112,12 @@ class PlaceKnown:
     Attributes:
         scale: its coordinates from now on.
         resting: the axis stands at a place that nothing has sent it to, as after `set_position`.
+        stood: it stood there when an earlier daemon kept it, and is still there.
     """
 
     scale: AxisScale
     resting: bool = False
+    stood: bool = False
 
 
 @dataclass(frozen=True, slots=True)

@@ -112,7 +112,7 @@ def check_does_not_coast(axis: AxisTracker) -> None:
             value=axis.status.motion_hidden_by,
             remedy=Remedy("look whether it stands, then {}", step("reset")),
         )
-    if axis.status.may_coast:
+    if axis.status.may_coast and axis.status.rest.left_turning and not axis.status.enabled:
         raise WrongState(
             f"axis {axis.name} may turn with its motor off: it was not read while it moved, and its encoder has not"
             f" counted since; it stands once it has not counted for {axis.status.rest.unseen_s:g} s",

@@ -170,6 +170,11 @@ class ReferenceKeeper:
             self._faults_kept = len(kept)
         self.faults = (*kept, *self.faults)
 
+    @property
+    def stood(self) -> bool:
+        """Whether the shaft stood when the reference was kept that holds still."""
+        return self._kept is not None and self._kept.low == self._kept.high
+
     async def recall(self, baud: int, identity: str, interrupted: str) -> tuple[float | None, str]:
         """Decide whether the reference that an earlier daemon has kept still holds.
 

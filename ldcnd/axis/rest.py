@@ -36,7 +36,8 @@ class RestEvidence:
         high: highest of them.
         quiet_s: for how long they must.
         unseen_s: for how long at least with the motor off, because the shaft may turn unseen; 0 once its encoder has
-            counted, or held its place.
+            counted with the motor off, and for a motion of this daemon.
+        left_turning: it turned when it was read last, or an earlier daemon has left it so.
     """
 
     rests: bool | None = None
@@ -47,11 +48,7 @@ class RestEvidence:
     high: int = 0
     quiet_s: float = REST_S
     unseen_s: float = 0.0
-
-    @property
-    def is_unseen(self) -> bool:
-        """Whether a shaft that coasts with a dead encoder would look the same."""
-        return self.unseen_s > 0 and not self.rests
+    left_turning: bool = False
 
     def observe(self, reading: AxisReading, at_s: float) -> "RestEvidence":
         """Return the evidence with a reading that was requested at an instant, in loop time."""
@@ -61,7 +58,7 @@ class RestEvidence:
         if runs or abs(reading.velocity_counts_per_s) > reading.velocity_resolution_counts_per_s:
             if self.rests is False and self.turns and self.since_s is None and self.quiet_s == REST_S:
                 return self
-            return RestEvidence(rests=False, turns=True, commanded=self.commanded)
+            return RestEvidence(rests=False, turns=True, commanded=self.commanded, unseen_s=self._unseen_s(reading))
         if self.commanded and reading.enabled:
             return self if self.rests else replace(self, rests=True)
         if self.since_s is None:
@@ -69,12 +66,19 @@ class RestEvidence:
         low, high, held_s = min(self.low, position), max(self.high, position), at_s - self.since_s
         if high - low > REST_COUNTS:
             quiet_s = min(max(2 * held_s, REST_S), MOST_REST_S)
-            return replace(self, rests=False, quiet_s=quiet_s, unseen_s=0.0, since_s=at_s, low=position, high=position)
+            unseen_s = self._unseen_s(reading)
+            return replace(
+                self, rests=False, quiet_s=quiet_s, unseen_s=unseen_s, since_s=at_s, low=position, high=position
+            )
         least_s = self.quiet_s if reading.enabled else max(self.quiet_s, self.unseen_s)
         rests = True if held_s >= least_s else self.rests
         if rests is self.rests and low == self.low and high == self.high:
             return self
         return replace(self, rests=rests, low=low, high=high)
+
+    def _unseen_s(self, reading: AxisReading) -> float:
+        # of a motor that others have set in motion nothing tells how it is to slow down: its encoder may cease in that
+        return self.unseen_s if reading.enabled and not self.commanded else 0.0
 
 
 NOTHING_SEEN = RestEvidence()

@@ -80,8 +80,8 @@ class SoftLimits:
 
 
 UNLIMITED = SoftLimits()
-UNSEEN_SHARE = 2.0
-"""Longest coasting as a multiple of `coast_s`, which is the shortest."""
+UNSEEN_SHARE = 4.0
+"""Longest coasting as a multiple of `coast_s`, which is the shortest: a runaway is faster than the velocity limit."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -379,7 +379,7 @@ class AxisStatus:
             return Moving.YES
         # every poll passes here: asked only where there may be an answer
         hidden = (self.faults or self.first_fault or self.following) and self.rest_unproven_by
-        return Moving.NO if rests and not hidden else Moving.UNKNOWN
+        return Moving.NO if rests and not hidden and not (self.rest.unseen_s and self.may_coast) else Moving.UNKNOWN
 
     @property
     def to_be_stopped(self) -> bool:
@@ -407,8 +407,8 @@ class AxisStatus:
 
     @property
     def may_coast(self) -> bool:
-        """Whether the shaft may turn unseen while the motor is off."""
-        return self.rest.is_unseen and not self.enabled
+        """Whether the shaft may turn unseen: with the motor off, or behind a motion that others have begun."""
+        return self.rest.unseen_s > 0 and (not self.rest.commanded if self.enabled else not self.rest.rests)
 
     @property
     def energised(self) -> bool:

@@ -356,7 +356,7 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
     # a counter that is not read may have been set, so what it shows later is no place
     # what stood goes on standing: only a motor that has power turns a shaft, and that the next reading shows
     stood = status.at_rest and not status.rest_unproven_by
-    rest = NOTHING_SEEN if stood else status.limits.unseen
+    rest = NOTHING_SEEN if stood else replace(status.limits.unseen, left_turning=True)
     status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=rest, coast=None)
     status = _with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again
@@ -391,8 +391,9 @@ def _refuse_reference(status: AxisStatus, event: ReferenceRefused) -> AxisStatus
     text = f"{REFERENCE_REFUSED.text}: {event.reason}; home the axis, or set its position"
     own = _own_and(status, replace(REFERENCE_REFUSED, text=text))
     # it was left in a motion, or something has moved it since: it may turn still, and its encoder may be dead
-    rest = status.rest if status.rest.turns or status.enabled else status.limits.unseen
-    return replace(status, refused=event.reason, reference_lost=True, own=own, rest=rest)
+    return replace(
+        status, refused=event.reason, reference_lost=True, own=own, rest=replace(status.rest, left_turning=True)
+    )
 
 
 def _know_place(status: AxisStatus, event: PlaceKnown) -> AxisStatus:
@@ -407,6 +408,7 @@ def _know_place(status: AxisStatus, event: PlaceKnown) -> AxisStatus:
         refused="",
         own=own,
         target=target,
+        rest=replace(status.rest, unseen_s=0.0) if event.stood else status.rest,
     )
 
 
@@ -447,12 +449,13 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         way=command.way,
         pace=None,
         # it counts as moving before it does, so that nothing is decided by the rest of before
-        rest=RestEvidence(rests=False, commanded=status.rest.commanded),
+        rest=RestEvidence(rests=False, commanded=status.rest.commanded, unseen_s=status.rest.unseen_s),
     )
 
 
 def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
-    command, ends_at_s = status.command, status.ends_at_s
+    command, ends_at_s, unseen_s = status.command, status.ends_at_s, status.rest.unseen_s
+    stops = command is not None and command.state is AxisState.STOPPING
     if command and command.duration_s is not None:
         ends_at_s = event.now_s + command.duration_s
     status = replace(
@@ -463,7 +466,8 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
         following=_next_following(status, event),
         unsure=event.unsure,
         driven_open=status.driven_open or (command is not None and command.opens_loop),
-        rest=RestEvidence(rests=False, commanded=True),
+        # what brings the motion of others to rest proves no more of its encoder than that has
+        rest=replace(status.rest, rests=False) if stops and unseen_s else RestEvidence(rests=False, commanded=True),
     )
     if event.target_counts is None:
         return status
@@ -511,7 +515,12 @@ def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:
 def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
     on = event.on
     # a loop that closes holds the shaft; one that is let go may coast, or fall; what was off before is as it was
-    rest = RestEvidence(rests=True if on else None, commanded=on) if on or status.enabled else status.rest
+    rest = status.rest
+    if on:  # where nothing has shown that the encoder counts, its first motion does
+        seen = not status.may_coast
+        rest = RestEvidence(rests=True, commanded=seen, unseen_s=0.0 if seen else rest.unseen_s)
+    elif status.enabled:
+        rest = RestEvidence(unseen_s=rest.unseen_s)
     return replace(
         _abort(status, Verb.POWER, event.by),
         state=_state_at_rest(status, enabled=on),
@@ -525,7 +534,7 @@ def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
 
 
 def _switch_loop(status: AxisStatus, event: LoopSwitched) -> AxisStatus:
-    rest = RestEvidence(rests=False, commanded=status.rest.commanded)
+    rest = RestEvidence(rests=False, commanded=status.rest.commanded, unseen_s=status.rest.unseen_s)
     if not event.on:  # a load may fall; a shaft whose motor was off before is as it was
         rest = replace(rest, rests=None) if status.enabled else status.rest
     return replace(status, effective_from_s=event.now_s, enabled=event.on, rest=rest)

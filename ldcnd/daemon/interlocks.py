@@ -438,9 +438,11 @@ def _unproven(status: AxisStatus) -> str:
     """Return why readings do not prove how fast a shaft is; empty where they do."""
     if fault := status.rest_unproven_by:
         return f"may move: after fault {fault} its encoder does not prove that it stands; look, then reset the axis"
+    if status.may_coast and status.enabled:
+        return "may turn: its encoder is yet to count in a motion of this daemon; home it, or switch it off"
     if status.may_coast:
         seconds = f"{status.rest.unseen_s:g} s"
-        return f"may coast: it was not read while it moved, and stands once it has not counted for {seconds}"
+        return f"may coast: nothing has shown yet that it stands; it does once it has not counted for {seconds}"
     return ""
 
 

@@ -485,6 +485,37 @@ def test_a_healthy_rotor_that_is_stopped_at_speed_has_no_fault(rpm, ended):
     assert not alone(stops)
 
 
+@pytest.mark.parametrize("start", ["reset", "adopt"])
+@pytest.mark.parametrize("off", [False, True])
+@pytest.mark.parametrize(("speed", "dead_s"), [(2.0, 0.3), (10.0, 0.45), (25.0, 0.1)])
+@pytest.mark.sweep(3)
+def test_a_daemon_that_begins_beside_a_rotor_whose_encoder_has_died_opens_no_lock(start, off, speed, dead_s):
+    (line,) = CENTRIFUGE.bus
+    config = CENTRIFUGE.model_copy(update={"bus": (line.model_copy(update={"start": start}),)})
+
+    async def program():
+        async with simulated_rig(config) as rig, rig.client.watch("rotor") as rotor:
+            await asyncio.sleep(1.0)
+            await rig.client.set_io("cabinet", low=("door", "unlock", "pin"))
+            await asyncio.sleep(1.0)
+            machine = await made_ready(rig, rotor)
+            await rotor.move_velocity(speed, acceleration=10, duration_s=60)
+            await rig.until(lambda: machine.speed > 0.95 * speed)
+            if off:
+                await rotor.power(on=False)
+            rig.faults.daemon_killed(for_s=0.5)
+            rig.faults.encoder_stuck("rotor", after_s=dead_s)
+            written_at = []
+            for _ in range(600):
+                await asyncio.sleep(0.1)
+                with suppress(LdcndError, TimeoutError):
+                    await rig.client.set_io("cabinet", high=("unlock",), low=("door", "pin"))
+                    written_at.append(machine.speed)
+            return [each for each in written_at if each > CREEPS]
+
+    assert run(program()) == []
+
+
 @pytest.mark.parametrize("after_s", [0.0, 0.03, 0.06, 0.1, 0.3, 1.0])
 @pytest.mark.parametrize("speed", [10.0, 3.0])
 @pytest.mark.sweep(3)
@@ -549,7 +580,7 @@ def test_why_names_what_is_in_the_way_of_homing_before_the_homing_that_is_wanted
     async def program():
         async with simulated_rig(CENTRIFUGE) as rig, rig.client.control("rotor", client="test") as rotor:
             machine = Centrifuge(rig, rotor)
-            await machine.sees(locked=True, door_closed=True, pin=False, door=False, unlock=False)
+            await rig.until(lambda: rotor.state.sample.moving is Moving.NO)
             await rotor.power(on=True)
             await machine.shut_door_opens()
             return [each.code for each in (await rotor.why()).causes]
@@ -827,7 +858,7 @@ def test_who_wrote_outputs_is_in_the_events_done_and_refused_and_the_same_again_
 
 def test_the_command_line_shows_who_wrote_outputs(monkeypatch):
     with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
-        machine.wait(asyncio.sleep(1))
+        machine.wait(asyncio.sleep(45))
         codes = [
             machine.run(f"bus set-io cabinet {each}").code for each in ("unlock=high 12=input", "door=low", "pin=hig")
         ]
