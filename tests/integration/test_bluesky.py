@@ -45,7 +45,7 @@ from ldcnd.lab.bluesky import Fly, PlanAxis, ReadableAxis, Signal, Status, Trace
 from ldcnd.sim.ldcn.power import FaultCondition
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.bluesky_engine import Laboratory, laboratory
-from tests.support.rig import running_rig, two_axes
+from tests.support.rig import EPOCH_NS, running_rig, two_axes
 
 IN_POSITION = 0.02
 """Millimetres between where a motor stands and where it was sent."""
@@ -284,10 +284,22 @@ def flown(device, flight, stream: str, **more):
 
 
 def test_two_axes_fly_in_one_stream_that_is_collected_meanwhile(lab: Laboratory):
+    truth: list[tuple[float, float]] = []
+
+    async def look():
+        while True:
+            now_s = asyncio.get_running_loop().time()
+            lab.chain.pass_until(now_s)
+            lab.module("y").catch_up(now_s)
+            truth.append((EPOCH_NS * 1e-9 + now_s, lab.truth("y")))
+            await asyncio.sleep(0.005)
+
     with lab.powered("x", "y") as (x, y):
         both = lab.devices.flight(x, y)
         flights = {"x": Fly(0, 10, velocity=5), "y": Fly(0, -4, velocity=2)}
+        looking = lab.loop.start(look())
         lab.engine(flown(both, flights, "both", flush_period=0.5))
+        looking.cancel()
         with pytest.raises(WrongState, match="each of x, y"):
             both.prepare(Fly(0, 1))
 
@@ -306,7 +318,13 @@ def test_two_axes_fly_in_one_stream_that_is_collected_meanwhile(lab: Laboratory)
     for places, speed in ((xs, 5), (ys, -2)):
         middle = [(at, value) for at, value in places if 1 < abs(value) < 3]
         assert (middle[-1][1] - middle[0][1]) / (middle[-1][0] - middle[0][0]) == pytest.approx(speed, rel=0.02)
-    assert all(abs(x_at - y_at) < 0.2 for (x_at, _), (y_at, _) in zip(xs, ys, strict=True))
+    assert [at for at, _ in xs] == [at for at, _ in ys]
+    places = iter(truth)
+    before = after = next(places)
+    for at, value in ys:
+        while after[0] < at:
+            before, after = after, next(places)
+        assert min(before[1], after[1]) - IN_POSITION / 2 < value < max(before[1], after[1]) + IN_POSITION / 2
 
 
 def test_a_flight_of_which_one_axis_fails_halts_the_other(lab: Laboratory):

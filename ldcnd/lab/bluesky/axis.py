@@ -25,7 +25,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import LinkState, PositionSample, Quality
-from ldcnd.lab.bluesky.flight import Flight, Fly
+from ldcnd.lab.bluesky.flight import Flight, Fly, FlownPlace
 from ldcnd.lab.bluesky.followers import Followers, ValueCallback
 from ldcnd.lab.bluesky.setting import Setting
 from ldcnd.lab.bluesky.status import Status
@@ -387,6 +387,17 @@ class PlanAxis(ReadableAxis):
     def positions(self) -> Positions:
         """Return the positions from now on, for the devices' own loop."""
         return self._axis.positions()
+
+    async def place_at(self, t: int) -> FlownPlace | None:
+        """Return where it was at an instant, UTC in ns since 1970, on the devices' own loop; None if not known."""
+        try:
+            found = await self._axis.at(t)
+        except LdcndError:
+            return None
+        if found.position is None or found.unit != self._info.unit:
+            return None
+        value, modulo = found.position.value, self._info.modulo
+        return FlownPlace(value % modulo if modulo else value, t)
 
     def _velocity_of(self, fly: Fly) -> float | None:
         return self.velocity.value if fly.velocity is None else fly.velocity

@@ -1,16 +1,18 @@
 """Flights: motions during which positions are recorded, of one axis or of several, as the events of one stream."""
 
 import asyncio
+from collections import deque
 from collections.abc import AsyncIterator, Coroutine, Mapping
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown, WrongState
 from ldcnd.contract.samples import PositionSample
 from ldcnd.lab.bluesky.status import Status
+from ldcnd.lab.bluesky.values import PATIENCE_S
 
 if TYPE_CHECKING:
     from bluesky.protocols import Hints
@@ -21,8 +23,18 @@ if TYPE_CHECKING:
 
 PAGE_SAMPLES = 1000
 """Maximum number of positions on a page of a fly scan."""
+POSITIONS_BEHIND = 4
+"""Positions of an axis that follow an instant until the daemon knows where it was then."""
 
-Row = tuple[PositionSample, ...]
+
+class FlownPlace(NamedTuple):
+    """Where an axis was, in its unit, and when, UTC in ns since 1970."""
+
+    value: float
+    t: int
+
+
+Row = tuple[FlownPlace, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +55,8 @@ class Fly:
 class Flight:
     """Axes that fly at the same time; made by `Devices.flight`. Each axis is one of its own, too.
 
-    An event has the position of the first axis and those that the others had published last, each with the time at
-    which its drive was there.
+    An event has the position of the first axis, and where the others were at that instant; what such an axis had
+    published last, with the time of that, where the daemon does not know.
 
     Attributes:
         name: of the device.
@@ -113,7 +125,7 @@ class Flight:
                 if not flights:
                     raise WrongState(f"{self.name}: no fly scan is prepared", remedy="call prepare")
                 began: list[asyncio.Future[None]] = [asyncio.get_running_loop().create_future() for _ in self._axes]
-                self._rows = []
+                self._rows.clear()
                 self._under_way = self._start("flight", self._fly(flights, began))
                 await asyncio.gather(*began)
 
@@ -158,28 +170,32 @@ class Flight:
             columns = {axis.name: [row[at] for row in page] for at, axis in enumerate(self._axes)}
             yield {
                 "time": [row[0].t * 1e-9 for row in page],
-                "data": {name: [sample.value for sample in column] for name, column in columns.items()},
-                "timestamps": {name: [sample.t * 1e-9 for sample in column] for name, column in columns.items()},
+                "data": {name: [place.value for place in column] for name, column in columns.items()},
+                "timestamps": {name: [place.t * 1e-9 for place in column] for name, column in columns.items()},
             }
 
     async def _taken(self) -> list[Row]:
-        rows, self._rows = self._rows, []
+        rows = list(self._rows)
+        self._rows.clear()
         return rows
 
     async def _fly(self, flights: Mapping[str, Fly], began: list[asyncio.Future[None]]) -> None:
         """Move every axis to its end and keep the positions on the way."""
         readers = [axis.positions() for axis in self._axes]
         last: dict[int, PositionSample] = {}
+        places = _Places(self._axes, self._rows)
 
         async def keep(at: int) -> None:
             async for sample in readers[at]:
                 last[at] = sample
                 if at == 0 and len(last) == len(readers):
-                    self._rows.append(tuple(last[each] for each in range(len(readers))))
+                    places.add(tuple(FlownPlace(last[each].value, last[each].t) for each in range(len(readers))))
+                places.count(at)
 
         keeping = [
             asyncio.create_task(keep(at), name=f"positions of {axis.name}") for at, axis in enumerate(self._axes)
         ]
+        placing = asyncio.create_task(places.find(), name=f"places of {self.name}")
         moves = [axis.begin_flight(flights[axis.name], future) for axis, future in zip(self._axes, began, strict=True)]
         try:
             for moved, future in zip(moves, began, strict=True):
@@ -187,6 +203,7 @@ class Flight:
             await asyncio.gather(*(moved.wrapped() for moved in moves))
             for axis in self._axes:
                 await axis.measured()
+            await places.found()
             if not any(axis.is_stopped() for axis in self._axes):
                 self._unfinished = {}
         except LdcndError:
@@ -194,8 +211,9 @@ class Flight:
                 await self.stop(success=False)
             raise
         finally:
-            for task in keeping:
+            for task in (*keeping, placing):
                 task.cancel()
+            places.end()
         dropped = sum(reader.dropped for reader in readers)
         if dropped:
             raise OutcomeUnknown(
@@ -207,6 +225,63 @@ class Flight:
 
     def __repr__(self) -> str:
         return f"<flight {self.name}: {', '.join(axis.name for axis in self._axes)}>"
+
+
+class _Places:
+    """Rows that wait until the daemon knows where all axes were at the instant of the first one.
+
+    Args:
+        axes: in the order of a row.
+        rows: takes those that are known.
+    """
+
+    def __init__(self, axes: "tuple[PlanAxis, ...]", rows: list[Row]) -> None:
+        self._axes = axes
+        self._rows = rows
+        self._counts = [0] * len(axes)
+        self._waiting: deque[tuple[Row, tuple[int, ...]]] = deque()
+        self._changed = asyncio.Event()
+        self._takes = True
+        self._all_found = asyncio.Event()
+
+    def add(self, row: Row) -> None:
+        """Take a row as it was published."""
+        if self._takes:
+            self._waiting.append((row, tuple(self._counts)))
+
+    def count(self, axis: int) -> None:
+        """Take note that one more position of an axis has come."""
+        self._counts[axis] += 1
+        self._changed.set()
+
+    async def find(self) -> None:
+        """Hand rows over as they become known, until it is cancelled."""
+        while True:
+            while self._waiting and self._is_known():
+                first, *others = self._waiting[0][0]
+                found = [await axis.place_at(first.t) for axis in self._axes[1:]]
+                self._waiting.popleft()
+                self._rows.append((first, *(place or last for place, last in zip(found, others, strict=True))))
+            if not self._waiting and not self._takes:
+                self._all_found.set()
+            self._changed.clear()
+            await self._changed.wait()
+
+    def _is_known(self) -> bool:
+        behind = (now - then for now, then in zip(self._counts[1:], self._waiting[0][1][1:], strict=True))
+        return all(count >= POSITIONS_BEHIND for count in behind)
+
+    async def found(self) -> None:
+        """Take no more rows, and wait until none waits, but not for ever."""
+        self._takes = False
+        if self._waiting:
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._all_found.wait(), PATIENCE_S)
+
+    def end(self) -> None:
+        """Hand over what still waits as it was published."""
+        self._rows.extend(row for row, _ in self._waiting)
+        self._waiting.clear()
 
 
 def _pass_on(loop: LoopThread, began: asyncio.Future[None], move: Status) -> None:
