@@ -148,13 +148,15 @@ def rules_table() -> str:
     rows = []
     for path in (ROOT / "tests" / "integration").glob("*.py"):
         text = path.read_text(encoding="utf-8")
-        for node in ast.walk(ast.parse(text)) if "mark.record(" in text else ():
-            match node:
-                case ast.Call(
-                    func=ast.Attribute(attr="record"), args=[ast.Constant(str(field)), ast.Constant(str(rule))]
-                ):
-                    rows.append(f"| {field} | {rule} |\n")
-    return "".join(["| field | rule |\n|---|---|\n", *sorted(rows)])
+        tests = [each for each in ast.parse(text).body if isinstance(each, ast.AsyncFunctionDef)]
+        for node in tests if "mark.record(" in text else ():
+            for mark in node.decorator_list:
+                match mark:
+                    case ast.Call(
+                        func=ast.Attribute(attr="record"), args=[ast.Constant(str(field)), ast.Constant(str(rule))]
+                    ):
+                        rows.append(f"| {field} | {rule} (`{node.name}`) |\n")
+    return "".join(["| field | rule (test) |\n|---|---|\n", *sorted(rows)])
 
 
 if __name__ == "__main__":

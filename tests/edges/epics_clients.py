@@ -13,6 +13,7 @@ from collections.abc import Callable
 import pytest
 
 from tests.support.bluesky_engine import Documents
+from tests.support.epics_records import SCREENS
 
 LONGEST_S = 60.0
 
@@ -52,6 +53,22 @@ def caget(record: str) -> None:
     assert [epics.caget(f"{record}-Err"), epics.caget(f"{record}-MsgTxt", as_string=True)] == [0, ""]
     assert len(seen) > 3
     epics.camonitor_clear(f"{record}.RBV")
+
+
+def screens(record: str) -> None:
+    """Every channel of the motor record's own screens connects, but those for scans, which the page names."""
+    import epics
+
+    fields = {field for screen in ("motorx_all", "motor8x") for field in SCREENS[screen].split()}
+    here = {f"{record}.{field}" for field in fields} | {
+        f"{record}_able.VAL",
+        f"{record.rpartition(':')[0]}:allstop.VAL",
+    }
+    scans = {f"{record}:scanParms.{field}" for field in ("GO", "LOAD")}
+    channels = {name: epics.PV(name) for name in here | scans}
+    until(lambda: all(channels[name].connected for name in here))
+    assert {name for name in here if channels[name].get(timeout=LONGEST_S) is None} == set()
+    assert not any(channels[name].connected for name in scans)
 
 
 def aioca_calls(record: str) -> None:
@@ -220,7 +237,7 @@ def p4p_calls(record: str) -> None:
 
 CLIENTS = {
     client.__name__: client
-    for client in (caget, aioca_calls, pyepics_motor, ophyd_motor, ophyd_async_motor, caproto_tools, p4p_calls)
+    for client in (caget, screens, aioca_calls, pyepics_motor, ophyd_motor, ophyd_async_motor, caproto_tools, p4p_calls)
 }
 
 if __name__ == "__main__":

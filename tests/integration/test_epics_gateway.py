@@ -32,19 +32,8 @@ from ldcnd.daemon.assembly import build_daemon
 from ldcnd.lab.epics.gateway import gateway
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.dialect_rig import LS_182AP, dialect_rig
-from tests.support.epics_records import VALUES, put, records, shows
+from tests.support.epics_records import SCREENS, VALUES, put, records, shows
 from tests.support.rig import EPOCH_NS, running_rig, two_axes
-
-SCREENS = {
-    "motorx_all": "ACCL ATHM BACC BDST BVEL CARD CNEN DESC DHLM DIFF DIR DLLM DLY DMOV DRBV DTYP DVAL EGU ERES FLNK "
-    "FOFF FRAC HLM HLS HOMF HOMR JAR JOGF JOGR JVEL LLM LLS LVIO MIP MOVN MRES MSTA OFF OMSL PREC RBV RCNT RDBD RDBL "
-    "REP RLV RMP RRBV RRES RTRY RVAL SET SPMG STAT STOP TDIR TWF TWR TWV UEIP URIP VAL VBAS VELO VERS VMAX",
-    "motor8x": "DESC DMOV EGU HLS LLS LVIO RBV SET STOP TWF TWR TWV VAL",
-    "ophyd and pyepics": "ACCL DIR DMOV EGU HLM HLS HOMF HOMR LLM LLS MOVN MSTA OFF RBV RTYP SET STOP TDIR VAL VELO",
-    "NICOS": "RBV VAL DMOV MOVN MISS LVIO HLS LLS HLM LLM DHLM DLLM OFF DIR SPMG STAT SEVR STOP RDBD EGU VELO CNEN",
-}
-"""Fields that screens of the motor record and clients use, in their own words."""
-
 
 AT_REST = 0.05
 """Millimetres by which a shaft still settles once it stands, from where a halt or a stop has ended."""

@@ -8,6 +8,7 @@ import pytest
 from caproto import AccessRights, AlarmSeverity, ChannelType
 
 from ldcnd.client.axis import Axis
+from ldcnd.config.plan import plan_rig
 from ldcnd.contract.errors import CommandAborted, LdcndError, PositionLimit, StopLatched, WrongState
 from ldcnd.contract.samples import Moving
 from tests.support.epics_records import monitored, put, records, shows
@@ -108,6 +109,52 @@ async def test_a_homing_shows_and_ends():
         assert made.variables["T:x.VAL"].value == pytest.approx(made.variables["T:x.RBV"].value, abs=0.02)
 
 
+@pytest.mark.record("MISS", "it is 1 after a move that did not settle, until one does")
+async def test_a_move_that_does_not_settle_is_a_miss():
+    config = two_axes()
+    (bus,) = config.bus
+    never = bus.axis[0].settle.model_copy(update={"window": 1e-9, "time_s": 0.01, "timeout_s": 0.05})
+    axes = (bus.axis[0].model_copy(update={"settle": never}), *bus.axis[1:])
+    missing = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
+    async with records(config=missing) as (running, made):
+        await put(made, "T:x", 1.0)
+        assert values(made, "MISS", "DMOV") == (1, 1)
+        running.daemon.reconfigure(config, plan_rig(config))
+        await put(made, "T:x", 2.0)
+
+        assert values(made, "MISS", "DMOV") == (0, 1)
+
+
+@pytest.mark.record("ATHM", "it is 1 at the index of the encoder, as bit 8 of MSTA is")
+async def test_the_index_of_the_encoder_is_at_home():
+    async with records() as (running, made):
+        await put(made, "T:x", 0.69)
+        await put(made, "T:x.VELO", 0.02)
+        sent = await monitored(made, "T:x.ATHM")
+        moving = asyncio.create_task(put(made, "T:x", 0.72))
+        at_index = []
+        while not moving.done():
+            at, mask = values(made, "ATHM", "MSTA")
+            if at and mask & AT_INDEX:
+                at_index.append((await running.client.position("x")).counts)
+            await asyncio.sleep(0.01)
+        await moving
+
+        assert at_index
+        assert 698 <= min(at_index) <= max(at_index) <= 706  # the pulse is four counts wide, from 700 on
+        assert [sent.get_nowait().values[0] for _ in range(sent.qsize())][-1] == 0
+        assert not values(made, "MSTA")[0] & AT_INDEX
+
+
+@pytest.mark.record("NAME", "it is the record's, DTYP is family and model of the drive, RRBV its count")
+async def test_a_record_says_whose_it_is():
+    async with records(moves=False) as (running, made):
+        position, (info, _) = await running.client.position("x"), await running.client.axes()
+
+        assert values(made, "NAME", "DTYP") == ("T:x", f"{info.family} {info.model}")
+        assert abs(values(made, "RRBV")[0] - position.counts) <= 1
+
+
 @pytest.mark.record("SSET", "a put sets SET to Set, one to SUSE to Use")
 async def test_set_and_use_have_a_field_each():
     async with records() as (_, made):
@@ -161,7 +208,6 @@ async def test_puts_are_disabled_and_a_stop_is_not():
         assert made.variables["T:x.RBV"].value == pytest.approx(1, abs=0.02)
 
 
-@pytest.mark.record("STOP", "`allstop` is one for all records of the gateway")
 @pytest.mark.parametrize("refusal", ["disabled", "paused", "beyond"])
 @pytest.mark.sweep(2)
 async def test_a_motion_that_is_refused_ends_with_an_alarm_until_a_put_is_taken(refusal):
@@ -183,6 +229,7 @@ async def test_a_motion_that_is_refused_ends_with_an_alarm_until_a_put_is_taken(
         assert made.variables["T:x.RBV"].alarm.severity == AlarmSeverity.NO_ALARM
 
 
+@pytest.mark.record("STOP", "`allstop` is one for all records of the gateway")
 async def test_a_stop_of_all_halts_each_axis():
     async with records() as (running, made):
         await put(made, "T:y.CNEN", "Enable")

@@ -21,7 +21,7 @@ from ldcnd.lab.epics.gateway import WHO, Gateway, gateway
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive
-from tests.support.epics_records import any_put, put, shows
+from tests.support.epics_records import STARTS, any_put, put, shows
 from tests.support.rig import RunningRig, running_rig, two_axes
 
 pytestmark = pytest.mark.timeout(3600)
@@ -33,6 +33,8 @@ SETTLING_COUNTS = 50
 SETTLING_S = 3.0
 """By how much, and for how long, the loop goes on after the end of a profile that a halt has cut short."""
 PAUSE_S = 5.0
+STOPPED = 0.5
+"""Share of the comparisons before which x is stopped; before the others it ends what was put."""
 MOVES = {"move_absolute", "home", "jog"}
 
 
@@ -53,6 +55,8 @@ class Campaign:
     checks: int = 0
     stops: int = 0
     compared: int = 0
+    asked: int = 0
+    """Puts that may begin a motion."""
 
     def counts(self, axis: str) -> float:
         return drive(self.chain, PLACES[axis]).shaft.position_counts
@@ -60,6 +64,7 @@ class Campaign:
     def begin(self) -> None:
         """Put something, without waiting for the end of it."""
         name, value = any_put(self.made, self.dice)
+        self.asked += name.endswith(STARTS) or name == "T:x"
 
         async def attempt() -> None:
             with suppress(LdcndError, ValueError, TypeError, CaprotoError, Forbidden):
@@ -138,11 +143,11 @@ class Campaign:
         return False
 
     async def reload(self) -> None:
-        """Have the daemon read a configuration with other velocities."""
+        """Have the daemon read a configuration with other velocities, and perhaps another unit."""
         config = two_axes()
         (bus,) = config.bus
-        velocity = self.dice.choice([5.0, 10.0, 20.0])
-        axes = tuple(axis.model_copy(update={"velocity": velocity}) for axis in bus.axis)
+        changed = {"velocity": self.dice.choice([5.0, 10.0, 20.0]), "unit": self.dice.choice(["mm", "mm", "um"])}
+        axes = tuple(axis.model_copy(update=changed) for axis in bus.axis)
         config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
         self.running.daemon.reconfigure(config, plan_rig(config))
 
@@ -150,13 +155,18 @@ class Campaign:
         """At rest VAL is where x was sent, which is where it stands, whatever has been put or has stopped it."""
         if self.taken:
             return
-        await put(self.made, "T:x.STOP", 1)
+        if stops := self.dice.random() < STOPPED:
+            await put(self.made, "T:x.STOP", 1)
+        else:
+            for field in (".JOGF", ".JOGR"):  # a jog that nobody releases has no end
+                with suppress(LdcndError):
+                    await put(self.made, f"T:x{field}", 0)
         while self.under_way:
             await asyncio.wait(self.under_way)
         await self.running.until("x", lambda state: state.moving is Moving.NO and state.command is None)
         await asyncio.sleep(SETTLING_S)
         target, here = (float(self.made.variables[f"T:x.{name}"].value) for name in ("VAL", "RBV"))
-        assert abs(target - here) <= SETTLING_COUNTS / COUNTS_PER_UNIT
+        assert abs(target - here) <= SETTLING_COUNTS / COUNTS_PER_UNIT, f"stopped: {stops}"
         self.compared += 1
 
     async def step(self) -> None:
@@ -204,6 +214,7 @@ async def campaign(seed: int, steps: int) -> tuple[int, int]:
             await going.compare()
         events = (await running.client.ask(ReadEvents(count=1000))).events
     begun = [event for event in events if event.verb in MOVES]
+    assert len({event.command_id for event in begun}) <= going.asked
     assert {(event.axis, event.client) for event in begun} <= {("x", WHO)}
     return len(begun), going.checks
 

@@ -25,7 +25,7 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import LinkState, PositionSample, Quality
-from ldcnd.lab.bluesky.flight import Flight, Fly, FlownPlace
+from ldcnd.lab.bluesky.flight import Flight, FlownPlace, Fly
 from ldcnd.lab.bluesky.followers import Followers, ValueCallback
 from ldcnd.lab.bluesky.setting import Setting
 from ldcnd.lab.bluesky.status import Status
