@@ -20,6 +20,7 @@ from tests.bench import (
     counts,
     interlock_cost,
     ports,
+    ring_cost,
     round_trip,
     saturated_command,
     scaling,
@@ -65,6 +66,7 @@ PARTS = (
     "client",
     "counts",
     "interlocks",
+    "ring",
     "ports",
 )
 
@@ -131,6 +133,7 @@ def _parts(folder: Path, rounds: int, virtual_s: float, before: Path | None) -> 
         client_sample.rows,
         partial(counts.rows, ROOT, before),
         interlock_cost.rows,
+        ring_cost.rows,
         partial(ports.rows, virtual_s),
     )
     return dict(zip(PARTS, found, strict=True))

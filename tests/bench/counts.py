@@ -140,7 +140,8 @@ async def _costs(what: str, work: Callable[[], Awaitable[float]]) -> dict[str, f
     }
 
 
-def _config(*, axes: int, hz: float, order: str = "deadline") -> RigConfig:
+def config_of(*, axes: int, hz: float, order: str = "deadline") -> RigConfig:
+    """Return a rig of one line whose axes are asked for all items so often."""
     rates = dict.fromkeys(ITEMS, hz) if hz else dict.fromkeys(ITEMS, 0.0) | {"state": 1.0}
     drive = {"model": "ls-182ap", "velocity": 1, "acceleration": 100, "gains": GAINS, "rates": rates}
     drives = [drive | {"name": f"a{n}", "address": n} for n in range(1, axes + 1)]
@@ -150,7 +151,7 @@ def _config(*, axes: int, hz: float, order: str = "deadline") -> RigConfig:
 
 
 async def _polls(axes: int, order: str) -> dict[str, float]:
-    async with running_rig(_config(axes=axes, hz=HZ, order=order)) as rig:
+    async with running_rig(config_of(axes=axes, hz=HZ, order=order)) as rig:
         await asyncio.sleep(SETTLED_S)
         statistics = rig.daemon.rig.buses[0].bus.statistics
 
@@ -165,7 +166,7 @@ async def _polls(axes: int, order: str) -> dict[str, float]:
 @asynccontextmanager
 async def _quiet_rig() -> AsyncIterator[RunningRig]:
     """One drive that is hardly polled, so that what is counted is the command's."""
-    async with running_rig(_config(axes=1, hz=0.0)) as rig:
+    async with running_rig(config_of(axes=1, hz=0.0)) as rig:
         await rig.until("a1", lambda state: state.link == "up")
         await rig.client.command("a1", Power(on=True))
         await asyncio.sleep(SETTLED_S)

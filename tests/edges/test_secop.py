@@ -1,6 +1,7 @@
 """frappy's own client, unmodified, with a daemon and a SECoP node in processes of their own."""
 
 import asyncio
+import json
 import socket
 import time
 from collections.abc import AsyncIterator, Callable
@@ -123,6 +124,91 @@ async def test_a_stopped_axis_is_busy_until_it_rests(command: str):
         at_end, at_rest = await asyncio.to_thread(use, uri, stop)
 
     assert abs(at_end - at_rest) < 0.1, (at_end, at_rest)
+
+
+PREDEFINED = {
+    *("value", "status", "target", "pollinterval", "ramp", "setpoint", "mode"),
+    *("stop", "reset", "clear_errors", "go", "hold", "shutdown", "communicate"),
+}
+"""Accessibles that SECoP 1.0 names; names of others begin with an underscore."""
+CODES = {0, 100, 200, 300, 400}
+"""Status codes of SECoP 1.0 that an axis uses."""
+
+
+async def test_the_node_keeps_the_rules_of_the_protocol_line_by_line():
+    """What is asked here is what "SECoP Specification 1.0" says of messages, errors and descriptions."""
+
+    def use(port: int) -> None:
+        def ask(line: str) -> tuple[str, str, object]:
+            node.sendall(line.encode() + b"\n")
+            while True:  # what is active sends updates in between
+                action, _, rest = lines.readline().decode().rstrip("\n").partition(" ")
+                if action not in {"update", "error_update"}:
+                    specifier, _, data = rest.partition(" ")
+                    return action, specifier, json.loads(data) if data[:1] in ("[", "{") else data
+
+        def refused(line: str) -> str:
+            action, specifier, report = ask(line)
+            asked, name = line.split(" ")[:2]
+            assert (action, specifier) == (f"error_{asked}", name), line
+            assert isinstance(report, list)
+            assert len(report) == 3
+            assert isinstance(report[1], str)
+            return str(report[0])
+
+        with socket.create_connection(("127.0.0.1", port), 10) as node, node.makefile("rb") as lines:
+            node.sendall(b"*IDN?\n")
+            assert lines.readline().decode().startswith("ISSE")
+            action, specifier, described = ask("describe")
+            assert (action, specifier) == ("describing", ".")
+            assert isinstance(described, dict)
+            assert {"modules", "equipment_id", "description"} <= set(described)
+            for name, module in described["modules"].items():
+                assert {"accessibles", "description", "interface_classes"} <= set(module), name
+                accessibles = module["accessibles"]
+                assert {"value", "status"} <= set(accessibles), name
+                assert {each for each in accessibles if each[0] != "_"} <= PREDEFINED, name
+                for accessible, described_as in accessibles.items():
+                    assert {"description", "datainfo"} <= set(described_as), (name, accessible)
+                    assert ("readonly" in described_as) is (described_as["datainfo"]["type"] != "command"), accessible
+                status = accessibles["status"]["datainfo"]
+                assert [status["type"], *(member["type"] for member in status["members"])] == [
+                    "tuple",
+                    "enum",
+                    "string",
+                ]
+                assert set(status["members"][0]["members"].values()) >= {100, 400}
+            x = described["modules"]["x"]["accessibles"]
+            assert {"target", "stop"} <= set(x)
+            assert x["target"]["datainfo"]["type"] == x["value"]["datainfo"]["type"]
+            assert x["target"]["datainfo"]["unit"] == x["value"]["datainfo"]["unit"] == "mm"
+            _, _, (value, qualifiers) = ask("read x:value")
+            assert isinstance(value, float)
+            assert abs(qualifiers["t"] - time.time()) < 5
+            _, _, ((code, text), _) = ask("read x:status")
+            assert code in CODES
+            assert isinstance(text, str)
+            action, specifier, (nothing, qualifiers) = ask("ping 17")
+            assert (action, specifier, nothing) == ("pong", "17", None)
+            assert "t" in qualifiers
+            assert refused("read nobody:value") == "NoSuchModule"
+            assert refused("read x:nothing") == "NoSuchParameter"
+            assert refused("do x:nothing") == "NoSuchCommand"
+            assert refused("change x:value 3.0") == "ReadOnly"
+            assert refused('change x:target "far"') in ("WrongType", "RangeError")
+            assert refused("change x:target 1e6") == "RangeError"
+            assert ask("activate")[0] == "active"
+            assert ask("deactivate")[0] == "inactive"
+
+    port = free_port()
+    async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
+        async with process("secop", "x", "-e", endpoint, "--address", f"127.0.0.1:{port}", "--moves") as running:
+            assert running.stdout
+            await running.stdout.readline()
+            async with client(endpoint) as rig:
+                await rig.command("x", Power(on=True))
+                await asyncio.to_thread(use, port)
+                assert (await rig.state("x")).moving is Moving.NO
 
 
 async def test_a_read_only_node_has_readables():

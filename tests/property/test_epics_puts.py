@@ -143,11 +143,11 @@ class Campaign:
         return False
 
     async def reload(self) -> None:
-        """Have the daemon read a configuration with other velocities, and perhaps another unit."""
+        """Have the daemon read a configuration with other velocities."""
         config = two_axes()
         (bus,) = config.bus
-        changed = {"velocity": self.dice.choice([5.0, 10.0, 20.0]), "unit": self.dice.choice(["mm", "mm", "um"])}
-        axes = tuple(axis.model_copy(update=changed) for axis in bus.axis)
+        velocity = self.dice.choice([5.0, 10.0, 20.0])
+        axes = tuple(axis.model_copy(update={"velocity": velocity}) for axis in bus.axis)
         config = config.model_copy(update={"bus": (bus.model_copy(update={"axis": axes}),)})
         self.running.daemon.reconfigure(config, plan_rig(config))
 
@@ -157,12 +157,11 @@ class Campaign:
             return
         if stops := self.dice.random() < STOPPED:
             await put(self.made, "T:x.STOP", 1)
-        else:
-            for field in (".JOGF", ".JOGR"):  # a jog that nobody releases has no end
-                with suppress(LdcndError):
-                    await put(self.made, f"T:x{field}", 0)
         while self.under_way:
             await asyncio.wait(self.under_way)
+        for jog in ("JOGF", "JOGR") if not stops else ():  # one that nobody releases has no end
+            with suppress(LdcndError):
+                await put(self.made, f"T:x.{jog}", 0)
         await self.running.until("x", lambda state: state.moving is Moving.NO and state.command is None)
         await asyncio.sleep(SETTLING_S)
         target, here = (float(self.made.variables[f"T:x.{name}"].value) for name in ("VAL", "RBV"))
