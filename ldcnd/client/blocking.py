@@ -71,6 +71,10 @@ class BlockingMotion(Facade[motion.Motion]):
         """Yield the progress with each value that arrives until the command has ended."""
         return self._loop.each(aiter(self._wrapped))
 
+    def _repr_html_(self) -> str:
+        """Return what it is and how it has ended as a table, for notebooks."""
+        return self._wrapped._repr_html_()
+
 
 class BlockingJogging(Facade[motion.Jogging]):
     """A jog under way; made by `BlockingAxis.jogging`."""

@@ -2,6 +2,7 @@
 
 import asyncio
 
+import pandas as pd
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
@@ -34,6 +35,7 @@ async def test_tables_are_parquet_files_with_types(tmp_path):
     assert [str(table.schema.field(name).type) for name in ("t_ns", "enabled", "state")] == ["int64", "bool", "string"]
     assert [str(positions.schema.field(name).type) for name in ("value", "counts")] == ["double", "int64"]
     assert pa.table(expected).num_rows == table.num_rows
+    assert pd.DataFrame(expected)["t_ns"].tolist() == expected["t_ns"]
 
 
 async def test_columns_without_values_have_the_types_of_what_is_published(tmp_path):

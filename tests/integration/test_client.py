@@ -4,6 +4,7 @@ import ast
 import asyncio
 import errno
 import inspect
+import json
 import os
 import sys
 import threading
@@ -281,6 +282,9 @@ async def test_the_first_program_runs(tmp_path: Path):
                 move = y.move_absolute(2, velocity=5)
                 print(len(list(move)) > 1)
                 move.done()
+                print(all(word in move._repr_html_() for word in ("move_absolute of y: ended", "<td>target</td>")))
+                trace = y.take_trace("position", samples=20)
+                print(trace._repr_html_().count("<svg"), len(trace.table()["offset_ns"]), len(repr(trace)) < 2000)
                 print(y.position, y)
                 print(next(y.positions()).unit, "<td>x</td>" in rig._repr_html_())
                 with y.jogging(5) as jog:
@@ -289,15 +293,20 @@ async def test_the_first_program_runs(tmp_path: Path):
                 print("jogged")
         """
         blocked = await run_program(inspect.cleandoc(quietly), endpoint)
+        async with process("axis", "at", "y", "--ago", "0.5", "--json", "-e", endpoint) as asked:
+            assert asked.stdout
+            was = json.loads(await asked.stdout.read())
 
     assert float(printed[0].split()[0]) == pytest.approx(5.0, abs=0.05)
     assert "mm (" in printed[0]
     assert "standstill (" in printed[0]
     assert float(printed[1]) == pytest.approx(5.0, abs=0.05)
-    assert blocked[0] == "True"
-    assert float(blocked[1].split()[0]) == pytest.approx(2.0, abs=0.05)
-    assert blocked[2].endswith("True")
-    assert blocked[3] == "jogged"
+    assert blocked[:3] == ["True", "True", "1 20 True"]
+    assert float(blocked[3].split()[0]) == pytest.approx(2.0, abs=0.05)
+    assert blocked[4].endswith("True")
+    assert blocked[5] == "jogged"
+    assert was["position"]["lower"] <= was["position"]["value"] <= was["position"]["upper"]
+    assert 2.4 < was["position"]["value"] < 10
 
 
 @pytest.mark.real_time
