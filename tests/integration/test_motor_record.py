@@ -11,11 +11,13 @@ from ldcnd.client.axis import Axis
 from ldcnd.config.plan import plan_rig
 from ldcnd.contract.errors import CommandAborted, LdcndError, PositionLimit, StopLatched, WrongState
 from ldcnd.contract.samples import Moving
+from ldcnd.lab.epics.record import MotorRecord
 from tests.support.epics_records import monitored, put, records, shows
 from tests.support.rig import two_axes
 
 DONE, CLOSED, ENCODER, MOVING, SUPPORT, HOMED, PLUS = 0x2, 0x20, 0x100, 0x400, 0x800, 0x4000, 0x1
 ALWAYS = ENCODER | SUPPORT | HOMED
+NO_COMMUNICATION = 0x1000
 AT_INDEX = 0x80
 """Comes and goes as the motor turns."""
 
@@ -251,14 +253,19 @@ async def test_a_stop_of_all_halts_each_axis():
 async def test_alarms_are_enumerations():
     async with records() as (running, made):
         status, severity = made.variables["T:x.STAT"], made.variables["T:x.SEVR"]
+        info = (await running.client.axes())[0]
         assert {status.data_type, severity.data_type} == {ChannelType.ENUM}
         assert (status.raw_value, severity.raw_value, made.variables["T:x.UDF"].value) == (0, 0, 0)
         await running.client.stop("x")
         await shows(made, "T:x.STAT", "STATE")
+        assert not made.variables["T:x.MSTA"].value & NO_COMMUNICATION
         running.daemon.end()
         await shows(made, "T:x.STAT", "COMM")
 
         assert (status.raw_value, severity.raw_value) == (9, 3)
+        assert made.variables["T:x.MSTA"].value & NO_COMMUNICATION
+        unknown = MotorRecord(info, None)
+        assert (unknown["UDF"].value, unknown["UDF"].severity) == (1, AlarmSeverity.INVALID_ALARM)
 
 
 async def test_puts_that_do_not_wait_take_effect_in_their_order(monkeypatch):

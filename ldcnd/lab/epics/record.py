@@ -424,7 +424,7 @@ class MotorRecord:
             | MSTA_POSITION * bool(state and state.enabled)
             | MSTA_HOMED * bool(state and state.referenced)
             | MSTA_PROBLEM * bool(state and state.state is AxisState.ERROR_STOP)
-            | MSTA_COMM * (state is None or state.link is LinkState.DOWN)
+            | MSTA_COMM * (state is None or state.link is LinkState.DOWN or self._alarm == SILENT)
         )
         await self["DMOV"].show(int(stands))
         await self["STAT"].show(self._alarm.status.name)
