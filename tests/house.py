@@ -299,7 +299,8 @@ def _commands(command: click.Command, context: click.Context) -> set[click.Comma
     """Return the commands below one that are written by hand; one that has two names counts once."""
     if isinstance(command, click.Group):
         found = (command.get_command(context, name) for name in command.list_commands(context))
-        return {each for inner in found if inner for each in _commands(inner, click.Context(inner, parent=context))}
+        below = {each for inner in found if inner for each in _commands(inner, click.Context(inner, parent=context))}
+        return below | ({command} if command.invoke_without_command else set())
     return set() if isinstance(command, Derived) else {command}
 
 

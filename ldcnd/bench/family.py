@@ -86,11 +86,9 @@ class BenchFamily(ABC, Generic[BusT]):
     """One drive family on the bench.
 
     Attributes:
-        examination: what `ldcnd doctor` does with its lines, as a help text.
         is_tuned_by_host: whether `ldcnd tune` finds gains for its axes.
     """
 
-    examination: str
     is_tuned_by_host: bool = False
 
     @abstractmethod

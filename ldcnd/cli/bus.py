@@ -12,10 +12,11 @@ from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import show_lines
 from ldcnd.cli.sending import NAME, Shown, derived_question
-from ldcnd.cli.typed import Finite, NewFile, force_option
+from ldcnd.cli.typed import Finite, NewFile, force_option, is_file
 from ldcnd.client.events import fetch_wire_log
 from ldcnd.client.overview import last_bus_health
 from ldcnd.client.rig_client import RigClient
+from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import GuestHealth
 from ldcnd.contract.leases import GuestSentAway, SendGuestAway
 from ldcnd.contract.meta import AxisInfo
@@ -138,9 +139,13 @@ command.add_command(derived_question("snapshot", Snapshot, "bus", shows=_snapsho
 
 
 @command.command("list")
+@click.option("--guests", is_flag=True, help="Show every port instead, the program at it, and what it controls.")
 @with_target
-def list_buses(target: Target) -> None:
+def list_buses(target: Target, *, guests: bool) -> None:
     """Show every line: rate, counters, latencies."""
+    if guests:
+        _list_guests(target)
+        return
     for bus in target.run(lambda client: client.buses()):
         health = f"up; {bus.problem}".rstrip("; ") if bus.up else f"down: {bus.problem}"
         losses = f"{bus.timeouts} timeouts, {bus.corrupt_replies} corrupt, {bus.resent} resent"
@@ -151,10 +156,7 @@ def list_buses(target: Target) -> None:
         )
 
 
-@command.command("guests")
-@with_target
-def list_guests(target: Target) -> None:
-    """Show every port of a line, and the program that uses it: what it controls, how much it asks."""
+def _list_guests(target: Target) -> None:
     reports = target.run(last_bus_health)
     for bus in reports:
         for guest in bus.guests:
@@ -172,7 +174,7 @@ def _doing(guest: GuestHealth) -> str:
 
 
 @command.command("wire-log")
-@click.argument("bus")
+@click.argument("what", metavar="WHAT")
 @click.option(
     "--seconds",
     type=Finite(0, 86_400, min_open=True),
@@ -185,32 +187,35 @@ def _doing(guest: GuestHealth) -> str:
 @force_option
 @DISSECTOR
 @with_target
-def wire_log(target: Target, bus: str, seconds: float, form: str | None, out: Path | None) -> None:
-    """Show what was on the line BUS in the last seconds, or write it to a file.
+def wire_log(target: Target, what: str, seconds: float, form: str | None, out: Path | None) -> None:
+    """Show what was on the line WHAT in the last seconds, or what is in the capture WHAT, or write it to a file.
+
+    A name with a dot or a slash is a capture, which is shown whole.
 
     text is a capture: bytes, with their meaning as comments. words has the meaning alone. pcapng is for Wireshark with
     the plugin of --dissector. --json prints or writes one object a record instead.
     """
-    log, header, describe = target.run(lambda client: _fetch(client, bus, seconds))
+    if is_file(what):
+        capture, describe = _captured(Path(what))
+        _render(capture, describe, form, out, as_json=target.as_json)
+        return
+    log, header, describe = target.run(lambda client: _fetch(client, what, seconds))
     _render(Capture(header, parse_records(log.lines)), describe, form, out, as_json=target.as_json)
     if lost := log.next_record - log.first_record - len(log.lines):
         click.echo(f"{lost} records were overwritten while they were fetched", err=True)
 
 
-@command.command("convert")
-@click.argument("file", type=click.Path(path_type=Path, exists=True, dir_okay=False))
-@FORMAT
-@OUT
-@force_option
-@click.option("--json", "as_json", is_flag=True, help="One JSON object a record.")
-def convert(file: Path, form: str | None, out: Path | None, *, as_json: bool) -> None:
-    """Put the capture in FILE into another form, as `wire-log` has them."""
-    capture = parse_capture(file.read_text(encoding="utf-8"))
+def _captured(file: Path) -> tuple[Capture, Describe]:
+    try:
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from error
+    capture = parse_capture(text)
     models: dict[int, str] = {}
     if capture.header.config:
         (line,) = config_of(capture.header).bus
         models = {each.address: each.model for each in (*line.axis, *getattr(line, "module", ()))}
-    _render(capture, FAMILIES[capture.header.family].describe(models), form, out, as_json=as_json)
+    return capture, FAMILIES[capture.header.family].describe(models)
 
 
 def _render(capture: Capture, describe: Describe, form: str | None, out: Path | None, *, as_json: bool) -> None:

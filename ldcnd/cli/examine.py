@@ -7,12 +7,11 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import click
 
 from ldcnd.bench.begun import begun_with, scan_port, write
-from ldcnd.bench.family import BenchFamily, TrialMove
+from ldcnd.bench.family import TrialMove
 from ldcnd.bench.known import BENCHES, line_of, ports_here, show_findings
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.typed import CONFIGURATION, Finite, WholeNumber
@@ -104,7 +103,7 @@ def _list_ports(*, as_json: bool) -> bool:
 
 
 class Examinations(CommandGroup):
-    """One command for each family, and what else a family can examine."""
+    """What else families can examine, beside a line."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002 - click's signature
         """Return the names of all commands."""
@@ -117,44 +116,40 @@ class Examinations(CommandGroup):
 
     @staticmethod
     def _commands() -> dict[str, click.Command]:
-        commands = {name: _examination(name, family) for name, family in BENCHES.items()}
-        more = {str(each.name): each for family in BENCHES.values() for each in family.commands()}
-        return commands | more
+        return {str(each.name): each for family in BENCHES.values() for each in family.commands()}
 
 
-@click.command(cls=Examinations)
-def doctor() -> None:
-    """Examine a line; only reads by default. No daemon may use it meanwhile."""
+@click.command(cls=Examinations, invoke_without_command=True)
+@click.option("--config", type=CONFIGURATION, help="The rig's configuration (TOML).")
+@click.option("--bus", "name", help="The line to examine.")
+@click.option("--json", "as_json", is_flag=True, help="Print JSON lines.")
+def doctor(config: Path | None, name: str | None, *, as_json: bool) -> None:
+    """Examine adapter, drives and timing of a line; only reads by default. No daemon may use it meanwhile.
 
+    A SmartStep line is best examined with RUN off. Exits with 1 when something must be put right.
+    """
+    if click.get_current_context().invoked_subcommand:
+        return
+    if config is None or name is None:
+        raise click.UsageError("name the configuration with --config and the line with --bus")
+    rig = load_config(config)
+    settings = next((bus for bus in rig.bus if bus.name == name), None)
+    if settings is None:
+        lines = ", ".join(bus.name for bus in rig.bus)
+        raise ConfigError(f"{config}: no line {name!r}; there are {lines}")
+    wrong = False
 
-def _examination(family_name: str, family: BenchFamily[Any]) -> click.Command:
-    """Return the command that examines lines of a family."""
+    def show(finding: Finding) -> None:
+        nonlocal wrong
+        wrong = wrong or finding.verdict is Verdict.WRONG
+        assumption = f"  [{finding.verifies}]" if finding.verifies else ""
+        remedy = f"\n{'':31}> {finding.remedy}" if finding.remedy else ""
+        text = f"{finding.axis:8} {finding.verdict:5} {finding.what:16} {finding.text}{assumption}{remedy}"
+        print(finding.model_dump_json() if as_json else text, flush=True)
 
-    def examine(config: Path, name: str, *, as_json: bool) -> None:
-        rig = load_config(config)
-        settings = next((bus for bus in rig.bus if bus.name == name and bus.family == family_name), None)
-        if settings is None:
-            raise ConfigError(f"{config}: no {family_name} line {name!r}")
-        wrong = False
-
-        def show(finding: Finding) -> None:
-            nonlocal wrong
-            wrong = wrong or finding.verdict is Verdict.WRONG
-            assumption = f"  [{finding.verifies}]" if finding.verifies else ""
-            remedy = f"\n{'':31}> {finding.remedy}" if finding.remedy else ""
-            text = f"{finding.axis:8} {finding.verdict:5} {finding.what:16} {finding.text}{assumption}{remedy}"
-            print(finding.model_dump_json() if as_json else text, flush=True)
-
-        configure_logging(level="error")  # findings say the rest
-        asyncio.run(examine_line(rig, settings, show))
-        sys.exit(1 if wrong else 0)
-
-    options: list[click.Parameter] = [
-        click.Option(["--config"], type=CONFIGURATION, required=True, help="The rig's configuration (TOML)."),
-        click.Option(["--bus", "name"], required=True, help="The line to examine."),
-        click.Option(["--json", "as_json"], is_flag=True, help="Print JSON lines."),
-    ]
-    return click.Command(family_name, callback=examine, params=options, help=family.examination)
+    configure_logging(level="error")  # findings say the rest
+    asyncio.run(examine_line(rig, settings, show))
+    sys.exit(1 if wrong else 0)
 
 
 async def examine_line(rig: RigConfig, settings: BusConfig, show: Callable[[Finding], None]) -> None:
@@ -234,7 +229,7 @@ def _refutes(finding: Finding) -> bool:
 def _list(family: str) -> None:
     found = BENCHES[family].assumptions()
     if not found:
-        click.echo(f"a trial confirms nothing that this manual leaves open; see `ldcnd doctor {family}`", err=True)
+        click.echo("a trial confirms nothing that this manual leaves open; see `ldcnd doctor`", err=True)
     for each in found:
         print(json.dumps({"family": family, **each}))
 

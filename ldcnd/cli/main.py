@@ -75,12 +75,12 @@ class CommandGroup(click.Group):
 
     def _not_here(self, ctx: click.Context, name: str, *rest: str) -> str:
         here = _words(ctx)
+        if now := RENAMED.get(before := " ".join([*here, name])):
+            return f"There is no `ldcnd {before}` any more: type `ldcnd {shlex.join([*now.split(), *rest])}`."
         elsewhere = [name] if here and name in COMMANDS else ["axis", name]
         if " ".join(elsewhere) in EXAMPLES and elsewhere != [*here, name]:
             given = [word.replace(_MINUS, "-", 1) if word.startswith(_MINUS) else word for word in rest]
             return f"There is no `ldcnd {' '.join([*here, name])}`: type `ldcnd {shlex.join([*elsewhere, *given])}`."
-        if not here and name in RENAMED:
-            return f"There is no `ldcnd {name}` any more: type `ldcnd {shlex.join([RENAMED[name], *rest])}`."
         near = get_close_matches(name, self.list_commands(ctx), 1)
         meant = f" Did you mean {near[0]!r}?" if near else ""
         return f"No such command {name!r}.{meant}"

@@ -43,9 +43,9 @@ GROUPS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
         "log": ("ldcnd.cli.log:log", "Show what happened: who moved what, faults, losses, in one order."),
         "fleet": ("ldcnd.cli.looking:fleet", "Show every rig, axis, version and health that can be reached."),
         "bus": ("ldcnd.cli.bus", "Show the lines of a running daemon, and what was on them."),
-        "trace": ("ldcnd.cli.trace", "Record an axis against time, show the result, draw it."),
+        "trace": ("ldcnd.cli.trace", "Record an axis against time, and show the result."),
         "record": ("ldcnd.cli.record:record", "Record a rig to MCAP; recover and convert recordings."),
-        "plot": ("ldcnd.cli.record:plot", "Draw an axis of a recording."),
+        "plot": ("ldcnd.cli.record:plot", "Draw a trace, or an axis of a recording."),
         "shadow": (
             "ldcnd.cli.commission:shadow",
             "Watch axes for growing friction, a changed load, a coupling that slips.",
@@ -104,13 +104,10 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "group": "move x=10 y=20 --wait",
     "group move": "x=10 y=20 --wait",
     "group path": "z=20,20,0 c=0,15,0",
-    "group preview": "x=10 y=20",
     "position": "go rig.toml park",
     "position go": "rig.toml park",
-    "position list": "rig.toml",
     "position teach": "rig.toml park z x",
     "sequence": "run rig.toml load",
-    "sequence list": "rig.toml",
     "sequence run": "rig.toml load --record load.jsonl",
     "axis": "probe x --source index --distance 5 --wait",
     "axis alarms": "feed",
@@ -136,8 +133,6 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "log": "--since 10m --axis x",
     "fleet": "--watch 2",
     "bus": "list",
-    "bus convert": "line0.capture --format words",
-    "bus guests": "",
     "bus list": "",
     "bus send-away": "labview",
     "bus set-io": "io 4=high 9=low",
@@ -147,8 +142,6 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "bus wire-log": "line0 --seconds 2 --format words",
     "trace": "take x -c position --samples 200 --out x.csv",
     "trace abort": "x",
-    "trace last": "x --out x.csv",
-    "trace plot": "x.csv -o x.png",
     "trace show": "x.csv",
     "trace take": "x -c position --samples 200 --out x.csv",
     "record": "--out run.mcap",
@@ -157,9 +150,7 @@ EXAMPLES: Final[Mapping[str, str]] = {
     "plot": "run.mcap x -o x.png",
     "shadow": "x",
     "scan": "/dev/ttyUSB0 --write rig.toml",
-    "doctor": "ldcn --config rig.toml --bus line0",
-    "doctor ldcn": "--config rig.toml --bus line0",
-    "doctor smartstep": "--config rig.toml --bus line1",
+    "doctor": "--config rig.toml --bus line0",
     "doctor verify": "--config rig.toml --bus line1 --axis feed",
     "commission": "x --config rig.toml",
     "tune": "x --within 5",
@@ -191,7 +182,18 @@ EXAMPLES: Final[Mapping[str, str]] = {
 }
 """One example of each command, as it is typed behind its name."""
 
-RENAMED: Final[Mapping[str, str]] = {"events": "log"}
+RENAMED: Final[Mapping[str, str]] = {
+    "events": "log",
+    "trace plot": "plot",
+    "trace last": "trace show",
+    "position list": "position go --list",
+    "sequence list": "sequence run --list",
+    "group preview": "group move --dry-run --straight",
+    "bus convert": "bus wire-log",
+    "bus guests": "bus list --guests",
+    "doctor ldcn": "doctor",
+    "doctor smartstep": "doctor",
+}
 """Commands that had another name."""
 
 

@@ -12,7 +12,7 @@ import click
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.sending import Shown, derived_question
-from ldcnd.cli.typed import NewFile, WholeNumber, force_option
+from ldcnd.cli.typed import NewFile, WholeNumber, force_option, is_file
 from ldcnd.client.parameters import Transfer, carry_out, plan_transfer, read_dump
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.errors import ConfigError
@@ -371,7 +371,7 @@ def _sides(target: Target, left: str, right: str) -> int:
 
 
 def _source(target: Target, name: str) -> ParameterFile | ParameterDump:
-    if "." in name or "/" in name:
+    if is_file(name):
         return load_parameters(Path(name))
     return target.run(lambda client: read_dump(client, name))
 

@@ -15,9 +15,11 @@ from ldcnd.cli.connection import Serving, Target, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import on_end
 from ldcnd.cli.quantities import save_figure, stacked_rows
+from ldcnd.cli.trace import plot_trace
 from ldcnd.cli.typed import NewFile, WholeNumber, force_option
 from ldcnd.client.rig_client import RigClient
-from ldcnd.client.traces import column_title
+from ldcnd.client.traces import SUFFIXES as TRACES
+from ldcnd.client.traces import column_title, load_trace
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.events import FINAL, CommandEvent, CommandStatus
 from ldcnd.parts import require
@@ -147,23 +149,34 @@ MOST_LABELS = 40
 
 
 @click.command()
-@click.argument("recording", type=RECORDING)
-@click.argument("axis")
+@click.argument("file", type=RECORDING)
+@click.argument("axis", required=False)
 @click.option("--output", "-o", type=NewFile(), required=True, help="Picture to write, such as a PNG.")
 @force_option
-def plot(recording: Path, axis: str, output: Path) -> None:
-    """Draw AXIS of RECORDING: its quantities, commands and faults against time; needs the extras record and plot."""
+def plot(file: Path, axis: str | None, output: Path) -> None:
+    """Draw FILE, a trace, or AXIS of a recording: quantities, commands and faults against time.
+
+    Needs the extra plot, and for recordings record.
+    """
+    if file.suffix in TRACES:
+        trace = load_trace(file)
+        if axis not in {None, trace.header.axis}:
+            raise click.UsageError(f"{file} is a trace of axis {trace.header.axis}, not of {axis}")
+        plot_trace(trace, output)
+        return
+    if axis is None:
+        raise click.UsageError(f"name the axis to draw of the recording {file}")
     require("mcap")
     from ldcnd.lab.recording.reading import Recording, axis_history  # noqa: PLC0415 - needs an optional package
 
-    file = Recording(recording)
+    recording = Recording(file)
     with a_failure():
-        history = axis_history(file, axis)
+        history = axis_history(recording, axis)
     plot_axis(history, output)
     if history.not_understood:
         click.echo(f"{history.not_understood} messages of another version were left out", err=True)
-    if file.damages:
-        tell_damages(recording, file.damages)
+    if recording.damages:
+        tell_damages(file, recording.damages)
         sys.exit(EXIT_INCOMPLETE)
 
 

@@ -303,6 +303,7 @@ def group() -> None:
 @click.option("--straight", is_flag=True, help="Keep to a straight line: all ramp alike and arrive together.")
 @click.option("--max-deviation", type=Quantity(), help="Refuse a line that would be left by more, in axis units.")
 @click.option("--wait", is_flag=True, help="Return when all have ended; Ctrl-C halts them.")
+@click.option("--dry-run", is_flag=True, help="Show how each would move, and for how long; move none.")
 @commanding
 def group_move(
     sender: Sender,
@@ -313,12 +314,18 @@ def group_move(
     straight: bool,
     max_deviation: float | None,
     wait: bool,
+    dry_run: bool,
 ) -> None:
     """Start absolute moves of all members of a configured group together, or none of them: `x=10 y=20`."""
-    who = {"lease": sender.lease, "client": None if sender.lease else NAME}
+    # a preview needs no lease
+    who = {} if dry_run else {"lease": sender.lease, "client": None if sender.lease else NAME}
     wanted = _shares(moves, velocity, acceleration, who)
     path = LinePath.LINEAR if straight else LinePath.INDEPENDENT
     moved = tuple(move for move, _ in wanted)
+    if dry_run:
+        asked = of_options(PreviewTogether, moves=moved, path=path, max_deviation=max_deviation)
+        _preview(sender.target, asked, wanted, {"max_deviation": max_deviation})
+        return
     request = of_options(MoveTogether, moves=moved, path=path, max_deviation=max_deviation)
     if wait:
         end_as_interrupted()
@@ -352,19 +359,18 @@ def group_move(
         sys.exit(FAILED)
 
 
-@group.command("preview", context_settings={"ignore_unknown_options": True})
-@click.argument("moves", nargs=-1, required=True, metavar="AXIS=POSITION...")
-@click.option("--velocity", type=Quantity(), help="Units a second, for each axis; the axis defaults when missing.")
-@click.option("--acceleration", type=Quantity(), help="Units a second squared; the axis defaults when missing.")
-@with_target
-def group_preview(target: Target, moves: tuple[str, ...], velocity: float | None, acceleration: float | None) -> None:
-    """Say how long a straight line of a group would take, and how far from it the axes would get; nothing moves."""
-    wanted = _shares(moves, velocity, acceleration, {})
-    request = of_options(PreviewTogether, moves=tuple(move for move, _ in wanted), path=LinePath.LINEAR)
+def _preview(
+    target: Target,
+    request: PreviewTogether,
+    wanted: list[tuple[AxisMove, Mapping[str, object]]],
+    given: Mapping[str, object],
+) -> None:
+    """Show what a move of a group would be like; nothing moves."""
 
     async def work(client: RigClient) -> tuple[PreviewTogetherReply, list[AxisInfo]]:
-        converted, infos = await _in_units(client, request, wanted, {})
-        return await client.ask(converted), infos
+        converted, infos = await _in_units(client, request, wanted, given)
+        with naming_nearest(*_typed(converted, wanted, infos)):
+            return await client.ask(converted), infos
 
     reply, infos = target.run(work)
     lines = [
@@ -372,7 +378,8 @@ def group_preview(target: Target, moves: tuple[str, ...], velocity: float | None
         f" with {quantity_text(each.acceleration, info, Dimension.ACCELERATION)}"
         for each, info in zip(reply.shares, infos, strict=True)
     ]
-    lines.append(f"{rounded(reply.duration_s)} s, at most {rounded(reply.deviation or 0.0)} from the line")
+    off = "" if reply.deviation is None else f", at most {rounded(reply.deviation)} from the line"
+    lines.append(f"{rounded(reply.duration_s)} s{off}")
     target.show(reply, *lines)
 
 
@@ -433,7 +440,9 @@ def _shares(
 
 
 def _typed(
-    request: MoveTogether | WalkPath, shares: Sequence[tuple[AxisMove, Mapping[str, object]]], infos: Sequence[AxisInfo]
+    request: MoveTogether | PreviewTogether | WalkPath,
+    shares: Sequence[tuple[AxisMove, Mapping[str, object]]],
+    infos: Sequence[AxisInfo],
 ) -> list[Typed]:
     """Return the share of each axis as it is sent, with what was typed for it."""
     return [(move, given, info) for move, (_, given), info in zip(request.moves, shares, infos, strict=True)]

@@ -38,11 +38,7 @@ def sequence() -> None:
     """Carry out a sequence of the configuration, step by step."""
 
 
-@sequence.command("list")
-@click.argument("file", type=CONFIGURATION)
-def list_sequences(file: Path) -> None:
-    """Show the sequences of FILE, a rig's configuration, and their steps."""
-    rig = load_config(file)
+def _list_sequences(rig: RigConfig) -> None:
     units = {axis.name: axis.axis_units for bus in rig.bus for axis in bus.axis}
     positions = {each.name: each for each in rig.position}
     for each in rig.sequence:
@@ -52,20 +48,28 @@ def list_sequences(file: Path) -> None:
 
 @sequence.command("run")
 @click.argument("file", type=CONFIGURATION)
-@click.argument("name")
+@click.argument("name", required=False)
+@click.option("--list", "list_only", is_flag=True, help="Show the sequences of FILE and their steps, and end.")
 @click.option("--from", "first", type=WholeNumber(1), default=1, show_default=True, help="Begin with this step.")
 @click.option("--record", type=NewFile(), help="Write what happens to each step to this file, as JSON lines.")
 @force_option
 @click.option("--take", is_flag=True, help="Take control from its holder.")
 @with_target
-def run_sequence(target: Target, file: Path, name: str, first: int, record: Path | None, *, take: bool) -> None:
+def run_sequence(
+    target: Target, file: Path, name: str | None, first: int, record: Path | None, *, take: bool, list_only: bool
+) -> None:
     """Carry out the sequence NAME of FILE, a rig's configuration.
 
     On a terminal the space bar has the next step wait, and go on. Ctrl-C, and a step that fails, halt what moves;
     outputs stay as they are.
     """
     rig = load_config(file)
+    if list_only:
+        _list_sequences(rig)
+        return
     known = {each.name: each for each in rig.sequence}
+    if name is None:
+        raise click.UsageError("name the sequence, or see them with --list")
     if name not in known:
         raise unknown("sequence", name, known)
     _carry_out(target, rig, known[name], record, first, take=take)
@@ -144,11 +148,7 @@ def position() -> None:
     """Teach named positions from where axes stand, and go to them."""
 
 
-@position.command("list")
-@click.argument("file", type=CONFIGURATION)
-def list_positions(file: Path) -> None:
-    """Show the named positions of FILE, a rig's configuration."""
-    rig = load_config(file)
+def _list_positions(rig: RigConfig) -> None:
     units = {axis.name: axis.unit for bus in rig.bus for axis in bus.axis}
     for each in rig.position:
         show_lines(f"{each.name:16} {', '.join(f'{axis} {at:g} {units[axis]}' for axis, at in each.axes.items())}")
@@ -184,13 +184,19 @@ def teach_position(target: Target, file: Path, name: str, axes: tuple[str, ...])
 
 @position.command("go")
 @click.argument("file", type=CONFIGURATION)
-@click.argument("name")
+@click.argument("name", required=False)
+@click.option("--list", "list_only", is_flag=True, help="Show the named positions of FILE, and end.")
 @click.option("--take", is_flag=True, help="Take control from its holder.")
 @with_target
-def go(target: Target, file: Path, name: str, *, take: bool) -> None:
+def go(target: Target, file: Path, name: str | None, *, take: bool, list_only: bool) -> None:
     """Move the axes of the position NAME of FILE there, one after the other; Ctrl-C halts them."""
     rig = load_config(file)
+    if list_only:
+        _list_positions(rig)
+        return
     known = {each.name for each in rig.position}
+    if name is None:
+        raise click.UsageError("name the position, or see them with --list")
     if name not in known:
         raise unknown("position", name, known)
     there = SequenceConfig(name=f"go_{name}"[:63], step=(SequenceStep(go=name, timeout_s=86_400),))

@@ -1,4 +1,4 @@
-"""`ldcnd trace`: record an axis against time, show the result, draw it."""
+"""`ldcnd trace`: record an axis against time, and show the result."""
 
 import sys
 from datetime import UTC, datetime
@@ -11,7 +11,7 @@ from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import end_as_interrupted, show_passing
 from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.sending import Shown, derived_question
-from ldcnd.cli.typed import Finite, NewFile, WholeNumber, axis_of, force_option
+from ldcnd.cli.typed import Finite, NewFile, WholeNumber, axis_of, force_option, is_file
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import (
     Trace,
@@ -146,13 +146,17 @@ def take(
 
 
 @command.command()
-@click.argument("axis", type=AXIS)
+@click.argument("what", metavar="WHAT", type=AXIS)
 @out_option
 @force_option
 @with_target
-def last(target: Target, axis: str, out: Path | None) -> None:
-    """Fetch the last trace of AXIS, of any client."""
-    _deliver(target, target.run(lambda client: fetch_trace(client, axis)), out)
+def show(target: Target, what: str, out: Path | None) -> None:
+    """Tell what is in WHAT: a file, or the last trace of an axis, of any client.
+
+    A name with a dot or a slash is a file.
+    """
+    trace = load_trace(Path(what)) if is_file(what) else target.run(lambda client: fetch_trace(client, what))
+    _deliver(target, trace, out)
 
 
 def _aborted(reply: TraceAbortReply, _axis: AxisInfo | None) -> Shown:
@@ -160,22 +164,6 @@ def _aborted(reply: TraceAbortReply, _axis: AxisInfo | None) -> Shown:
 
 
 command.add_command(derived_question("abort", AbortTrace, shows=_aborted))
-
-
-@command.command()
-@click.argument("file", type=click.Path(path_type=Path))
-def show(file: Path) -> None:
-    """Tell what is in FILE."""
-    print("\n".join(_summary(load_trace(file))))
-
-
-@command.command()
-@click.argument("file", type=click.Path(path_type=Path))
-@click.option("--output", "-o", type=NewFile(), required=True, help="Picture to write, such as a PNG.")
-@force_option
-def plot(file: Path, output: Path) -> None:
-    """Draw FILE; needs the extra `plot`."""
-    plot_trace(load_trace(file), output)
 
 
 def _granted(reply: TraceReply) -> str:

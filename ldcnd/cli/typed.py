@@ -209,6 +209,11 @@ def _keep_force(context: click.Context, _parameter: click.Parameter, force: bool
 force_option = click.option("--force", cls=ForceOption)
 
 
+def is_file(name: str) -> bool:
+    """Tell whether a name that may be of an axis or of a line is that of a file: those have neither dot nor slash."""
+    return "." in name or "/" in name
+
+
 CONFIGURATION = click.Path(path_type=Path, readable=False)
 """Configuration file. Its reader reports an unreadable one as a configuration that cannot work, exit code 78; click
 would report wrong usage, exit code 2, after which a service manager tries again."""

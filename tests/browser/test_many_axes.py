@@ -37,11 +37,11 @@ ONE_ROW = """() => new Set([...document.querySelectorAll(".rig-commands button")
 })).size"""
 
 
-def plant(axes: int) -> str:
+def plant(axes: int, most_on_a_line: int = MOST_ON_A_LINE) -> str:
     """Return the configuration of a rig of so many axes, every third of which is not homed."""
     parts = [f'rig = "plant{axes}"\n[zenoh]\nlisten = []']
     names = [f"a{number}" for number in range(1, axes + 1)]
-    lines = [names[first : first + MOST_ON_A_LINE] for first in range(0, axes, MOST_ON_A_LINE)]
+    lines = [names[first : first + most_on_a_line] for first in range(0, axes, most_on_a_line)]
     for line, here in enumerate(lines):
         parts.append(f'[[bus]]\nname = "line{line}"\nport = "sim:line{line}"\nbaud = 115200\nmargin_ms = 250')
         for address, name in enumerate(here, 1):

@@ -1,4 +1,4 @@
-"""`ldcnd doctor ldcn`: what it finds out about adapters and lines, and what it says to type."""
+"""`ldcnd doctor`: what it finds out about adapters and lines, and what it says to type."""
 
 import asyncio
 from pathlib import Path
@@ -156,7 +156,7 @@ def test_errors_are_counted_from_the_examination_on():
 @pytest.mark.long
 async def test_command_prints_findings_as_json_lines():
     running = await asyncio.create_subprocess_exec(
-        *LDCND, "doctor", "ldcn", "--config", str(SIMULATED), "--bus", "line0", "--json", stdout=asyncio.subprocess.PIPE
+        *LDCND, "doctor", "--config", str(SIMULATED), "--bus", "line0", "--json", stdout=asyncio.subprocess.PIPE
     )
     output, _ = await running.communicate()
 

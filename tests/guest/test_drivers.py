@@ -576,7 +576,7 @@ def test_the_doctor_names_the_driver_and_what_makes_it_slow(bench):
     guest = bench.guest
     guest.must(f"systemctl stop {ON_BOARD}", timeout_s=START_S)
     guest.must("echo 8 > /sys/class/tty/ttyS1/rx_trig_bytes")
-    said = guest.run("ldcnd doctor ldcn --config /etc/ldcnd/uart.toml --bus uart --json", timeout_s=START_S).stdout
+    said = guest.run("ldcnd doctor --config /etc/ldcnd/uart.toml --bus uart --json", timeout_s=START_S).stdout
     guest.must("echo 1 > /sys/class/tty/ttyS1/rx_trig_bytes")
 
     findings = {finding["what"]: finding for finding in map(json.loads, said.splitlines())}

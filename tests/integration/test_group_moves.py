@@ -27,6 +27,7 @@ from ldcnd.drives.ldcn.packet import CommandCode
 from ldcnd.drives.ldcn.registers import FRACTION
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
 from tests.support.chain_rig import drive, rig_on, simulated_config
+from tests.support.command_line import virtual_rig
 
 MODELS = ("ls182ap", "ls182ap", "picservo-v4", "picservo-v4")
 GANTRY = simulated_config(group=[{"name": "gantry", "axes": ["x", "y"]}])
@@ -266,6 +267,33 @@ async def test_a_start_that_takes_longer_than_members_wait_for_each_other_has_on
             await rig.client.wait_for_end(reply.axis, reply.command_id)
 
         assert [drive(chain, at).shaft.position_counts for at in (1, 2)] == pytest.approx([10_000, -10_000], abs=60)
+
+
+async def shafts(chain):
+    return [drive(chain, at).shaft.position_counts for at in (1, 2)]
+
+
+def test_a_dry_run_of_a_group_says_what_would_be_done_and_moves_nothing(monkeypatch):
+    chain = chain_of()
+    with virtual_rig(monkeypatch, GANTRY, {"line0": chain}) as rig:
+        rig.wait(asyncio.sleep(1))
+        rig.run("power on")
+        straight = rig.run("group move x=12 y=-5 --straight --dry-run")
+        apart = rig.run("group move x=12 y=-5 --dry-run")
+        too_far = rig.run("group move x=12 y=-5 --straight --max-deviation 0.000001 --dry-run")
+        rig.wait(asyncio.sleep(2))
+        stood = rig.wait(shafts(chain))
+        moved = rig.run("group move x=12 y=-5 --straight --wait")
+        went = rig.wait(shafts(chain))
+
+    assert (straight.code, apart.code, moved.code) == (0, 0, 0)
+    assert straight.printed.splitlines()[0].startswith("x: to 12 at ")
+    assert "from the line" in straight.printed
+    assert "from the line" not in apart.printed
+    assert too_far.code == 1
+    assert "leave the line" in too_far.errors
+    assert stood == pytest.approx([0, 0], abs=2)
+    assert went == pytest.approx([12_000, -5_000], abs=60)
 
 
 def test_a_group_of_one_is_refused_in_words():

@@ -131,14 +131,14 @@ async def test_a_program_that_is_sent_away_loses_its_connection_and_another_is_l
 def test_the_command_line_lists_guests_and_sends_them_away(tmp_path, monkeypatch):
     with virtual_rig(monkeypatch, with_port(tmp_path / "port", "control"), {"line": chain_of_machine()}) as rig:
         rig.wait(asyncio.sleep(2))
-        assert "old        line       no program; 0 refused" in rig.run("bus guests").printed
+        assert "old        line       no program; 0 refused" in rig.run("bus list --guests").printed
         program = open_port(tmp_path / "port")
         rig.wait(program.begin())
         rig.wait(program.send(HOLDS))
         rig.wait(asyncio.sleep(2))
 
-        row = rig.run("bus guests").printed.splitlines()[-1]
-        found = json.loads(rig.run("bus guests --json").printed.splitlines()[-1])
+        row = rig.run("bus list --guests").printed.splitlines()[-1]
+        found = json.loads(rig.run("bus list --guests --json").printed.splitlines()[-1])
         sent = rig.run("bus send-away old")
         again = rig.run("bus send-away old")
 
@@ -194,8 +194,8 @@ def test_the_words_of_a_wire_log_name_the_program(tmp_path, monkeypatch):
 
 def test_a_rig_without_ports_says_so(monkeypatch):
     with virtual_rig(monkeypatch) as rig:
-        assert "no port is served" in rig.run("bus guests").errors
-        assert rig.run("bus guests --json").printed == ""
+        assert "no port is served" in rig.run("bus list --guests").errors
+        assert rig.run("bus list --guests --json").printed == ""
 
 
 async def test_a_port_that_cannot_be_opened_is_shown_with_the_reason(tmp_path):

@@ -80,7 +80,7 @@ NOT_RUN = {
         "docs/how-to/confirm-on-hardware.md",
         "ldcnd accept /dev/ldcn-FT4ABCDE-00 --out acceptance --move 1 --gains 350,3000,400,400,250,4000 --counts 2000",
     ): "test_trial_move_confirms_the_rest_and_leaves_the_loop_open",
-    ("docs/how-to/choose-an-adapter.md", "ldcnd doctor ldcn --config rig.toml --bus line0"): (
+    ("docs/how-to/choose-an-adapter.md", "ldcnd doctor --config rig.toml --bus line0"): (
         "test_command_prints_findings_as_json_lines"
     ),
     ("docs/how-to/probe-and-inputs.md", "ldcnd bus snapshot line0"): (

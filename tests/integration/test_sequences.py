@@ -171,8 +171,8 @@ def test_it_is_typed_and_taught(monkeypatch, tmp_path):
                 f"sequence run {config} shut",
                 f"position go {config} bucket2",
                 f"position teach {config} here rotor",
-                f"position list {config}",
-                f"sequence list {config}",
+                f"position go {config} --list",
+                f"sequence run {config} --list",
             )
         ]
         refused = rig.run(f"sequence run {config} shutt")

@@ -30,7 +30,7 @@ async def test_ctrl_c_and_sigterm_end_the_trace_that_waits(number):
         async with asyncio.timeout(30):
             while (header := await trace_header(rig, "x")) is None or header.phase is not TracePhase.WAITING:
                 await asyncio.sleep(0.1)
-            early = await ldcnd("trace", "last", "x", "-e", endpoint)
+            early = await ldcnd("trace", "show", "x", "-e", endpoint)
             taking.send_signal(number)
             await taking.communicate()
         header = await trace_header(rig, "x")
@@ -58,9 +58,9 @@ async def test_a_move_is_traced_to_a_file_shown_and_drawn(tmp_path):
                     await asyncio.sleep(0.1)
             await rig.command("x", MoveAbsolute(position=10.0))
         refused = await ldcnd("trace", "take", "x", "-e", endpoint, "-c", "torque")
-        last = await ldcnd("trace", "last", "x", "-e", endpoint)
+        last = await ldcnd("trace", "show", "x", "-e", endpoint)
     shown = await ldcnd("trace", "show", str(file))
-    drawn = await ldcnd("trace", "plot", str(file), "-o", str(picture))
+    drawn = await ldcnd("plot", str(file), "-o", str(picture))
 
     code, printed, errors = taking.result()
     trace = load_trace(file)

@@ -17,7 +17,7 @@ pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 PAGE = (ROOT / "docs" / "how-to" / "replay-a-capture.md").read_text(encoding="utf-8")
 ON_PAGE = re.findall(r"^ldcnd bus wire-log .+$", PAGE, re.MULTILINE)
-ON_FILES = re.findall(r"^ldcnd bus convert .+$", PAGE, re.MULTILINE)
+ON_FILES = re.findall(r"^ldcnd bus wire-log fault\.capture .+$", PAGE, re.MULTILINE)
 
 
 async def test_a_line_is_dumped_as_a_capture_in_words_as_json_and_for_wireshark(tmp_path):
@@ -46,7 +46,7 @@ async def test_replies_of_a_module_that_is_no_axis_are_read_by_what_stands_there
     async with daemon(ROOT / "config" / "centrifuge.toml") as endpoint:
         commands = [f"ldcnd bus wire-log line0 --seconds 3 --format words -e {endpoint}"]
         commands.append(f"ldcnd bus wire-log line0 --seconds 3 --out one.capture -e {endpoint}")
-        *ran, converted = await run_all(tmp_path, *commands, "ldcnd bus convert one.capture --format words")
+        *ran, converted = await run_all(tmp_path, *commands, "ldcnd bus wire-log one.capture --format words")
     for each in (ran[0], converted):
         assert each.code == 0, each
         assert "levels" in each.printed

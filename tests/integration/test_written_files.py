@@ -49,8 +49,7 @@ def test_the_commands_that_write_a_file_are_found():
     assert found >= {
         "params dump",
         "trace take",
-        "trace last",
-        "trace plot",
+        "trace show",
         "plot",
         "bus wire-log",
         "commission",

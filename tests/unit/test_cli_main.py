@@ -91,6 +91,15 @@ def test_the_help_has_five_groups_with_every_command():
         ("set-position x -1", "`ldcnd axis set-position x -1`"),
         ("probe x", "`ldcnd axis probe x`"),
         ("mvoe x 1", "'move'"),
+        ("events --axis x", "`ldcnd log --axis x`"),
+        ("trace plot x.csv -o x.png", "`ldcnd plot x.csv -o x.png`"),
+        ("trace last x", "`ldcnd trace show x`"),
+        ("position list rig.toml", "`ldcnd position go --list rig.toml`"),
+        ("sequence list rig.toml", "`ldcnd sequence run --list rig.toml`"),
+        ("group preview x=-1", "`ldcnd group move --dry-run --straight x=-1`"),
+        ("bus convert one.capture", "`ldcnd bus wire-log one.capture`"),
+        ("bus guests", "`ldcnd bus list --guests`"),
+        ("doctor ldcn --bus line0", "`ldcnd doctor --bus line0`"),
     ],
 )
 def test_a_command_that_stands_elsewhere_is_refused_with_what_to_type(typed, said):

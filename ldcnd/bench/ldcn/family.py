@@ -18,9 +18,6 @@ from ldcnd.line.transport import Opener
 class LdcnBench(BenchFamily[LdcnBusConfig]):
     """LDCN (Logosol) and NMC (J R Kerr)."""
 
-    examination = (
-        "Examine adapter, drives and timing of an LDCN or NMC line; exits with 1 when something must be put right."
-    )
     is_tuned_by_host = True
 
     @override

@@ -31,10 +31,6 @@ SOFT_PARITY = SmartStepProfile(framing=Framing.SOFT_PARITY)
 class SmartStepBench(BenchFamily[SmartStepBusConfig]):
     """OMRON SmartStep."""
 
-    examination = (
-        "Examine the SmartSteps of one line, best with RUN off; exits with 1 when something must be put right."
-    )
-
     @override
     async def examine(self, line: UnopenedLine, settings: SmartStepBusConfig) -> AsyncIterator[Finding]:
         for axis in line.network.axes.values():
