@@ -1,9 +1,7 @@
 """`ldcnd bus`: show the lines of a running daemon."""
 
-import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from datetime import UTC, datetime
-from pathlib import Path
 from types import MappingProxyType
 
 import click
@@ -12,11 +10,8 @@ from ldcnd.cli.connection import Target, of_options, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import show_lines
 from ldcnd.cli.sending import NAME, Shown, derived_question
-from ldcnd.cli.typed import Finite, NewFile, force_option, is_file
-from ldcnd.client.events import fetch_wire_log
+from ldcnd.cli.typed import Finite
 from ldcnd.client.overview import last_bus_health
-from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.health import GuestHealth
 from ldcnd.contract.leases import GuestSentAway, SendGuestAway
 from ldcnd.contract.meta import AxisInfo
@@ -29,40 +24,10 @@ from ldcnd.contract.rig_commands import (
     SetIoTimer,
     Snapshot,
     SnapshotReply,
-    WireLogReply,
-)
-from ldcnd.daemon.capture import config_of
-from ldcnd.drives.known import FAMILIES
-from ldcnd.line.capture import Capture, CaptureHeader, capture_lines, parse_capture
-from ldcnd.line.flight_recorder import Describe, WireEvent, WireRecord, parse_records
-
-TEXT, WORDS, PCAPNG = FORMATS = ("text", "words", "pcapng")
-
-FORMAT = click.option(
-    "--format", "form", type=click.Choice(FORMATS), help="[default: by the suffix of --out, else text]"
-)
-OUT = click.option("--out", type=NewFile(), help="Write a file instead of printing.")
-
-
-def _install_dissector(context: click.Context, _option: click.Parameter, wanted: bool) -> None:  # noqa: FBT001 - click's
-    if wanted and not context.resilient_parsing:
-        from ldcnd.ops.dissector import install  # noqa: PLC0415 - a wing
-
-        click.echo(install(Path.home()))
-        context.exit()
-
-
-DISSECTOR = click.option(
-    "--dissector",
-    is_flag=True,
-    is_eager=True,
-    expose_value=False,
-    callback=_install_dissector,
-    help="Install the dissector of these lines for Wireshark and tshark of this user, print its file, and end.",
 )
 
 
-@click.group(cls=CommandGroup)
+@click.group(cls=CommandGroup, homes={"wire-log": "ldcnd.cli.wire_log"})
 def command() -> None:
     """Show the lines of a running daemon, and what was on them."""
 
@@ -171,108 +136,3 @@ def _doing(guest: GuestHealth) -> str:
     holds = f"controls {', '.join(guest.axes)}" if guest.axes else "controls nothing"
     since = datetime.fromtimestamp(guest.since / 1e9, UTC).isoformat(timespec="seconds")
     return f"since {since}; {holds}; {guest.packets_hz:.1f} packets/s"
-
-
-@command.command("wire-log")
-@click.argument("what", metavar="WHAT")
-@click.option(
-    "--seconds",
-    type=Finite(0, 86_400, min_open=True),
-    default=10.0,
-    show_default=True,
-    help="How far back.",
-)
-@FORMAT
-@OUT
-@force_option
-@DISSECTOR
-@with_target
-def wire_log(target: Target, what: str, seconds: float, form: str | None, out: Path | None) -> None:
-    """Show what was on the line WHAT in the last seconds, or what is in the capture WHAT, or write it to a file.
-
-    A name with a dot or a slash is a capture, which is shown whole.
-
-    text is a capture: bytes, with their meaning as comments. words has the meaning alone. pcapng is for Wireshark with
-    the plugin of --dissector. --json prints or writes one object a record instead.
-    """
-    if is_file(what):
-        capture, describe = _captured(Path(what))
-        _render(capture, describe, form, out, as_json=target.as_json)
-        return
-    log, header, describe = target.run(lambda client: _fetch(client, what, seconds))
-    _render(Capture(header, parse_records(log.lines)), describe, form, out, as_json=target.as_json)
-    if lost := log.next_record - log.first_record - len(log.lines):
-        click.echo(f"{lost} records were overwritten while they were fetched", err=True)
-
-
-def _captured(file: Path) -> tuple[Capture, Describe]:
-    try:
-        text = file.read_text(encoding="utf-8")
-    except OSError as error:
-        raise ConfigError(f"{file}: cannot be read: {error.strerror}") from error
-    capture = parse_capture(text)
-    models: dict[int, str] = {}
-    if capture.header.config:
-        (line,) = config_of(capture.header).bus
-        models = {each.address: each.model for each in (*line.axis, *getattr(line, "module", ()))}
-    return capture, FAMILIES[capture.header.family].describe(models)
-
-
-def _render(capture: Capture, describe: Describe, form: str | None, out: Path | None, *, as_json: bool) -> None:
-    header, records = capture.header, capture.records
-    form = form or (PCAPNG if out and out.suffix == ".pcapng" else TEXT)
-    if form == PCAPNG and not as_json:
-        if out is None:
-            raise click.UsageError("pcapng is not for a terminal: name a file with --out")
-        from ldcnd.ops.pcapng import encode_pcapng  # noqa: PLC0415 - a wing
-
-        out.write_bytes(encode_pcapng(records, header.bus, header.zero_ns))
-        return
-    make = _json_lines if as_json else capture_lines if form == TEXT else _word_lines
-    text = "\n".join(make(header, records, describe))
-    if out:
-        out.write_text(f"{text}\n", encoding="utf-8")
-    else:
-        click.echo(text)
-
-
-async def _fetch(client: RigClient, bus: str, seconds: float) -> tuple[WireLogReply, CaptureHeader, Describe]:
-    log = await fetch_wire_log(client, bus, seconds)
-    daemon = await client.daemon()
-    line = next(line for line in await client.buses() if line.bus == bus)
-    header = CaptureHeader(
-        version=daemon.version,
-        bus=bus,
-        family=log.family,
-        port=line.port,
-        baud=line.baud,
-        instance=daemon.instance,
-        zero_ns=log.zero,
-        started_s=log.started,
-        until_s=log.now,
-        first_record=log.first_record,
-    )
-    models = {axis.address: axis.model for axis in await client.axes() if axis.bus == bus}
-    models |= {module.address: module.model for module in line.modules if module.model}
-    return log, header, FAMILIES[log.family].describe(models)
-
-
-def _word_lines(_header: CaptureHeader, records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:
-    for record in records:
-        words = record.data.decode() if record.event is WireEvent.COMMAND else describe(record)
-        guest = f" for {record.guest}" if record.guest and words else ""
-        yield f"{record.at_s:.6f} {record.event:<8} {words or record.note}{guest}".rstrip()
-
-
-def _json_lines(_header: CaptureHeader, records: tuple[WireRecord, ...], describe: Describe) -> Iterator[str]:
-    for record in records:
-        is_text = record.event is WireEvent.COMMAND
-        yield json.dumps(
-            {
-                "at_s": record.at_s,
-                "event": record.event,
-                "data": record.data.decode() if is_text else record.data.hex(),
-                "note": record.note,
-                "words": describe(record),
-            }
-        )

@@ -8,6 +8,7 @@ import serial
 
 from ldcnd.contract.commands import Halt, SetPosition
 from ldcnd.contract.leases import Acquire, ListHolders
+from ldcnd.contract.traces import TakeTrace
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
@@ -344,3 +345,23 @@ async def test_the_events_page_has_all_events_and_says_since_when_they_are_known
         await panel.get_by_label("Axis").select_option("sim/x")
         shown = await panel.get_by_role("status").inner_text()
     assert int(shown.split()[0]) >= 160
+
+
+async def test_an_event_leads_to_its_packets_and_to_the_trace_of_that_moment(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        trace = TakeTrace(channels=("position",), samples=200, interval_s=0.01)
+        await house.sim.rig.command("x", trace)
+        await house.sim.rig.command("x", Halt())
+        await desk.open("events")
+        panel = desk.panel("Commands and how they ended")
+        await panel.get_by_label("Axis").select_option("sim/x")
+        row = panel.get_by_role("row", name=re.compile(" halt .*done")).first
+        await expect(row.get_by_role("link", name="trace of x")).to_have_attribute("href", "#/trace/sim/x")
+        await row.get_by_role("link", name="wire log of x").click()
+        packets = desk.page.get_by_role("region", name="Wire log of sim on line0")
+        await expect(packets).to_be_in_viewport()
+        await expect(packets).to_contain_text("halt")
+        await expect(desk.panel("sim · line0").get_by_text("Around ")).to_be_visible()
+        times_s = [float(line.split()[0]) for line in (await packets.inner_text()).splitlines()]
+        assert times_s[-1] - times_s[0] <= 1.0

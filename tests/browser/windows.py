@@ -2,7 +2,7 @@
 
 import asyncio
 import itertools
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from playwright.async_api import CDPSession, Page
 from tests.browser.house import House, console
 from tests.support.marionette import CONTROL, DELETE, ENTER, ESCAPE, SHIFT, TAB, Firefox, firefox, open_firefox
 
-__all__ = ["PRESS", "PRESSABLE", "Chromium", "Window", "console", "open_chromium", "open_gecko", "until"]
+__all__ = ["PRESS", "PRESSABLE", "Chromium", "Window", "console", "gecko_with", "open_chromium", "open_gecko", "until"]
 PATIENCE_S = 45.0
 NAMED = {CONTROL: "Control", DELETE: "Delete", ENTER: "Enter", TAB: "Tab", ESCAPE: "Escape", SHIFT: "Shift"}
 
@@ -129,14 +129,21 @@ async def open_chromium(house: House, _folder: Path) -> AsyncIterator[Window]:
 @asynccontextmanager
 async def open_gecko(house: House, folder: Path) -> AsyncIterator[Window]:
     """Open a page of Firefox with the cookies of a page that the console has let in."""
-    program = firefox()
-    if program is None:
-        pytest.skip("no firefox-esr: install it, or say where one is in LDCND_FIREFOX")
     async with house.desk() as desk:
         await desk.open("rig")
         cookies = await desk.page.context.cookies()
+    async with gecko_with(cookies, house.url, folder) as window:
+        yield window
+
+
+@asynccontextmanager
+async def gecko_with(cookies: Iterable[Mapping[str, Any]], url: str, folder: Path) -> AsyncIterator[Firefox]:
+    """Open a page of Firefox with cookies that a console has given."""
+    program = firefox()
+    if program is None:
+        pytest.skip("no firefox-esr: install it, or say where one is in LDCND_FIREFOX")
     async with open_firefox(program, folder) as window:
-        await window.open(f"{house.url}/")
+        await window.open(f"{url}/")
         for cookie in cookies:
             given = {"name": cookie["name"], "value": cookie["value"], "path": "/", "httpOnly": cookie["httpOnly"]}
             await window.command("WebDriver:AddCookie", cookie=given)

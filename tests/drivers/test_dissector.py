@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from ldcnd.cli import bus
+from ldcnd.cli import wire_log
 from ldcnd.config.rig import load_config
 from ldcnd.daemon.capture import config_of
 from ldcnd.drives.ldcn.packet import CommandCode, PacketReader, StatusItem, StatusPacket, decode_status, status_bytes
@@ -162,7 +162,7 @@ def test_plugin_is_installed_where_wireshark_looks_for_it(tmp_path: Path):
 def test_command_installs_it_without_a_line_or_a_daemon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("HOME", str(tmp_path))
 
-    done = CliRunner().invoke(bus.command, ["wire-log", "--dissector"])
+    done = CliRunner().invoke(wire_log.command, ["--dissector"])
 
     assert (done.exit_code, done.output) == (0, f"{tmp_path / PERSONAL_PLUGINS / FILE}\n")
 

@@ -45,7 +45,7 @@ OTHERS = {
 
 
 SLOW_TO_LOAD = {"structlog", "rich", "matplotlib", "textual", "starlette", "hypothesis"}
-CALLS = ("stop", "trace take x", "group move x=1 y=1")
+CALLS = ("stop", "trace take x", "group move x=1 y=1", "bus list")
 CALL = """
 import sys
 from ldcnd.cli.main import main

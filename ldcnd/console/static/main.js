@@ -32,10 +32,10 @@ const PAGES = [
   ["commissioning", "Commissioning", CommissioningPage],
 ];
 
-/** The parts of the address behind the hash: page, rig, axis. */
+/** The parts of the address behind the hash: page, rig, axis or line, and an instant. */
 function place() {
   const [page = "rig", ...rest] = location.hash.slice(2).split("/").map(decodeURIComponent);
-  return { page: page || "rig", rig: rest[0] ?? null, axis: rest[1] ?? null };
+  return { page: page || "rig", rig: rest[0] ?? null, axis: rest[1] ?? null, instant: Number(rest[2]) || null };
 }
 
 function Navigation({ at }) {

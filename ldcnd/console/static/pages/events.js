@@ -7,9 +7,12 @@ import { save } from "../parts/chart_view.js";
 import { dateAndClock, words } from "../parts/format.js";
 import { faultPage, Mark } from "../parts/state.js";
 import { COMMAND_STATUSES } from "../session/contract.js";
+import { LONGEST_AGO_S } from "./network_wire_log.js";
 import { learnAllEvents, useRigs } from "../session/rigs.js";
 
 const MOST_SHOWN = 300;
+/** Between two samples of a trace that is as fast as the line allows, at most, in seconds. */
+const SLOWEST_LINE_S = 0.05;
 const LEVELS = { refused: "warn", aborted: "warn", failed: "bad", unknown: "bad", fault: "bad" };
 
 export function EventsPage() {
@@ -46,7 +49,7 @@ export function EventsPage() {
       <${RefusalText} refusal=${refusal} />
       ${all.filter((rig) => rig.eventsBegin?.t).map((rig) => html`<p class="quiet">${lostOf(rig)}</p>`)}
       <p class="quiet" role="status">${found.length} events${found.length > MOST_SHOWN ? `, the latest ${MOST_SHOWN} are shown` : ""}.</p>
-      <${Table} label="Events" head=${["When", "Axis", "Command", "Status", "By", "Reason"]}
+      <${Table} label="Events" head=${["When", "Axis", "Command", "Status", "By", "Reason", "More"]}
         rows=${found.slice(0, MOST_SHOWN).map(Row)} />
     <//>`;
 }
@@ -57,7 +60,26 @@ function Row({ rig, event }) {
     <td>${!event.axis ? rig.name : !rig.axes.get(event.axis)?.info ? event.axis : html`<a href=${`#/axis/${rig.name}/${event.axis}`}>${event.axis}</a>`}</td>
     <td>${whatOf(event)}</td><td><${Mark}
       level=${LEVELS[event.status] ?? ""}>${event.status}<//></td><td>${event.client ?? "–"}</td>
-    <td>${[event.reason, way(event)].filter(Boolean).join("; ")}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td></tr>`;
+    <td>${[event.reason, way(event)].filter(Boolean).join("; ")}${event.code && html` <a href=${faultPage(event.code)}>${event.code}</a>`}</td>
+    <td><${Around} rig=${rig} event=${event} /></td></tr>`;
+}
+
+/** Where to see more of that moment: packets of the line while they are kept, and a trace that was under way. */
+function Around({ rig, event }) {
+  const axis = rig.axes.get(event.axis);
+  if (!axis?.info) return null;
+  const of = html`<span class="unseen"> of ${event.axis} at ${dateAndClock(event.t)}</span>`;
+  const kept = (rig.nowNs() - event.t) / 1e9 < LONGEST_AGO_S;
+  return html`${kept && html`<a href=${`#/network/${rig.name}/${axis.info.bus}/${event.t}`}>wire log${of}</a> `}${
+    isTraced(axis.trace, event.t) && html`<a href=${`#/trace/${rig.name}/${event.axis}`}>trace${of}</a>`}`;
+}
+
+/** Whether an instant lies in the last trace of an axis, as far as its header tells. */
+function isTraced(trace, t) {
+  if (trace?.phase !== "complete") return false;
+  const { interval_s: interval, samples, pre_trigger: before } = trace;
+  const eachS = interval || SLOWEST_LINE_S;
+  return trace.t - before * eachS * 1e9 <= t && t <= trace.t + (samples - before) * eachS * 1e9;
 }
 
 /** What it was, in words: of `power`, which way. */

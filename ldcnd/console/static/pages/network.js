@@ -20,14 +20,15 @@ const COUNTERS = [
   "losses",
 ];
 
-export function NetworkPage() {
+export function NetworkPage({ at }) {
   const lines = [...useRigs().values()].flatMap((rig) => [...rig.buses.values()].map((bus) => ({ rig, bus })));
   return html`<h1>Network</h1>
     ${lines.length ? lines.map(({ rig, bus }) => html`<${Line}
-      key=${`${rig.name}/${bus.name}`} rig=${rig} bus=${bus} />`) : html`<p>No line is known yet.</p>`}`;
+      key=${`${rig.name}/${bus.name}`} rig=${rig} bus=${bus}
+      instant=${rig.name === at.rig && bus.name === at.axis ? at.instant : null} />`) : html`<p>No line is known yet.</p>`}`;
 }
 
-function Line({ rig, bus }) {
+function Line({ rig, bus, instant }) {
   const { info } = bus;
   const plan = rig.plan?.buses.find((each) => each.bus === bus.name);
   if (!info) return null;
@@ -54,7 +55,7 @@ function Line({ rig, bus }) {
     <${Modules} rig=${rig} bus=${bus} />
     <${Snapshot} rig=${rig} bus=${bus.name} />
     <h3>Wire log</h3>
-    <${WireLog} rig=${rig} bus=${bus.name} />
+    <${WireLog} rig=${rig} bus=${bus.name} instant=${instant} />
   <//>`;
 }
 
