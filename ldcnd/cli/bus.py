@@ -117,7 +117,8 @@ def list_buses(target: Target, *, guests: bool) -> None:
         target.show(
             bus,
             f"{bus.bus:10} {bus.port:20} {bus.baud:7d} baud  {health}",
-            f"           {bus.exchanges} exchanges, {losses}; 99 % of polls within {bus.poll_p99_s * 1e3:.2f} ms",
+            f"           {bus.exchanges} exchanges, {losses}",
+            f"           99 % of polls within {bus.poll_p99_s * 1e3:.2f} ms",
         )
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import sys
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from difflib import get_close_matches
@@ -28,6 +29,7 @@ from ldcnd.contract.parameters import (
 from ldcnd.contract.questions import Why, WhyReply
 from ldcnd.contract.samples import (
     FaultSample,
+    LinkState,
     MonitorName,
     MonitorSample,
     Moving,
@@ -79,13 +81,27 @@ def axes_table(axes: list[AxisNow]) -> list[str]:
             now.condition.position(_digits(now), now.info.unit, now.age_s),
             now.condition.state,
             f"moving {_motion(now.seen)}",
-            f"link {now.last.state.link if now.last.state else 'unknown'}",
+            _link(now.last.state),
             ", ".join(now.condition.notes),
         )
         for now in axes
     ]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    return ["  ".join(map(str.ljust, each, widths)).rstrip() for each in cells]
+    return _aligned(cells)
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Return rows as lines with columns as wide as what is in them; a column without anything is left out."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True) if width).rstrip() for row in rows
+    ]
+
+
+def _link(state: StateSample | None) -> str:
+    """Return the link of an axis where it is not up: on 80 columns there is room for what is out of the ordinary."""
+    if state is None:
+        return "link unknown"
+    return "" if state.link is LinkState.UP else f"link {state.link}"
 
 
 def _motion(seen: AxisSeen) -> str:
@@ -313,17 +329,17 @@ def rig_table(rig: RigReport) -> list[str]:
     version = f"ldcnd {rig.daemon.version}" if rig.daemon else "version unknown"
     lines = [f"{rig.rig}  {version}  run {rig.instance}  {'needs attention' if rig.problems else 'well'}"]
     lines += [f"  ! {problem}" for problem in rig.problems]
-    lines += [f"  {_axis(axis)}" for axis in rig.axes]
+    lines += [f"  {line}" for line in _aligned([_axis(axis) for axis in rig.axes])]
     return lines
 
 
-def _axis(axis: AxisReport) -> str:
+def _axis(axis: AxisReport) -> tuple[str, ...]:
     info, state, health = axis.info, axis.state, axis.health
     where = f"{info.bus}/{info.address}"
     what = axis.condition.in_full
     link = state.link.value if state else "?"
-    rate = f"{health.rate_hz:6.1f} Hz" if health else "     ? Hz"
-    return f"{info.axis:12} {info.model:14} {where:12} {link:8} {rate}  {what}"
+    rate = f"{health.rate_hz:5.1f} Hz" if health else "    ? Hz"
+    return info.axis, info.model, where, link, rate, what
 
 
 class Code(click.types.StringParamType):
