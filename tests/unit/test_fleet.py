@@ -68,7 +68,7 @@ async def test_every_rig_is_listed_with_its_axes_and_is_well():
         assert all(axis.state and axis.state.link is LinkState.UP for axis in view.axes)
         text = "\n".join(rig_table(view))
         assert text.startswith(f"{view.rig}  ldcnd {view.daemon.version}  run {view.instance}  well")
-        assert "x            ls-182ap" in text
+        assert "\n  x  ls-182ap " in text
 
 
 async def test_a_daemon_that_is_alive_and_answers_nothing_is_told():
