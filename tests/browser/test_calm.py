@@ -172,6 +172,37 @@ async def test_a_stop_is_in_the_headline_until_reset_whoever_has_stopped(house):
     await house.mixed.quiet("x")
 
 
+async def test_the_answer_to_a_stop_is_gone_with_what_the_axis_tells_since_and_a_new_press_is_not_answered_by_it(house):
+    await house.alpha.start()
+    try:
+        async with house.desk() as desk:
+            await desk.open("axis/alpha/x")
+            strip = desk.page.locator(".strip.of-axis")
+            await desk.button("Stop x").click()
+            await house.alpha.until("x", lambda state: state.stop_latched)
+            await house.alpha.rig.command("x", Reset())
+            await house.alpha.until("x", lambda state: not state.stop_latched)
+            await playwright.expect(desk.page.locator(".stops")).to_have_count(0)
+            house.alpha.pause(on=True)
+            await playwright.expect(strip).to_contain_text("daemon silent")
+            await playwright.expect(strip).not_to_contain_text("confirmed by")
+
+            await desk.button("Stop x").click()
+            await playwright.expect(strip).to_contain_text("no answer yet")
+            await playwright.expect(strip).not_to_contain_text("confirmed by")
+            await playwright.expect(strip).to_contain_text("did not get through")
+            await playwright.expect(strip).to_contain_text("Use the emergency stop.")
+
+            house.alpha.pause(on=False)
+            await house.alpha.kill()
+            await house.alpha.start()
+            await playwright.expect(strip).not_to_contain_text("did not get through")
+    finally:
+        with suppress(ProcessLookupError):  # it has ended already
+            house.alpha.pause(on=False)
+        await house.alpha.end()
+
+
 async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_the_daemon(house):
     await house.alpha.start()
     try:

@@ -425,7 +425,7 @@ async def test_what_stands_at_an_io_module_can_be_seen_and_can_fail(ldcnd_rig):
     assert cabinet().powered
     assert cabinet().parts == {"lock": 1.0, "door": 0.0, "pin": 0.0}
     assert cabinet().inputs["locked"]
-    await asyncio.sleep(1)  # the rotor is known to stand by then
+    await asyncio.sleep(45)  # the rotor is known to stand by then
     await ldcnd_rig.client.set_io("cabinet", high=["unlock"])
     await ldcnd_rig.until(lambda: cabinet().parts["lock"] == 0.0)
     assert cabinet().outputs["unlock"] is True

@@ -24,16 +24,19 @@ export function PlaceAndTarget({ axis }) {
 export function AxisStrip({ axis }) {
   const toHalt = obstacle(axis, "halt");
   const [told, setTold] = useState(null);
-  const ends = (what, act) => ({
-    act: async () => {
-      const at = clock(Date.now() * 1e6);
-      setTold({ text: `${what} sent at ${at}: no answer yet.`, state: axis.state });
-      const reply = await act();
-      setTold({ text: `${what} at ${at}: ${came(reply)}.`, state: axis.state });
-    },
-    onRefused: (error) => setTold({ text: `${what} did not get through: ${sentence(error.message)} Use the emergency stop.`, failed: true, state: axis.state }),
-  });
-  const isNews = told && (told.failed || axis.rig.worth) && told.state === axis.state;
+  const ends = (what, act) => {
+    const since = axis.state;
+    const tell = (text, failed = false) => setTold({ text, failed, since });
+    return {
+      act: async () => {
+        const at = clock(Date.now() * 1e6);
+        tell(`${what} sent at ${at}: no answer yet.`);
+        tell(`${what} at ${at}: ${came(await act())}.`);
+      },
+      onRefused: (error) => tell(`${what} did not get through: ${sentence(error.message)} Use the emergency stop.`, true),
+    };
+  };
+  const isNews = told && (told.failed || axis.rig.worth) && told.since === axis.state;
   return html`<div class="strip of-axis">
     <span class="where"><b>${titleOf(axis)}</b> <${PlaceAndTarget} axis=${axis} /></span>
     <span><${StateWord} axis=${axis} /> <${Homed} axis=${axis} /><${TroubleWords} axis=${axis} /></span>
