@@ -148,6 +148,9 @@ class LdcndCentrifuge(CentrifugeBackend):  # type: ignore[misc]  # it has no typ
 
     async def _rest(self) -> None:
         await (await self._rotor.halt()).done()
+        state = await self._rig.latest("rotor", "state")
+        if isinstance(state, StateSample) and state.enabled and state.moving is Moving.UNKNOWN:
+            await self._rotor.power(on=False)  # others have spun it: it is known to stand a while behind that
         await self._until({}, at_rest=True, within_s=120.0)
 
     async def _until(self, named: Mapping[str, bool], *, at_rest: bool = False, within_s: float = 10.0) -> None:
