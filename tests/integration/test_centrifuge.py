@@ -485,6 +485,28 @@ def test_a_healthy_rotor_that_is_stopped_at_speed_has_no_fault(rpm, ended):
     assert not alone(stops)
 
 
+@pytest.mark.parametrize("lost", ["cable_cut", "mute", "power_loss"])
+@pytest.mark.parametrize("for_s", [0.5, 3.0])
+@pytest.mark.sweep(2)
+def test_the_steps_that_why_names_lead_out_of_a_loss_in_a_spin(lost, for_s):
+    async def goes_on(machine):
+        await machine.spin()
+        getattr(machine.rig.faults, lost)("rotor", for_s=for_s)
+        await asyncio.sleep(for_s + 5.0)
+        for _ in range(40):
+            causes = (await machine.rotor.why()).causes
+            if [each.code for each in causes] == ["not_referenced"]:
+                break
+            verb = causes[0].steps[0].verb if causes and causes[0].steps else ""
+            with suppress(LdcndError):
+                await (machine.rotor.power(on=True) if verb == "power" else machine.rotor.reset())
+            await asyncio.sleep(2.0)
+        await (await machine.rotor.home()).done()
+        return (await machine.rotor.why()).causes
+
+    assert not alone(goes_on)
+
+
 @pytest.mark.parametrize("start", ["reset", "adopt"])
 @pytest.mark.parametrize("off", [False, True])
 @pytest.mark.parametrize(("speed", "dead_s"), [(2.0, 0.3), (10.0, 0.45), (25.0, 0.1)])
