@@ -192,8 +192,7 @@ class Following:
         Args:
             reading: what the drive shows.
             at_s: when it was requested, in loop time.
-            at_velocity: its profile slows down only where it is told another speed, of which `velocity_counts_per_s` is
-                the lowest.
+            at_velocity: the profile keeps its velocity, or goes up to it: it ends by another command only.
         """
         position, error = reading.position_counts, reading.following_error_counts
         low, high = min(self.low, position), max(self.high, position)

@@ -228,7 +228,7 @@ def check_speed(axis: AxisTracker) -> None:
 def check_not_forced(axis: AxisTracker) -> None:
     """Refuse to reset a faulted axis whose motor has voltage and turns, or may, whatever the state says."""
     status = axis.status
-    # one that has only not been seen to count is none: behind the reset it coasts, and a while tells whether it stands
+    # a shaft that was only not seen to count may coast: behind the reset `coast_s` tells when it stands
     stands = status.moving is Moving.NO or (status.may_coast and status.at_rest and not status.rest_unproven_by)
     if status.state is AxisState.ERROR_STOP and status.energised and not stands:
         waits = Remedy("{}, wait until it stands, then {}", step("halt"), step("reset"))

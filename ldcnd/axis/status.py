@@ -407,7 +407,7 @@ class AxisStatus:
 
     @property
     def may_coast(self) -> bool:
-        """Whether the shaft may turn unseen: with the motor off, or behind a motion that others have begun."""
+        """Whether the shaft may turn unseen: motor off, or loop closed before a motion of this daemon."""
         return self.rest.unseen_s > 0 and (not self.rest.commanded if self.enabled else not self.rest.rests)
 
     @property

@@ -141,7 +141,7 @@ async def _costs(what: str, work: Callable[[], Awaitable[float]]) -> dict[str, f
 
 
 def config_of(*, axes: int, hz: float, order: str = "deadline") -> RigConfig:
-    """Return a rig of one line whose axes are asked for all items so often."""
+    """Return a rig of one line with axes that are polled for all items at a rate; 0 for hardly."""
     rates = dict.fromkeys(ITEMS, hz) if hz else dict.fromkeys(ITEMS, 0.0) | {"state": 1.0}
     drive = {"model": "ls-182ap", "velocity": 1, "acceleration": 100, "gains": GAINS, "rates": rates}
     drives = [drive | {"name": f"a{n}", "address": n} for n in range(1, axes + 1)]
