@@ -169,6 +169,11 @@ class Following:
         return self.until_s < math.inf
 
     @property
+    def is_long(self) -> bool:
+        """Whether a shaft that follows it is seen to move."""
+        return self.way_counts >= 2 * self.least_counts
+
+    @property
     def is_unseen(self) -> bool:
         """Whether a part of the profile has gone, or is over, in which the shaft was not seen to move."""
         coming = self.speed_counts_per_s**2 / (4 * self.acceleration_counts_per_s2)

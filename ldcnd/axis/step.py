@@ -454,8 +454,13 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
 
 
 def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
-    command, ends_at_s, unseen_s = status.command, status.ends_at_s, status.rest.unseen_s
-    stops = command is not None and command.state is AxisState.STOPPING
+    command, ends_at_s = status.command, status.ends_at_s
+    following, rest = _next_following(status, event), RestEvidence(rests=False, commanded=True)
+    if status.may_coast:  # its encoder proves nothing before it has counted in a motion that is long enough for that
+        if event.following and following and following.is_long:
+            following = replace(following, gone_counts=math.inf)
+        else:
+            rest = replace(status.rest, rests=False)
     if command and command.duration_s is not None:
         ends_at_s = event.now_s + command.duration_s
     status = replace(
@@ -463,11 +468,10 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
         effective_from_s=event.now_s,
         ends_at_s=ends_at_s,
         pace=event.pace,
-        following=_next_following(status, event),
+        following=following,
         unsure=event.unsure,
         driven_open=status.driven_open or (command is not None and command.opens_loop),
-        # what brings the motion of others to rest proves no more of its encoder than that has
-        rest=replace(status.rest, rests=False) if stops and unseen_s else RestEvidence(rests=False, commanded=True),
+        rest=rest,
     )
     if event.target_counts is None:
         return status

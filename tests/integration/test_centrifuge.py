@@ -538,6 +538,34 @@ def test_a_daemon_that_begins_beside_a_rotor_whose_encoder_has_died_opens_no_loc
     assert run(program()) == []
 
 
+@pytest.mark.parametrize("rpm", [1, 3, 5])
+def test_a_slow_motion_beside_a_rotor_that_turns_unseen_opens_no_lock(rpm):
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig, rig.client.watch("rotor") as rotor:
+            await asyncio.sleep(1.0)
+            await rig.client.set_io("cabinet", low=("door", "unlock", "pin"))
+            await asyncio.sleep(1.0)
+            machine = await made_ready(rig, rotor)
+            await rotor.move_velocity(10.0, acceleration=10, duration_s=60)
+            await rig.until(lambda: machine.speed > 9.5)
+            rig.faults.daemon_killed(for_s=0.5)
+            rig.faults.encoder_stuck("rotor", after_s=0.45)
+            await asyncio.sleep(6.0)
+            with suppress(LdcndError):  # the first command tells a client that there is another daemon
+                await rotor.reset()
+            await rotor.power(on=True)
+            await rotor.move_velocity(rpm / 60, acceleration=1, duration_s=5)
+            written_at = []
+            for _ in range(200):
+                with suppress(LdcndError, TimeoutError):
+                    await rig.client.set_io("cabinet", high=("unlock",), low=("door", "pin"))
+                    written_at.append(machine.speed)
+                await asyncio.sleep(0.01)
+            return [each for each in written_at if each > CREEPS]
+
+    assert run(program()) == []
+
+
 @pytest.mark.parametrize("after_s", [0.0, 0.03, 0.06, 0.1, 0.3, 1.0])
 @pytest.mark.parametrize("speed", [10.0, 3.0])
 @pytest.mark.sweep(3)
