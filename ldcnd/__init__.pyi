@@ -172,6 +172,7 @@ from ldcnd.contract.samples import (
     ShadowSample,
     StateSample,
     TelemetryItem,
+    Unseen,
     VelocitySample,
 )
 from ldcnd.contract.traces import (
@@ -371,6 +372,7 @@ __all__ = [
     "UnknownAxis",
     "UnknownCommand",
     "UnknownVerb",
+    "Unseen",
     "ValueOutOfRange",
     "VelocityLimit",
     "VelocitySample",

@@ -29,7 +29,7 @@ from ldcnd.contract.errors import (
     step,
 )
 from ldcnd.contract.meta import AxisLimits
-from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving
+from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Unseen
 from ldcnd.contract.units import Dimension
 from ldcnd.drives.driver import QuietDrive
 
@@ -112,7 +112,7 @@ def check_does_not_coast(axis: AxisTracker) -> None:
             value=axis.status.motion_hidden_by,
             remedy=Remedy("look whether it stands, then {}", step("reset")),
         )
-    if axis.status.may_coast and axis.status.rest.left_turning and not axis.status.enabled:
+    if axis.status.unseen is Unseen.LEFT_TURNING:
         raise WrongState(
             f"axis {axis.name} may turn with its motor off: it was not read while it moved, and its encoder has not"
             f" counted since; it stands once it has not counted for {axis.status.rest.unseen_s:g} s",
@@ -229,7 +229,7 @@ def check_not_forced(axis: AxisTracker) -> None:
     """Refuse to reset a faulted axis whose motor has voltage and turns, or may, whatever the state says."""
     status = axis.status
     # a shaft that was only not seen to count may coast: behind the reset `coast_s` tells when it stands
-    stands = status.moving is Moving.NO or (status.may_coast and status.at_rest and not status.rest_unproven_by)
+    stands = status.moving is Moving.NO or (status.unseen and status.at_rest and not status.rest_unproven_by)
     if status.state is AxisState.ERROR_STOP and status.energised and not stands:
         waits = Remedy("{}, wait until it stands, then {}", step("halt"), step("reset"))
         raise WrongState(

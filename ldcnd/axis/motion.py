@@ -150,7 +150,7 @@ class AxisMotion:
         until_s = self._loop.time() + within_s
         while not (self.tracker.status.enabled or self.tracker.status.at_rest):
             self.tracker.take(LookTaken(await self.read()))
-            if not (self.tracker.status.coasts or self.tracker.status.may_coast) or self._loop.time() >= until_s:
+            if not (self.tracker.status.coasts or self.tracker.status.unseen) or self._loop.time() >= until_s:
                 break
             await asyncio.sleep(LOOK_AGAIN_S)
         check_does_not_coast(self.tracker)

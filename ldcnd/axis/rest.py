@@ -76,6 +76,10 @@ class RestEvidence:
             return self
         return replace(self, rests=rests, low=low, high=high)
 
+    def again(self, **changes: float | None) -> "RestEvidence":
+        """Return it with other terms, under which what it has proved until now counts no more."""
+        return replace(self, rests=None if self.rests else self.rests, **changes)
+
     def _unseen_s(self, reading: AxisReading) -> float:
         # of a motor that others have set in motion nothing tells how it is to slow down: its encoder may cease in that
         return self.unseen_s if reading.enabled and not self.commanded else 0.0

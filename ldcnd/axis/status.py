@@ -17,7 +17,7 @@ from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
-from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Quality, StateSample
+from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Quality, StateSample, Unseen
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import Fault, StopMode
 from ldcnd.line.exchange import Timing
@@ -379,7 +379,7 @@ class AxisStatus:
             return Moving.YES
         # every poll passes here: asked only where there may be an answer
         hidden = (self.faults or self.first_fault or self.following) and self.rest_unproven_by
-        return Moving.NO if rests and not hidden and not (self.rest.unseen_s and self.may_coast) else Moving.UNKNOWN
+        return Moving.NO if rests and not hidden and self.unseen is None else Moving.UNKNOWN
 
     @property
     def to_be_stopped(self) -> bool:
@@ -406,9 +406,14 @@ class AxisStatus:
         return self.rest.turns and not self.enabled
 
     @property
-    def may_coast(self) -> bool:
-        """Whether the shaft may turn unseen: motor off, or loop closed before a motion of this daemon."""
-        return self.rest.unseen_s > 0 and (not self.rest.commanded if self.enabled else not self.rest.rests)
+    def unseen(self) -> Unseen | None:
+        """Why the shaft may turn though it shows no count; None where something has shown that its encoder counts."""
+        rest = self.rest
+        if not rest.unseen_s or (rest.commanded if self.enabled else rest.rests):
+            return None
+        if self.enabled:
+            return Unseen.UNDER_POWER
+        return Unseen.LEFT_TURNING if rest.left_turning else Unseen.MOTOR_OFF
 
     @property
     def energised(self) -> bool:

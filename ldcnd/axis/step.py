@@ -75,7 +75,7 @@ from ldcnd.axis.status import (
 )
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
-from ldcnd.contract.samples import AxisState, FaultEntry, LinkState
+from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Unseen
 from ldcnd.drives.driver import Fault, StopMode
 
 MISSES_UNTIL_DOWN = 3
@@ -151,6 +151,8 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     reading, at_s, now_ns = event.reading, event.sent_at_s, event.now_ns
     rest, enabled, command = status.rest.observe(reading, at_s), reading.enabled, status.command
     if rest is not status.rest or enabled is not status.enabled:
+        if status.enabled and not enabled and status.limits.unseen.unseen_s:
+            rest = rest.again(since_s=None)  # how long it has not counted under voltage says nothing of a shaft that is let go
         status = replace(status, rest=rest, enabled=enabled)
     if status.unsure and status.unsure.from_rest and (shows_velocity(reading) or not reading.profile_done):
         status = _with(status, unsure=None)
@@ -354,13 +356,19 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
     if not was_up and not event.another and not event.asked:
         return status
     # a counter that is not read may have been set, so what it shows later is no place
-    # what stood goes on standing: only a motor that has power turns a shaft, and that the next reading shows
-    stood = status.at_rest and not status.rest_unproven_by
-    rest = NOTHING_SEEN if stood else replace(status.limits.unseen, left_turning=True)
+    rest = _out_of_sight(status) if was_up else status.rest
     status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=rest, coast=None)
     status = _with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again
     return _fail(status, "the drive did not answer") if was_up and status.state is not AxisState.DISABLED else status
+
+
+def _out_of_sight(status: AxisStatus) -> RestEvidence:
+    """Return what is known of the rest of an axis that could not be read for a while."""
+    # what stood goes on standing: only a motor that has power turns a shaft, and that the next reading shows
+    if status.at_rest and not status.rest_unproven_by and status.unseen is None:
+        return NOTHING_SEEN
+    return replace(status.limits.unseen, left_turning=status.unseen is not Unseen.MOTOR_OFF)
 
 
 def _take_unusable(status: AxisStatus, event: ReplyUnusable) -> AxisStatus:
@@ -369,15 +377,17 @@ def _take_unusable(status: AxisStatus, event: ReplyUnusable) -> AxisStatus:
     if status.in_vain < MISSES_UNTIL_DOWN or status.replies_unusable or link is LinkState.DOWN:
         return status
     own = _own_and(status, REPLIES_UNUSABLE)
-    status = _with_faults(replace(status, rest=NOTHING_SEEN, own=own), own, event.now_ns)
+    status = _with_faults(replace(status, rest=_out_of_sight(status), own=own), own, event.now_ns)
     return status if status.state is AxisState.DISABLED else _fail(status, REPLIES_UNUSABLE.text)
 
 
 def _take_contradiction(status: AxisStatus, event: ReadingsContradicted) -> AxisStatus:
+    # what has proved its rest before was of the same encoder
+    rest = replace(status.limits.unseen, left_turning=True)
     if not status.contradicts:
         own = _own_and(status, READINGS_CONTRADICT)
         status = _with_faults(replace(status, own=own), own, event.now_ns)
-    status = _with(_place_lost(status), misses=0, in_vain=0, link=LinkState.UP, rest=NOTHING_SEEN, position_lost=True)
+    status = _with(_place_lost(status), misses=0, in_vain=0, link=LinkState.UP, rest=rest, position_lost=True)
     return status if status.state is AxisState.DISABLED else _fail(status, READINGS_CONTRADICT.text)
 
 
@@ -456,7 +466,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
 def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
     command, ends_at_s = status.command, status.ends_at_s
     following, rest = _next_following(status, event), RestEvidence(rests=False, commanded=True)
-    if status.may_coast:  # its encoder proves nothing before it has counted in a motion that is long enough for that
+    if status.unseen:  # its encoder proves nothing before it has counted in a motion that is long enough for that
         if event.following and following and following.is_long:
             following = replace(following, gone_counts=math.inf)
         else:
@@ -521,7 +531,7 @@ def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
     # a loop that closes holds the shaft; one that is let go may coast, or fall; what was off before is as it was
     rest = status.rest
     if on:  # where nothing has shown that the encoder counts, its first motion does
-        seen = not status.may_coast
+        seen = status.unseen is None
         rest = RestEvidence(rests=True, commanded=seen, unseen_s=0.0 if seen else rest.unseen_s)
     elif status.enabled:
         rest = RestEvidence(unseen_s=rest.unseen_s)
@@ -630,6 +640,9 @@ def _recall_latch(status: AxisStatus, event: LatchRecalled) -> AxisStatus:
 
 
 def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
+    rest = status.rest
+    if status.rest_unproven_by:  # whoever resets says that it stands: that gives power, and opens no lock
+        rest = rest.again(unseen_s=status.limits.unseen.unseen_s)
     return replace(
         status,
         # MC_Reset leads to Standstill or, without power, to Disabled (PLCopen part 1, state diagram, notes 3 and 4)
@@ -645,6 +658,7 @@ def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
         first_fault=None,
         last_error=None,
         interlock="",
+        rest=rest,
     )
 
 

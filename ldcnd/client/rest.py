@@ -48,10 +48,14 @@ async def until_at_rest(
                 except TimeoutError:
                     raise nothing_received(axis) from None
     except TimeoutError:
+        last = state()
+        unseen = last is not None and last.moving is Moving.UNKNOWN and last.unseen is not None
         raise WrongState(
-            f"axis {axis} does not come to rest within {within_s:g} s",
+            f"axis {axis} {'is not known to stand after' if unseen else 'does not come to rest within'} {within_s:g} s",
             axis=axis,
-            remedy="look for a load that moves it, then give the command again",
+            remedy="wait for four times its coast_s, for its encoder has not counted yet, then give the command again"
+            if unseen
+            else "look for a load that moves it, then give the command again",
         ) from None
     return last
 
@@ -63,11 +67,18 @@ def drive_silent(axis: str) -> OutcomeUnknown:
 
 def motion_hidden(axis: str, state: StateSample) -> OutcomeUnknown:
     """Return the error for an axis whose readings do not prove that it stands."""
-    fault = state.motion_hidden_by
+    fault, unknown = state.motion_hidden_by, f"axis {axis}: it is not known whether it stands"
     off = step("power", 'send power {"on": false}', on=False)
+    if not fault:
+        return OutcomeUnknown(
+            f"{unknown}: it was taken over, and its encoder has not counted in a motion of this daemon yet",
+            axis=axis,
+            value=state.unseen,
+            remedy=Remedy("{}, or {} and wait until it stands", step("home"), off),
+        )
     look = "look whether it stands, then {}"
     return OutcomeUnknown(
-        f"axis {axis}: it is not known whether it stands: after {fault} its encoder does not prove it",
+        f"{unknown}: after {fault} its encoder does not prove it",
         axis=axis,
         value=fault,
         # a reset of a motor under voltage is refused

@@ -22,6 +22,7 @@ from ldcnd.contract.samples import (
     PastFault,
     Quality,
     TelemetryItem,
+    Unseen,
 )
 
 ENOUGH = 0.9
@@ -217,6 +218,10 @@ class KnownState(Protocol):
         """The fault behind which readings do not prove that it stands; empty without one."""
 
     @property
+    def unseen(self) -> Unseen | None:
+        """Why it may turn though its encoder does not count."""
+
+    @property
     def has_reference(self) -> bool:
         """Whether it can be referenced at all."""
 
@@ -307,6 +312,29 @@ _MAY_MOVE = Trouble(
     " switch its motor off, look at the machine, then reset it",
     "may move",
 )
+_UNSEEN = {
+    Unseen.MOTOR_OFF: Trouble(
+        TroubleKind.HIDDEN,
+        _NOTICE,
+        "it may coast: nothing has shown yet that its encoder counts; it stands once it has not for four times its"
+        " coast_s, or when it is homed",
+        "may coast",
+    ),
+    Unseen.LEFT_TURNING: Trouble(
+        TroubleKind.HIDDEN,
+        _WRONG,
+        "it may coast: it turned when it was read last, and its encoder has not counted since; it stands once it has"
+        " not for four times its coast_s",
+        "may coast",
+    ),
+    Unseen.UNDER_POWER: Trouble(
+        TroubleKind.HIDDEN,
+        _NOTICE,
+        "it may turn: it was taken over, and its encoder has not counted in a motion of this daemon yet; home it, or"
+        " switch its motor off and wait until it stands",
+        "may turn",
+    ),
+}
 _UNCOMMANDED = Trouble(
     TroubleKind.UNCOMMANDED,
     _WRONG,
@@ -338,6 +366,7 @@ PAGES: Mapping[str, str] = {
     **dict.fromkeys((_ERROR_STOP, _OVERRIDE), "wrong_state"),
     _UNCOMMANDED.short: "drive_changed",
     _MAY_MOVE.short: "position_error",
+    **{each.short: "stood_at_once" for each in _UNSEEN.values()},
     _BY_INTERLOCK: "interlock_violated",
     _SLOW: "bus_busy",
 }
@@ -558,6 +587,8 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
     found += _ended(state, faults, in_fault=bool(found))
     if state.motion_hidden_by and state.moving is Moving.UNKNOWN:
         found.append(_MAY_MOVE)
+    elif state.unseen and state.moving is Moving.UNKNOWN:
+        found.append(_UNSEEN[state.unseen])
     if place is Place.OLD:
         found.append(_OLD)
     if state.has_reference and not state.referenced and place is not Place.CONTRADICTED:  # that is its cause

@@ -45,6 +45,17 @@ class Moving(StrEnum):
     UNKNOWN = "unknown"
 
 
+class Unseen(StrEnum):
+    """Why an axis may turn whose encoder does not count: nothing has shown yet that it does."""
+
+    MOTOR_OFF = "motor_off"
+    """Its motor is off; it stands once it has not counted for a time that its configuration gives."""
+    LEFT_TURNING = "left_turning"
+    """So, too, and it turned when it was read last, or an earlier daemon has left it so: its power stays off."""
+    UNDER_POWER = "under_power"
+    """Others have closed its loop: it stands once it has counted in a motion of this daemon, or its motor is off."""
+
+
 class Quality(StrEnum):
     """How much a sample is worth."""
 
@@ -307,7 +318,7 @@ class StateSample(Sample):
     """The position is valid: the axis was homed or its position was set since its drive was last reset, and neither
     the link nor the encoder was lost since then, nor has the counter wrapped."""
     moving: Moving
-    """Whether it moves; unknown when the drive does not answer, and where `motion_hidden_by` names a fault."""
+    """Whether it moves; unknown when the drive does not answer, and where `motion_hidden_by` or `unseen` says why."""
     link: LinkState
     """Whether the drive answers."""
     stop_latched: bool
@@ -324,6 +335,8 @@ class StateSample(Sample):
     motion_hidden_by: str = ""
     """Code that says why readings do not prove that the axis stands: shaft and encoder did not go where they were sent,
     or ceased to move too suddenly. Empty while they do, and again after reset."""
+    unseen: Unseen | None = None
+    """Why an axis that shows no count may turn, where nothing has shown yet that its encoder counts; null elsewhere."""
     has_reference: bool = True
     """Whether its drive can have a reference; false where `home` and `set_position` are not among its commands."""
     reference_lost: bool = False
@@ -342,9 +355,9 @@ class StateSample(Sample):
 
     @property
     def has_ended(self) -> bool:
-        """Whether nothing is to be waited for: it stands, or only a look at the machine tells whether it does."""
+        """Whether nothing is to be waited for: it stands, or no time will tell whether it does."""
         if self.moving is Moving.UNKNOWN and self.link is LinkState.UP and self.command is None:
-            return bool(self.motion_hidden_by)
+            return bool(self.motion_hidden_by) or self.unseen is Unseen.UNDER_POWER
         return self.moving is Moving.NO
 
 

@@ -20,7 +20,7 @@ from ldcnd.contract.commands import kind_of
 from ldcnd.contract.errors import InterlockViolated, LdcndError, Remedy, RemedyCommand, ValueOutOfRange, step
 from ldcnd.contract.events import INTERLOCK, CommandStatus
 from ldcnd.contract.rig_commands import OverrideInterlock, OverrideReply
-from ldcnd.contract.samples import AxisState, LinkState
+from ldcnd.contract.samples import AxisState, LinkState, Unseen
 from ldcnd.contract.units import Dimension
 from ldcnd.daemon.leases import STOP_MODES, Authority
 from ldcnd.daemon.ledger import EventLog
@@ -438,9 +438,9 @@ def _unproven(status: AxisStatus) -> str:
     """Return why readings do not prove how fast a shaft is; empty where they do."""
     if fault := status.rest_unproven_by:
         return f"may move: after fault {fault} its encoder does not prove that it stands; look, then reset the axis"
-    if status.may_coast and status.enabled:
+    if status.unseen is Unseen.UNDER_POWER:
         return "may turn: its encoder is yet to count in a motion of this daemon; home it, or switch it off"
-    if status.may_coast:
+    if status.unseen:
         seconds = f"{status.rest.unseen_s:g} s"
         return f"may coast: nothing has shown yet that it stands; it does once it has not counted for {seconds}"
     return ""

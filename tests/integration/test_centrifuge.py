@@ -15,6 +15,7 @@ from ldcnd.contract.errors import ErrorCode, InterlockViolated, LdcndError, Leas
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import OverrideInterlock
 from ldcnd.contract.samples import Moving, Quality
+from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.lab.sequences import SequenceRun
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
@@ -509,11 +510,14 @@ def test_the_steps_that_why_names_lead_out_of_a_loss_in_a_spin(lost, for_s):
 
 @pytest.mark.parametrize("start", ["reset", "adopt"])
 @pytest.mark.parametrize("off", [False, True])
-@pytest.mark.parametrize(("speed", "dead_s"), [(2.0, 0.3), (10.0, 0.45), (25.0, 0.1)])
+@pytest.mark.parametrize(("speed", "dead_s"), [(2.0, 0.3), (2.0, 0.6), (5.0, 0.85), (10.0, 0.45), (25.0, 0.1)])
+@pytest.mark.parametrize("then", [None, "cable", "silence", "noise", "power"])
 @pytest.mark.sweep(3)
-def test_a_daemon_that_begins_beside_a_rotor_whose_encoder_has_died_opens_no_lock(start, off, speed, dead_s):
+def test_a_daemon_that_begins_beside_a_rotor_whose_encoder_has_died_opens_no_lock(start, off, speed, dead_s, then):
     (line,) = CENTRIFUGE.bus
-    config = CENTRIFUGE.model_copy(update={"bus": (line.model_copy(update={"start": start}),)})
+    config = CENTRIFUGE.model_copy(
+        update={"bus": (line.model_copy(update={"start": StartPolicy(start), "adopt_fallback": AdoptFallback.RESET}),)}
+    )
 
     async def program():
         async with simulated_rig(config) as rig, rig.client.watch("rotor") as rotor:
@@ -527,6 +531,14 @@ def test_a_daemon_that_begins_beside_a_rotor_whose_encoder_has_died_opens_no_loc
                 await rotor.power(on=False)
             rig.faults.daemon_killed(for_s=0.5)
             rig.faults.encoder_stuck("rotor", after_s=dead_s)
+            if then:  # what was not seen to count before is not known to stand behind that either
+                lost = {
+                    "cable": lambda: rig.faults.cable_cut("rotor", after_s=4.0, for_s=2.0),
+                    "silence": lambda: rig.faults.mute("rotor", after_s=4.0, for_s=2.0),
+                    "noise": lambda: rig.faults.noise(1.0, after_s=4.0, for_s=2.0),
+                    "power": lambda: rig.faults.power_loss("rotor", after_s=4.0, for_s=2.0),
+                }
+                lost[then]()
             written_at = []
             for _ in range(600):
                 await asyncio.sleep(0.1)
@@ -999,3 +1011,29 @@ def test_an_override_is_shown_by_list_and_why_with_its_rule_its_client_and_its_e
         re.search(r"interlock door_shut is overridden by Bert for (9|10|11|12) s still", each) for each in during
     )
     assert not any("overridden" in each for each in after)
+
+
+@pytest.mark.parametrize("rpm", [300, 900, 3000])
+@pytest.mark.parametrize("first", [None, "motor_supply_lost", "power_loss", "power off"])
+@pytest.mark.sweep(3)
+def test_a_reset_that_comes_too_soon_opens_no_lock(rpm, first):
+    async def resets(machine):
+        rotor, faults = machine.rotor, machine.rig.faults
+        await rotor.move_velocity(rpm / 60, acceleration=10, duration_s=60)
+        await machine.rig.until(lambda: machine.speed > 0.95 * rpm / 60)
+        if first == "power off":
+            await rotor.power(on=False)
+        elif first:
+            getattr(faults, first)("rotor", for_s=2.0)
+        faults.encoder_stuck("rotor", after_s=0.3 if first else 0.0)
+        written_at = []
+        for _ in range(100):
+            await asyncio.sleep(0.2)
+            with suppress(LdcndError):
+                await rotor.reset()
+            with suppress(LdcndError):
+                await machine.high("unlock")
+                written_at.append(machine.speed)
+        return [each for each in written_at if each > CREEPS]
+
+    assert alone(resets) == []
