@@ -233,8 +233,9 @@ def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, .
     status = replace(status, coast=None)
     if seen or STOOD_AT_ONCE in status.own:
         return status
-    status = replace(status, own=_own_and(status, STOOD_AT_ONCE))
-    return _with_faults(status, (*faults, STOOD_AT_ONCE), event.now_ns)
+    status = _with_faults(replace(status, own=_own_and(status, STOOD_AT_ONCE)), (*faults, STOOD_AT_ONCE), event.now_ns)
+    # at once, for a reset may come before the next reading
+    return replace(_place_lost(status), position_lost=True, target=None)
 
 
 def _watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
