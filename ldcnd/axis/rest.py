@@ -76,9 +76,13 @@ class RestEvidence:
             return self
         return replace(self, rests=rests, low=low, high=high)
 
-    def again(self, **changes: float | None) -> "RestEvidence":
-        """Return it with other terms, under which what it has proved until now counts no more."""
-        return replace(self, rests=None if self.rests else self.rests, **changes)
+    def let_go(self) -> "RestEvidence":
+        """Return it for a shaft whose loop has opened: that it has not counted under voltage says nothing of it."""
+        return replace(self, rests=None if self.rests else self.rests, since_s=None)
+
+    def doubted(self, unseen_s: float) -> "RestEvidence":
+        """Return it for a shaft whose encoder is not believed: it is at rest once it has not counted for a time."""
+        return replace(self, rests=None if self.rests else self.rests, unseen_s=unseen_s)
 
     def _unseen_s(self, reading: AxisReading) -> float:
         # of a motor that others have set in motion nothing tells how it is to slow down: its encoder may cease in that

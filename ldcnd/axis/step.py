@@ -87,6 +87,7 @@ NAMED_STOPS = frozenset({Verb.HALT, Verb.QUICK_STOP})
 WENT_ON = "sent again, because the axis went on for longer than it should need to come to rest"
 STRAYED = "sent because the axis was not on the way to its target"
 LEFT = "sent before the drive was read: what it did while no daemon read it is not known"
+CLOSED_AGAIN = "sent because its drive had opened its loop, and what was sent before that was seen has closed it again"
 UNFOLLOWED = "sent because the profile of a motion has run and the encoder has not counted"
 OUTRUN = "sent because the axis stayed faster than it was told"
 
@@ -151,9 +152,8 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     reading, at_s, now_ns = event.reading, event.sent_at_s, event.now_ns
     rest, enabled, command = status.rest.observe(reading, at_s), reading.enabled, status.command
     if rest is not status.rest or enabled is not status.enabled:
-        if status.enabled and not enabled and status.limits.unseen.unseen_s:
-            rest = rest.again(since_s=None)  # how long it has not counted under voltage says nothing of a shaft that is let go
-        status = replace(status, rest=rest, enabled=enabled)
+        let_go = status.enabled and not enabled and status.limits.unseen.unseen_s
+        status = replace(status, rest=rest.let_go() if let_go else rest, enabled=enabled)
     if status.unsure and status.unsure.from_rest and (shows_velocity(reading) or not reading.profile_done):
         status = _with(status, unsure=None)
     # the command fails when it comes to rest, not before: until then it may still move
@@ -167,8 +167,7 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         if status.own is not before.own and NOT_FOLLOWED in status.own:
             return status
     if faults and any(fault.stops for fault in faults):
-        lost = "; its position is lost" if status.position_lost else ""
-        return _fail(status, f"the drive reports a fault{lost}")
+        return _fail_by_fault(status, event)
     if enabled:
         # with its loop closed it is not driven open any more, whatever came of the stop
         if status.driven_open:
@@ -182,6 +181,13 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
         return status
     return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
+
+
+def _fail_by_fault(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
+    if status.enabled and any(fault.stops and fault.hides_motion for fault in event.reading.faults):
+        status = _keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, CLOSED_AGAIN))
+    lost = "; its position is lost" if status.position_lost else ""
+    return _fail(status, f"the drive reports a fault{lost}")
 
 
 def _watch_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -643,7 +649,7 @@ def _recall_latch(status: AxisStatus, event: LatchRecalled) -> AxisStatus:
 def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
     rest = status.rest
     if status.rest_unproven_by:  # whoever resets says that it stands: that gives power, and opens no lock
-        rest = rest.again(unseen_s=status.limits.unseen.unseen_s)
+        rest = rest.doubted(status.limits.unseen.unseen_s)
     return replace(
         status,
         # MC_Reset leads to Standstill or, without power, to Disabled (PLCopen part 1, state diagram, notes 3 and 4)

@@ -22,7 +22,13 @@ STOP, COMMAND, POLL, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and tur
 
 
 class Queueable(Protocol):
-    """The interface of a job that the schedule uses."""
+    """The interface of a job that the schedule uses.
+
+    Attributes:
+        exchange: of which its node counts.
+    """
+
+    exchange: Exchange[Any]
 
     @property
     def abandoned(self) -> bool:
@@ -113,7 +119,7 @@ class Schedule(Generic[JobT]):
         if self._probe is None and not any(self._jobs.values()):  # as nearly always, and this is between two packets
             self._commands_in_a_row = 0
             return None
-        if stop := self._take(STOP):
+        if stop := self._take_stop():
             return stop
         probe, self._probe = self._probe, None
         if probe and not probe.abandoned:
@@ -128,6 +134,15 @@ class Schedule(Generic[JobT]):
             return self._take(BACKGROUND)
         self.polls_in_a_row += 1
         return None
+
+    def _take_stop(self) -> JobT | None:
+        """Remove and return the next stop: one that a node awaits in vain lets those pass that will be answered."""
+        stops = self._jobs[STOP]
+        for stop in stops if self.mute.misses else ():
+            if not (stop.abandoned or stop.doubted or stop.exchange.node in self.mute.misses):
+                stops.remove(stop)
+                return stop
+        return self._take(STOP)
 
     def _take(self, lane: Lane) -> JobT | None:
         waiting = self._jobs[lane]

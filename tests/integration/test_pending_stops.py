@@ -22,6 +22,7 @@ from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.faults import FaultInjector, FaultKind, FaultPlan, LineFault
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
+from ldcnd.testing import run, simulated_rig
 from ldcnd.testing.memory_session import MemoryBroker
 from tests.support.axis_bench import put
 from tests.support.rig import EPOCH_NS, SIMULATED, RunningRig, openers_of, running_rig
@@ -323,3 +324,51 @@ async def test_a_latched_axis_that_moves_when_its_line_is_back_comes_to_rest_wha
         await rig.until("x", lambda state: state.link is LinkState.UP)
         await asyncio.sleep(1.0)
         assert await stands(chain)
+
+
+@pytest.mark.parametrize("axis", ["x", "z"])
+@pytest.mark.parametrize("gap_s", [0.35, 0.5, 0.7])
+@pytest.mark.parametrize("stop", ["halt", "stop", "quick_stop", "none"])
+@pytest.mark.promise("stop-closes-no-loop")
+@pytest.mark.sweep(2)
+def test_a_drive_that_has_tripped_behind_a_gap_of_its_line_is_switched_off_again(axis, gap_s, stop):
+    async def program():
+        async with simulated_rig("config/simulated.toml") as rig, rig.client.control(axis, client="test") as moved:
+            await moved.power(on=True)
+            await moved.set_position(0.0)
+            await moved.move_velocity(20.0, duration_s=5)
+            await asyncio.sleep(0.5)
+            rig.faults.cable_cut(axis, for_s=gap_s)
+            rig.faults.jam(axis, for_s=gap_s)
+            await rig.until(lambda: not rig.truth(axis).energised)
+            stopped = asyncio.create_task(getattr(moved, stop)()) if stop != "none" else None
+            await asyncio.sleep(4.0)
+            if stopped:
+                await asyncio.wait([stopped])
+                stopped.exception()
+            return rig.truth(axis).energised, moved.state.sample.state, moved.state.sample.enabled
+
+    assert run(program()) == (False, AxisState.ERROR_STOP, False)
+
+
+@pytest.mark.parametrize("mute", [(), ("x",), ("x", "y"), ("c",)])
+def test_a_drive_that_answers_is_stopped_before_those_that_do_not(mute):
+    async def program():
+        async with simulated_rig("config/simulated.toml") as rig, rig.client.control("z", client="test") as moved:
+            await moved.power(on=True)
+            await moved.set_position(0.0)
+            await moved.move_velocity(10.0, duration_s=20)
+            for axis in mute:
+                rig.faults.mute(axis, for_s=10.0)
+            await asyncio.sleep(2.0)
+            speed, at_s = abs(rig.truth("z").velocity), rig.now_s
+            stopped = asyncio.create_task(rig.client.stop())
+            while abs(rig.truth("z").velocity) > 0.99 * speed:
+                await asyncio.sleep(0.001)
+            slowed_s = rig.now_s - at_s
+            await asyncio.wait([stopped])
+            stopped.exception()
+            return slowed_s
+
+    # one packet that is on its way to who does not answer, and the flush behind it
+    assert run(program()) < (0.12 if mute else 0.05)

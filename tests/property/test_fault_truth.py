@@ -73,7 +73,7 @@ class History:
         if arrives:
             self.axis.stop(control)
         if not (arrives and answered):
-            self.known.switched_unconfirmed(pic_ae=bool(control & ON))
+            self.known.switched_unconfirmed(pic_ae=bool(control & ON), closed=not control & StopControl.MOTOR_OFF)
             self.story[-1] += "?"
             return False
         self.known.switched(pic_ae=bool(control & ON), closed=not control & StopControl.MOTOR_OFF)

@@ -91,7 +91,9 @@ class Groups:
         finally:
             for group in groups:
                 for name in group.members:
-                    self._drives[name].state.switched_unconfirmed(pic_ae=bool(control & StopControl.AMP_ENABLE))
+                    self._drives[name].state.switched_unconfirmed(
+                        pic_ae=bool(control & StopControl.AMP_ENABLE), closed=not control & StopControl.MOTOR_OFF
+                    )
 
     async def start(self, motions: Mapping[str, CountsMotion], still_wanted: Callable[[], None]) -> None:
         """See `Network.start_group`.

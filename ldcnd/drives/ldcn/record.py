@@ -18,6 +18,8 @@ from ldcnd.drives.ldcn.registers import ServoRegisters
 
 BEGUN_COUNTS = 16
 """A counter that was reset reads 0, and a shaft that its loop has let go settles near it."""
+OPENED_AND_CLOSED = LdcnFault(FaultCode.LATCHED_FAULT, latched=True)
+"""It has switched its motor off, and a stop that holds, sent before that was seen, has closed its loop again."""
 FOREIGN_CAPTURE = "a capture is armed that this daemon has not armed"
 _MOVE_DONE, _POWER_ON, _LIMIT1, _LIMIT2, _HOMING = map(
     int,
@@ -58,6 +60,8 @@ class DriveState:
         off_before: the motor was switched off, and nothing shows that what was to close its loop since has done so.
         loop_may_open: the loop is open on purpose (PWM mode), or will be once home is captured: then the position
             error flag, which every open loop shows, is no fault.
+        watched_closed: the loop was seen closed with the position error flag clear, and this host has not opened it
+            since: a flag that is set then tells that the drive has, even if a stop has closed it again meanwhile.
         runs_open: it is open from the start of the motion, also while a capture is armed that stops it at a switch.
         motion_locked: the drive refuses motion since it homed on a limit switch.
         guard: the limit switch at which the drive stops the present motion by itself; empty without one.
@@ -84,7 +88,7 @@ class DriveState:
         """The drive was reset or lost power: nothing that was sent before holds any more."""
         self.known = AFTER_RESET
         self.homing_armed = self.arming = self.off_before = False
-        self.loop_may_open = self.runs_open = False
+        self.loop_may_open = self.runs_open = self.watched_closed = False
         self.motion_locked = False
         self.guard = ""
         self.guard_hit = False
@@ -99,15 +103,17 @@ class DriveState:
     def unseen(self) -> None:
         """The drive was out of reach for a while; nothing was sent to it meanwhile, by this host at least."""
         self.known = replace(self.known, seen=False)
+        self.watched_closed = False
 
-    def switched_unconfirmed(self, *, pic_ae: bool) -> None:
-        """A Stop Motor was sent, or may have been, that was not acknowledged: it may have opened the loop.
+    def switched_unconfirmed(self, *, pic_ae: bool, closed: bool) -> None:
+        """A Stop Motor was sent, or may have been, that was not acknowledged; with `closed` one that opens no loop.
 
         What it would leave as it is known to be stays known: a motor that was off is off, whether it arrived or not.
         """
         self.off_before = self.off_before or self.known.pic_ae is False
         known = pic_ae if self.known.pic_ae is pic_ae else None
-        self.known = replace(self.known, pic_ae=known, nothing_latched=False, closed=False)
+        self.known = replace(self.known, pic_ae=known, nothing_latched=False, closed=closed and self.known.closed)
+        self.watched_closed = closed and self.watched_closed
 
     def switched(self, *, pic_ae: bool, closed: bool) -> None:
         """The drive acknowledged a Stop Motor that closes the loop, or opens it."""
@@ -116,6 +122,7 @@ class DriveState:
             pic_ae=pic_ae, nothing_latched=False, latched=self.known.latched, closed=closed, seen=True, absolute=False
         )
         self.loop_may_open = self.runs_open = self.off_before = False
+        self.watched_closed = closed and self.watched_closed
 
     def clearing(self) -> None:
         """Clear Sticky Bits is on its way: a cause that was known may be gone before that is acknowledged."""
@@ -134,6 +141,7 @@ class DriveState:
         """A motion was loaded: to an analog target or not; one that opens the loop on purpose, at once or at home."""
         self.known = replace(self.known, absolute=absolute)
         self.loop_may_open, self.runs_open = runs_open or opens_at_home, runs_open
+        self.watched_closed = self.watched_closed and not self.loop_may_open
 
     # -- what it shows -----------------------------------------------------------------------------------------------
 
@@ -223,6 +231,9 @@ class DriveState:
             for fault in diagnose(self._profile, status, self.known)
             if not (open_on_purpose and fault.code is FaultCode.POSITION_ERROR)
         )
+        # "It is also set whenever the position servo is disabled" (LS-182AP manual, status byte, bit 4)
+        if self.watched_closed and servo_on(status) and status.flags & StatusFlag.POSITION_ERROR:
+            found = (OPENED_AND_CLOSED, *found)
         cause = next((fault for fault in found if fault.latched and fault.stops), None)
         # without this byte the loop counts as open, and every open loop shows the position error flag
         if status.aux is not None:
@@ -243,6 +254,8 @@ class DriveState:
         logosol = self._profile.pic_ae_diagnostics
         if servo_on(status):
             self.off_before = False
+            if not (status.flags & StatusFlag.POSITION_ERROR or self.loop_may_open):
+                self.watched_closed = True
             # PIC-SERVO closes its loop whatever the amplifier (manual, 5.2), a Logosol drive does not
             pic_ae = True if logosol else self.known.pic_ae
             self.known = replace(self.known, pic_ae=pic_ae, nothing_latched=False, latched=None, closed=True)

@@ -316,7 +316,7 @@ class LdcnAxis(Moves):
             await self._bus.execute(exchange, lane)
         # cancelled or lost: it may have been executed, so nothing is believed of loop and power driver
         except BaseException:
-            self.state.switched_unconfirmed(pic_ae=pic_ae)
+            self.state.switched_unconfirmed(pic_ae=pic_ae, closed=closed)
             raise
         self.state.switched(pic_ae=pic_ae, closed=closed)
 
