@@ -24,6 +24,8 @@ BRAKES_SHARE = 1.5
 """Most that a deceleration is taken for of what a profile has: shafts swing."""
 FOLLOWS_WITHIN_S = 1.0
 """Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
+LAGS_S = 0.04
+"""Shortest time over which a way is compared with its speed: a request may be some ms late on its line."""
 LEAST_COAST_S = 0.01
 """Readings that follow each other sooner tell nothing of how a shaft slows down."""
 COASTS_S = 0.3
@@ -179,6 +181,11 @@ class Following:
         coming = self.speed_counts_per_s**2 / (4 * self.acceleration_counts_per_s2)
         return self.is_missed or self.gone_counts >= 2 * self.least_counts + coming
 
+    @property
+    def brakes_within_s(self) -> float:
+        """Longest time from the beginning of its braking until its end, seconds, also by the clock of its drive."""
+        return 1.1 * self.velocity_counts_per_s / self.acceleration_counts_per_s2 + 2 * LAG_S
+
     def after(self, before: "Following | None") -> "Following":
         """Return it behind an earlier motion of its command, in which the shaft was perhaps not seen to move."""
         if before is None or before.command_id != self.command_id or before.counted:
@@ -203,6 +210,8 @@ class Following:
         low, high = min(self.low, position), max(self.high, position)
         runs = reading.enabled and not reading.profile_done
         if high - low > REST_COUNTS:
+            if runs and self._lags(position, at_s, brakes=not at_velocity):
+                return False
             return self._seen_to_move(reading, at_s, runs=runs, brakes=not at_velocity)
         if runs and self._stands_at_once(at_s, brakes=not at_velocity):
             return False
@@ -238,6 +247,14 @@ class Following:
         if not brakes:  # on average, and half of what the profile gets faster
             least += self.acceleration_counts_per_s2 * stood_s / 4
         return min(least, self.velocity_counts_per_s) * stood_s >= 2 * self.least_counts
+
+    def _lags(self, position: int, at_s: float, *, brakes: bool) -> bool:
+        """Tell whether a shaft that cannot slow down at once has gone less than half of its least way since."""
+        took_s = at_s - self.since_s
+        if not (self.coasts and self.counted) or took_s < LAGS_S:
+            return False
+        least = min(self._least_counts_per_s(at_s, brakes=brakes), self.velocity_counts_per_s) * took_s
+        return 2 * (abs(position - self.low) + 2 * self.least_counts) < least
 
     def _seen_to_move(self, reading: AxisReading, at_s: float, *, runs: bool, brakes: bool) -> "Following":
         speed = max(0.0, abs(reading.velocity_counts_per_s) - reading.velocity_resolution_counts_per_s)

@@ -209,8 +209,14 @@ def _watch_following(
     # its drive knows more of it, and has switched the motor off
     tripped = any(fault.stops for fault in event.reading.faults)
     command = status.command
-    goes_on = command and command.verb is Verb.MOVE_VELOCITY and command.state is AxisState.CONTINUOUS_MOTION
-    seen = tripped or following.observe(event.reading, event.sent_at_s, at_velocity=bool(goes_on))
+    at_velocity = (
+        command is not None
+        and command.verb is Verb.MOVE_VELOCITY
+        and command.state is AxisState.CONTINUOUS_MOTION
+        # a run with an end is a long move to its drive
+        and (status.ends_at_s is None or event.sent_at_s < status.ends_at_s - following.brakes_within_s)
+    )
+    seen = tripped or following.observe(event.reading, event.sent_at_s, at_velocity=at_velocity)
     if isinstance(seen, Following):
         return status if seen is following else replace(status, following=seen)
     if seen and status.command and not tripped:

@@ -607,7 +607,18 @@ def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed,
 
 @pytest.mark.parametrize("begun_at", [None, 2.0])
 @pytest.mark.parametrize(
-    ("speed", "cut_s"), [(50.0, 0.15), (50.0, 1.0), (5.0, 1.0), (5.0, 0.12), (1.0, 0.12), (0.3, 0.3)]
+    ("speed", "cut_s"),
+    [
+        (50.0, 0.15),
+        (50.0, 1.0),
+        (5.0, 1.0),
+        (5.0, 0.12),
+        (1.0, 0.12),
+        (0.3, 0.3),
+        (50.0, 0.06),
+        (16.0, 0.06),
+        (5.0, 0.06),
+    ],
 )
 @pytest.mark.sweep(3)
 def test_an_encoder_that_was_cut_for_a_while_in_a_spin_costs_the_reference(speed, cut_s, begun_at):
