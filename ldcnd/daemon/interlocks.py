@@ -8,7 +8,7 @@ lines they are.
 import asyncio
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 from ldcnd.axis.axis import AxisService
@@ -65,9 +65,24 @@ def in_words(lacks: Iterable[Lack]) -> str:
     return "; ".join(texts)
 
 
-Obstacle = Callable[[bool], Lack | None]
-"""Returns how a requirement does not hold, or is not known to; None when it does. Takes whether a motion is only
-watched: an output that is being written counts with its last reading then, as long as that is not too old."""
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """What a requirement is asked for.
+
+    Attributes:
+        levels: of the outputs that are to be written, by name, None to let go of one: they count as they will be.
+        watched: a motion is only watched: an output that is being written counts with its last reading, as long as
+            that is not too old.
+    """
+
+    levels: Mapping[str, bool | None] = field(default_factory=dict)
+    watched: bool = False
+
+
+NOW = Asked()
+WATCHED = Asked(watched=True)
+Obstacle = Callable[[Asked], Lack | None]
+"""Returns how a requirement does not hold, or is not known to; None when it does."""
 
 
 @dataclass(slots=True)
@@ -200,14 +215,14 @@ class Interlocks:
         self._version += 1
         self._changed.set()
 
-    def _lacks(self, rule: BoundRule, *, watched: bool = False) -> tuple[Lack, ...]:
+    def _lacks(self, rule: BoundRule, asked: Asked = NOW) -> tuple[Lack, ...]:
         """Return why a rule forbids what it binds; nothing when it does not."""
         if rule.override is not None and self._goes_on(rule, rule.override):
             return ()
-        if lacks := tuple(lack for requirement in rule.requires if (lack := requirement(watched))):
+        if lacks := tuple(lack for requirement in rule.requires if (lack := requirement(asked))):
             return lacks
         # not while an output is being written: then it may hold for those who only watch
-        if rule.modules and not any(module.before for module in rule.modules):
+        if rule.modules and not asked.levels and not any(module.before for module in rule.modules):
             age_s = rule.config.within_ms / 1e3 * (1 - 1 / LOOKS)
             rule.version, rule.until_s = self._version, min(each.read_at_s for each in rule.modules) + age_s
         return ()
@@ -223,7 +238,7 @@ class Interlocks:
         assert name is not None  # noqa: S101 - a requirement names one of the four
         return partial(self._lack_of_line, self._modules[name], name, what, each.value, age_s)
 
-    def _lack_of_module(self, module: ModuleService, age_s: float, _watched: bool) -> Lack | None:  # noqa: FBT001
+    def _lack_of_module(self, module: ModuleService, age_s: float, _asked: Asked) -> Lack | None:
         return None if self._now_s() - module.read_at_s <= age_s else Lack(f"module {module.name}", "does not answer")
 
     def _lack_of_line(
@@ -233,12 +248,12 @@ class Interlocks:
         what: str,
         wanted: bool,  # noqa: FBT001 - of a configuration
         age_s: float,
-        watched: bool,  # noqa: FBT001 - see `Obstacle`
+        asked: Asked,
     ) -> Lack | None:
         if self._now_s() - module.read_at_s > age_s:
             return Lack(f"{what} {name}", "is not known", f"module {module.name} does not answer")
-        value = module.values[name]
-        if watched and value is None and name in module.before:
+        value = asked.levels.get(name, module.values[name])
+        if asked.watched and value is None and name in module.before:
             before, read_at_s = module.before[name]
             value = before if self._now_s() - read_at_s <= age_s else None
         if value is wanted:
@@ -255,13 +270,7 @@ class Interlocks:
             return Lack(f"output {name}", "is not known", why, None if why else sets)
         return Lack(f"output {name}", f"is {other}", step=sets)
 
-    def _lack_of_axis(
-        self,
-        axis: AxisService,
-        each: Requirement,
-        age_s: float,
-        _watched: bool,  # noqa: FBT001 - see `Obstacle`
-    ) -> Lack | None:
+    def _lack_of_axis(self, axis: AxisService, each: Requirement, age_s: float, _asked: Asked) -> Lack | None:
         text = self._is_instead(axis, each, age_s)
         return Lack(f"axis {axis.config.name}", text) if text else None
 
@@ -314,7 +323,7 @@ class Interlocks:
             level = levels[rule.config.of]
             # an output that is let go of may become anything, so every rule of it binds
             kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW
-            if kind in (None, *rule.kinds) and (lacks := self._lacks(rule)):
+            if kind in (None, *rule.kinds) and (lacks := self._lacks(rule, Asked(levels))):
                 raise rule.violation(f"output {rule.config.of}", lacks)
 
     # -- watched -----------------------------------------------------------------------------------------------------
@@ -347,7 +356,7 @@ class Interlocks:
         moves = moves and (status.rest.rests is False or _commanded(status))
         moves = moves and not own.hold(self._version, self._now_s())
         for rule in own.rules:
-            lacks = self._lacks(rule, watched=True) if moves and self._binds(rule, axis, status) else ()
+            lacks = self._lacks(rule, WATCHED) if moves and self._binds(rule, axis, status) else ()
             if lacks and not rule.reacted:
                 self._react(axis, rule, lacks, group)
             rule.reacted = bool(lacks)

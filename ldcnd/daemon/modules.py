@@ -3,12 +3,20 @@
 import asyncio
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from enum import StrEnum
 from itertools import count
 
 from ldcnd.axis.clock import Clock
-from ldcnd.contract.errors import BusError, CommandAborted, LdcndError, MalformedRequest, ValueOutOfRange
+from ldcnd.contract.errors import (
+    BusError,
+    CommandAborted,
+    InterlockViolated,
+    LdcndError,
+    MalformedRequest,
+    ValueOutOfRange,
+)
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.health import ModuleHealth
 from ldcnd.contract.rig_commands import IoReply, IoTimer, SetIo, SetIoTimer
@@ -28,6 +36,8 @@ DIFFERS_AFTER = 2
 """Readings in a row in which a pin shows another level than was written, until the output counts as different."""
 APPLIED_AGAIN_S = 0.5
 """Pause before outputs are written again whose packets were lost, seconds."""
+READ_AGAIN_S = 1.0
+"""Longest wait of a request for the reading of an output that was written before and that it requires, seconds."""
 log = get_logger("io")
 
 
@@ -137,6 +147,7 @@ class ModuleService:
         self.before: dict[str, tuple[bool | None, float]] = {}
         self._differs = dict.fromkeys(outputs, 0)
         self._unread_until_s: dict[str, float] = {}  # outputs of which only what is requested from then on tells
+        self._known = asyncio.Event()  # what was written was read again, or is out of reach
         self._set: dict[str, bool] = {}  # levels of outputs that were written, until the module loses its power
         self._floating: dict[str, bool] = {}  # those that it has lost so, until they are written again
         self._reading: IoReading | None = None
@@ -191,6 +202,8 @@ class ModuleService:
         # a reply to a request from before the write tells the level of before
         for name in [name for name, until_s in self._unread_until_s.items() if timing.sent_at_s >= until_s]:
             del self._unread_until_s[name], self.before[name]
+        if not self._unread_until_s:
+            self._known.set()
         # when it was asked for, since the level may have changed directly behind that
         self._misses, self._reading, self.read_at_s = 0, reading, timing.sent_at_s
         values = {
@@ -239,6 +252,7 @@ class ModuleService:
         if self._seen:
             self._link_events.lost()
         self._reading, self.read_at_s = None, -math.inf
+        self._known.set()
         for each in self._inputs.values():
             each.forget()
         self._take(dict.fromkeys(self._lines))
@@ -366,16 +380,21 @@ class ModuleService:
             self.check(asked)
 
         async with self._writes:
-            self._check(condition)
-            values = self.values
-            changes = [name for name, level in asked.items() if level is None or level is not values[name]]
-            # first of all: motions ask for these outputs, as this asks for motions, and never do both pass
-            self._take(values | dict.fromkeys(changes))
-            try:
-                permitted()
-            except LdcndError:
-                self._take(values)
-                raise
+            while True:
+                self._check(condition)
+                values = self.values
+                changes = [name for name, level in asked.items() if level is None or level is not values[name]]
+                # first of all: motions ask for these outputs, as this asks for motions, and never do both pass
+                self._take(values | dict.fromkeys(changes))
+                try:
+                    permitted()
+                except LdcndError as error:
+                    self._take(values)
+                    # it may require an output that was written directly before
+                    if not (isinstance(error, InterlockViolated) and await self._come_to_be_known()):
+                        raise
+                else:
+                    break
             # without an end while it is written: any reply may be to a request from before
             self._unread_until_s |= dict.fromkeys(changes, math.inf)
             self.before = {name: (values[name], self.read_at_s) for name in changes} | self.before
@@ -389,8 +408,18 @@ class ModuleService:
                         self._set[name] = level
                 return reading
             finally:
+                self._known.clear()
                 # also after an error: which of the packets have arrived is not known
                 self._unread_until_s |= dict.fromkeys(changes, asyncio.get_running_loop().time())
+
+    async def _come_to_be_known(self) -> bool:
+        """Wait until outputs that were written are read again; return False if none was, or they are not in time."""
+        if not self._unread_until_s:
+            return False
+        with suppress(TimeoutError):
+            async with asyncio.timeout(READ_AGAIN_S):
+                await self._known.wait()
+        return not self._unread_until_s
 
     async def set_timer(self, command: SetIoTimer, condition: Condition) -> IoReply:
         """Choose what is counted, if the sender still may when the packet is sent.

@@ -112,13 +112,13 @@ def shutting(rig):
     return SequenceRun(rig.client, sequence, {}, lambda _: None, lambda: 0)
 
 
-def operated(what: Callable, without: str | None = None):
+def operated(what: Callable, without: str | None = None, rules=CENTRIFUGE.interlock):
     """Return what an operation returns on the centrifuge, of whose rules one may be left away."""
 
     async def program():
-        rules = tuple(each for each in CENTRIFUGE.interlock if each.name != without)
+        kept = tuple(each for each in rules if each.name != without)
         async with (
-            simulated_rig(CENTRIFUGE.model_copy(update={"interlock": rules})) as rig,
+            simulated_rig(CENTRIFUGE.model_copy(update={"interlock": kept})) as rig,
             rig.client.control("rotor", client="test") as rotor,
         ):
             found = await made_ready(rig, rotor)
@@ -186,6 +186,74 @@ async def drives_its_bolt_out_beside_an_open_door(machine):
         await machine.low("unlock")
     await asyncio.sleep(1.0)
     return machine.part("lock") > 0.0
+
+
+async def drives_its_bolt_in_as_it_drives_its_door(machine):
+    return await bolt_beside_the_door(machine, [(("door",), ("unlock",))])
+
+
+async def drives_its_bolt_in_behind_its_door(machine):
+    return await bolt_beside_the_door(machine, [(("door",), ()), ((), ("unlock",))])
+
+
+async def drives_its_door_behind_its_bolt(machine):
+    return await bolt_beside_the_door(machine, [((), ("unlock",)), (("door",), ())])
+
+
+async def bolt_beside_the_door(machine, requests):
+    """Send requests to a door that is shut and unlocked; return whether it is driven, or has moved, at a bolt."""
+    await machine.high("unlock")
+    await machine.rig.until(lambda: machine.part("lock") == 0.0)
+    for high, low in requests:
+        with suppress(InterlockViolated):
+            await machine.rig.client.set_io("cabinet", high=high, low=low)
+    for _ in range(40):
+        await asyncio.sleep(0.05)
+        driven = machine.rig.module_truth("cabinet").outputs["door"]
+        if machine.part("lock") > 0.0 and (driven or machine.part("door") > 0.0):
+            return True
+    return False
+
+
+TOGETHER = (
+    drives_its_bolt_in_as_it_drives_its_door,
+    drives_its_bolt_in_behind_its_door,
+    drives_its_door_behind_its_bolt,
+)
+
+
+@pytest.mark.parametrize("requests", TOGETHER, ids=lambda each: each.__name__)
+def test_a_bolt_never_falls_in_beside_a_door_that_is_driven(requests):
+    assert not operated(requests)
+
+
+@pytest.mark.parametrize(("row", "requests"), [*zip(("lock_closes", "door_opens"), TOGETHER[1:], strict=True)])
+def test_an_output_that_a_row_requires_is_what_keeps_bolt_and_door_apart(row, requests):
+    rules = [
+        each.model_copy(update={"requires": tuple(one for one in each.requires if not one.output)})
+        if each.name == row
+        else each
+        for each in CENTRIFUGE.interlock
+    ]
+    assert operated(requests, rules=tuple(rules))
+
+
+def test_outputs_are_judged_by_what_is_so_behind_the_request_that_sets_them():
+    async def sets(machine):
+        await unlocked(machine)
+        await machine.low("unlock", "door")
+        await machine.sees(locked=True)
+        await unlocked(machine)
+        await machine.high("unlock", "door")  # one that is high already counts as it will be
+        await machine.sees(door_open=True)
+        await machine.low("door")
+        await machine.sees(door_closed=True)
+        await machine.low("door")
+        await machine.low("unlock")  # directly behind what it requires: that is read back first
+        await machine.sees(locked=True)
+        return machine.open_or_unlocked
+
+    assert not operated(sets)
 
 
 NEEDS = {
