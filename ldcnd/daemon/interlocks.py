@@ -10,13 +10,15 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from types import MappingProxyType
 
+from ldcnd.axis import guards
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.events import CommandFailing
 from ldcnd.axis.rest import REST_COUNTS
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
-from ldcnd.contract.commands import kind_of
+from ldcnd.contract.commands import Verb, kind_of
 from ldcnd.contract.errors import InterlockViolated, LdcndError, Remedy, RemedyCommand, ValueOutOfRange, step
 from ldcnd.contract.events import INTERLOCK, CommandStatus
 from ldcnd.contract.rig_commands import OverrideInterlock, OverrideReply
@@ -31,6 +33,9 @@ from ldcnd.log import get_logger
 
 log = get_logger("interlocks")
 
+DEEPEST = 2
+"""How many rules of outputs a way out leads through."""
+NOT_HOMED = "is not homed"
 HUNTING = 0.1
 """Share of its speed by which a servo may be faster than its profile, between two readings."""
 
@@ -42,14 +47,20 @@ class Lack:
     Attributes:
         of: what it is required of.
         text: how that is instead.
+        wanted: how it is required to be.
         because: why it is not known, in words that are the same for all of which that is so.
-        step: the command that has it hold, if there is one.
+        sets: the module and the levels of its output that have it hold, if writing it may.
+        axis: the axis that a way out is about.
+        way: what has it hold, if a command of that axis does.
     """
 
     of: str
     text: str
+    wanted: str
     because: str = ""
-    step: RemedyCommand | None = None
+    sets: tuple[ModuleService, Mapping[str, bool]] | None = None
+    axis: str | None = None
+    way: Remedy | None = None
 
 
 def in_words(lacks: Iterable[Lack]) -> str:
@@ -127,22 +138,6 @@ class BoundRule:
     until_s: float = 0.0
     override: Override | None = None
     reacted: bool = False
-
-    def violation(self, what: str, lacks: Sequence[Lack]) -> InterlockViolated:
-        """Return the refusal of what it binds."""
-        name = self.config.name
-        found = [each.step for each in lacks if each.step]
-        # one command may be what several of them lack
-        steps = tuple({frozenset(each.arguments.items()): each for each in reversed(found)}.values())[::-1]
-        ways = [each.said for each in steps]
-        if len(found) < len(lacks):
-            ways.append(f"see to it that {'the rest' if steps else 'this'} holds")
-        return InterlockViolated(
-            f"{what}: interlock {name}: {in_words(lacks)}",
-            axis=self.axis.config.name if self.axis else None,
-            value=name,
-            remedy=Remedy.of(f"{', '.join(ways)}; for service override_interlock lifts {name} for a time", steps),
-        )
 
 
 @dataclass(slots=True)
@@ -238,8 +233,111 @@ class Interlocks:
         assert name is not None  # noqa: S101 - a requirement names one of the four
         return partial(self._lack_of_line, self._modules[name], name, what, each.value, age_s)
 
+    # -- the way out -------------------------------------------------------------------------------------------------
+
+    def _violation(
+        self,
+        rule: BoundRule,
+        what: str,
+        lacks: Sequence[Lack],
+        levels: Mapping[str, bool | None] = MappingProxyType({}),
+    ) -> InterlockViolated:
+        """Return the refusal of what a rule binds, with the steps that lead out: none of them is refused as the first.
+
+        Args:
+            rule: of which requirements do not hold.
+            what: is refused.
+            lacks: those requirements.
+            levels: of the outputs that were to be written.
+        """
+        name = rule.config.name
+        axis = rule.axis.config.name if rule.axis else next((each.axis for each in lacks if each.way), None)
+        wanted = {output: level for output, level in levels.items() if level is not None}
+        if wanted and wanted.keys() == levels.keys():
+            stages = self._to_set(self._modules[rule.config.of], wanted, axis)
+        else:
+            stages = self._to_hold(lacks, axis, waits=False)
+            led = [each for each in lacks if each.sets or (each.axis == axis and each.way)]
+            if len(led) < len(lacks):
+                stages.append(Remedy(f"see to it that {'the rest' if stages else 'this'} holds"))
+        return InterlockViolated(
+            f"{what}: interlock {name}: {in_words(lacks)}",
+            axis=axis,
+            value=name,
+            remedy=Remedy.of(
+                f"{', then '.join(stages)}; for service override_interlock lifts {name} for a time",
+                tuple(step for stage in stages for step in stage.steps),
+            ),
+        )
+
+    def _to_hold(self, lacks: Sequence[Lack], axis: str | None, *, waits: bool = True, depth: int = 0) -> list[Remedy]:
+        """Return in stages what has requirements hold.
+
+        Args:
+            lacks: those that do not.
+            axis: of which commands may be named.
+            waits: what no command leads to is waited for.
+            depth: how many rules have led here.
+        """
+        stages = list({str(each.way): each.way for each in lacks if each.way and each.axis == axis}.values())
+        levels: dict[ModuleService, dict[str, bool]] = {}
+        for each in lacks:
+            if each.sets:
+                levels.setdefault(each.sets[0], {}).update(each.sets[1])
+        for module, wanted in levels.items() if depth < DEEPEST else ():
+            stages += self._to_set(module, wanted, axis, depth)
+        if waits and (unled := [each.wanted for each in lacks if not each.sets]):
+            *others, last = dict.fromkeys(unled)
+            stages.append(Remedy(f"wait until {', '.join(others)}{' and ' if others else ''}{last}"))
+        return stages
+
+    def _to_set(
+        self, module: ModuleService, wanted: Mapping[str, bool], axis: str | None, depth: int = 0
+    ) -> list[Remedy]:
+        """Return in stages how outputs of a module get their levels: what a rule still forbids waits for the others."""
+        levels = module.levels_to_set(wanted)
+        later = {name: level for name, level in levels.items() if self._forbidden(levels, name)}
+        # an output of which nothing is known is written, too: only so it comes to be known
+        first = {
+            name: level is not (name in later)
+            for name, level in levels.items()
+            if name not in later or module.is_unwritten(name)
+        }
+        stages = []
+        if first:
+            if lacks := self._forbidden(first):
+                stages += self._to_hold(lacks, axis, depth=depth + 1)
+            stages.append(Remedy("{}", _sets(module, first)))
+        if later:
+            lacks = self._forbidden(first | later, *later)
+            stages += self._to_hold(lacks, axis, depth=depth + 1)
+            stages.append(Remedy("{}", _sets(module, later)))
+        return stages
+
+    def _forbidden(self, levels: Mapping[str, bool], *names: str) -> tuple[Lack, ...]:
+        """Return what keeps outputs from being written to their levels, all or some of those in one request."""
+        return tuple(
+            lack
+            for rule in self._rules.values()
+            if rule.config.of in (names or levels)
+            and (InterlockKind.HIGH if levels[rule.config.of] else InterlockKind.LOW) in rule.kinds
+            for lack in self._lacks(rule, Asked(levels))
+        )
+
+    def _may_home(self, axis: AxisService) -> bool:
+        """Tell whether a search for the reference would begin now."""
+        try:
+            guards.check(Verb.HOME, axis.tracker)
+        except LdcndError:
+            return False
+        rules = (rule for rule in self._rules.values() if rule.axis is axis and InterlockKind.HOME in rule.kinds)
+        return Verb.HOME in axis.driver.capabilities and not any(self._lacks(rule) for rule in rules)
+
+    # -- what is lacking ---------------------------------------------------------------------------------------------
+
     def _lack_of_module(self, module: ModuleService, age_s: float, _asked: Asked) -> Lack | None:
-        return None if self._now_s() - module.read_at_s <= age_s else Lack(f"module {module.name}", "does not answer")
+        of = f"module {module.name}"
+        return None if self._now_s() - module.read_at_s <= age_s else Lack(of, "does not answer", f"{of} answers")
 
     def _lack_of_line(
         self,
@@ -250,29 +348,39 @@ class Interlocks:
         age_s: float,
         asked: Asked,
     ) -> Lack | None:
+        of, word = f"{what} {name}", _word(what, wanted)
         if self._now_s() - module.read_at_s > age_s:
-            return Lack(f"{what} {name}", "is not known", f"module {module.name} does not answer")
+            return Lack(of, "is not known", f"{of} is {word}", f"module {module.name} does not answer")
         value = asked.levels.get(name, module.values[name])
         if asked.watched and value is None and name in module.before:
             before, read_at_s = module.before[name]
             value = before if self._now_s() - read_at_s <= age_s else None
         if value is wanted:
             return None
+        text = "is not known" if value is None else f"is {_word(what, not wanted)}"
         if what == "input":
-            return Lack(f"input {name}", "is not known" if value is None else f"is {'false' if wanted else 'true'}")
-        level, other = ("high", "low") if wanted else ("low", "high")
-        lines = {key: each for key, each in module.lines_to_set(name, high=wanted).items() if each}
-        others = [f"{each} {key}" for key, named in lines.items() for each in named if each != name]
-        beside = f", at once {', '.join(others)}" if others else ""
-        sets = step("set_io", f"set output {name} {level}{beside}", module=module.name, **lines)
-        if value is None:
-            why = module.why_unknown(name)
-            return Lack(f"output {name}", "is not known", why, None if why else sets)
-        return Lack(f"output {name}", f"is {other}", step=sets)
+            return Lack(of, text, f"{of} is {word}")
+        why = module.why_unknown(name) if value is None else ""
+        return Lack(of, text, f"{of} is {word}", why, None if why else (module, {name: wanted}))
 
     def _lack_of_axis(self, axis: AxisService, each: Requirement, age_s: float, _asked: Asked) -> Lack | None:
-        text = self._is_instead(axis, each, age_s)
-        return Lack(f"axis {axis.config.name}", text) if text else None
+        if not (text := self._is_instead(axis, each, age_s)):
+            return None
+        name, status = axis.config.name, axis.tracker.status
+        way: Remedy | None = None
+        off = step("power", 'send power {"on": false}', on=False)
+        if (each.standstill or each.below is not None) and _unproven(status):
+            if status.rest_unproven_by:
+                resets = "look whether it stands, then {}"
+                way = (
+                    Remedy(f"{{}}, {resets}", off, step("reset")) if status.energised else Remedy(resets, step("reset"))
+                )
+            elif status.unseen is Unseen.UNDER_POWER:
+                waits = f"{{}} and wait until it stands, for {status.rest.unseen_s:g} s"
+                way = Remedy(f"{{}}, or {waits}", step("home"), off) if self._may_home(axis) else Remedy(waits, off)
+        elif text == NOT_HOMED and self._may_home(axis):
+            way = Remedy("{} and wait until it is homed", step("home"))
+        return Lack(f"axis {name}", text, f"axis {name} {_required(status, each)}", axis=name, way=way)
 
     def _is_instead(self, axis: AxisService, each: Requirement, age_s: float) -> str:
         """Return how an axis is that is required to be another way; empty when it is as required."""
@@ -295,7 +403,7 @@ class Interlocks:
             return f"may be at {now}, which is not below {limit}"
         in_range = (each.min, each.max) != (None, None)
         if (each.homed or in_range) and (not status.referenced or status.position_lost):
-            return "is not homed"
+            return NOT_HOMED
         if in_range:
             here = status.scale.shown_at(reading.position_counts)
             if (each.min is not None and here < each.min) or (each.max is not None and here > each.max):
@@ -313,7 +421,7 @@ class Interlocks:
         for rule in own.rules:
             above = rule.config.above
             if kind in rule.kinds and (above is None or speed > above) and (lacks := self._lacks(rule)):
-                yield rule.violation(what, lacks)
+                yield self._violation(rule, what, lacks)
 
     def _check_outputs(self, levels: Mapping[str, bool | None]) -> None:
         """Refuse to write outputs; see `ModuleService.check`."""
@@ -324,7 +432,7 @@ class Interlocks:
             # an output that is let go of may become anything, so every rule of it binds
             kind = None if level is None else InterlockKind.HIGH if level else InterlockKind.LOW
             if kind in (None, *rule.kinds) and (lacks := self._lacks(rule, Asked(levels))):
-                raise rule.violation(f"output {rule.config.of}", lacks)
+                raise self._violation(rule, f"output {rule.config.of}", lacks, levels)
 
     # -- watched -----------------------------------------------------------------------------------------------------
 
@@ -365,7 +473,7 @@ class Interlocks:
         name, reaction = axis.config.name, LossPolicy(rule.config.reaction)
         text = in_words(lacks)
         log.warning("interlock violated", axis=name, interlock=rule.config.name, reason=text, reaction=reaction.value)
-        error = rule.violation(f"axis {name}", lacks)
+        error = self._violation(rule, f"axis {name}", lacks)
         reason = f"{error.message}; reaction: {reaction.value}"
         self._events.note(name, INTERLOCK, CommandStatus.ABORTED, reason, code=error.code.value)
         # the end of the command gives this as its reason
@@ -446,13 +554,38 @@ class Interlocks:
 def _unproven(status: AxisStatus) -> str:
     """Return why readings do not prove how fast a shaft is; empty where they do."""
     if fault := status.rest_unproven_by:
-        return f"may move: after fault {fault} its encoder does not prove that it stands; look, then reset the axis"
+        return f"may move: after fault {fault} its encoder does not prove that it stands"
     if status.unseen is Unseen.UNDER_POWER:
-        return "may turn: its encoder is yet to count in a motion of this daemon; home it, or switch it off"
+        return "may turn: its encoder is yet to count in a motion of this daemon"
     if status.unseen:
         seconds = f"{status.rest.unseen_s:g} s"
         return f"may coast: nothing has shown yet that it stands; it does once it has not counted for {seconds}"
     return ""
+
+
+def _required(status: AxisStatus, each: Requirement) -> str:
+    """Return in words how an axis is required to be."""
+    parts = ["stands"] if each.standstill else []
+    parts += [] if each.below is None else [f"is below {status.scale.text(each.below, Dimension.VELOCITY)}"]
+    parts += ["is homed"] if each.homed else []
+    if (each.min, each.max) != (None, None):
+        parts.append(f"is between {each.min} and {each.max} {status.unit}")
+    return " and ".join(parts) or "answers"
+
+
+def _word(what: str, value: bool) -> str:  # noqa: FBT001 - of a line
+    return str(value).lower() if what == "input" else "high" if value else "low"
+
+
+def _sets(module: ModuleService, levels: Mapping[str, bool]) -> RemedyCommand:
+    """Return the request that sets outputs of a module."""
+    *others, last = (f"output {name} {_word('output', level)}" for name, level in levels.items())
+    said = f"set {', '.join(others)} and {last} at once" if others else f"set {last}"
+    lines = {
+        word: tuple(name for name, at in levels.items() if at is level)
+        for word, level in (("high", True), ("low", False))
+    }
+    return step("set_io", said, module=module.name, **{word: names for word, names in lines.items() if names})
 
 
 def _commanded(status: AxisStatus) -> bool:

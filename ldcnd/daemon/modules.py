@@ -264,17 +264,19 @@ class ModuleService:
         written = self._driver.written(self._outputs[output].line)
         return "" if written is None else f"it was set {_word(written)} and its pin shows {_word(not written)}"
 
-    def lines_to_set(self, output: str, *, high: bool) -> Mapping[str, tuple[str, ...]]:
-        """Return the lines that `set_io` is to name for an output to get a level, as its `high` and its `low`.
+    def is_unwritten(self, output: str) -> bool:
+        """Tell whether no level of an output is known to be written, as after a take-over or a loss of power."""
+        return self._driver.written(self._outputs[output].line) is None
+
+    def levels_to_set(self, wanted: Mapping[str, bool]) -> Mapping[str, bool]:
+        """Return the levels that one `set_io` is to name for outputs to get those that are wanted.
 
         After a take-over none is set without the others: they are named with the levels of their pins, and keep them.
         """
-        levels = {output: high}
-        if (reading := self._reading) is not None:
-            unknown = (name for name, each in self._outputs.items() if self._driver.written(each.line) is None)
-            levels = {name: reading.levels[self._outputs[name].line - 1] for name in unknown} | levels
-        found = {"high": True, "low": False}
-        return {key: tuple(name for name, at in levels.items() if at is level) for key, level in found.items()}
+        if (reading := self._reading) is None:
+            return wanted
+        kept = (name for name in self._outputs if self.is_unwritten(name))
+        return {name: reading.levels[self._outputs[name].line - 1] for name in kept} | dict(wanted)
 
     # -- commands ----------------------------------------------------------------------------------------------------
 

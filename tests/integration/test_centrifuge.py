@@ -730,6 +730,112 @@ def test_why_names_what_is_in_the_way_of_homing_before_the_homing_that_is_wanted
     assert ({*before}, last) == ({"interlock_violated"}, "not_referenced")
 
 
+async def follows(machine, told):
+    """Carry out what a cause or a refusal names, wait behind each step; return what was refused."""
+    refused = []
+    for each in told.steps if hasattr(told, "steps") else told.remedy.steps:
+        given = dict(each.arguments)
+        try:
+            match each.verb:
+                case "set_io":
+                    await machine.rig.client.set_io(**given)
+                case "power":
+                    await machine.rotor.power(on=given["on"])
+                case "home":
+                    await (await machine.rotor.home()).done()
+                case "reset":
+                    await machine.rotor.reset()
+                case "set_position":  # instead of homing
+                    continue
+                case _:
+                    pytest.fail(f"{each.verb} in {told}")
+        except LdcndError as error:
+            refused.append(f"{each}: {error}")
+        await asyncio.sleep(45.0 if each.verb == "power" else 3.0)
+    return refused
+
+
+async def led_out(machine):
+    """Follow why until the rotor can move; return what was refused of that."""
+    for _ in range(6):
+        if not (causes := (await machine.rotor.why()).causes):
+            await (await machine.rotor.move_absolute(0.1)).done()
+            return []
+        if refused := await follows(machine, causes[0]):
+            return refused
+    return causes
+
+
+def test_steps_that_why_names_beside_an_open_door_say_what_to_wait_for_between_them():
+    async def shuts(machine):
+        await machine.shut_door_opens()
+        (cause,) = (await machine.rotor.why()).causes
+        return cause.remedy, await led_out(machine)
+
+    remedy, refused = operated(shuts)
+    assert remedy.startswith(
+        "set output door low, then wait until input door_closed is true, input door_ajar is false and input door_open"
+        " is false, then set output unlock low"
+    )
+    assert not refused
+
+
+@pytest.mark.parametrize("opening_s", [0.5, 0.7, 0.9])
+@pytest.mark.parametrize("asked", ["why", "the bolt", "the door"])
+@pytest.mark.sweep(3)
+def test_what_is_named_leads_out_of_a_bolt_that_has_sprung_in_beside_an_open_door(asked, opening_s):
+    async def springs(machine):
+        await machine.high("unlock")
+        await asyncio.sleep(0.6)
+        await machine.high("door")
+        await asyncio.sleep(opening_s)
+        machine.rig.faults.module_power_loss("cabinet", for_s=2)
+        await asyncio.sleep(8)
+        assert machine.part("lock") == 1.0
+        assert machine.part("door") > PLAY
+        if asked == "why":
+            return await led_out(machine)
+        with pytest.raises(InterlockViolated) as refused:
+            await (machine.low("unlock") if asked == "the bolt" else machine.high("door"))
+        if asked == "the door":
+            return [*await follows(machine, refused.value), *([] if machine.part("door") == 1.0 else ["door"])]
+        return [*await follows(machine, refused.value), *(["open"] if machine.open_or_unlocked else [])]
+
+    assert operated(springs) == []
+
+
+@pytest.mark.parametrize("open_s", [0.7, 3.0])
+def test_the_steps_that_why_names_lead_out_of_a_daemon_that_was_killed_beside_an_open_door(open_s):
+    (line,) = CENTRIFUGE.bus
+    config = CENTRIFUGE.model_copy(
+        update={"bus": (line.model_copy(update={"start": StartPolicy.ADOPT, "adopt_fallback": AdoptFallback.RESET}),)}
+    )
+
+    async def program():
+        async with simulated_rig(config) as rig:
+            await asyncio.sleep(45.0)
+            await rig.client.set_io("cabinet", low=("door", "unlock", "pin"))
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                await machine.high("unlock")
+                await asyncio.sleep(0.6)
+                await machine.high("door")
+            await asyncio.sleep(open_s)
+            await rig.kill_daemon()
+            await asyncio.sleep(2.0)
+            await rig.start_daemon()
+            await asyncio.sleep(2.0)
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = Centrifuge(rig, rotor)
+                (cause, *_) = (await rotor.why()).causes
+                return cause.remedy, await led_out(machine)
+
+    remedy, refused = run(program())
+    assert remedy.startswith('send power {"on": false} and wait until it stands')
+    assert "home" not in remedy
+    assert refused == []
+
+
 @pytest.mark.parametrize("ramp_s", [2.0, 5.0, 12.0])
 @pytest.mark.parametrize("speed", [0.3, 1.0, 5.0, 20.0])
 @pytest.mark.sweep(3)

@@ -415,7 +415,7 @@ async def test_all_requirements_that_do_not_hold_are_named():
         await refused(rig, "rotor", SPIN, f"interlock door_shut: {parts}$")
         (cause,) = (await rig.client.ask(Why(absolute=False), "rotor")).causes
         assert cause.text.endswith(parts)
-        assert cause.remedy.startswith("set output lock high, see to it that the rest holds; for service")
+        assert cause.remedy.startswith("set output lock high, then see to it that the rest holds; for service")
 
         rig.io.power(on=False, at_s=asyncio.get_running_loop().time())
         await asyncio.sleep(0.5)
