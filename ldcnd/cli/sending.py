@@ -22,7 +22,7 @@ from ldcnd.cli.typed import Finite, Quantity, WholeNumber, axis_of, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, Verb
-from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, step
+from ldcnd.contract.errors import LdcndError, SessionError, UnknownAxis, WrongState, step
 from ldcnd.contract.events import CommandStatus, ReadOutcome
 from ldcnd.contract.frozen import Frozen, attribute_docstrings
 from ldcnd.contract.meta import AxisInfo
@@ -181,7 +181,12 @@ class Sender:
             reply = await self.command(client, axis, command)
             if wait:
                 await client.wait_for_end(axis, reply.command_id)
-                await client.wait_for_rest(axis, None)  # its load may turn one whose loop is open
+                try:
+                    await client.wait_for_rest(axis)
+                except WrongState as error:  # its load may turn one whose loop is open, or it coasts
+                    show_error(error)
+                    show_lines(f"{axis}: this waits on until it stands; Ctrl-C ends the wait", err=True)
+                    await client.wait_for_rest(axis, None)
         except LdcndError as error:
             return error
         return reply

@@ -62,7 +62,13 @@ async def until_at_rest(
 
 def drive_silent(axis: str) -> OutcomeUnknown:
     """Return the error for an axis whose drive has stopped answering."""
-    return OutcomeUnknown(f"axis {axis}: the drive does not answer any more", axis=axis)
+    return OutcomeUnknown(
+        f"axis {axis}: the drive does not answer any more",
+        axis=axis,
+        remedy=Remedy(
+            "look whether it moves, check the power of the drive and its line; once it answers, {}", step("halt")
+        ),
+    )
 
 
 def motion_hidden(axis: str, state: StateSample) -> OutcomeUnknown:
@@ -74,7 +80,7 @@ def motion_hidden(axis: str, state: StateSample) -> OutcomeUnknown:
             f"{unknown}: it was taken over, and its encoder has not counted in a motion of this daemon yet",
             axis=axis,
             value=state.unseen,
-            remedy=Remedy("{}, or {} and wait until it stands", step("home"), off),
+            remedy=Remedy("{} and wait until it stands, or {} if nothing is in the way of that", off, step("home")),
         )
     look = "look whether it stands, then {}"
     return OutcomeUnknown(
@@ -88,4 +94,8 @@ def motion_hidden(axis: str, state: StateSample) -> OutcomeUnknown:
 
 def nothing_received(axis: str) -> OutcomeUnknown:
     """Return the error for an axis of which nothing has come for too long."""
-    return OutcomeUnknown(f"axis {axis}: nothing was received from it for {PATIENCE_S:g} s", axis=axis)
+    return OutcomeUnknown(
+        f"axis {axis}: nothing was received from it for {PATIENCE_S:g} s",
+        axis=axis,
+        remedy="look whether it moves, then whether the daemon runs and can be reached",
+    )

@@ -9,7 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from ldcnd.client.own_samples import Origin
-from ldcnd.client.rest import REST_S, drive_silent, until_at_rest
+from ldcnd.client.rest import PATIENCE_S, REST_S, drive_silent, nothing_received, until_at_rest
 from ldcnd.contract.codec import Encoding, decode_error, decode_received, encode
 from ldcnd.contract.commands import LONGEST_NAME, AxisCommand, Command, Effect, Stop, StopReply
 from ldcnd.contract.errors import CommandExpired, LdcndError, OutcomeUnknown, SessionError, UnknownAxis, UnknownCommand
@@ -415,22 +415,33 @@ class RigClient:
         """Wait until a command has begun and is not the axis's current one any more, and return the state after it.
 
         Raises:
-            OutcomeUnknown: the drive stopped answering.
+            OutcomeUnknown: the drive stopped answering, or nothing comes from the axis any more.
         """
-        async with self.samples(axis, TelemetryItem.STATE) as states:
-            sample: Measurement | None = await self.state(axis)
+        async with self.samples(axis) as samples:
+            state = await self.state(axis)
+
+            async def next_state() -> StateSample:
+                while True:
+                    try:
+                        async with asyncio.timeout(PATIENCE_S):
+                            _, sample = await anext(samples)
+                    except TimeoutError:
+                        raise nothing_received(axis) from None
+                    if isinstance(sample, StateSample):
+                        return sample
+
             while True:
                 waits = False
-                if isinstance(sample, StateSample):
-                    if sample.link is LinkState.DOWN:
+                if state is not None:
+                    if state.link is LinkState.DOWN:
                         raise drive_silent(axis)
-                    if sample.command is None or sample.command.command_id != command_id:
+                    if state.command is None or state.command.command_id != command_id:
                         waits = await self._waits(command_id)
                         if not waits:
-                            return sample
+                            return state
                 with suppress(TimeoutError):
                     async with asyncio.timeout(CHECK_PERIOD_S if waits else None):
-                        _, sample = await anext(states)
+                        state = await next_state()
 
     async def wait_for_rest(self, axis: str, within_s: float | None = REST_S) -> StateSample:
         """Wait until an axis stands, and return its state then; see `until_at_rest`.

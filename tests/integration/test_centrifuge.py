@@ -1180,6 +1180,70 @@ def test_a_halt_that_is_waited_for_returns_when_a_rotor_that_nothing_drives_stan
     assert (at_rest["moving"], abs(at_rest["velocity"]) < 0.5) == ("no", True)
 
 
+@pytest.mark.parametrize("then", ["halted", "seen to turn", "switched off", "silent"])
+def test_no_halt_that_is_waited_for_hangs_on_a_rotor_that_was_taken_over(monkeypatch, then):
+    (line,) = CENTRIFUGE.bus
+    config = CENTRIFUGE.model_copy(
+        update={"bus": (line.model_copy(update={"start": StartPolicy.ADOPT, "adopt_fallback": AdoptFallback.RESET}),)}
+    )
+
+    with virtual_rig(monkeypatch, config) as machine:
+        machine.wait(asyncio.sleep(41))
+        for each in ("bus set-io cabinet door=low unlock=low pin=low", "power on rotor", "home rotor --wait"):
+            assert machine.run(each).code == 0
+        assert machine.run("move rotor 600 --at-velocity --for 60").code == 0
+        machine.wait(asyncio.sleep(5))
+        machine.wait(machine.rig.begin_anew(0.5, killed=True))
+        machine.wait(asyncio.sleep(0.3 if then == "seen to turn" else 6.0))
+        if then == "switched off":
+            machine.run("power off rotor")
+        if then == "silent":
+            machine.rig.lives.faults.mute("rotor")
+            machine.wait(asyncio.sleep(1.0))
+        begun_s = machine.wait(_now_s())
+        halted = machine.run("halt rotor --wait")
+        took_s = machine.wait(_now_s()) - begun_s
+
+    assert took_s < (60.0 if then == "switched off" else 15.0)
+    assert ("this waits on until it stands" in halted.errors) is (took_s > 10.0)
+    if then == "switched off":
+        assert halted.code == 0
+    elif then == "silent":
+        assert "check the power of the drive and its line" in halted.errors
+    else:
+        assert "\n  ldcnd power off rotor and wait until it stands, or ldcnd home rotor" in halted.errors
+
+
+def test_a_command_that_is_waited_for_ends_with_what_to_do_when_its_daemon_was_killed(monkeypatch):
+    with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
+        machine.wait(asyncio.sleep(1))
+        for each in ("power on rotor", "home rotor --wait"):
+            assert machine.run(each).code == 0
+
+        async def killed():
+            await asyncio.sleep(3)
+            await machine.rig.lives.kill_daemon()
+
+        killing = machine.wait(_begun(killed()))
+        begun_s = machine.wait(_now_s())
+        moved = machine.run("move rotor 600 --at-velocity --for 60 --wait")
+        took_s = machine.wait(_now_s()) - begun_s
+        machine.wait(killing)
+        machine.wait(machine.rig.lives.start_daemon())
+
+    assert 10.0 < took_s < 30.0
+    assert "nothing was received from it for 10 s" in moved.errors
+    assert "look whether it moves" in moved.errors
+
+
+async def _begun(work):
+    return asyncio.create_task(work)
+
+
+async def _now_s():
+    return asyncio.get_running_loop().time()
+
+
 @pytest.mark.long
 def test_an_override_is_shown_by_list_and_why_with_its_rule_its_client_and_its_end(monkeypatch):
     with virtual_rig(monkeypatch, CENTRIFUGE) as machine:
