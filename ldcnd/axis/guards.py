@@ -12,7 +12,7 @@ from ldcnd.axis.status import AxisStatus
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
-from ldcnd.contract.condition import is_over, over_in_words
+from ldcnd.contract.condition import is_over, over_in_words, way_to_rest
 from ldcnd.contract.errors import (
     AccelerationLimit,
     AxisUnreachable,
@@ -95,7 +95,7 @@ def check_stands(axis: AxisTracker) -> None:
             f"axis {axis.name} is {axis.status.state.words}",
             axis=axis.name,
             value=axis.status.state,
-            remedy=Remedy("{} and wait", step("halt")),
+            remedy=way_to_rest(axis.status.state),
         )
 
 
@@ -135,7 +135,9 @@ def check_referenced(axis: AxisTracker) -> None:
         raise NotReferenced(
             f"axis {axis.name} is not homed: its position is not known{kept}",
             axis=axis.name,
-            remedy=Remedy("{} or {}", step("home"), step("set_position", "set_position")),
+            remedy=way_to_rest(axis.status.state)
+            if axis.status.state is AxisState.HOMING
+            else Remedy("{} or {}", step("home"), step("set_position", "set_position")),
         )
 
 

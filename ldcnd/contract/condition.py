@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 from enum import Enum, IntEnum, StrEnum, auto
 from typing import Protocol
 
+from ldcnd.contract.errors import Remedy, step
 from ldcnd.contract.health import AxisHealth, CertificateHealth, DaemonHealth, ModuleHealth
 from ldcnd.contract.samples import (
     UNKNOWN_HOLDER,
@@ -467,6 +468,16 @@ def assess_module(health: ModuleHealth, *, line_up: bool = True, silence: str = 
         troubles.append(Trouble(TroubleKind.FLOATING, _NOTICE, text, _FLOATS))
     alarm = Alarm(max((trouble.severity for trouble in troubles), default=_FINE))
     return Condition(Place.KNOWN, "", "answers", live=True, alarm=alarm, troubles=tuple(troubles))
+
+
+def way_to_rest(state: AxisState) -> Remedy:
+    """Return how an axis that moves comes to rest: one that does so by itself is waited for.
+
+    A search for the reference that is halted leaves no reference, and would have to begin anew.
+    """
+    if state is AxisState.HOMING:
+        return Remedy("wait until it is homed")
+    return Remedy("wait until it stands") if state is AxisState.STOPPING else Remedy("{} and wait", step("halt"))
 
 
 def is_over(fault: PastFault, active: Collection[FaultEntry], link: LinkState) -> bool:

@@ -9,8 +9,8 @@ from ldcnd.client.motion import Motion, State
 from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
-from ldcnd.contract.errors import ConfigError, LdcndError, Remedy, WrongState
-from ldcnd.contract.errors import step as remedy_step
+from ldcnd.contract.condition import way_to_rest
+from ldcnd.contract.errors import ConfigError, LdcndError, WrongState
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import IoSample, Moving, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
@@ -96,7 +96,7 @@ class SequenceRun:
                 raise WrongState(
                     f"axis {axis} is {states[axis].state.words}; sequence {self._sequence.name} has begun nothing",
                     axis=axis,
-                    remedy=Remedy("{} and wait", remedy_step("halt")),
+                    remedy=way_to_rest(states[axis].state),
                 )
 
     @property

@@ -11,7 +11,7 @@ import pytest
 
 from ldcnd.client.events import latest_events
 from ldcnd.config.rig import load_config
-from ldcnd.contract.errors import ErrorCode, InterlockViolated, LdcndError, LeaseExpired, NotReferenced
+from ldcnd.contract.errors import ErrorCode, InterlockViolated, LdcndError, LeaseExpired, NotReferenced, WrongState
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import OverrideInterlock
 from ldcnd.contract.samples import Moving, Quality
@@ -834,6 +834,20 @@ def test_the_steps_that_why_names_lead_out_of_a_daemon_that_was_killed_beside_an
     assert remedy.startswith('send power {"on": false} and wait until it stands')
     assert "home" not in remedy
     assert refused == []
+
+
+def test_who_waits_for_the_homing_under_way_as_a_refusal_says_moves_behind_it():
+    async def homes(machine):
+        await machine.rotor.set_position(0.5)
+        homing = await machine.rotor.home()
+        with pytest.raises(WrongState) as refused:
+            await machine.rotor.move_absolute(0.1)
+        causes = (await machine.rotor.why()).causes
+        await homing.done()
+        await (await machine.rotor.move_absolute(0.1)).done()
+        return {refused.value.remedy, *(each.remedy for each in causes)}
+
+    assert operated(homes) == {"wait until it is homed"}
 
 
 @pytest.mark.parametrize("ramp_s", [2.0, 5.0, 12.0])

@@ -48,8 +48,8 @@ def test_an_axis_that_stands_and_is_powered_may_move():
         ({"state": AxisState.DISABLED, "enabled": False}, WrongState, "power"),
         ({"state": AxisState.DISCRETE_MOTION}, WrongState, "halt"),
         ({"state": AxisState.CONTINUOUS_MOTION}, WrongState, "halt"),
-        ({"state": AxisState.HOMING}, WrongState, "halt"),
-        ({"state": AxisState.STOPPING}, WrongState, "halt"),
+        ({"state": AxisState.HOMING}, WrongState, "wait until it is homed"),
+        ({"state": AxisState.STOPPING}, WrongState, "wait until it stands"),
     ],
 )
 def test_a_refusal_names_the_axis_and_the_way_out(change, error, remedy):
