@@ -247,13 +247,20 @@ def is_trouble(told: ConsoleMessage) -> bool:
 @asynccontextmanager
 async def console(*endpoints: str, commission: Path | None = None) -> AsyncIterator[str]:
     """Run `ldcnd console` on a free port, for commissioning with a configuration; yields the link that it prints."""
+    async with console_process(*endpoints, commission=commission) as (_running, link):
+        yield link
+
+
+@asynccontextmanager
+async def console_process(*endpoints: str, commission: Path | None = None) -> AsyncIterator[tuple[Process, str]]:
+    """Run it likewise; yields its process, too."""
     connect = [word for endpoint in endpoints for word in ("-e", endpoint)]
     more = ["--commission", str(commission)] if commission else []
     async with process("console", *connect, *more, "--listen", "127.0.0.1:0", "--json") as running:
         assert running.stdout
         async with asyncio.timeout(PATIENCE_S):
             told = await running.stdout.readline()
-        yield json.loads(told)["link"]
+        yield running, json.loads(told)["link"]
 
 
 @asynccontextmanager

@@ -51,8 +51,28 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
       onKeyDown=${(event) => event.repeat && event.key === "Enter" && event.preventDefault()}
     >${children}</button>
     ${obstacle && !reason && html`<small class="reason" id=${own}>${obstacle}</small>`}
+    ${calms && underWay && html`<${NoAnswerYet} what=${wordsOf(children)} />`}
     <${RefusalText} refusal=${refusal} />
   </span>`;
+}
+
+/** The visible words on a button. */
+function wordsOf(children) {
+  return [children].flat().filter((each) => typeof each === "string").join("");
+}
+
+/** Every answer of a console, a daemon and drives that are well has come by then; a person who waits goes by what is said. */
+const LATE_MS = 400;
+
+/** What is said of a press that takes energy out while its answer is late: it may not even have gone out. */
+export function NoAnswerYet({ what }) {
+  const [late, setLate] = useState(false);
+  useEffect(() => {
+    const timer = setTimeout(() => setLate(true), LATE_MS);
+    return () => clearTimeout(timer);
+  }, []);
+  return html`<span class="refusal" role="alert">${late && html`<span class="mark" data-level="bad">${what}: no answer yet, it
+    may not have got through. If the machine moves, use the emergency stop.</span>`}</span>`;
 }
 
 /** Presses of a button that takes energy out: done when a finger comes down.

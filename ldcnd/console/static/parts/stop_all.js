@@ -1,11 +1,11 @@
 /** The stop of every page: a button and a key, and what came of it. It is software, no emergency stop, and says so. */
 
-import { html, useEffect, useState } from "../html.js";
+import { html, useEffect, useRef, useState } from "../html.js";
 import { askAtOnce, rigPath } from "../session/api.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { rigs } from "../session/rigs.js";
-import { Action, useAtOnce } from "./controls.js";
+import { Action, NoAnswerYet, useAtOnce } from "./controls.js";
 import { clock, sentence } from "./format.js";
 
 const KEY = "Escape";
@@ -19,15 +19,18 @@ export function stopAxis(axis) {
 /** The button and the key. What came of a stop is in the states of the axes: `Stops` shows that, whoever has stopped. */
 export function StopAll() {
   const [report, setReport] = useState(null);
+  const latest = useRef(0);
 
   async function stop() {
-    setReport({ at: Date.now() * 1e6, text: "Stop sent; waiting for the drives.", lines: [] });
+    const press = (latest.current += 1);
     const at = Date.now() * 1e6;
+    setReport({ at, press, waits: true, lines: [] });
+    const tell = (lines) => press === latest.current && setReport({ at, lines }); // the answer to a later press says more
     try {
       const { rigs: replies } = await askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
-      setReport({ at, lines: Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)) });
+      tell(Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)));
     } catch (error) {
-      setReport({ at, lines: [{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad" }] });
+      tell([{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad" }]);
     }
   }
 
@@ -47,7 +50,7 @@ export function StopAll() {
   useEffect(() => {
     if (left) setReport((last) => last && { ...last, lines: last.lines.filter(isNews) });
   }, [left]);
-  const shown = Boolean(report?.text) || lines.length > 0;
+  const shown = Boolean(report?.waits) || lines.length > 0;
   const presses = useAtOnce(stop);
   return html`<div class="stop-all">
     <button type="button" class="stop" aria-keyshortcuts=${KEY} ...${presses}>
@@ -57,7 +60,7 @@ export function StopAll() {
       ${
         shown &&
         html`<p class="quiet">Stop at ${clock(report.at)}</p>
-        ${report.text && html`<p>${report.text}</p>`}
+        ${report.waits && html`<p>Sent to the console.</p><${NoAnswerYet} key=${report.press} what="Stop all axes" />`}
         ${lines.map((line) => html`<p class="mark" data-level=${line.level}>${line.text}</p>`)}
         <button type="button" class="plain" onClick=${() => setReport(null)}>Dismiss</button>`
       }

@@ -19,7 +19,7 @@ export function PlaceAndTarget({ axis }) {
 /** The strip of the page of an axis. Anyone may end a motion, with or without control.
  *
  * What came of that is in the state of the axis. For a page to which nothing comes any more the answer is shown, until
- * the axis has told anything since; that none has come yet is shown, too.
+ * the axis has told anything since.
  */
 export function AxisStrip({ axis }) {
   const toHalt = obstacle(axis, "halt");
@@ -30,7 +30,7 @@ export function AxisStrip({ axis }) {
     return {
       act: async () => {
         const at = clock(Date.now() * 1e6);
-        tell(`${what} sent at ${at}: no answer yet.`);
+        setTold(null); // what the press before was answered is no answer to this one
         tell(`${what} at ${at}: ${came(await act())}.`);
       },
       onRefused: (error) => tell(`${what} did not get through: ${sentence(error.message)} Use the emergency stop.`, true),

@@ -5,21 +5,26 @@ import { decode } from "../vendor/msgpack/decode.mjs";
 const RATE_HZ = 10;
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 4_000;
-/** A frame comes at least twice a second: so much silence means that the console process, or the way to it, is gone. */
-const SILENCE_MS = 2_000;
+/** A frame comes at least twice a second. Behind so much silence no value of a page stands as a present one. */
+const SILENCE_MS = 1_000;
+/** So much means that the console process, or the way to it, is gone: another socket is tried. */
+const GONE_MS = 3_000;
 
 /** A feed hands entries on as they come; who listens decides what is kept. */
 export class Feed {
   /** Samples that the console process had to drop for this page, because it was too slow. */
   dropped = 0;
-  /** Whether a socket is open and has brought a frame. */
-  live = false;
-
   #listeners = new Set();
   #streams = [];
   #socket = null;
   #silence = 0;
+  #heardAtMs = -Infinity;
   #pauseMs = FIRST_PAUSE_MS;
+
+  /** Whether the latest frame is young enough: by the clock, so that a page that slept has no old values when it wakes. */
+  get live() {
+    return performance.now() - this.#heardAtMs < SILENCE_MS;
+  }
 
   /** Call `listener(rig, topic, sample)` for every entry; returns what ends that. */
   listen(listener) {
@@ -55,14 +60,19 @@ export class Feed {
   }
 
   #take([_sentNs, dropped, entries]) {
-    this.live = true;
+    this.#heardAtMs = performance.now();
     clearTimeout(this.#silence);
-    this.#silence = setTimeout(() => this.#giveUp(), SILENCE_MS);
+    this.#silence = setTimeout(() => this.#fallSilent(), SILENCE_MS);
     this.#pauseMs = FIRST_PAUSE_MS;
     this.dropped = dropped;
     for (const [rig, topic, sample] of entries) {
       for (const listener of this.#listeners) listener(rig, topic, sample);
     }
+  }
+
+  #fallSilent() {
+    this.#silence = setTimeout(() => this.#giveUp(), GONE_MS - SILENCE_MS);
+    for (const listener of this.#listeners) listener(null, "silent", null);
   }
 
   #giveUp() {
@@ -73,7 +83,7 @@ export class Feed {
   }
 
   #lost() {
-    this.live = false;
+    this.#heardAtMs = -Infinity;
     clearTimeout(this.#silence);
     for (const listener of this.#listeners) listener(null, "lost", null);
     setTimeout(() => this.open(), this.#pauseMs);
