@@ -4,7 +4,7 @@ import { html, useEffect, useRef, useState } from "../html.js";
 import { askAtOnce, rigPath } from "../session/api.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
-import { rigs } from "../session/rigs.js";
+import { axesOf, rigs } from "../session/rigs.js";
 import { Action, NoAnswerYet, useAtOnce } from "./controls.js";
 import { clock, sentence } from "./format.js";
 
@@ -27,7 +27,8 @@ export function StopAll() {
     setReport({ at, press, waits: true, lines: [] });
     const tell = (lines) => press === latest.current && setReport({ at, lines }); // the answer to a later press says more
     try {
-      const { rigs: replies } = await askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
+      const answer = askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
+      const [{ rigs: replies }] = await Promise.all([answer, ...axesOf().map((axis) => axis.afterPress(answer))]);
       tell(Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)));
     } catch (error) {
       tell([{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad" }]);
@@ -90,7 +91,9 @@ function StopsOf({ rig }) {
   const latched = axes.filter(({ state }) => !state.stop_pending);
   const unread = latched.filter(({ state }) => state.was_read === false);
   const read = latched.filter(({ state }) => state.was_read !== false);
-  const [moving, stopped] = [true, false].map((is) => read.filter(({ state }) => (state.moving === "yes") === is));
+  const stopped = read.filter((axis) => axis.isStopped);
+  const moving = read.filter((axis) => axis.condition.live && axis.state.moving === "yes");
+  const unseen = read.filter((axis) => !stopped.includes(axis) && !moving.includes(axis));
   if (!axes.length) return null;
   // what no stop reaches goes on beside the others where all of those were to stop
   const all = [...rig.axes.values()].filter((axis) => axis.info);
@@ -100,9 +103,10 @@ function StopsOf({ rig }) {
   const of = rigs.size > 1 ? `${rig.name}: ` : "";
   const ready = latched.filter((axis) => obstacle(axis, "reset") === null);
   const reset = () => Promise.all(ready.map((axis) => command(axis, "reset")));
-  return html`<p class="notice mark stops" data-level=${pending.length || going.length ? "bad" : "warn"}>
+  return html`<p class="notice mark stops" data-level=${pending.length || going.length || unseen.some(({ condition }) => !condition.live) ? "bad" : "warn"}>
     ${pending.length > 0 && html`<span>${of}stop NOT confirmed by ${named(pending)}: use the machine’s emergency stop.</span> `}
     ${moving.length > 0 && html`<span>${of}stop latched, moving still: ${named(moving)}.</span> `}
+    ${unseen.length > 0 && html`<span>${of}stop latched, not seen to stand: ${named(unseen)}.</span> `}
     ${unread.length > 0 && html`<span>${of}stop latched, drive not read yet: ${named(unread)}.</span> `}
     ${stopped.length > 0 && html`<span>${of}stopped and latched: ${named(stopped)}.${axes.length < all.length ? "" : " Nothing moves before Reset."}</span> `}
     ${free.length > 0 && html`<span>No stop reaches ${named(free)}${going.length ? `; ${named(going)} may move: emergency stop` : ""}.</span> `}

@@ -31,7 +31,7 @@ export function AxisStrip({ axis }) {
       act: async () => {
         const at = clock(Date.now() * 1e6);
         setTold(null); // what the press before was answered is no answer to this one
-        tell(`${what} at ${at}: ${came(await act())}.`);
+        tell(`${what} at ${at}: ${came(await axis.afterPress(act()))}.`);
       },
       onRefused: (error) => tell(`${what} did not get through: ${sentence(error.message)} Use the emergency stop.`, true),
     };

@@ -36,6 +36,11 @@ export class Axis {
   /** How often its units have changed: what was typed before means something else now. */
   unitChanges = 0;
   #outNs = 0;
+  /** When the latch that stands was first told of, and a press that ends motions was answered last; how many are not yet. */
+  #latchedNs = 0;
+  #answeredNs = 0;
+  #unanswered = 0;
+  #readNs = 0;
   #info = null;
   #units = null;
   #told = {};
@@ -111,8 +116,33 @@ export class Axis {
     return this.bus?.health?.axes.find((each) => each.axis === this.name) ?? null;
   }
 
+  /** Whether it stands under its latch, as its drive has shown since the latest press that this page knows of.
+   *
+   * The daemon latches at once and the drive confirms later, or never: what was read before says nothing about that.
+   */
+  get isStopped() {
+    const { state } = this;
+    if (!state?.stop_latched || state.stop_pending || this.#unanswered > 0) return false;
+    const answers = this.condition.live && state.link === "up" && state.was_read !== false;
+    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.#answeredNs);
+  }
+
+  /** Return the answer to a press that ends motions; nothing that was read before it shows that the axis stands. */
+  async afterPress(answer) {
+    this.#unanswered += 1;
+    try {
+      return await answer;
+    } finally {
+      this.#unanswered -= 1;
+      this.#answeredNs = this.rig.nowNs();
+      changed();
+    }
+  }
+
   take(item, sample) {
     const [kind, monitor] = item.split("/");
+    if (item === "state" && sample?.stop_latched && !this.state?.stop_latched) this.#latchedNs = sample.t;
+    if (item === "position" && sample && sample.quality !== "bad") this.#readNs = sample.t;
     if (item === "state" && sample?.state !== this.state?.state) this.refusal = null; // of a state that is over
     if (kind === "monitor") this.#keep(this.monitors, monitor, sample);
     else if (item === "trace") this.trace = sample;
