@@ -1,15 +1,16 @@
 """No page calls an axis stopped before its drive has shown it: a latch is the daemon's, and says nothing of a shaft."""
 
 import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 
 import pytest
 
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import MoveVelocity, Power
-from ldcnd.contract.samples import LinkState
 from ldcnd.net.zenoh_session import open_zenoh_session
 from ldcnd.net.zenoh_settings import ZenohSettings
-from ldcnd.testing import served_rig
+from ldcnd.testing import ServedRig, served_rig
 from tests.support.process import ROOT
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
@@ -35,9 +36,9 @@ LISTEN = """() => {
 """Gather everything that the strip says of stops."""
 
 
-@pytest.mark.parametrize("press", ["Escape", "Stop x", "Quick stop"])
-@pytest.mark.parametrize("moves", ["x", "z"])
-async def test_a_drive_that_does_not_answer_is_at_no_instant_called_stopped(house, press, moves):
+@asynccontextmanager
+async def looking_at_x(house) -> AsyncIterator[tuple[ServedRig, RigClient, object]]:
+    """Show x on a page; yields its rig, whose drives can fail, a client of it, and the page."""
     with served_rig(ROOT / "config" / "simulated.toml") as rig:
         settings = ZenohSettings(mode="client", connect=(rig.endpoint,))
         async with (
@@ -45,38 +46,47 @@ async def test_a_drive_that_does_not_answer_is_at_no_instant_called_stopped(hous
             house_of.console_process(rig.endpoint) as (_, link),
             await house.browser.new_context(reduced_motion="reduce") as context,
         ):
-            client = RigClient(session, "sim")
             page = await context.new_page()
             await page.goto(link)
             await page.goto(f"{link.partition('/?')[0]}/#/axis/sim/x")
             await expect(page.locator(".now-state")).to_contain_text("good")
-            await client.command(moves, Power(on=True))
-            await client.command(moves, MoveVelocity(velocity=2))
-            rig.until(lambda each: abs(each.truth(moves).velocity) > 1)
-            await page.evaluate(LISTEN)
+            yield rig, RigClient(session, "sim"), page
 
-            rig.ask(lambda each: each.faults.mute("x"))
-            if press == "Escape":
-                await page.keyboard.press(press)
-            else:
-                await page.get_by_role("button", name=press).click()
-            await expect(page.locator(".stops")).to_contain_text("stop NOT confirmed by x")
-            if press == "Escape":
-                await expect(page.locator(".stops")).to_contain_text(re.compile(r"stopped and latched: [^.]*\bz\b"))
-            said = await page.evaluate("() => window.said")
-            assert not [each for each in said if re.search(r"stopped and latched: [^.]*\bx\b", each)], said
+
+async def called_stopped(page) -> list[str]:
+    """Return what the strip has said while it called x stopped."""
+    said = await page.evaluate("() => window.said")
+    return [each for each in said if re.search(r"stopped and latched: [^.]*\bx\b", each)]
+
+
+@pytest.mark.parametrize("press", ["Escape", "Stop x", "Quick stop"])
+@pytest.mark.parametrize("moves", ["x", "z"])
+async def test_a_drive_that_does_not_answer_is_at_no_instant_called_stopped(house, press, moves):
+    async with looking_at_x(house) as (rig, client, page):
+        await client.command(moves, Power(on=True))
+        await client.command(moves, MoveVelocity(velocity=2))
+        rig.until(lambda each: abs(each.truth(moves).velocity) > 1)
+        await page.evaluate(LISTEN)
+
+        rig.ask(lambda each: each.faults.mute("x"))
+        if press == "Escape":
+            await page.keyboard.press(press)
+        else:
+            await page.get_by_role("button", name=press).click()
+        await expect(page.locator(".stops")).to_contain_text("stop NOT confirmed by x")
+        if press == "Escape":
+            await expect(page.locator(".stops")).to_contain_text(re.compile(r"stopped and latched: [^.]*\bz\b"))
+        assert not await called_stopped(page)
 
 
 async def test_a_second_press_is_not_answered_by_what_was_read_before_it(house):
-    await house.sim.quiet("x", "y", "z", "c")
-    async with house.desk() as desk:
-        await desk.open("axis/sim/x")
-        stops = desk.page.locator(".stops").filter(has_text="sim")
-        await desk.page.keyboard.press("Escape")
+    async with looking_at_x(house) as (rig, _, page):
+        stops = page.locator(".stops")
+        await page.keyboard.press("Escape")
         await expect(stops).to_contain_text("stopped and latched: x, y, z, c")
-        await desk.page.route("**/api/stop", lambda _route: None)  # it is never answered
-        await desk.page.keyboard.press("Escape")
-        await expect(stops).to_contain_text("not seen to stand: x, y, z, c")
-        assert (await house.sim.rig.state("x")).link is LinkState.UP
-    await house.sim.quiet("x", "y", "z", "c")
-    await house.mixed.quiet("x")
+        rig.ask(lambda each: each.faults.mute("x"))
+        await page.keyboard.press("Escape")
+        await expect(stops).to_contain_text("not seen to stand: x")
+        await page.evaluate(LISTEN)
+        await expect(stops).to_contain_text("stop NOT confirmed by x")
+        assert not await called_stopped(page)

@@ -28,7 +28,8 @@ export function StopAll() {
     const tell = (lines) => press === latest.current && setReport({ at, lines }); // the answer to a later press says more
     try {
       const answer = askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
-      const [{ rigs: replies }] = await Promise.all([answer, ...axesOf().map((axis) => axis.afterPress(answer))]);
+      for (const axis of axesOf()) axis.notePress();
+      const { rigs: replies } = await answer;
       tell(Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)));
     } catch (error) {
       tell([{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad" }]);

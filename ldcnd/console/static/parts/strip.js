@@ -30,8 +30,9 @@ export function AxisStrip({ axis }) {
     return {
       act: async () => {
         const at = clock(Date.now() * 1e6);
+        axis.notePress();
         setTold(null); // what the press before was answered is no answer to this one
-        tell(`${what} at ${at}: ${came(await axis.afterPress(act()))}.`);
+        tell(`${what} at ${at}: ${came(await act())}.`);
       },
       onRefused: (error) => tell(`${what} did not get through: ${sentence(error.message)} Use the emergency stop.`, true),
     };

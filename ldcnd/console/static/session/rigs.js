@@ -36,10 +36,9 @@ export class Axis {
   /** How often its units have changed: what was typed before means something else now. */
   unitChanges = 0;
   #outNs = 0;
-  /** When the latch that stands was first told of, and a press that ends motions was answered last; how many are not yet. */
+  /** When the latch that stands was first told of, when this page was pressed last to end motions, and the last reading. */
   #latchedNs = 0;
-  #answeredNs = 0;
-  #unanswered = 0;
+  #pressedNs = 0;
   #readNs = 0;
   #info = null;
   #units = null;
@@ -122,21 +121,15 @@ export class Axis {
    */
   get isStopped() {
     const { state } = this;
-    if (!state?.stop_latched || state.stop_pending || this.#unanswered > 0) return false;
+    if (!state?.stop_latched || state.stop_pending) return false;
     const answers = this.condition.live && state.link === "up" && state.was_read !== false;
-    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.#answeredNs);
+    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.#pressedNs);
   }
 
-  /** Return the answer to a press that ends motions; nothing that was read before it shows that the axis stands. */
-  async afterPress(answer) {
-    this.#unanswered += 1;
-    try {
-      return await answer;
-    } finally {
-      this.#unanswered -= 1;
-      this.#answeredNs = this.rig.nowNs();
-      changed();
-    }
+  /** Note a press that is to end its motion: nothing that was read before it shows that the axis stands. */
+  notePress() {
+    this.#pressedNs = this.rig.nowNs();
+    changed();
   }
 
   take(item, sample) {
