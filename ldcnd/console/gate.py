@@ -45,13 +45,14 @@ WEBSOCKET_POLICY_VIOLATION = 1008
 
 STRANGER_PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>ldcnd console</title>
-<link rel="stylesheet" href="/static/style/base.css"></head>
+<link rel="stylesheet" href="/static/style/base.css"><script src="/static/again.js"></script></head>
 <body><main><h1>This browser is not let in yet</h1>
 <p>Open the console with the link that <code>ldcnd console</code> prints when it starts. A link works once, within ten
 minutes. For another one, press <i>Let another browser in</i> on a page that is open, or send the console's process the
 signal USR1: it then prints one.</p>
 <p>If you came here by a link just now, <a href="/">try once more</a>.</p></main></body></html>
 """
+"""Its script asks once more: cookies that are strict do not come with a request that another site has led to."""
 
 
 class RequestGate:

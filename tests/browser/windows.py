@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.async_api import CDPSession, Page
+from playwright.async_api import CDPSession, Error, Page
 
 from tests.browser.house import House, console
 from tests.support.marionette import CONTROL, DELETE, ENTER, ESCAPE, SHIFT, TAB, Firefox, firefox, open_firefox
@@ -52,8 +52,13 @@ class Chromium:
 
     # Any: what JSON holds
     async def evaluate(self, script: str, *arguments: object) -> Any:
-        """Return what a function of JavaScript returns."""
-        return await self._page.evaluate(f"(given) => ({script})(...given)", list(arguments))
+        """Return what a function of JavaScript returns; a page that goes meanwhile leaves the question to the next one."""
+        while True:
+            try:
+                return await self._page.evaluate(f"(given) => ({script})(...given)", list(arguments))
+            except Error as error:
+                if "context was destroyed" not in error.message:
+                    raise
 
     async def keys(self, *strokes: str, pause_ms: int = 0) -> None:
         """Press keys one after another; several characters in one stroke are held together."""
@@ -145,7 +150,7 @@ async def gecko_with(cookies: Iterable[Mapping[str, Any]], url: str, folder: Pat
     async with open_firefox(program, folder) as window:
         await window.open(f"{url}/")
         for cookie in cookies:
-            given = {"name": cookie["name"], "value": cookie["value"], "path": "/", "httpOnly": cookie["httpOnly"]}
+            given = {"path": "/"} | {name: cookie[name] for name in ("name", "value", "httpOnly", "sameSite")}
             await window.command("WebDriver:AddCookie", cookie=given)
         yield window
 

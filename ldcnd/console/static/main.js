@@ -179,6 +179,9 @@ for (const kind of ["dragover", "drop"]) {
   });
 }
 
+// a browser that came by a link on another site has asked twice: `again.js`
+if (location.search) history.replaceState(null, "", `${location.pathname}${location.hash}`);
+
 watch();
 keepControl();
 render(html`<${Console} />`, document.getElementById("console"));
