@@ -1,4 +1,4 @@
-"""A link to the console on another page leads a browser that is logged in to where it points, and a stranger nowhere."""
+"""A link to the console on another page leads a browser that is logged in to where it points, a stranger nowhere."""
 
 import pytest
 

@@ -11,11 +11,19 @@ import pytest
 from playwright.async_api import CDPSession, Error, Page
 
 from tests.browser.house import House, console
-from tests.support.marionette import CONTROL, DELETE, ENTER, ESCAPE, SHIFT, TAB, Firefox, firefox, open_firefox
+from tests.support.marionette import CONTROL, DELETE, DOWN, ENTER, ESCAPE, SHIFT, TAB, Firefox, firefox, open_firefox
 
 __all__ = ["PRESS", "PRESSABLE", "Chromium", "Window", "console", "gecko_with", "open_chromium", "open_gecko", "until"]
 PATIENCE_S = 45.0
-NAMED = {CONTROL: "Control", DELETE: "Delete", ENTER: "Enter", TAB: "Tab", ESCAPE: "Escape", SHIFT: "Shift"}
+NAMED = {
+    CONTROL: "Control",
+    DELETE: "Delete",
+    DOWN: "ArrowDown",
+    ENTER: "Enter",
+    TAB: "Tab",
+    ESCAPE: "Escape",
+    SHIFT: "Shift",
+}
 
 
 PRESSABLE = """(text) => [...document.querySelectorAll("main button")].some(
@@ -52,7 +60,7 @@ class Chromium:
 
     # Any: what JSON holds
     async def evaluate(self, script: str, *arguments: object) -> Any:
-        """Return what a function of JavaScript returns; a page that goes meanwhile leaves the question to the next one."""
+        """Return what a function of JavaScript returns; of a page that goes meanwhile the next one is asked."""
         while True:
             try:
                 return await self._page.evaluate(f"(given) => ({script})(...given)", list(arguments))

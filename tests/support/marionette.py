@@ -19,6 +19,7 @@ CONTROL = "\ue009"
 DELETE = "\ue017"
 ENTER = "\ue007"
 ESCAPE = "\ue00c"
+DOWN = "\ue015"
 SHIFT = "\ue008"
 TAB = "\ue004"
 NARROWEST = 640

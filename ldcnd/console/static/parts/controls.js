@@ -160,15 +160,24 @@ export function enterSends(event) {
   event.currentTarget.closest(".panel").querySelector("button.main").click();
 }
 
+/** Keys that open a list, in one browser or the other. */
+const OPENS = [" ", "Enter", "ArrowDown", "ArrowUp", "F4"];
+const MOST_LISTED = 12;
+
 /** A labelled choice; `options` are pairs of value and text.
 
  * It shows what `value` is: one that is not among the options, or not any more, stands there as `missing`. While the list
  * has the focus, and so may be open, its options stay as they are.
+ *
+ * The page opens the list itself, in its place: one that the browser opens keeps Escape to itself, and nothing would stop.
+ * A finger opens that of the browser, without which a phone shows none.
  */
 export function Choice({ label, options, value, onChange, hint, missing }) {
   const id = useId();
   const list = useRef();
   const shown = useRef(options);
+  const by = useRef({ finger: false, opened: false });
+  const [open, setOpen] = useState(false);
   if (document.activeElement !== list.current || !list.current) shown.current = options;
   const wanted = `${value ?? ""}`;
   const known = shown.current.some(([each]) => `${each}` === wanted);
@@ -176,13 +185,55 @@ export function Choice({ label, options, value, onChange, hint, missing }) {
   useLayoutEffect(() => {
     list.current.value = wanted;
   }, [wanted, shown.current]);
+  useLayoutEffect(() => {
+    if (open) list.current.scrollIntoView({ block: "nearest" });
+  }, [open]);
+
+  function show() {
+    list.current.parentElement.style.height = `${list.current.offsetHeight}px`; // what is below stays where it is
+    list.current.focus();
+    setOpen(true);
+  }
+  function close(taken) {
+    if (!open) return;
+    list.current.parentElement.style.height = "";
+    setOpen(false);
+    if (taken && list.current.value !== wanted) onChange(list.current.value);
+    else list.current.value = wanted;
+  }
+  const pressed = (event) => {
+    const { key, altKey } = event;
+    if (!open && OPENS.includes(key)) show();
+    else if (open && (key === "Enter" || key === " " || key === "F4" || (altKey && key === "ArrowUp"))) close(true);
+    else {
+      if (key === "Tab") close(true);
+      if (key === "Escape") close(false);
+      return;
+    }
+    event.preventDefault();
+  };
   return html`<div class="field">
     <label for=${id}>${label}</label>
-    <select id=${id} ref=${list} autocomplete="off" aria-describedby=${hint ? `${id}-hint` : null}
-      onChange=${(event) => onChange(event.target.value)} onBlur=${() => redraw((count) => count + 1)}>
+    <span class="choice" data-open=${open ? "yes" : "no"}><select id=${id} ref=${list} autocomplete="off" aria-describedby=${hint ? `${id}-hint` : null}
+      size=${open ? Math.max(2, Math.min(MOST_LISTED, shown.current.length + (known ? 0 : 1))) : 0}
+      onChange=${(event) => !open && onChange(event.target.value)} onKeyDown=${pressed}
+      onPointerDown=${(event) => {
+        by.current = { finger: event.pointerType === "touch", opened: false };
+      }}
+      onMouseDown=${(event) => {
+        if (open || event.button !== 0 || by.current.finger) return;
+        event.preventDefault();
+        by.current.opened = true;
+        show();
+      }}
+      onClick=${(event) => event.target.tagName === "OPTION" && !by.current.opened && close(true)}
+      onBlur=${() => {
+        close(false);
+        redraw((count) => count + 1);
+      }}>
       ${!known && html`<option key=" missing" value=${wanted} disabled>${missing ?? (wanted ? `${wanted}: not there any more` : "")}</option>`}
       ${shown.current.map(([each, text]) => html`<option key=${each} value=${each}>${text}</option>`)}
-    </select>
+    </select></span>
     ${hint && html`<small id=${`${id}-hint`}>${hint}</small>`}
   </div>`;
 }

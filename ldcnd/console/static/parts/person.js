@@ -61,11 +61,10 @@ function TextQuestion({ question, answer }) {
     <div class="field">
       <label for=${id}>${question.text}</label>
       <input id=${id} ref=${field} type="text" inputmode=${question.kind === "number" ? "decimal" : null} maxlength="400"
-        autocomplete="off" list=${likely.length ? `${id}-likely` : null} value=${text}
+        autocomplete="off" value=${text}
         onInput=${({ target }) => setText(target.value)} />
-      ${likely.length > 0 && html`<datalist id=${`${id}-likely`}>
-        ${likely.map(({ word }) => html`<option value=${word}></option>`)}</datalist>`}
     </div>
+    ${likely.map(({ word }) => html`<button key=${word} type="button" class="plain" onClick=${() => setText(word)}>${word}</button>`)}
     <button class="main" disabled=${fresh}>Answer</button>
   </form>`;
 }
