@@ -28,7 +28,7 @@ OPTION = f"""(text) => {{
   return [x + width / 2, y + height / 2];
 }}"""
 CHOSEN = f"() => {LIST}.selectedOptions[0].text"
-FIELD = """() => [...document.querySelectorAll(".panel")].find((each) => each.querySelector("h2").textContent === "Move")
+FIELD = """() => [...document.querySelectorAll(".panel")].find((each) => each.innerText.startsWith("Move"))
   .querySelector("input").labels[0].textContent"""
 FOCUS = f"() => {LIST}.focus()"
 BELOW = f"() => {LIST}.closest('.panel').querySelector('button.main').getBoundingClientRect().top"

@@ -153,6 +153,48 @@ async def test_what_is_told_of_a_stop_lies_over_nothing_that_ends_a_motion(house
         await expect(report).to_be_hidden()
 
 
+@pytest.mark.parametrize("width", [1366, 1000])
+async def test_what_is_told_of_a_stop_covers_nothing_of_the_page_and_goes_once_all_axes_are_seen_to_stand(house, width):
+    await house.sim.quiet("x")
+    failed = {"rigs": {"sim": {"status": "error", "message": "no answer"}}}
+
+    async def unanswered(route):
+        await route.fetch()
+        await route.fulfill(json=failed)
+
+    async with house.desk() as desk:
+        await desk.page.set_viewport_size({"width": width, "height": 768})
+        await desk.open("axis/sim/x")
+        report = desk.page.locator(".stop-report")
+        await desk.page.route("**/api/stop", lambda route: route.fulfill(json=failed))
+        await desk.page.keyboard.press("Escape")
+        await expect(report).to_contain_text("sim: not stopped: no answer. Use the emergency stop.")
+        box = await report.bounding_box()
+        header = await desk.page.locator("header.frame").bounding_box()
+        assert box["y"] + box["height"] <= header["y"] + header["height"] + 1
+        assert (await desk.page.locator("main").bounding_box())["y"] >= box["y"] + box["height"] - 1
+
+        await desk.page.unroute("**/api/stop")
+        await desk.page.route("**/api/stop", unanswered)
+        await desk.page.keyboard.press("Escape")
+        await house.sim.until("x", lambda state: state.stop_latched)
+        await expect(report).to_have_attribute("data-shown", "no")
+    await house.sim.quiet("x", "y", "z", "c")
+    await house.mixed.quiet("x")
+
+
+@pytest.mark.parametrize("place", ["rig", "axis/sim/x"])
+async def test_on_a_phone_on_its_side_the_header_leaves_the_page_two_thirds(house, place):
+    await house.sim.quiet("x", "y", "z", "c")
+    await house.mixed.quiet("x")
+    async with house.desk(width=844, height=390) as desk:
+        await desk.open(place)
+        await expect(desk.page.locator("tr[data-axis=x], .big").first).to_be_visible()
+        await expect(desk.page.locator(".notices .notice")).to_have_count(0)
+        assert (await desk.page.locator("header.frame").bounding_box())["height"] <= 390 / 3
+        assert await desk.page.get_by_role("button", name="Stop all axes").bounding_box()
+
+
 async def test_a_fault_is_shown_with_its_remedy_and_the_remedy_helps(house):
     await house.sim.quiet("z")
     async with house.desk() as desk:

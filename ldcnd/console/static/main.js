@@ -15,7 +15,7 @@ import { problems } from "./parts/problems.js";
 import { Mark } from "./parts/state.js";
 import { AxisStrip, PlaceAndTarget } from "./parts/strip.js";
 import { overrideOf, slowed } from "./pages/rig_speed.js";
-import { StopAll, Stops } from "./parts/stop_all.js";
+import { StopAll, StopReport, Stops } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
 import { loginIsGone } from "./session/api.js";
 import { feed } from "./session/feed.js";
@@ -166,6 +166,7 @@ function Console() {
       </div>
       <${Strip} at=${at} />
       <${Notices} />
+      <${StopReport} />
     </header>
     <main id="main" tabindex="-1" ref=${main}>
       <${Guarded} key=${`${location.hash} ${rigs.get(at.rig)?.axes.get(at.axis)?.unitChanges ?? 0}`}><${Page} at=${at} /><//>

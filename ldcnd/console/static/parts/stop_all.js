@@ -1,10 +1,10 @@
 /** The stop of every page: a button and a key, and what came of it. It is software, no emergency stop, and says so. */
 
-import { html, useEffect, useRef, useState } from "../html.js";
+import { html, useEffect } from "../html.js";
 import { askAtOnce, rigPath } from "../session/api.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
-import { axesOf, rigs } from "../session/rigs.js";
+import { axesOf, changed, rigs } from "../session/rigs.js";
 import { Action, NoAnswerYet, useAtOnce } from "./controls.js";
 import { clock, sentence } from "./format.js";
 
@@ -16,26 +16,32 @@ export function stopAxis(axis) {
   return askAtOnce(`${rigPath(axis.rig.name)}/stop`, { axis: axis.name }, { patienceMs: PATIENCE_MS });
 }
 
-/** The button and the key. What came of a stop is in the states of the axes: `Stops` shows that, whoever has stopped. */
-export function StopAll() {
-  const [report, setReport] = useState(null);
-  const latest = useRef(0);
+/** What came of the last press of this page; null before the first, and once it is dismissed. */
+let report = null;
+let presses = 0;
 
-  async function stop() {
-    const press = (latest.current += 1);
-    const at = Date.now() * 1e6;
-    setReport({ at, press, waits: true, lines: [] });
-    const tell = (lines) => press === latest.current && setReport({ at, lines }); // the answer to a later press says more
-    try {
-      const answer = askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
-      for (const axis of axesOf()) axis.notePress();
-      const { rigs: replies } = await answer;
-      tell(Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)));
-    } catch (error) {
-      tell([{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad" }]);
-    }
+function setReport(told) {
+  report = told;
+  changed();
+}
+
+async function stop() {
+  const press = (presses += 1);
+  const at = Date.now() * 1e6;
+  setReport({ at, press, waits: true, lines: [] });
+  const tell = (lines) => press === presses && setReport({ at, lines }); // the answer to a later press says more
+  try {
+    const answer = askAtOnce("/api/stop", {}, { patienceMs: PATIENCE_MS, keepalive: true });
+    for (const axis of axesOf()) axis.notePress();
+    const { rigs: replies } = await answer;
+    tell(Object.entries(replies).map(([rig, reply]) => outcome(rig, reply)));
+  } catch (error) {
+    tell([{ text: `The stop did not get through: ${sentence(error.message)} Use the emergency stop.`, level: "bad", failed: [...rigs.keys()] }]);
   }
+}
 
+/** The button and the key. */
+export function StopAll() {
   useEffect(() => {
     const pressed = (event) => {
       if (event.key !== KEY || event.repeat) return;
@@ -45,37 +51,42 @@ export function StopAll() {
     addEventListener("keydown", pressed, true);
     return () => removeEventListener("keydown", pressed, true);
   }, []);
-
-  // what a rig publishes now says more than what it answered then, and goes on to when it falls silent later
-  const lines = report?.lines.filter(isNews) ?? [];
-  const left = report && lines.length < report.lines.length;
-  useEffect(() => {
-    if (left) setReport((last) => last && { ...last, lines: last.lines.filter(isNews) });
-  }, [left]);
-  const shown = Boolean(report?.waits) || lines.length > 0;
-  const presses = useAtOnce(stop);
   return html`<div class="stop-all">
-    <button type="button" class="stop" aria-keyshortcuts=${KEY} ...${presses}>
+    <button type="button" class="stop" aria-keyshortcuts=${KEY} ...${useAtOnce(stop)}>
       <b>Stop all axes</b> <kbd>Esc</kbd><small>software stop, not an emergency stop</small>
     </button>
-    <div class="stop-report" role="alert" data-shown=${shown ? "yes" : "no"}>
-      ${
-        shown &&
-        html`<p class="quiet">Stop at ${clock(report.at)}</p>
-        ${report.waits && html`<p>Sent to the console.</p><${NoAnswerYet} key=${report.press} what="Stop all axes" />`}
-        ${lines.map((line) => html`<p class="mark" data-level=${line.level}>${line.text}</p>`)}
-        <button type="button" class="plain" onClick=${() => setReport(null)}>Dismiss</button>`
-      }
-    </div>
   </div>`;
 }
 
-function isNews({ answered }) {
-  return !answered || rigs.get(answered)?.worth !== null;
+/** What came of that as far as no state of an axis says it: `Stops` shows those, whoever has stopped. */
+export function StopReport() {
+  // what a rig publishes now says more than what it answered then, and goes on to when it falls silent later
+  if (report && !report.waits) report.lines = report.lines.filter(isNews);
+  const shown = Boolean(report?.waits || report?.lines.length);
+  return html`<div class="stop-report" role="alert" data-shown=${shown ? "yes" : "no"}>
+    ${
+      shown &&
+      html`<p class="quiet">Stop at ${clock(report.at)}</p>
+      ${report.waits && html`<p>Sent to the console.</p><${NoAnswerYet} key=${report.press} what="Stop all axes" />`}
+      ${report.lines.map((line) => html`<p class="mark" data-level=${line.level}>${line.text}</p>`)}
+      <button type="button" class="plain" onClick=${() => setReport(null)}>Dismiss</button>`
+    }
+  </div>`;
+}
+
+/** Whether no state says it: of a rig that has answered that comes with the next value, of another once all are stopped. */
+function isNews({ answered, failed }) {
+  if (answered) return rigs.get(answered)?.worth !== null;
+  return !failed?.length || !failed.every((rig) => isStopped(rigs.get(rig)));
+}
+
+function isStopped(rig) {
+  const axes = [...(rig?.axes.values() ?? [])].filter((axis) => axis.info);
+  return axes.length > 0 && !rig.worth && axes.every((axis) => axis.isStopped || (!axis.can("stop") && axis.condition.live && axis.state?.moving === "no"));
 }
 
 function outcome(rig, reply) {
-  if (!reply.axes) return { level: "bad", text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.` };
+  if (!reply.axes) return { level: "bad", text: `${rig}: not stopped: ${reply.message}. Use the emergency stop.`, failed: [rig] };
   const text = [reply.shortfall, sentence(reply.outcome), reply.unreached, reply.warning].filter(Boolean).join(" ");
   const told = reply.outcome ? { answered: rig } : {}; // without a latch no state tells of it
   return { ...told, level: reply.shortfall ? "bad" : reply.warning && "warn", text: `${rig}: ${text}` };
