@@ -488,3 +488,33 @@ async def test_no_place_and_no_word_about_it_is_cut_at_1280_pixels(house):
             .map((each) => each.textContent));
         }"""
         assert await row.evaluate(cut, ["reference lost", "not homed", "line down", "no answer"]) == []
+
+
+async def test_after_a_short_motion_the_page_asks_nobody_to_wait_until_the_axis_stands(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        move = desk.panel("Move")
+        await move.get_by_label("Move", exact=True).select_option("by a distance")
+        await move.get_by_label("Distance mm").fill("-0.05" if await house.sim.position("x") > 0 else "0.05")
+        await expect(desk.button("Move")).to_be_enabled()
+        await desk.page.evaluate(
+            """() => {
+              const move = [...document.querySelectorAll(".panel")].find((each) => each.innerText.startsWith("Move"));
+              window.wrong = [];
+              const look = () => {
+                const stands = document.querySelector(".lamps").textContent.includes("moving no");
+                if (stands && move.textContent.includes("wait until the axis stands")) window.wrong.push("asked");
+                requestAnimationFrame(look);
+              };
+              move.querySelector("button.main").addEventListener("click", () => setTimeout(look, 300));
+            }"""
+        )
+        await desk.page.keyboard.press("Tab")
+        await desk.button("Move").click()
+        await expect(move.locator(".story")).to_contain_text("settled")
+        await expect(desk.button("Move")).to_be_enabled()
+        assert not await desk.page.evaluate("() => window.wrong")

@@ -62,7 +62,7 @@ function wordsOf(children) {
 }
 
 /** Every answer of a console, a daemon and drives that are well has come by then; a person who waits goes by what is said. */
-const LATE_MS = 400;
+const LATE_MS = 350;
 
 /** What is said of a press that takes energy out while its answer is late: it may not even have gone out. */
 export function NoAnswerYet({ what }) {
@@ -111,8 +111,9 @@ export function useOnce() {
   const last = useRef({ text: null, atMs: 0 });
   const obstacle = (body, moving) => {
     if (!body || last.current.text !== JSON.stringify(body)) return null;
-    const recent = performance.now() - last.current.atMs < ONCE_MS;
-    return recent || moving ? "This motion was sent just now: change a value, or wait until the axis stands." : null;
+    if (moving) return "This motion was sent just now: change a value, or wait until the axis stands.";
+    const recent = performance.now() - last.current.atMs < ONCE_MS; // a short one may be over before a second press
+    return recent ? "This motion was sent less than a second ago: change a value, or wait for a moment." : null;
   };
   const send = (body, moving, act) => {
     const again = obstacle(body, moving);
