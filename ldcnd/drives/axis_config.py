@@ -287,8 +287,9 @@ on their limit inputs."""
     longest_run_s: float | None = Field(default=None, gt=0, le=86_400)
     """Longest duration of a `move_velocity`, and of one that asks for none, in seconds; without it `jog_horizon_s`."""
     coast_s: float | None = Field(default=None, gt=0, le=3600)
-    """Shortest time from its velocity limit to rest with the motor off, in seconds: a shaft that seems to stand sooner
-    is not believed, nor for four times as long one not read yet, or lost in motion, until its encoder has counted."""
+    """Shortest time from its velocity limit to rest with the motor off, in seconds: a shaft that stands sooner is not
+    believed, nor for four times as long, until it has counted, one not read yet, lost in motion, or reset while it may
+    have moved."""
     jog_reach_s: float = Field(default=5.0, gt=0, le=3600)
     """How far ahead the goal of a jog is, in seconds, in a drive that takes no other goal before it stands: if the \
 daemon dies it runs on for as long, and a jog that is held for longer pauses there. PIC-SERVO SC gets nearer goals."""
