@@ -1,6 +1,6 @@
 """Named positions and sequences of a configuration: refused where they name what is not there, and taught."""
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 from pydantic import ValidationError
 
@@ -24,6 +24,8 @@ def check_sequences(
     axes = {axis.name for bus in buses for axis in bus.axis}
     outputs = {name for bus in buses for name in bus.outputs}
     lines = outputs | {name for bus in buses for name in bus.inputs}
+    modules = {name for bus in buses for name in bus.module_names}
+    by_number = {f"{name}.LINE" for name in modules}
     named = {each.name for each in positions}
     for position in positions:
         _known(f"position {position.name}", "axis", position.axes, axes)
@@ -32,9 +34,15 @@ def check_sequences(
             where = f"sequence {sequence.name}: step {number}"
             _known(where, "axis", [*filter(None, [step.axis]), *step.standstill], axes)
             _known(where, "position", filter(None, [step.go]), named)
-            _known(where, "output", step.set, outputs)
+            _known(where, "output", (name for name in step.set if not is_line_of(name, modules)), outputs | by_number)
             _known(where, "input or output", step.until, lines)
             _check_command(where, step)
+
+
+def is_line_of(name: str, modules: Collection[str]) -> bool:
+    """Tell whether a name is that of a line by its number, such as cabinet.10, of one of these modules."""
+    module, _, line = name.partition(".")
+    return module in modules and line.isdecimal()
 
 
 def _known(where: str, what: str, names: Iterable[str], there: Iterable[str]) -> None:

@@ -39,7 +39,7 @@ class SequenceStep(Frozen):
     go: str | None = None
     """Named position to which its axes are moved."""
     set: Mapping[str, bool] = {}
-    """Named outputs that are written before anything moves, true for high."""
+    """Outputs that are written before anything moves, at once, true for high; one without a name is MODULE.LINE."""
     until: Mapping[str, bool] = {}
     """Named inputs and outputs, and the values that they must have at the end; what is not known has none."""
     leave_running: bool = False

@@ -19,14 +19,14 @@ from ldcnd.axis.rest import REST_COUNTS
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
 from ldcnd.contract.commands import Verb, kind_of
-from ldcnd.contract.errors import InterlockViolated, LdcndError, Remedy, RemedyCommand, ValueOutOfRange, step
+from ldcnd.contract.errors import InterlockViolated, LdcndError, Remedy, ValueOutOfRange, step
 from ldcnd.contract.events import INTERLOCK, CommandStatus
 from ldcnd.contract.rig_commands import OverrideInterlock, OverrideReply
 from ldcnd.contract.samples import AxisState, LinkState, Unseen
 from ldcnd.contract.units import Dimension
 from ldcnd.daemon.leases import STOP_MODES, Authority
 from ldcnd.daemon.ledger import EventLog
-from ldcnd.daemon.modules import ModuleService
+from ldcnd.daemon.modules import ModuleService, setting
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.axis_config import LossPolicy
 from ldcnd.log import get_logger
@@ -307,11 +307,11 @@ class Interlocks:
         if first:
             if lacks := self._forbidden(first):
                 stages += self._to_hold(lacks, axis, depth=depth + 1)
-            stages.append(Remedy("{}", _sets(module, first)))
+            stages.append(Remedy("{}", setting(module.name, first)))
         if later:
             lacks = self._forbidden(first | later, *later)
             stages += self._to_hold(lacks, axis, depth=depth + 1)
-            stages.append(Remedy("{}", _sets(module, later)))
+            stages.append(Remedy("{}", setting(module.name, later)))
         return stages
 
     def _forbidden(self, levels: Mapping[str, bool], *names: str) -> tuple[Lack, ...]:
@@ -575,17 +575,6 @@ def _required(status: AxisStatus, each: Requirement) -> str:
 
 def _word(what: str, value: bool) -> str:  # noqa: FBT001 - of a line
     return str(value).lower() if what == "input" else "high" if value else "low"
-
-
-def _sets(module: ModuleService, levels: Mapping[str, bool]) -> RemedyCommand:
-    """Return the request that sets outputs of a module."""
-    *others, last = (f"output {name} {_word('output', level)}" for name, level in levels.items())
-    said = f"set {', '.join(others)} and {last} at once" if others else f"set {last}"
-    lines = {
-        word: tuple(name for name, at in levels.items() if at is level)
-        for word, level in (("high", True), ("low", False))
-    }
-    return step("set_io", said, module=module.name, **{word: names for word, names in lines.items() if names})
 
 
 def _commanded(status: AxisStatus) -> bool:

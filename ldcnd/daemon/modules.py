@@ -15,7 +15,11 @@ from ldcnd.contract.errors import (
     InterlockViolated,
     LdcndError,
     MalformedRequest,
+    RegisterUnknown,
+    Remedy,
+    RemedyCommand,
     ValueOutOfRange,
+    step,
 )
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.health import ModuleHealth
@@ -401,8 +405,11 @@ class ModuleService:
             self._unread_until_s |= dict.fromkeys(changes, math.inf)
             self.before = {name: (values[name], self.read_at_s) for name in changes} | self.before
             try:
-                with only_while(permitted):
-                    reading = await self._driver.set_outputs(levels, inputs, pwm)
+                try:
+                    with only_while(permitted):
+                        reading = await self._driver.set_outputs(levels, inputs, pwm)
+                except RegisterUnknown as error:
+                    raise (pwm == (None, None) and self._left_out(asked)) or error from None
                 for name, level in asked.items():
                     self._floating.pop(name, None)
                     self._set.pop(name, None)
@@ -413,6 +420,22 @@ class ModuleService:
                 self._known.clear()
                 # also after an error: which of the packets have arrived is not known
                 self._unread_until_s |= dict.fromkeys(changes, asyncio.get_running_loop().time())
+
+    def _left_out(self, asked: Mapping[str, bool | None]) -> RegisterUnknown | None:
+        """Return the refusal of a request that leaves out outputs of which nothing is known; None if it names all."""
+        unknown = [name for name in self._outputs if self.is_unwritten(name) and name not in asked]
+        if not unknown:
+            return None
+        lines = ", ".join(
+            f"line {name}" if name.isdigit() else f"{name} (line {self._lines[name]})" for name in unknown
+        )
+        levels = self.levels_to_set({name: level for name, level in asked.items() if level is not None})
+        sets = setting(self.name, levels)
+        return RegisterUnknown(
+            f"module {self.name}: what was written to outputs {lines} is not known; one request is to name all of them",
+            value=self.name,
+            remedy=Remedy("{}, with the levels that their pins have", sets),
+        )
 
     async def _come_to_be_known(self) -> bool:
         """Wait until outputs that were written are read again; return False if none was, or they are not in time."""
@@ -521,6 +544,14 @@ class ModuleService:
         if self._wanted.get(name) is wanted:
             del self._wanted[name]
         return True
+
+
+def setting(module: str, levels: Mapping[str, bool]) -> RemedyCommand:
+    """Return the one request that gives outputs of a module their levels, true for high."""
+    *others, last = (f"output {name} {_word(level)}" for name, level in levels.items())
+    said = f"set {', '.join(others)} and {last} at once" if others else f"set {last}"
+    named = {_word(at): tuple(name for name, level in levels.items() if level is at) for at in (True, False)}
+    return step("set_io", said, module=module, **{word: names for word, names in named.items() if names})
 
 
 def _word(level: bool) -> str:  # noqa: FBT001 - a level

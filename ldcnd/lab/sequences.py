@@ -147,8 +147,7 @@ class SequenceRun:
         seen: dict[str, bool | None] = dict.fromkeys(step.until)
         try:
             async with asyncio.timeout(step.timeout_s):
-                for name, high in step.set.items():
-                    await self._write(name, high=high)
+                await self._write(step.set)
                 await self._command(step)
                 if step.until:
                     await self._come(step, seen)
@@ -163,10 +162,19 @@ class SequenceRun:
                 limit=step.timeout_s,
             ) from None
 
-    async def _write(self, name: str, *, high: bool) -> None:
-        if name not in self._modules:
-            raise WrongState(f"output {name}: its module has not been seen", value=name)
-        await self._rig.set_io(self._modules[name], high=[name] if high else (), low=() if high else [name])
+    async def _write(self, levels: Mapping[str, bool]) -> None:
+        """Write outputs, those of one module in one request: after a take-over none is written without the others."""
+        of_module: dict[str, dict[int | str, bool]] = {}
+        for name, high in levels.items():
+            module, _, number = name.partition(".")
+            if not number and name not in self._modules:
+                raise WrongState(f"output {name}: its module has not been seen", value=name)
+            lines = of_module.setdefault(module if number else self._modules[name], {})
+            lines[int(number) if number else name] = high
+        for module, lines in of_module.items():
+            await self._rig.set_io(
+                module, high=[each for each in lines if lines[each]], low=[each for each in lines if not lines[each]]
+            )
 
     async def _command(self, step: SequenceStep) -> None:
         for axis, place in self._positions[step.go].axes.items() if step.go else ():

@@ -1112,7 +1112,7 @@ def test_who_wrote_outputs_is_in_the_events_done_and_refused_and_the_same_again_
 
     assert (refused.status, refused.client, refused.code) == ("refused", "test", "interlock_violated")
     assert refused.reason.startswith("door high: output door: interlock door_opens: ")
-    assert [each.reason for each in done] == ["pin low", "unlock high", "door low", "unlock low"]
+    assert [each.reason for each in done] == ["unlock high, pin low, door low", "unlock low"]
     assert {(each.status, each.client) for each in done} == {("done", "sequence shut")}
     assert (last.reason, last.client) == ("pin low", None)
 

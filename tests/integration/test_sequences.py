@@ -6,10 +6,18 @@ import tomllib
 
 import pytest
 
-from ldcnd.config.rig import load_config
+from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import Halt, MoveVelocity, Power
-from ldcnd.contract.errors import CommandAborted, ConfigError, InterlockViolated, WrongState
+from ldcnd.contract.errors import (
+    CommandAborted,
+    ConfigError,
+    InterlockViolated,
+    LdcndError,
+    RegisterUnknown,
+    WrongState,
+)
 from ldcnd.contract.sequences import SequenceConfig, SequenceStep
+from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.lab.sequences import SequenceRun
 from ldcnd.testing import run, simulated_rig
 from tests.support.command_line import virtual_rig
@@ -237,7 +245,11 @@ def _toml(step):
     [
         ('go = "bucket1"', 'go = "bucket3"', "sequence spin: step 6: there is no position 'bucket3'"),
         ("axes = { rotor = 0.1 }", "axes = { lid = 0.1 }", "position bucket1: there is no axis 'lid'"),
-        ("{ pin = false }", "{ pim = false }", "sequence shut: step 2: there is no output 'pim'; there are: door, pin"),
+        (
+            "{ pin = false,",
+            "{ pim = false,",
+            "sequence shut: step 2: there is no output 'pim'; there are: cabinet.LINE, door",
+        ),
         (
             'velocity = "100 g"',
             'velocity = "100 mm/s"',
@@ -333,3 +345,60 @@ def test_steps_are_called_by_what_they_command():
         "go to bucket2 (rotor 0.6 rev)",
         "by hand",
     ]
+
+
+def taken_over(sequence, config=CENTRIFUGE):
+    """Run a sequence behind a daemon that was killed while the rotor stood; return levels, and the error if any."""
+    (line,) = config.bus
+    line = line.model_copy(update={"start": StartPolicy.ADOPT, "adopt_fallback": AdoptFallback.RESET})
+
+    async def program():
+        async with simulated_rig(config.model_copy(update={"bus": (line,)})) as rig:
+            await asyncio.sleep(45)
+            await rig.client.set_io("cabinet", low=(9, 10, 11))
+            await rig.kill_daemon()
+            await asyncio.sleep(2)
+            await rig.start_daemon()
+            await asyncio.sleep(45)
+            error = None
+            try:
+                await SequenceRun(rig.client, sequence, POSITIONS, lambda _: None, lambda: 0).run()
+                await asyncio.sleep(1)
+            except LdcndError as raised:
+                error = raised
+            return rig.module_truth("cabinet"), error
+
+    return run(program())
+
+
+def test_the_door_is_shut_by_its_sequence_behind_a_daemon_that_took_its_outputs_over():
+    truth, error = taken_over(SEQUENCES["shut"])
+    assert error is None
+    assert (truth.parts["door"], truth.parts["lock"]) == (0.0, 1.0)
+
+
+def test_a_sequence_that_leaves_out_an_output_that_is_not_known_is_told_all_of_them_at_once():
+    step = SequenceStep(set={"pin": False})
+    _, error = taken_over(SequenceConfig(name="one", step=(step,)))
+    assert isinstance(error, RegisterUnknown)
+    assert "outputs door (line 10), unlock (line 11)" in error.message
+    (named,) = error.remedy.steps
+    assert {*named.arguments["low"]} == {"pin", "door", "unlock"}
+
+
+def test_a_line_without_a_name_is_named_by_its_number():
+    data = tomllib.loads(FILE.read_text(encoding="utf-8"))
+    (module,) = data["bus"][0]["module"]
+    module["outputs"] = [9, 10, 11]
+    del data["interlock"], data["sequence"]
+    levels = {"cabinet.9": True, "cabinet.10": False, "cabinet.11": False}
+    data["sequence"] = [{"name": "free", "step": [{"set": levels}]}]
+    config = RigConfig.model_validate(data)
+    truth, error = taken_over(config.sequence[0], config)
+    assert error is None
+    assert truth.parts["pin"] == 1.0
+
+    for wrong in ("cabinet.x", "cupboard.9"):
+        data["sequence"][0]["step"] = [{"set": {wrong: True}}]
+        with pytest.raises(ValueError, match=f"there is no output '{wrong}'.*cabinet.LINE"):
+            RigConfig.model_validate(data)
