@@ -65,6 +65,7 @@ from ldcnd.contract.errors import (
     CommandAborted,
     InterlockViolated,
     LdcndError,
+    NotReferenced,
     NotSupported,
     OutcomeUnknown,
     WrongState,
@@ -370,6 +371,9 @@ class AxisService:
                     causes += [(each, True) for each in self._while_it_coasts()]
                 if guard is guards.check_referenced:  # what is in the way of a motion is in the way of homing, too
                     causes, forbidden = causes + forbidden, []
+                    if any(not passes for _, passes in causes):
+                        behind = "home it, or set its position, once nothing else is in the way"
+                        error = NotReferenced(error.message, axis=name, remedy=behind)  # noqa: PLW2901 - said another way
                 causes.append((error, guard is guards.check_stands))
         causes += forbidden
         if not moves:

@@ -836,6 +836,25 @@ def test_the_steps_that_why_names_lead_out_of_a_daemon_that_was_killed_beside_an
     assert refused == []
 
 
+@pytest.mark.parametrize("lost", ["power_loss", "motor_supply_lost", "mute"])
+@pytest.mark.parametrize("after_s", [6.0, 60.0])
+def test_why_names_no_homing_that_would_be_refused_behind_the_steps_that_are_named_before_it(lost, after_s):
+    async def goes_on(machine):
+        await machine.spin()
+        getattr(machine.rig.faults, lost)("rotor", for_s=3.0)
+        await asyncio.sleep(after_s)
+        for _ in range(6):
+            causes = (await machine.rotor.why()).causes
+            for each in causes:
+                if refused := await follows(machine, each):
+                    return refused
+            if not causes:
+                break
+        return causes
+
+    assert not alone(goes_on)
+
+
 def test_who_waits_for_the_homing_under_way_as_a_refusal_says_moves_behind_it():
     async def homes(machine):
         await machine.rotor.set_position(0.5)
