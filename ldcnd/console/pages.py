@@ -47,6 +47,11 @@ LOOK_EACH_S = 0.05
 HELD_S = 0.4
 """A jog ends after this time without a message that its button is held, in the daemon without one of this process;
 pages send one each tenth of a second."""
+PULSE_S = 0.25
+STOOD_S = 1.0
+"""So much more between two pulses, and this process stood still, seconds."""
+STOOD_LATELY_S = 15.0
+"""So long it counts as the cause of control that is lost: renewals wait for their answers."""
 MOST_PAGES = 64
 TOKEN_BYTES = 16
 
@@ -132,6 +137,31 @@ class _Hold:
             self.sending -= 1
 
 
+class _Pulse:
+    """Notices when this process stands still: its leases end then, however well the daemon is."""
+
+    def __init__(self) -> None:
+        self._stood_s = 0.0
+        self._went_on_s = -STOOD_LATELY_S
+
+    async def beat(self) -> None:
+        """Beat until cancelled."""
+        loop = asyncio.get_running_loop()
+        while True:
+            before_s = loop.time()
+            await asyncio.sleep(PULSE_S)
+            if (late_s := loop.time() - before_s - PULSE_S) > STOOD_S:
+                self._stood_s, self._went_on_s = late_s, loop.time()
+
+    @property
+    def stood(self) -> str:
+        """Why control is lost that was not renewed lately; empty unless this process stood still."""
+        if asyncio.get_running_loop().time() > self._went_on_s + STOOD_LATELY_S:
+            return ""
+        ends = f"control ends {LEASE_S:g} s after it was renewed"
+        return f"the console process stood still for {self._stood_s:.0f} s, and {ends}"
+
+
 class PageControl:
     """The axes that one open page controls; made by `Pages.open`.
 
@@ -150,6 +180,8 @@ class PageControl:
         self._gone = False
         self._jogging: asyncio.Task[None] | None = None
         self._held_on = asyncio.Event()
+        self._pulse = _Pulse()
+        self._beating = group.create_task(self._pulse.beat(), name=f"pulse of {client}")
 
     def heard(self, message: FromPage) -> None:
         """Take a message of the page."""
@@ -231,6 +263,7 @@ class PageControl:
     async def leave(self) -> None:
         """Give up everything: halt what may move, then release it. Nothing more is sent for this page."""
         self._gone = True
+        self._beating.cancel()
         self._end_jog()
         holds, self._held = list(self._held.values()), {}
         async with asyncio.TaskGroup() as group:
@@ -292,9 +325,10 @@ class PageControl:
         if hold and hold.control is control:
             del self._held[rig, axis]
             self._rigs.control_changed(rig, axis)
-            why = control.lost.message if control.lost else ""
-            log.info("control lost", client=self.client, rig=rig, axis=axis, reason=why)
             taker = await self._holder(rig, axis)
+            # nothing is heard of a daemon, however well it is, by a process that stands still, nor at once afterwards
+            why = self._pulse.stood or (control.lost.message if control.lost else "")
+            log.info("control lost", client=self.client, rig=rig, axis=axis, reason=why)
             if (rig, axis) in self._held:  # taken again meanwhile
                 taker = None
             self._tell(ToPage(lost=Lost(rig=rig, axis=axis, message=why, taken_by=taker)))

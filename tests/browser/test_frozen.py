@@ -1,5 +1,6 @@
 """A console process that stands still: what its pages say of a press and of values that nobody has heard of since."""
 
+import asyncio
 import signal
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -86,3 +87,18 @@ async def test_values_of_a_console_that_sends_nothing_stand_as_present_ones_for_
 
         running.send_signal(signal.SIGCONT)
         await expect(page.get_by_label("Position", exact=True)).not_to_contain_text("(")
+
+
+async def test_control_that_ends_while_the_console_stands_still_is_not_laid_to_the_daemon(house):
+    await house.sim.quiet("x")
+    async with looking_at_x(house) as (running, page):
+        await page.get_by_role("button", name="Take control", exact=True).click()
+        await expect(page.get_by_text("Held by this page")).to_be_visible()
+        running.send_signal(signal.SIGSTOP)
+        async with asyncio.timeout(house_of.PATIENCE_S):  # its lease ends
+            while (await house.sim.rig.state("x")).holder:
+                await asyncio.sleep(0.05)
+        running.send_signal(signal.SIGCONT)
+        notice = page.locator(".notices").get_by_text("control of x was lost")
+        await expect(notice).to_contain_text("the console process stood still for")
+        await expect(notice).not_to_contain_text("no daemon serves")
