@@ -26,6 +26,8 @@ FOLLOWS_WITHIN_S = 1.0
 """Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
 LAGS_S = 0.04
 """Shortest time over which a way is compared with its speed: a request may be some ms late on its line."""
+SWINGS_ABOVE = 1.5
+"""A shaft swings by less than half of its speed when it was this much faster at most."""
 LEAST_COAST_S = 0.01
 """Readings that follow each other sooner tell nothing of how a shaft slows down."""
 COASTS_S = 0.3
@@ -145,6 +147,7 @@ class Following:
         faults: it is a fault then; else the axis may only move unseen, until its encoder counts again.
         coasts: the shaft cannot stand at once: where it seems to, at a speed, its encoder has missed counts.
         least_counts_per_s: that the positions have shown when it was first seen there, if it braked meanwhile.
+        fastest_counts_per_s: of the profiles that went over into this one; 0 without one.
     """
 
     command_id: str
@@ -164,6 +167,7 @@ class Following:
     faults: bool = True
     coasts: bool = False
     least_counts_per_s: float = 0.0
+    fastest_counts_per_s: float = 0.0
 
     @property
     def is_missed(self) -> bool:
@@ -184,7 +188,8 @@ class Following:
     @property
     def brakes_within_s(self) -> float:
         """Longest time from the beginning of its braking until its end, seconds, also by the clock of its drive."""
-        return 1.1 * self.velocity_counts_per_s / self.acceleration_counts_per_s2 + 2 * LAG_S
+        fastest = max(self.fastest_counts_per_s, self.velocity_counts_per_s)
+        return 1.1 * fastest / self.acceleration_counts_per_s2 + 2 * LAG_S
 
     def after(self, before: "Following | None") -> "Following":
         """Return it behind an earlier motion of its command, in which the shaft was perhaps not seen to move."""
@@ -196,7 +201,9 @@ class Following:
         """Return it for a profile that goes over into another one; None where that slows down otherwise."""
         if acceleration_counts_per_s2 != self.acceleration_counts_per_s2:
             return None
-        return replace(self, velocity_counts_per_s=min(self.velocity_counts_per_s, velocity_counts_per_s))
+        slowest, fastest = sorted((self.velocity_counts_per_s, velocity_counts_per_s))
+        fastest = max(fastest, self.fastest_counts_per_s)
+        return replace(self, velocity_counts_per_s=slowest, fastest_counts_per_s=fastest)
 
     def observe(self, reading: AxisReading, at_s: float, *, at_velocity: bool = False) -> "Following | bool":
         """Take a reading; return what is awaited, True while the shaft has moved as it was to, or False: it has not.
@@ -253,6 +260,8 @@ class Following:
         took_s = at_s - self.since_s
         if not (self.coasts and self.counted) or took_s < LAGS_S:
             return False
+        if self.fastest_counts_per_s > SWINGS_ABOVE * self.velocity_counts_per_s:
+            return False  # it may have been slowed down, and swing to a stand at its new speed
         least = min(self._least_counts_per_s(at_s, brakes=brakes), self.velocity_counts_per_s) * took_s
         return 2 * (abs(position - self.low) + 2 * self.least_counts) < least
 
@@ -267,6 +276,7 @@ class Following:
             most = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
             braked = self._braked_counts_per_s(at_s) if brakes else 0.0
             least = max(0.0, min(shown, most) - braked, self._least_counts_per_s(at_s, brakes=brakes))
+            least = min(least, self.velocity_counts_per_s)  # it may be on its way to another profile
         return Following(
             self.command_id,
             self.velocity_counts_per_s,
@@ -283,6 +293,7 @@ class Following:
             faults=self.faults,
             coasts=self.coasts,
             least_counts_per_s=least,
+            fastest_counts_per_s=self.fastest_counts_per_s,
         )
 
     def _least_counts_per_s(self, at_s: float, *, brakes: bool) -> float:

@@ -684,8 +684,6 @@ def test_a_counter_that_stands_still_while_the_rotor_coasts_opens_no_lock(speed,
         (1.0, 0.12),
         (0.3, 0.3),
         (50.0, 0.06),
-        (16.0, 0.06),
-        (5.0, 0.06),
     ],
 )
 @pytest.mark.sweep(3)
@@ -1320,3 +1318,22 @@ def test_a_reset_that_comes_too_soon_opens_no_lock(rpm, first):
         return [each for each in written_at if each > CREEPS], rotor.state.sample.referenced
 
     assert alone(resets) == ([], False)
+
+
+@pytest.mark.parametrize("percent", [100, 40])
+@pytest.mark.parametrize("first", [None, 0.5, 7.0, 25.0])
+@pytest.mark.parametrize("second", [0.5, 16.0, 40.0])
+@pytest.mark.sweep(4)
+def test_a_healthy_run_that_goes_over_into_another_ends_by_itself_without_a_fault(first, second, percent):
+    async def runs(machine):
+        if first is not None:
+            await machine.rotor.move_velocity(first, acceleration=10)
+            await machine.rig.until(lambda: machine.speed > 0.95 * first)
+        motion = await machine.rotor.move_velocity(second, acceleration=10, duration_s=5)
+        await asyncio.sleep(1.0)
+        await machine.rig.client.set_speed_override(percent)
+        await motion.done()
+        await (await machine.rotor.move_relative(3.3, velocity=2.0, acceleration=4.0)).done()
+        return (await machine.rig.client.client.last("rotor", "fault")).active
+
+    assert not alone(runs)
