@@ -23,12 +23,12 @@ from ldcnd.cli.typed import (
 )
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
+from ldcnd.client.sequences import SequenceRun
 from ldcnd.config.edit import teach
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.errors import NotReferenced, WrongState
 from ldcnd.contract.samples import Moving
-from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
-from ldcnd.lab.sequences import SequenceRun
+from ldcnd.contract.sequences import NamedPosition, SequenceConfig, StepReport, going_to
 
 PAUSE = " "
 
@@ -194,10 +194,9 @@ def go(target: Target, file: Path, name: str | None, *, take: bool, list_only: b
     if list_only:
         _list_positions(rig)
         return
-    known = {each.name for each in rig.position}
+    known = {each.name: each for each in rig.position}
     if name is None:
         raise click.UsageError("name the position, or see them with --list")
     if name not in known:
         raise unknown("position", name, known)
-    there = SequenceConfig(name=f"go_{name}"[:63], step=(SequenceStep(go=name, timeout_s=86_400),))
-    _carry_out(target, rig, there, None, take=take)
+    _carry_out(target, rig, going_to(known[name]), None, take=take)

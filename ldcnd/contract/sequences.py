@@ -98,6 +98,25 @@ class SequenceConfig(Frozen):
     step: tuple[SequenceStep, ...] = Field(min_length=1, max_length=500)
     """The steps."""
 
+    def used(self, positions: Mapping[str, NamedPosition]) -> tuple[str, ...]:
+        """Return the axes that it moves, or waits for; `positions` are the named ones, by name."""
+        used: list[str] = []
+        for step in self.step:
+            used += [step.axis] if step.axis else []
+            used += [*positions[step.go].axes] if step.go else []
+            used += step.standstill
+        return tuple(dict.fromkeys(used))
+
+    @property
+    def writes(self) -> bool:
+        """Whether it writes outputs: then it needs control of all axes of the rig."""
+        return any(step.set for step in self.step)
+
+
+def going_to(position: NamedPosition) -> SequenceConfig:
+    """Return the sequence of one step that moves the axes of a position there, one after the other."""
+    return SequenceConfig(name=f"go_{position.name}"[:63], step=(SequenceStep(go=position.name, timeout_s=86_400),))
+
 
 class StepReport(Frozen):
     """What came of one step: a line of the record."""

@@ -10,13 +10,13 @@ from contextlib import suppress
 import pytest
 
 from ldcnd.client.events import latest_events
+from ldcnd.client.sequences import SequenceRun
 from ldcnd.config.rig import load_config
 from ldcnd.contract.errors import ErrorCode, InterlockViolated, LdcndError, LeaseExpired, NotReferenced, WrongState
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import OverrideInterlock
 from ldcnd.contract.samples import Moving, Quality
 from ldcnd.drives.network import AdoptFallback, StartPolicy
-from ldcnd.lab.sequences import SequenceRun
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
 from ldcnd.sim.ldcn.power import FaultCondition

@@ -6,6 +6,7 @@ import tomllib
 
 import pytest
 
+from ldcnd.client.sequences import SequenceRun
 from ldcnd.config.rig import RigConfig, load_config
 from ldcnd.contract.commands import Halt, MoveVelocity, Power
 from ldcnd.contract.errors import (
@@ -18,7 +19,6 @@ from ldcnd.contract.errors import (
 )
 from ldcnd.contract.sequences import SequenceConfig, SequenceStep
 from ldcnd.drives.network import AdoptFallback, StartPolicy
-from ldcnd.lab.sequences import SequenceRun
 from ldcnd.testing import run, simulated_rig
 from tests.support.command_line import virtual_rig
 from tests.support.process import ROOT

@@ -29,6 +29,8 @@ class SequenceRun:
         positions: the named positions, by name.
         report: gets what happens to each step; the record is made of it.
         now_ns: UTC in ns since 1970.
+        who: the name under which it takes control; that of the sequence when missing. Control that the program has
+            under the same name is replaced.
 
     Attributes:
         going: cleared, the next step waits to begin; a motion under way is not touched.
@@ -41,7 +43,9 @@ class SequenceRun:
         positions: Mapping[str, NamedPosition],
         report: Callable[[StepReport], None],
         now_ns: Callable[[], int],
+        who: str | None = None,
     ) -> None:
+        self._who = who or f"sequence {sequence.name}"
         self.going = asyncio.Event()
         self.going.set()
         self._rig = rig
@@ -70,9 +74,8 @@ class SequenceRun:
             raise ConfigError(f"sequence {self._sequence.name} has no step {first}", value=first, limit=len(steps))
         await self._check_stand(steps[first - 1 :])
         axes = () if any(step.set for step in steps) else self.used
-        who = f"sequence {self._sequence.name}"
         async with AsyncExitStack() as held:
-            controlled = await held.enter_async_context(self._rig.controlled(axes, who, LEASE_S, force=force))
+            controlled = await held.enter_async_context(self._rig.controlled(axes, self._who, LEASE_S, force=force))
             self._axes = {axis.name: axis for axis in controlled}
             self._units = {info.axis: info for info in await self._rig.describe()}
             self._modules = await self._lines()
@@ -102,12 +105,7 @@ class SequenceRun:
     @property
     def used(self) -> tuple[str, ...]:
         """The axes that it moves, or waits for."""
-        used: list[str] = []
-        for step in self._sequence.step:
-            used += [step.axis] if step.axis else []
-            used += [*self._positions[step.go].axes] if step.go else []
-            used += step.standstill
-        return tuple(dict.fromkeys(used))
+        return self._sequence.used(self._positions)
 
     async def _lines(self) -> dict[str, str]:
         lines: dict[str, str] = {}
