@@ -10,9 +10,9 @@ from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.condition import way_to_rest
-from ldcnd.contract.errors import ConfigError, LdcndError, WrongState
+from ldcnd.contract.errors import ConfigError, LdcndError, StopLatched, WrongState
 from ldcnd.contract.meta import AxisInfo
-from ldcnd.contract.samples import IoSample, Moving, TelemetryItem
+from ldcnd.contract.samples import IoSample, Moving, StateSample, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
 from ldcnd.contract.units import POSITION, quantity_text
 
@@ -56,6 +56,7 @@ class SequenceRun:
         self._axes: dict[str, Axis] = {}
         self._units: dict[str, AxisInfo] = {}
         self._modules: dict[str, str] = {}  # by the names of their lines
+        self._latched: frozenset[str] | None = None
 
     async def run(self, first: int = 1, *, force: bool = False) -> None:
         """Carry it out under control of its axes, of all axes of the rig if it writes outputs.
@@ -70,10 +71,11 @@ class SequenceRun:
             LdcndError: a step was refused or has failed; nothing after it was begun.
         """
         steps = self._sequence.step
+        self._latched = None
         if not 1 <= first <= len(steps):
             raise ConfigError(f"sequence {self._sequence.name} has no step {first}", value=first, limit=len(steps))
         await self._check_stand(steps[first - 1 :])
-        axes = () if any(step.set for step in steps) else self.used
+        axes = () if self._sequence.writes else self.used
         async with AsyncExitStack() as held:
             controlled = await held.enter_async_context(self._rig.controlled(axes, self._who, LEASE_S, force=force))
             self._axes = {axis.name: axis for axis in controlled}
@@ -83,7 +85,7 @@ class SequenceRun:
                 await self._carry_out(number, steps[number - 1])
 
     async def _check_stand(self, steps: Sequence[SequenceStep]) -> None:
-        """Refuse to move an axis that another program moves: to give up its control again would halt that motion."""
+        """Refuse to control an axis that another program moves: to give up its control again would halt that motion."""
         states, brought_to_rest = await self._rig.states(), set[str]()
         for step in steps:
             brought_to_rest.update(step.standstill)
@@ -94,13 +96,27 @@ class SequenceRun:
             elif verb and AXIS_COMMANDS[verb].effect is Effect.MOTION:
                 sent.append(str(step.axis))
             for axis in sent:
-                if axis in brought_to_rest or axis not in states or states[axis].moving is not Moving.YES:
-                    continue
-                raise WrongState(
-                    f"axis {axis} is {states[axis].state.words}; sequence {self._sequence.name} has begun nothing",
-                    axis=axis,
-                    remedy=way_to_rest(states[axis].state),
-                )
+                if axis not in brought_to_rest and axis in states:
+                    self._refuse_moving(axis, states[axis])
+        others = set(self._rig.axes) - brought_to_rest if self._sequence.writes else set()
+        for axis in sorted(others & states.keys()):
+            self._refuse_moving(axis, states[axis])
+
+    def _refuse_moving(self, axis: str, state: StateSample) -> None:
+        if state.moving is Moving.YES:
+            raise WrongState(
+                f"axis {axis} is {state.state.words}; sequence {self._sequence.name} has begun nothing",
+                axis=axis,
+                remedy=way_to_rest(state.state),
+            )
+
+    async def _check_latch(self) -> None:
+        """Go on under no stop that was pressed meanwhile: writing outputs needs no motor, and no latch refuses it."""
+        states = await self._rig.states()
+        now = frozenset(axis for axis in self._axes if axis in states and states[axis].stop_latched)
+        if self._latched is not None and (new := now - self._latched):
+            raise StopLatched(f"axis {min(new)} was stopped; sequence {self._sequence.name} ends", axis=min(new))
+        self._latched = now
 
     @property
     def used(self) -> tuple[str, ...]:
@@ -128,6 +144,7 @@ class SequenceRun:
         report("begun")
         began_s = loop.time()
         try:
+            await self._check_latch()
             await self._within(number, step)
             await asyncio.sleep(step.pause_s)
         except LdcndError as error:

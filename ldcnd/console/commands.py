@@ -16,6 +16,7 @@ from ldcnd.console.pages import Pages, control_needed, refuse_unwatched
 from ldcnd.console.replies import StopsReply
 from ldcnd.console.requests import body_of, json_reply
 from ldcnd.console.rigs import Rigs
+from ldcnd.console.sequences import PauseRequest, RunRequest, Runs
 from ldcnd.contract.catalogue import BY_VERB
 from ldcnd.contract.codec import Encoding, decode, error_reply, understand
 from ldcnd.contract.commands import About, AxisCommand, Command, ErrorReply, StopReply
@@ -100,21 +101,22 @@ async def _axis_command(rigs: Rigs, pages: Pages, request: Request) -> Response:
     return json_reply(await client.command(axis, command))
 
 
-async def _stop(rigs: Rigs, request: Request) -> Response:
-    """Stop an axis, or the rig where it cannot be read which axis is meant."""
+async def _stop(rigs: Rigs, runs: Runs, request: Request) -> Response:
+    """Stop an axis, or the rig where it cannot be read which axis is meant; a sequence that uses it ends, too."""
     client = rigs.client(request.path_params["rig"])
     body, complaint = await _body_of(request)
     try:
         scope = decode(StopScope, body, Encoding.JSON)
     except LdcndError as error:
         scope, complaint = StopScope(), complaint or error
+    runs.cancel(client.rig, scope.axis)
     reply = await client.stop(scope.axis, STOP_TIME_S, request.state.visitor.client)
     if complaint:
         raise complaint.although("the whole rig was stopped, but which axis was meant cannot be read:")
     return json_reply(reply)
 
 
-def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
+def command_routes(rigs: Rigs, pages: Pages, runs: Runs) -> list[Route]:
     """Return what pages may POST."""
 
     async def rig_command(request: Request) -> Response:
@@ -135,11 +137,28 @@ def command_routes(rigs: Rigs, pages: Pages) -> list[Route]:
         return json_reply(await client.ask(asked))
 
     async def stop_all(request: Request) -> Response:
-        return json_reply(StopsReply(rigs=await _all_stopped(rigs, request.state.visitor.client)))
+        return json_reply(StopsReply(rigs=await _all_stopped(rigs, runs, request.state.visitor.client)))
+
+    async def run(request: Request) -> Response:
+        page = page_of(request, pages)
+        wanted = decode(RunRequest, await body_of(request), Encoding.JSON)
+        return json_reply(await page.run(request.path_params["rig"], wanted))
+
+    async def pause(request: Request) -> Response:
+        page = page_of(request, pages)
+        wanted = decode(PauseRequest, await body_of(request), Encoding.JSON)
+        return json_reply(page.pause(request.path_params["rig"], on=wanted.on))
+
+    async def end_run(request: Request) -> Response:  # of any page, with control or without: it takes energy out
+        await runs.stop(request.path_params["rig"])
+        return Response("{}", media_type="application/json")
 
     routes: dict[str, Answer] = {
+        "/api/rigs/{rig}/run": run,
+        "/api/rigs/{rig}/run/pause": pause,
+        "/api/rigs/{rig}/run/stop": end_run,
         "/api/stop": stop_all,
-        "/api/rigs/{rig}/stop": partial(_stop, rigs),
+        "/api/rigs/{rig}/stop": partial(_stop, rigs, runs),
         "/api/rigs/{rig}/rig/{verb}": rig_command,
         "/api/rigs/{rig}/axes/{axis}/{verb}": partial(_axis_command, rigs, pages),
     }
@@ -154,10 +173,12 @@ async def _body_of(request: Request) -> tuple[bytes, LdcndError | None]:
         return b"", error
 
 
-async def _all_stopped(rigs: Rigs, who: str) -> dict[str, StopReply | ErrorReply]:
+async def _all_stopped(rigs: Rigs, runs: Runs, who: str) -> dict[str, StopReply | ErrorReply]:
     """Stop every rig, also those that come while the others are stopped."""
     stopped: dict[str, StopReply | ErrorReply] = {}
     while came := [rig for rig in rigs.names if rig not in stopped]:
+        for rig in came:
+            runs.cancel(rig)
         async with asyncio.TaskGroup() as group:
             stops = {rig: group.create_task(_stopped(rigs.client(rig), who), name=f"stop {rig}") for rig in came}
         stopped |= {rig: task.result() for rig, task in stops.items()}

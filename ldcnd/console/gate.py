@@ -40,7 +40,7 @@ HEADERS = {
 }
 SAFE_METHODS = frozenset({"GET", "HEAD"})
 _REST_VERBS = [verb for verb, command in BY_VERB[About.AXIS].items() if command.effect is Effect.REST]
-BRINGS_TO_REST = re.compile(rf"/api/(stop|rigs/[^/]+/(stop|axes/[^/]+/({'|'.join(_REST_VERBS)})))")
+BRINGS_TO_REST = re.compile(rf"/api/(stop|rigs/[^/]+/(stop|run/stop|axes/[^/]+/({'|'.join(_REST_VERBS)})))")
 WEBSOCKET_POLICY_VIOLATION = 1008
 
 STRANGER_PAGE = """<!doctype html>

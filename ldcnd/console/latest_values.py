@@ -17,6 +17,8 @@ from ldcnd.contract.codec import Encoding
 from ldcnd.contract.keys import ROOT
 
 RIG_TOPIC = "rig"
+RUN_TOPIC = "run"
+"""Topics of what the console itself tells of a rig: how it is, and how far a sequence is."""
 """Stands in the place of a topic where an entry tells of the rig itself."""
 MOST_PATHS = 20_000
 """More keys than any rigs have; what comes on others is left out."""
@@ -91,9 +93,9 @@ class LatestValues:
         for watcher in self.watchers:
             watcher.happened(path.name, path.start + payload)
 
-    def tell_of_rig(self, rig: str, told: Mapping[str, bool | str | None]) -> None:
-        """Replace the state of a rig itself for pages."""
-        key = f"{ROOT}/{rig}/{RIG_TOPIC}"
+    def tell_of_rig(self, rig: str, told: Mapping[str, object], topic: str = RIG_TOPIC) -> None:
+        """Replace what the console tells of a rig itself."""
+        key = f"{ROOT}/{rig}/{topic}"
         self._put(self._paths.get(key) or self._new_path(key), msgpack.packb(told))
 
     def begin_again(self, rig: str) -> None:
@@ -109,7 +111,9 @@ class LatestValues:
         for answer in answers:
             if answer.key not in newer:
                 self.take(answer)
-        kept = newer | {answer.key for answer in answers} | {f"{ROOT}/{rig}/{RIG_TOPIC}"}
+        kept = (
+            newer | {answer.key for answer in answers} | {f"{ROOT}/{rig}/{topic}" for topic in (RIG_TOPIC, RUN_TOPIC)}
+        )
         for key, path in self._paths.items():
             if path.rig == rig and key not in kept:
                 self._remove(path)

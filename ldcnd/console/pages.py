@@ -8,7 +8,7 @@ control is given up.
 import asyncio
 import secrets
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,8 +16,11 @@ from pydantic import Field
 
 from ldcnd.client.lease import Control, acquire
 from ldcnd.client.motion import Jogging
+from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
+from ldcnd.client.sequences import SequenceRun
 from ldcnd.console.rigs import Rigs
+from ldcnd.console.sequences import PageRun, RunProgress, RunRequest, Runs, read_catalogue
 from ldcnd.console.visitors import Visitor
 from ldcnd.contract.codec import error_reply
 from ldcnd.contract.commands import AxisCommand, BufferMode, CommandReply, Effect, ErrorReply, Halt, Jog
@@ -29,6 +32,7 @@ from ldcnd.contract.errors import (
     RequestRefused,
     TooManyRequests,
     UnknownAxis,
+    WrongState,
 )
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.leases import ListHolders
@@ -170,13 +174,17 @@ class PageControl:
         client: the name under which it holds control.
     """
 
-    def __init__(self, client: str, rigs: Rigs, tell: Callable[[ToPage], None], group: asyncio.TaskGroup) -> None:
+    def __init__(
+        self, client: str, rigs: Rigs, runs: Runs, tell: Callable[[ToPage], None], group: asyncio.TaskGroup
+    ) -> None:
         self.token = secrets.token_urlsafe(TOKEN_BYTES)
         self.client = client
         self._rigs = rigs
         self._tell = tell
         self._group = group
         self._held: dict[tuple[str, str], _Hold] = {}
+        self._runs = runs
+        self._lent: dict[tuple[str, str], PageRun] = {}
         self._gone = False
         self._jogging: asyncio.Task[None] | None = None
         self._held_on = asyncio.Event()
@@ -199,8 +207,10 @@ class PageControl:
             UnknownAxis: the rig has no such axis.
             LeaseHeld: another page or program controls it.
             LeaseExpired: the page has gone meanwhile.
+            WrongState: it has lent it to a sequence, which would end for want of it.
         """
         client = self._rigs.client(rig)
+        self._refuse_lent(rig, axis)
         if axis not in self._rigs.axes(rig):
             raise UnknownAxis(f"rig {rig} has no axis {axis[:64]!r}", axis=axis[:64], value=axis[:64])
         control = await acquire(client, self.client, (axis,), LEASE_S, force=force)
@@ -215,6 +225,8 @@ class PageControl:
 
     async def release(self, rig: str, axis: str) -> None:
         """Give up control of an axis; one that may move is halted before."""
+        if run := self._lent.get((rig, axis)):
+            await run.stop()  # which gives the axis back
         if hold := self._held.pop((rig, axis), None):
             await _give_up(hold, self.client)
             self._rigs.control_changed(rig, axis)
@@ -228,6 +240,8 @@ class PageControl:
         """
         hold = self._held.get((rig, axis))
         if hold is None:
+            if command.effect is Effect.MOTION:
+                self._refuse_lent(rig, axis)
             refuse_unwatched(axis, command)
             return await self._rigs.client(rig).command(axis, command)
         with hold.in_flight(moves=command.effect is Effect.MOTION):
@@ -245,11 +259,106 @@ class PageControl:
             for move in request.moves:
                 hold = self._held.get((rig, move.axis))
                 if hold is None:
+                    self._refuse_lent(rig, move.axis)
                     raise control_needed(move.axis)
                 sending.enter_context(hold.in_flight(moves=True))
                 moves.append(hold.control.stamped(move, move.axis))
             together = request.model_copy(update={"moves": tuple(moves)})
             return await self._rigs.client(rig).ask(together)
+
+    async def run(self, rig: str, wanted: RunRequest) -> RunProgress:
+        """Begin a sequence, or the way to a position; it ends with this page, and without control of its axes.
+
+        The run takes control itself, under the name of this page, in place of the page's own, and the page takes it
+        again at its end. So the lease of a run ends with it, and the daemon refuses whatever of it is still on the way
+        when it is stopped; and the page cannot move by hand what a sequence relies on.
+
+        Raises:
+            LeaseRequired: this page does not control one of the axes.
+            WrongState: another one runs on the rig, or it is not any more what the page shows.
+            LdcndError: the daemon does not answer.
+        """
+        client = self._rigs.client(rig)
+        catalogue = await read_catalogue(client, await client.axes())
+        config, found = catalogue.find(wanted)
+        there = Rig(client, await client.daemon())
+        # nothing is awaited from here on: a second press finds the first
+        self._runs.refuse_second(rig)
+        if self._gone:
+            raise _page_gone()
+        if untaken := [axis for axis in found.axes if (rig, axis) not in self._held]:
+            raise control_needed(untaken[0])
+        first = RunProgress(kind=found.kind, name=found.name, client=self.client, axes=found.axes, of=len(found.steps))
+        run = self._runs.new(rig, first)
+        sequence = SequenceRun(there, config, catalogue.positions, run.report, self._runs.now_ns, self.client)
+        carried = self._carry_out(rig, run, sequence)
+        run.begin(sequence, self._group.create_task(carried, name=f"{run.title} of {self.client}"))
+        return run.progress
+
+    def pause(self, rig: str, *, on: bool) -> RunProgress:
+        """Have the next step of this page's run wait, or go on.
+
+        Raises:
+            WrongState: no run of this page goes on there.
+        """
+        run = self._runs.going(rig)
+        if run is None or run.progress.client != self.client:
+            raise WrongState(f"this page runs no sequence on rig {rig}", remedy="look at the page that has begun it")
+        run.pause(on=on)
+        return run.progress
+
+    async def _carry_out(self, rig: str, run: PageRun, sequence: SequenceRun) -> None:
+        error: LdcndError | None = None
+        ended = False
+        try:
+            for axis in run.progress.axes:
+                self._lend(rig, axis, run)
+            await sequence.run()
+            ended = True
+        except LdcndError as failed:
+            error = failed
+        except BaseExceptionGroup as failures:
+            first = failures.exceptions[0]
+            if not isinstance(first, LdcndError):
+                raise
+            error = first
+        finally:
+            run.ending()
+            # what another client has taken moves for that one
+            halts = not ended and not isinstance(error, LeaseExpired)
+            async with asyncio.TaskGroup() as group:
+                for axis in run.progress.axes:
+                    group.create_task(self._take_back(rig, axis, halts=halts), name=f"{self.client} has {axis} again")
+            run.over(error, stopped=not ended and error is None)
+
+    def _lend(self, rig: str, axis: str, run: PageRun) -> None:
+        hold = self._held.pop((rig, axis), None)
+        if hold is None:  # lost since the press
+            raise control_needed(axis)
+        hold.keeping.cancel()
+        self._lent[rig, axis] = run
+        self._rigs.control_changed(rig, axis)
+
+    async def _take_back(self, rig: str, axis: str, *, halts: bool) -> None:
+        """Take control of an axis again after a run, unless the page has gone or another client was faster."""
+        if self._lent.pop((rig, axis), None) is None:
+            return
+        if halts:  # a command that had no answer yet may have begun a motion that the run knows nothing of
+            with suppress(LdcndError):
+                await self._rigs.client(rig).command(axis, Halt(client=self.client), HALT_TIME_S)
+        if self._gone:
+            return
+        try:
+            await self.take(rig, axis, force=False)
+        except LdcndError as error:
+            self._rigs.control_changed(rig, axis)
+            taker = await self._holder(rig, axis)
+            log.info("control lost", client=self.client, rig=rig, axis=axis, reason=error.message)
+            self._tell(ToPage(lost=Lost(rig=rig, axis=axis, message=error.message, taken_by=taker)))
+
+    def _refuse_lent(self, rig: str, axis: str) -> None:
+        if run := self._lent.get((rig, axis)):
+            raise WrongState(f"axis {axis}: {run.title} moves it", axis=axis, remedy="stop that, or wait for its end")
 
     def lease(self, rig: str, axis: str) -> str | None:
         """Return the lease of an axis, for questions."""
@@ -267,6 +376,8 @@ class PageControl:
         self._end_jog()
         holds, self._held = list(self._held.values()), {}
         async with asyncio.TaskGroup() as group:
+            for run in set(self._lent.values()):
+                group.create_task(run.stop(), name=f"{self.client} leaves {run.title}")
             for hold in holds:
                 group.create_task(_give_up(hold, self.client), name=f"{self.client} leaves {hold.axis}")
 
@@ -345,8 +456,9 @@ class PageControl:
 class Pages:
     """All open pages, by what their commands carry."""
 
-    def __init__(self, rigs: Rigs) -> None:
+    def __init__(self, rigs: Rigs, runs: Runs) -> None:
         self._rigs = rigs
+        self._runs = runs
         self._open: dict[str, tuple[Visitor, PageControl]] = {}
         self._count = 0
         rigs.lease_of = self.lease
@@ -366,7 +478,7 @@ class Pages:
             raise TooManyRequests(f"{MOST_PAGES} pages are open", limit=MOST_PAGES, remedy="close some of them")
         self._count += 1
         async with asyncio.TaskGroup() as group:
-            page = PageControl(f"{visitor.client}.{self._count}", self._rigs, tell, group)
+            page = PageControl(f"{visitor.client}.{self._count}", self._rigs, self._runs, tell, group)
             self._open[page.token] = (visitor, page)
             try:
                 yield page

@@ -1,5 +1,6 @@
 """Replies of the console that are no public model of the daemon."""
 
+from ldcnd.console.sequences import RunnablesReply
 from ldcnd.contract.commands import ErrorReply, StopReply
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo, BusInfo, CommandList, DaemonInfo
@@ -29,6 +30,8 @@ class RigReply(Frozen):
     """The bus budgets of the lines."""
     commands: CommandList | None = None
     """The commands of the rig."""
+    can_run: RunnablesReply = RunnablesReply()
+    """Its sequences and named positions."""
 
 
 class EndpointReply(Frozen):

@@ -11,11 +11,12 @@ from ldcnd.client.rig_client import RigClient
 from ldcnd.console.conditions import Conditions
 from ldcnd.console.latest_values import LatestValues, as_msgpack
 from ldcnd.console.replies import RigReply
+from ldcnd.console.sequences import RunnablesReply, read_catalogue
 from ldcnd.contract.codec import Encoding, decode_received
 from ldcnd.contract.condition import daemon_troubles
 from ldcnd.contract.errors import LdcndError, OutcomeUnknown
 from ldcnd.contract.health import DaemonHealth
-from ldcnd.contract.meta import CommandList
+from ldcnd.contract.meta import AxisInfo, CommandList
 from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.questions import Why
 from ldcnd.contract.samples import TelemetryItem
@@ -215,9 +216,11 @@ class RigWatch:
         client = self.client
         try:
             async with asyncio.timeout(DESCRIBE_TIME_S):
+                axes = tuple(await client.axes())
                 described = {
                     "daemon": await client.daemon(),
-                    "axes": tuple(await client.axes()),
+                    "axes": axes,
+                    "can_run": await self._runnables(axes),
                     "buses": tuple(await client.buses()),
                     "plan": next(iter(await client.read(client.keys.budget, RigBudget)), None),
                     "commands": next(iter(await client.read(client.keys.commands, CommandList)), None),
@@ -226,6 +229,12 @@ class RigWatch:
             raise OutcomeUnknown(f"rig {client.rig} takes too long to describe itself") from None
         self._reply = self._reply.model_copy(update=described)
         self._described_at_s = asyncio.get_running_loop().time()
+
+    async def _runnables(self, axes: tuple[AxisInfo, ...]) -> RunnablesReply:
+        try:
+            return (await read_catalogue(self.client, axes)).reply()
+        except LdcndError as error:  # of a daemon of another version; all else of it is shown
+            return RunnablesReply(problem=error.message)
 
     async def _stirred_within(self, seconds: float) -> None:
         try:

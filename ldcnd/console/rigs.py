@@ -9,10 +9,11 @@ from ldcnd.certificate import watch_certificate
 from ldcnd.client.network import Session, ZenohSettings, open_session
 from ldcnd.client.presence import tell_absence
 from ldcnd.client.rig_client import RigClient, daemons
-from ldcnd.console.latest_values import LatestValues
+from ldcnd.console.latest_values import RUN_TOPIC, LatestValues
 from ldcnd.console.replies import EndpointReply, RigReply
 from ldcnd.console.rig_watch import RigWatch
 from ldcnd.contract.errors import ConfigError, SessionError, UnknownAxis
+from ldcnd.contract.frozen import Frozen
 from ldcnd.log import get_logger
 
 log = get_logger("console")
@@ -88,6 +89,10 @@ class Rigs:
     def control_changed(self, rig: str, axis: str) -> None:
         """Learn that a page has another lease on an axis, or none any more."""
         self._watch(rig).want_why(axis)
+
+    def show_run(self, rig: str, progress: Frozen) -> None:
+        """Tell pages how far a sequence is."""
+        self._values.tell_of_rig(rig, progress.model_dump(mode="json"), RUN_TOPIC)
 
     def axes(self, rig: str) -> frozenset[str]:
         """Return the names of a rig's axes, as it described itself last."""

@@ -33,6 +33,7 @@ from ldcnd.console.pages import Pages
 from ldcnd.console.reading import STATIC, reading_routes
 from ldcnd.console.replies import LinkReply
 from ldcnd.console.rigs import Rigs
+from ldcnd.console.sequences import Runs
 from ldcnd.console.settings import ConsoleSettings
 from ldcnd.console.visitors import LINK_S, Visitors
 from ldcnd.contract.errors import ConfigError
@@ -77,12 +78,13 @@ def build_app(
     async def link(_: Request) -> Response:
         return Response(LinkReply(link=new_link()).model_dump_json(), media_type="application/json")
 
-    pages = Pages(rigs)
+    runs = Runs(rigs.show_run, time.time_ns)
+    pages = Pages(rigs, runs)
     routes = [
         *reading_routes(rigs, feed, visitors, commissions=commissioning is not None),
         *control_routes(pages),
         Route("/api/link", link, methods=["POST"]),
-        *command_routes(rigs, pages),
+        *command_routes(rigs, pages, runs),
         *(commissioning(rigs) if commissioning else ()),
         Mount("/static", StaticFiles(directory=STATIC)),
     ]

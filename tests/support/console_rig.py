@@ -7,6 +7,7 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
+import msgpack
 from starlette.types import ASGIApp, Message, Scope
 
 from ldcnd.config.rig import RigConfig
@@ -36,6 +37,16 @@ class RunningConsole:
     visitors: Visitors
     rigs: Rigs
     rig: RunningRig
+    values: LatestValues
+
+    def told_of_rig(self, rig: str, topic: str) -> JsonObject | None:
+        """Return what pages are told last on a topic of the console's own."""
+        name = f"{rig}/{topic}"
+        if not self.values.names(lambda each: each == name):
+            return None
+        *_, told = msgpack.unpackb(self.values.entry(name))
+        assert isinstance(told, dict)
+        return told
 
     async def enter(self) -> Browser:
         """Return one more browser that was let in."""
@@ -201,7 +212,7 @@ async def console_of(
         async with asyncio.timeout(PATIENCE_S):
             while not [each for each in await rigs.described() if each.connected]:
                 await asyncio.sleep(0.1)
-        yield RunningConsole(app, browser, visitors, rigs, rig)
+        yield RunningConsole(app, browser, visitors, rigs, rig, values)
         watching.cancel()
 
 

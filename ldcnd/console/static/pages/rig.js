@@ -14,6 +14,7 @@ import { axesOf, changed, endpoints, isWhole, useRigs } from "../session/rigs.js
 import { AxesOf, refused, ShortAction } from "./rig_axes.js";
 import { GroupMoves } from "./rig_groups.js";
 import { ModulesOf } from "./rig_modules.js";
+import { Sequences } from "./rig_sequences.js";
 import { SpeedOverride } from "./rig_speed.js";
 
 /** So many axes are found without a filter. */
@@ -121,6 +122,7 @@ function RigSection({ rig }) {
     })}
     ${!filtered && [...rig.buses.values()].map((bus) => html`<${ModulesOf} key=${bus.name} rig=${rig} bus=${bus} />`)}
     ${filtered && !axes.length && html`<p class="quiet">No axis of this rig is like that.</p>`}
+    <${Sequences} rig=${rig} />
     <${GroupMoves} rig=${rig} />
   </section>`;
 }

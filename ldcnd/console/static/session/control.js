@@ -94,6 +94,11 @@ export function ofRig(rig, verb, body = {}) {
   return ask(`${rigPath(rig.name)}/rig/${verb}`, given(body));
 }
 
+/** Begin a sequence under this page's control, or have it wait; it is not sent twice. */
+export function ofRun(rig, what, body) {
+  return ask(`${rigPath(rig.name)}/${what}`, body);
+}
+
 /** Ask about an axis: `why` and `plan`, which have no effect. */
 export function question(axis, verb, body = {}) {
   return ask(`${axisPath(axis.rig.name, axis.name)}/${verb}`, given(body));

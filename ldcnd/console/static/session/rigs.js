@@ -296,6 +296,10 @@ export class Rig {
   events = [];
   /** What the daemon says of each command, by its verb. */
   commands = new Map();
+  /** Its sequences and named positions, as the console process has read them. */
+  canRun = { runnables: [], problem: null };
+  /** How far a sequence is, or the last one was; null before the first. */
+  run = null;
   heardAtMs = performance.now();
   #newest = { ns: 0, atMs: 0 };
 
@@ -311,6 +315,11 @@ export class Rig {
     if (silentS > SILENT_AFTER_S)
       return { word: "old", level: "bad", why: `Nothing was heard for ${silentS.toFixed(0)} s.` };
     return null;
+  }
+
+  /** Whether a sequence runs. */
+  get runs() {
+    return this.run !== null && !this.run.end;
   }
 
   /** Whether a command may make an axis move, as the daemon says. */
@@ -336,6 +345,7 @@ export class Rig {
     if (told.daemon?.instance !== this.daemon?.instance) this.#newest = { ns: 0, atMs: 0 }; // its clock may be another
     this.daemon = told.daemon ?? this.daemon;
     this.plan = told.plan ?? this.plan;
+    this.canRun = told.can_run;
     const described = Boolean(told.daemon);
     if (described) for (const axis of this.axes.values()) axis.info = null; // those that it has not any more keep none
     for (const bus of this.buses.keys()) if (described && !told.buses.some((each) => each.bus === bus)) this.buses.delete(bus);
@@ -503,6 +513,7 @@ export function watch() {
   feed.listen((rig, topic, sample) => {
     if (rig !== null) {
       if (topic === "rig") joined(rigNamed(rig), sample);
+      else if (topic === "run") rigNamed(rig).run = sample; // of the console process: no sign of life of the daemon
       else rigNamed(rig).take(topic, sample);
     }
     changed();
