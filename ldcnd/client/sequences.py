@@ -10,7 +10,7 @@ from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.condition import way_to_rest
-from ldcnd.contract.errors import ConfigError, LdcndError, StopLatched, WrongState
+from ldcnd.contract.errors import ConfigError, LdcndError, WrongState
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import IoSample, Moving, StateSample, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
@@ -56,7 +56,6 @@ class SequenceRun:
         self._axes: dict[str, Axis] = {}
         self._units: dict[str, AxisInfo] = {}
         self._modules: dict[str, str] = {}  # by the names of their lines
-        self._latched: frozenset[str] | None = None
 
     async def run(self, first: int = 1, *, force: bool = False) -> None:
         """Carry it out under control of its axes, of all axes of the rig if it writes outputs.
@@ -71,7 +70,6 @@ class SequenceRun:
             LdcndError: a step was refused or has failed; nothing after it was begun.
         """
         steps = self._sequence.step
-        self._latched = None
         if not 1 <= first <= len(steps):
             raise ConfigError(f"sequence {self._sequence.name} has no step {first}", value=first, limit=len(steps))
         await self._check_stand(steps[first - 1 :])
@@ -110,14 +108,6 @@ class SequenceRun:
                 remedy=way_to_rest(state.state),
             )
 
-    async def _check_latch(self) -> None:
-        """Go on under no stop that was pressed meanwhile: writing outputs needs no motor, and no latch refuses it."""
-        states = await self._rig.states()
-        now = frozenset(axis for axis in self._axes if axis in states and states[axis].stop_latched)
-        if self._latched is not None and (new := now - self._latched):
-            raise StopLatched(f"axis {min(new)} was stopped; sequence {self._sequence.name} ends", axis=min(new))
-        self._latched = now
-
     @property
     def used(self) -> tuple[str, ...]:
         """The axes that it moves, or waits for."""
@@ -144,7 +134,6 @@ class SequenceRun:
         report("begun")
         began_s = loop.time()
         try:
-            await self._check_latch()
             await self._within(number, step)
             await asyncio.sleep(step.pause_s)
         except LdcndError as error:

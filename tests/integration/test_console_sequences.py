@@ -139,6 +139,7 @@ async def test_stop_of_any_page_halts_the_rotor_and_the_page_keeps_control(conso
 
 
 @pytest.mark.long
+@pytest.mark.promise("page-that-closes")
 async def test_a_page_that_goes_ends_its_run(console):
     async with at_work(console) as page:
         await run(console, page, "shut")

@@ -64,14 +64,16 @@ function Runnable({ rig, of: each }) {
   const run = () => once.send(body, false, () => ofRun(rig, "run", body));
   return html`<li aria-label=${`${kind} ${name}`}>
     <h3>${name}</h3>
-    <ol>${steps.map((step, index) => html`<li aria-current=${index + 1 === at ? "step" : null}>${step}</li>`)}</ol>
+    ${kind === "position"
+      ? html`<p>${steps[0]}</p>`
+      : html`<ol>${steps.map((step, index) => html`<li aria-current=${index + 1 === at ? "step" : null}>${step}</li>`)}</ol>`}
     <${Action} act=${run} obstacle=${way} of=${isThis ? rig.run?.ended : null}>${PRESS[kind]} ${name}<//>
   </li>`;
 }
 
 /** What forbids to run it now, in words; null where nothing does. */
 function wayOf(rig, { axes, first }) {
-  if (rig.runs) return `${rig.run.kind} ${rig.run.name} runs: stop it, or wait for its end.`;
+  if (rig.runs) return `The ${rig.run.kind} ${rig.run.name} runs: stop it, or wait for its end.`;
   for (const name of axes) {
     const way = hindrance(rig.axis(name), null);
     if (way) return axes.length > 1 ? `${name}: ${way}` : way;
