@@ -33,8 +33,6 @@ from ldcnd.log import get_logger
 
 log = get_logger("interlocks")
 
-DEEPEST = 2
-"""How many rules of outputs a way out leads through."""
 NOT_HOMED = "is not homed"
 HUNTING = 0.1
 """Share of its speed by which a servo may be faster than its profile, between two readings."""
@@ -270,48 +268,68 @@ class Interlocks:
             ),
         )
 
-    def _to_hold(self, lacks: Sequence[Lack], axis: str | None, *, waits: bool = True, depth: int = 0) -> list[Remedy]:
+    def _to_hold(self, lacks: Sequence[Lack], axis: str | None, *, waits: bool = True) -> list[Remedy]:
         """Return in stages what has requirements hold.
 
         Args:
             lacks: those that do not.
             axis: of which commands may be named.
             waits: what no command leads to is waited for.
-            depth: how many rules have led here.
         """
         stages = list({str(each.way): each.way for each in lacks if each.way and each.axis == axis}.values())
         levels: dict[ModuleService, dict[str, bool]] = {}
         for each in lacks:
             if each.sets:
                 levels.setdefault(each.sets[0], {}).update(each.sets[1])
-        for module, wanted in levels.items() if depth < DEEPEST else ():
-            stages += self._to_set(module, wanted, axis, depth)
-        if waits and (unled := [each.wanted for each in lacks if not each.sets]):
-            *others, last = dict.fromkeys(unled)
-            stages.append(Remedy(f"wait until {', '.join(others)}{' and ' if others else ''}{last}"))
-        return stages
+        for module, wanted in levels.items():
+            stages += self._to_set(module, wanted, axis)
+        return stages + (self._to_wait(lacks) if waits else [])
 
-    def _to_set(
-        self, module: ModuleService, wanted: Mapping[str, bool], axis: str | None, depth: int = 0
-    ) -> list[Remedy]:
-        """Return in stages how outputs of a module get their levels: what a rule still forbids waits for the others."""
-        levels = module.levels_to_set(wanted)
-        later = {name: level for name, level in levels.items() if self._forbidden(levels, name)}
+    def _to_wait(self, lacks: Sequence[Lack]) -> list[Remedy]:
+        """Return what is to be waited for, of what no output has hold."""
+        awaited = [*dict.fromkeys(each.wanted for each in lacks if not each.sets)]
+        if not awaited:
+            return []
+        *others, last = awaited
+        return [Remedy(f"wait until {', '.join(others)}{' and ' if others else ''}{last}")]
+
+    def _to_set(self, module: ModuleService, wanted: Mapping[str, bool], axis: str | None) -> list[Remedy]:
+        """Return in stages how outputs of a module get their levels, and what else of it that takes.
+
+        What only the machine can bring about, such as a door that is to fall shut, another output may have to bring
+        about first: an output that waits for an input is written behind all others.
+        """
+        levels = dict(wanted)
+        for _ in self._rules:  # what one rule wants another may bind
+            more = {
+                name: level
+                for lack in self._forbidden(levels)
+                if lack.sets and lack.sets[0] is module
+                for name, level in lack.sets[1].items()
+                if name not in levels
+            }
+            if not more:
+                break
+            levels |= more
+        levels = dict(module.levels_to_set(levels))
+        later = {
+            name: level
+            for name, level in levels.items()
+            if any(lack.axis is None and not lack.sets for lack in self._forbidden(levels, name))
+        }
         # an output of which nothing is known is written, too: only so it comes to be known
         first = {
             name: level is not (name in later)
             for name, level in levels.items()
             if name not in later or module.is_unwritten(name)
         }
-        stages = []
-        if first:
-            if lacks := self._forbidden(first):
-                stages += self._to_hold(lacks, axis, depth=depth + 1)
-            stages.append(Remedy("{}", setting(module.name, first)))
-        if later:
-            lacks = self._forbidden(first | later, *later)
-            stages += self._to_hold(lacks, axis, depth=depth + 1)
-            stages.append(Remedy("{}", setting(module.name, later)))
+        stages: list[Remedy] = []
+        for part, names in ((first, tuple(first)), (first | later, tuple(later))):
+            if names:
+                lacks = self._forbidden(part, *names)
+                ways = {str(each.way): each.way for each in lacks if each.way and each.axis == axis}
+                stages += [*ways.values(), *self._to_wait(lacks)]
+                stages.append(Remedy("{}", setting(module.name, {name: part[name] for name in names})))
         return stages
 
     def _forbidden(self, levels: Mapping[str, bool], *names: str) -> tuple[Lack, ...]:
