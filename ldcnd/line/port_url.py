@@ -64,8 +64,13 @@ def check_port(port: str) -> None:
         elif not port.startswith("/"):
             _server(port)
     except (ValueError, re.error) as error:
-        message = f"port {port!r} is not {KINDS}: {error}"
-        raise ConfigError(message, value=port, remedy="correct the port") from None
+        message, remedy = f"port {port!r} is not {KINDS}: {error}", "correct the port"
+        if "://" not in port:  # a daemon has a folder of its own, in which a path would mean another place
+            message, remedy = (
+                f"port {port!r} is not {KINDS}",
+                f"write a device with its whole path: {Path(port).absolute()}",
+            )
+        raise ConfigError(message, value=port, remedy=remedy) from None
 
 
 def is_here(port: str) -> bool:

@@ -9,10 +9,10 @@ from types import SimpleNamespace
 
 import pytest
 
-from ldcnd.contract.errors import TransportLost
+from ldcnd.contract.errors import ConfigError, TransportLost
 from ldcnd.drives.ldcn.config import LdcnBusConfig
 from ldcnd.line import ports_here as here
-from ldcnd.line.port_url import port_opener
+from ldcnd.line.port_url import check_port, port_opener
 from tests.support.command_line import run_here
 
 HOLDS = """
@@ -118,3 +118,9 @@ def test_a_configuration_takes_every_kind_of_port(port: str):
     assert LdcnBusConfig.model_validate(line | {"port": port}).port == port
     with pytest.raises(ValueError, match="is not a device path"):
         LdcnBusConfig.model_validate(line | {"port": port.removeprefix("/").replace("://", "//")})
+
+
+def test_a_relative_path_is_refused_with_the_whole_one():
+    with pytest.raises(ConfigError, match="is not a device path") as refused:
+        check_port("./line0")
+    assert f"{Path.cwd()}/line0" in str(refused.value.remedy)
