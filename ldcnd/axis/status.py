@@ -402,8 +402,8 @@ class AxisStatus:
 
     @property
     def coasts(self) -> bool:
-        """Whether the shaft is seen to turn while the motor is off."""
-        return self.rest.turns and not self.enabled
+        """Whether the shaft turns while the motor is off, as a look shows, or as polls have: an encoder may have ceased."""
+        return (self.rest.turns or self.coast is not None) and not self.enabled
 
     @property
     def unseen(self) -> Unseen | None:

@@ -1337,3 +1337,28 @@ def test_a_healthy_run_that_goes_over_into_another_ends_by_itself_without_a_faul
         return (await machine.rig.client.client.last("rotor", "fault")).active
 
     assert not alone(runs)
+
+
+@pytest.mark.parametrize("after_s", [0.0, 0.01, 0.02, 0.03, 0.04, 0.05])
+@pytest.mark.parametrize("rpm", [300, 950])
+@pytest.mark.sweep(3)
+def test_power_that_comes_as_an_encoder_dies_closes_no_loop_beside_a_rotor_that_coasts(rpm, after_s):
+    async def switches_on(machine):
+        await machine.rotor.move_velocity(rpm / 60, acceleration=10, duration_s=60)
+        await machine.rig.until(lambda: machine.speed > 0.95 * rpm / 60)
+        await machine.rotor.power(on=False)
+        await asyncio.sleep(0.5)
+        machine.rig.faults.encoder_stuck("rotor")
+        await asyncio.sleep(after_s)
+        closed_at, written_at = [], []
+        for _ in range(100):
+            with suppress(LdcndError):
+                await machine.rotor.power(on=True)
+                closed_at.append(machine.speed)
+            with suppress(LdcndError):
+                await machine.high("unlock")
+                written_at.append(machine.speed)
+            await asyncio.sleep(0.05)
+        return [each for each in (*closed_at, *written_at) if each > CREEPS]
+
+    assert alone(switches_on) == []
