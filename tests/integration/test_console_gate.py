@@ -124,12 +124,14 @@ async def test_a_page_without_its_cookies_goes_on_ending_motions_and_does_nothin
     page_of_old = console.browser.forging(cookie="ldcnd_session_8471=another", x_ldcnd_csrf=console.browser.csrf)
 
     ended = [await page_of_old.post(f"/api/rigs/sim/axes/x/{verb}") for verb in ("halt", "quick_stop")]
-    ended += [await page_of_old.post(path, {}) for path in ("/api/rigs/sim/stop", "/api/stop")]
+    ended += [
+        await page_of_old.post(path, {}) for path in ("/api/rigs/sim/stop", "/api/stop", "/api/rigs/sim/run/stop")
+    ]
     refused = [await page_of_old.post(path, ON) for path in (POWER, "/api/rigs/sim/axes/x/reset", "/api/link")]
     refused.append(await page_of_old.get("/api/rigs"))
     elsewhere = await page_of_old.forging(origin="http://127.0.0.1:8471").post("/api/stop")
 
-    assert [each.status for each in ended] == [200] * 4
+    assert [each.status for each in ended] == [200] * 5
     assert [each.status for each in refused] == [401] * 4
     assert elsewhere.status == 403
 

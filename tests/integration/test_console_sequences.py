@@ -8,7 +8,9 @@ import pytest
 from ldcnd.client.lease import acquire
 from ldcnd.config.rig import load_config
 from ldcnd.contract.leases import ListHolders
+from ldcnd.contract.plan import RigBudget
 from ldcnd.contract.samples import Moving
+from ldcnd.contract.sequences import NamedPosition
 from tests.support.console_rig import open_page, running_console
 from tests.support.process import ROOT
 
@@ -60,10 +62,6 @@ async def spins(console):
 async def holder(console):
     (told,) = (await console.rig.client.ask(ListHolders())).holders
     return told.client
-
-
-async def stands(console):
-    return (await console.rig.client.state("rotor")).moving is Moving.NO
 
 
 async def test_pages_are_told_what_can_be_run_in_words(console):
@@ -208,3 +206,37 @@ async def test_a_step_that_fails_says_why_and_is_kept_until_the_next_run(console
 
     assert (failed["end"], failed["step"]) == ("failed", 1)
     assert failed["error"]["remedy"]
+
+
+@pytest.mark.long
+async def test_a_daemon_that_is_started_again_has_nothing_run(console):
+    async with at_work(console) as page:
+        await run(console, page, "shut")
+        await until(console, lambda told: told["step"] >= 1)
+        await console.rig.begin_anew(2.0, killed=True)
+        end = await ended(console)
+        await asyncio.sleep(20)
+        after = console.told_of_rig("centrifuge", "run")
+
+    assert end["end"] == "failed"
+    assert after == end
+    assert await holder(console) is None
+    assert abs(console.rig.lives.truth("rotor").velocity) < 0.05
+
+
+async def test_after_a_reload_pages_have_what_the_daemon_has_and_press_nothing_of_before(console):
+    before = (await offered(console))["position", "bucket2"]
+    other = NamedPosition(name="bucket2", axes={"rotor": 0.7})
+    (plan,) = await console.rig.client.read(console.rig.client.keys.budget, RigBudget)
+    console.rig.daemon.reconfigure(CENTRIFUGE.model_copy(update={"position": (other,), "sequence": ()}), plan)
+
+    async with at_work(console) as page:
+        wanted = {name: before[name] for name in ("kind", "name", "mark")}
+        refused = await page.post(f"{RIG}/run", wanted)
+        async with asyncio.timeout(30):
+            while len(now := await offered(console)) != 1:
+                await asyncio.sleep(0.1)
+
+    assert refused.document["code"] == "wrong_state"
+    assert "is another one since the configuration was read again" in refused.document["message"]
+    assert now["position", "bucket2"]["steps"] == ["go to bucket2 (rotor 0.7 rev)"]
