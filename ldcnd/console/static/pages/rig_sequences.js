@@ -3,7 +3,6 @@
 import { html } from "../html.js";
 import { Action, Panel, RefusalText, useOnce } from "../parts/controls.js";
 import { clock, sentence } from "../parts/format.js";
-import { Mark } from "../parts/state.js";
 import { askAtOnce, rigPath } from "../session/api.js";
 import { client, ofRun } from "../session/control.js";
 import { hindrance } from "../session/obstacles.js";
@@ -18,7 +17,7 @@ export function Sequences({ rig }) {
   if (!runnables.length && !problem) return null;
   const positions = runnables.some(({ kind }) => kind === "position");
   return html`<${Panel} title="Sequences and positions" of=${rig}>
-    ${problem && html`<p><${Mark} level="warn">The sequences of this daemon cannot be read: ${sentence(problem)}<//></p>`}
+    ${problem && html`<p class="mark" data-level="warn">The sequences of this daemon cannot be read: ${sentence(problem)}</p>`}
     <${Progress} rig=${rig} />
     <ul class="runnables">${runnables.map((each) => html`<${Runnable} key=${`${each.kind} ${each.name}`} rig=${rig} of=${each} />`)}</ul>
     ${positions && html`<p class="quiet">Positions are taught on the command line: <code>ldcnd position teach</code>.</p>`}
@@ -33,7 +32,7 @@ function Progress({ rig }) {
   const pause = () => ofRun(rig, "run/pause", { on: !run.paused });
   const notMine = run?.client !== client && `It is run by ${run?.client}: go there, or stop it here.`;
   return html`<div class="run">
-    <p role="status">${run && html`<${Mark} level=${LEVELS[run.end] ?? ""}>${inWords(run)}<//>`}</p>
+    <p class="mark" role="status" data-level=${LEVELS[run?.end] ?? null}>${run && inWords(run)}</p>
     ${run?.error && html`<p><${RefusalText} refusal=${{ ...run.error, rig: rig.name }} /></p>`}
     ${goes && html`<p class="row">
       <${Action} key="stop" kind="main" act=${stop} calms=${true} title="What moves is halted; outputs stay as they are">Stop ${run.name}<//>
