@@ -402,7 +402,7 @@ class AxisStatus:
 
     @property
     def coasts(self) -> bool:
-        """Whether the shaft turns with the motor off, as a look shows, or as polls have: its encoder may have ceased."""
+        """Whether the shaft turns with the motor off, as a look or polls have shown: its encoder may have ceased."""
         return (self.rest.turns or self.coast is not None) and not self.enabled
 
     @property
