@@ -28,6 +28,8 @@ LAGS_S = 0.04
 """Shortest time over which a way is compared with its speed: a request may be some ms late on its line."""
 SWINGS_ABOVE = 1.5
 """A shaft swings by less than half of its speed when it was this much faster at most."""
+RUNAWAY_SHARE = 4.0
+"""No shaft swings to so many times its speed, even where it sticks and breaks free."""
 LEAST_COAST_S = 0.01
 """Readings that follow each other sooner tell nothing of how a shaft slows down."""
 COASTS_S = 0.3
@@ -216,12 +218,10 @@ class Following:
         position, error = reading.position_counts, reading.following_error_counts
         low, high = min(self.low, position), max(self.high, position)
         runs = reading.enabled and not reading.profile_done
-        if high - low > REST_COUNTS:
-            if runs and self._lags(position, at_s, brakes=not at_velocity):
-                return False
-            return self._seen_to_move(reading, at_s, runs=runs, brakes=not at_velocity)
-        if runs and self._stands_at_once(at_s, brakes=not at_velocity):
+        if runs and self._has_missed_counts(reading, at_s, brakes=not at_velocity):
             return False
+        if high - low > REST_COUNTS:
+            return self._seen_to_move(reading, at_s, runs=runs, brakes=not at_velocity)
         gone = max(self.gone_counts, self._gone_counts(at_s) if runs else 0.0)
         first = error if self.error_counts is None else self.error_counts
         if first is not None and error is not None:
@@ -245,6 +245,21 @@ class Following:
         return replace(
             self, error_counts=first, gone_counts=gone, until_s=until_s, given_up=given_up, low=low, high=high
         )
+
+    def _has_missed_counts(self, reading: AxisReading, at_s: float, *, brakes: bool) -> bool:
+        """Tell whether the encoder of a shaft that cannot stand at once has ceased to count, if only for a while."""
+        position = reading.position_counts
+        if self._runs_away(reading):
+            return True
+        if max(self.high, position) - min(self.low, position) > REST_COUNTS:
+            return self._lags(position, at_s, brakes=brakes)
+        return self._stands_at_once(at_s, brakes=brakes)
+
+    def _runs_away(self, reading: AxisReading) -> bool:
+        """Tell whether a shaft is so much faster than its profiles that it makes up for what its encoder has missed."""
+        fastest = max(self.fastest_counts_per_s, self.velocity_counts_per_s)
+        most = RUNAWAY_SHARE * (fastest + reading.velocity_resolution_counts_per_s)
+        return self.coasts and abs(reading.velocity_counts_per_s) > most
 
     def _stands_at_once(self, at_s: float, *, brakes: bool) -> bool:
         """Tell whether a shaft that cannot has come to stand: its profile has left it behind since it was seen here."""
