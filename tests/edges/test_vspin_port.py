@@ -133,8 +133,11 @@ def write_cabinet(folder: Path) -> Path:
         ("acceleration = 10 }", "acceleration = 60 }"),  # the program goes to its buckets at 50 rev/s²
         ("[bus.module.outputs]", '[bus.module.outputs]\nlamp = { line = 6, start = "low", reset = "low" }'),
         (
-            ', { input = "locked", value = false }, { input = "unlocked" }]',
-            "]",
+            """    { input = "locked", value = false },
+    { input = "unlocked" },
+    { output = "unlock" }, # a bolt that is about to fall in
+""",
+            "",
         ),  # the program unlocks and opens with one packet
     ):
         assert there in text
