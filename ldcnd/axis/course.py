@@ -24,8 +24,8 @@ BRAKES_SHARE = 1.5
 """Most that a deceleration is taken for of what a profile has: shafts swing."""
 FOLLOWS_WITHIN_S = 1.0
 """Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
-LAGS_S = 0.04
-"""Shortest time over which a way is compared with its speed: a request may be some ms late on its line."""
+LAGS_S = 0.02
+"""Shortest time over which a way is compared with its speed."""
 SWINGS_ABOVE = 1.5
 """A shaft swings by less than half of its speed when it was this much faster at most."""
 RUNAWAY_SHARE = 4.0
@@ -150,6 +150,7 @@ class Following:
         coasts: the shaft cannot stand at once: where it seems to, at a speed, its encoder has missed counts.
         least_counts_per_s: that the positions have shown when it was first seen there, if it braked meanwhile.
         fastest_counts_per_s: of the profiles that went over into this one; 0 without one.
+        there_until_s: the latest instant at which it can have been where it was first seen, in loop time.
     """
 
     command_id: str
@@ -170,6 +171,7 @@ class Following:
     coasts: bool = False
     least_counts_per_s: float = 0.0
     fastest_counts_per_s: float = 0.0
+    there_until_s: float = 0.0
 
     @property
     def is_missed(self) -> bool:
@@ -207,12 +209,15 @@ class Following:
         fastest = max(fastest, self.fastest_counts_per_s)
         return replace(self, velocity_counts_per_s=slowest, fastest_counts_per_s=fastest)
 
-    def observe(self, reading: AxisReading, at_s: float, *, at_velocity: bool = False) -> "Following | bool":
+    def observe(
+        self, reading: AxisReading, at_s: float, true_until_s: float = 0.0, *, at_velocity: bool = False
+    ) -> "Following | bool":
         """Take a reading; return what is awaited, True while the shaft has moved as it was to, or False: it has not.
 
         Args:
             reading: what the drive shows.
             at_s: when it was requested, in loop time.
+            true_until_s: the latest instant at which it can have been true.
             at_velocity: the profile keeps its velocity, or goes up to it: it ends by another command only.
         """
         position, error = reading.position_counts, reading.following_error_counts
@@ -221,7 +226,8 @@ class Following:
         if runs and self._has_missed_counts(reading, at_s, brakes=not at_velocity):
             return False
         if high - low > REST_COUNTS:
-            return self._seen_to_move(reading, at_s, runs=runs, brakes=not at_velocity)
+            seen = self._seen_to_move(reading, at_s, runs=runs, brakes=not at_velocity)
+            return replace(seen, there_until_s=true_until_s) if self.coasts else seen
         gone = max(self.gone_counts, self._gone_counts(at_s) if runs else 0.0)
         first = error if self.error_counts is None else self.error_counts
         if first is not None and error is not None:
@@ -272,7 +278,8 @@ class Following:
 
     def _lags(self, position: int, at_s: float, *, brakes: bool) -> bool:
         """Tell whether a shaft that cannot slow down at once has gone less than half of its least way since."""
-        took_s = at_s - self.since_s
+        # of a request that was held up behind its time stamp the reply is late, too
+        took_s = at_s - max(self.since_s, self.there_until_s)
         if not (self.coasts and self.counted) or took_s < LAGS_S:
             return False
         if self.fastest_counts_per_s > SWINGS_ABOVE * self.velocity_counts_per_s:

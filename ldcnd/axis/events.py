@@ -20,11 +20,13 @@ class ReadingTaken:
         reading: what the drive shows.
         sent_at_s: when it was requested, in loop time.
         now_ns: when it was true, UTC; it stamps the faults that the reading brings up.
+        true_until_s: the latest instant at which it can have been true, in loop time; that of the request without one.
     """
 
     reading: AxisReading
     sent_at_s: float
     now_ns: int
+    true_until_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

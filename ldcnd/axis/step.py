@@ -216,7 +216,7 @@ def _watch_following(
         # a run with an end is a long move to its drive
         and (status.ends_at_s is None or event.sent_at_s < status.ends_at_s - following.brakes_within_s)
     )
-    seen = tripped or following.observe(event.reading, event.sent_at_s, at_velocity=at_velocity)
+    seen = tripped or following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
     if isinstance(seen, Following):
         return status if seen is following else replace(status, following=seen)
     if seen and status.command and not tripped:

@@ -58,7 +58,7 @@ class AxisTracker:
         """
         self.earlier = self.reading, self.read_at_s
         self.reading, self.read_at_s, before = reading, timing.sent_at_s, self.status
-        after = take_reading(before, ReadingTaken(reading, timing.sent_at_s, now_ns))
+        after = take_reading(before, ReadingTaken(reading, timing.sent_at_s, now_ns, timing.true_until_s))
         if after is not before:  # most readings change nothing
             self._change(before, after)
         return after
