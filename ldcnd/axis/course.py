@@ -26,10 +26,12 @@ FOLLOWS_WITHIN_S = 1.0
 """Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
 LAGS_S = 0.02
 """Shortest time over which a way is compared with its speed."""
+CLOCK_SHARE = 1.1
+"""Longest braking as a multiple of the computed one: a drive has a clock of its own, and rounds its profile."""
 SWINGS_ABOVE = 1.5
 """A shaft swings by less than half of its speed when it was this much faster at most."""
 RUNAWAY_SHARE = 4.0
-"""No shaft swings to so many times its speed, even where it sticks and breaks free."""
+"""Factor by which a shaft swings above its speed at most, even where it sticks and breaks free."""
 LEAST_COAST_S = 0.01
 """Readings that follow each other sooner tell nothing of how a shaft slows down."""
 COASTS_S = 0.3
@@ -193,7 +195,7 @@ class Following:
     def brakes_within_s(self) -> float:
         """Longest time from the beginning of its braking until its end, seconds, also by the clock of its drive."""
         fastest = max(self.fastest_counts_per_s, self.velocity_counts_per_s)
-        return 1.1 * fastest / self.acceleration_counts_per_s2 + 2 * LAG_S
+        return CLOCK_SHARE * fastest / self.acceleration_counts_per_s2 + 2 * LAG_S
 
     def after(self, before: "Following | None") -> "Following":
         """Return it behind an earlier motion of its command, in which the shaft was perhaps not seen to move."""
@@ -262,7 +264,7 @@ class Following:
         return self._stands_at_once(at_s, brakes=brakes)
 
     def _runs_away(self, reading: AxisReading) -> bool:
-        """Tell whether a shaft is so much faster than its profiles that it makes up for what its encoder has missed."""
+        """Tell whether a shaft is too fast for its profiles: its loop makes up for counts that were missed."""
         fastest = max(self.fastest_counts_per_s, self.velocity_counts_per_s)
         most = RUNAWAY_SHARE * (fastest + reading.velocity_resolution_counts_per_s)
         return self.coasts and abs(reading.velocity_counts_per_s) > most

@@ -654,7 +654,7 @@ def _recall_latch(status: AxisStatus, event: LatchRecalled) -> AxisStatus:
 
 def _reset(status: AxisStatus, event: ResetDone) -> AxisStatus:
     rest = status.rest
-    if status.rest_unproven_by:  # whoever resets says that it stands: that gives power, and opens no lock
+    if status.rest_unproven_by:  # a person has looked at it: that permits power, and proves no rest to interlocks
         rest = rest.doubted(status.limits.unseen.unseen_s)
     return replace(
         status,

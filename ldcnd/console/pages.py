@@ -53,9 +53,9 @@ HELD_S = 0.4
 pages send one each tenth of a second."""
 PULSE_S = 0.25
 STOOD_S = 1.0
-"""So much more between two pulses, and this process stood still, seconds."""
+"""Delay of a pulse from which this process counts as having stood still, seconds."""
 STOOD_LATELY_S = 15.0
-"""So long it counts as the cause of control that is lost: renewals wait for their answers."""
+"""Time for which that is named as the cause of lost control, seconds: renewals wait for their answers."""
 MOST_PAGES = 64
 TOKEN_BYTES = 16
 

@@ -100,7 +100,7 @@ class RunProgress(Frozen):
     since: int | None = None
     """Instant at which the step began, or began to wait, UTC in ns since 1970."""
     waits: bool = False
-    """The step waits to begin: somebody has paused it."""
+    """The step waits to begin, as the run was paused."""
     paused: bool = False
     """The next step will wait, or this one does."""
     end: Literal["done", "failed", "stopped"] | None = None

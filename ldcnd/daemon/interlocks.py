@@ -26,7 +26,7 @@ from ldcnd.contract.samples import AxisState, LinkState, Unseen
 from ldcnd.contract.units import Dimension
 from ldcnd.daemon.leases import STOP_MODES, Authority
 from ldcnd.daemon.ledger import EventLog
-from ldcnd.daemon.modules import ModuleService, setting
+from ldcnd.daemon.modules import ModuleService, level_word, setting
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.axis_config import LossPolicy
 from ldcnd.log import get_logger
@@ -592,7 +592,7 @@ def _required(status: AxisStatus, each: Requirement) -> str:
 
 
 def _word(what: str, value: bool) -> str:  # noqa: FBT001 - of a line
-    return str(value).lower() if what == "input" else "high" if value else "low"
+    return str(value).lower() if what == "input" else level_word(value)
 
 
 def _commanded(status: AxisStatus) -> bool:

@@ -239,7 +239,8 @@ class ModuleService:
         # said once, by the reading that completes the row
         if before != DIFFERS_AFTER - 1:
             return before == DIFFERS_AFTER
-        reason = f"output {name} was set {_word(written)} and its pin shows {_word(not written)}: check what it drives"
+        was, shows = level_word(written), level_word(not written)
+        reason = f"output {name} was set {was} and its pin shows {shows}: check what it drives"
         log.error("output differs", module=self.name, output=name, reason=reason)
         self._note("output_differs", CommandStatus.FAILED, reason, None)
         return True
@@ -266,7 +267,9 @@ class ModuleService:
         if output in self._unread_until_s:
             return "it is being written"
         written = self._driver.written(self._outputs[output].line)
-        return "" if written is None else f"it was set {_word(written)} and its pin shows {_word(not written)}"
+        return (
+            "" if written is None else f"it was set {level_word(written)} and its pin shows {level_word(not written)}"
+        )
 
     def is_unwritten(self, output: str) -> bool:
         """Tell whether no level of an output is known to be written, as after a take-over or a loss of power."""
@@ -343,7 +346,7 @@ class ModuleService:
         if newer and newer.word > word:
             raise CommandAborted(
                 f"module {self.name}: since this was asked for, {newer.situation.value} has called for output {name}"
-                f" {_word(newer.level)}",
+                f" {level_word(newer.level)}",
                 value=name,
                 remedy="set it again if it is still wanted",
             )
@@ -474,7 +477,7 @@ class ModuleService:
             self._floating, self._set = self._floating | self._set, {}
             for name, level in self._floating.items():
                 if Situation.RESET.level_of(self._outputs[name]) is None:
-                    self._link_events.add(f"output {name}, which was {_word(level)}, floats until it is set")
+                    self._link_events.add(f"output {name}, which was {level_word(level)}, floats until it is set")
             self.enter(self._return_as)
         elif self._seen:
             self.enter(Situation.BUS)
@@ -527,7 +530,7 @@ class ModuleService:
 
         if self._wanted.get(name) is not wanted:
             return True
-        said = f"output {name} {_word(wanted.level)}, its level of {wanted.situation.value}"
+        said = f"output {name} {level_word(wanted.level)}, its level of {wanted.situation.value}"
         try:
             await self._write({self._outputs[name].line: wanted.level}, frozenset(), (None, None), still_wanted)
         except LdcndError as error:
@@ -548,11 +551,12 @@ class ModuleService:
 
 def setting(module: str, levels: Mapping[str, bool]) -> RemedyCommand:
     """Return the one request that gives outputs of a module their levels, true for high."""
-    *others, last = (f"output {name} {_word(level)}" for name, level in levels.items())
+    *others, last = (f"output {name} {level_word(level)}" for name, level in levels.items())
     said = f"set {', '.join(others)} and {last} at once" if others else f"set {last}"
-    named = {_word(at): tuple(name for name, level in levels.items() if level is at) for at in (True, False)}
+    named = {level_word(at): tuple(name for name, level in levels.items() if level is at) for at in (True, False)}
     return step("set_io", said, module=module, **{word: names for word, names in named.items() if names})
 
 
-def _word(level: bool) -> str:  # noqa: FBT001 - a level
+def level_word(level: bool) -> str:  # noqa: FBT001 - a level
+    """Return the word for a level of an output."""
     return "high" if level else "low"

@@ -58,7 +58,7 @@ export function StopAll() {
   </div>`;
 }
 
-/** What came of that as far as no state of an axis says it: `Stops` shows those, whoever has stopped. */
+/** Outcome of a stop that no state of an axis shows yet; `Stops` shows the states, whichever client has stopped. */
 export function StopReport() {
   // what a rig publishes now says more than what it answered then, and goes on to when it falls silent later
   if (report && !report.waits) report.lines = report.lines.filter(isNews);

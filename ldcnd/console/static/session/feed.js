@@ -5,7 +5,7 @@ import { decode } from "../vendor/msgpack/decode.mjs";
 const RATE_HZ = 10;
 const FIRST_PAUSE_MS = 500;
 const LONGEST_PAUSE_MS = 4_000;
-/** A frame comes at least twice a second. Behind so much silence no value of a page stands as a present one. */
+/** Longest time without a frame for which values are shown as present, ms: a frame comes at least twice a second. */
 const SILENCE_MS = 1_000;
 /** So much means that the console process, or the way to it, is gone: another socket is tried. */
 const GONE_MS = 3_000;
