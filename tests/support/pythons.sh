@@ -1,6 +1,6 @@
 #!/bin/bash
-# pythons.sh PYTHON...: the tests that need no wall clock, on each of these interpreters that is on this machine: on the
-# PATH, in pyenv or in uv's own folder. PYTEST_ARGS: which tests, and how.
+# pythons.sh PYTHON...: what `make test` has that needs no wall clock, on each of these interpreters that is on this
+# machine: on the PATH, in pyenv or in uv's own folder. PYTEST_ARGS: how.
 set -euo pipefail
 tried=0
 for name; do
@@ -16,7 +16,7 @@ for name; do
     "$python" -m venv "$place"
     uv pip install --quiet --python "$place/bin/python" -c constraints.txt -e '.[test]'
     echo "$name: $("$place/bin/python" --version)"
-    "$place/bin/python" -m pytest -q -m "not soak and not system and not edges and not guest and not real_time" ${PYTEST_ARGS:--n 2}
+    "$place/bin/python" -m pytest -q -m "not soak and not system and not long and not edges and not guest and not real_time" ${PYTEST_ARGS:--n 2}
     tried=$((tried + 1))
 done
 [ "$tried" -gt 0 ]
