@@ -30,6 +30,26 @@ def pytest_configure() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+def kept_here() -> tuple[tuple[str, int], ...]:
+    """Return the files of the folder `state` below the working directory, and when each was written."""
+    return tuple(sorted((str(file), file.stat().st_mtime_ns) for file in Path("state").rglob("*")))
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Note what lies in the folder that the examples name: what one test kept there would be read by another."""
+    session.stash[KEPT] = kept_here()
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Fail when a test has run an example with its own folder for what outlives the daemon."""
+    if not hasattr(session.config, "workerinput") and kept_here() != session.stash[KEPT]:
+        sys.stderr.write("a test has kept something in the folder `state` of the working directory\n")
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+KEPT = pytest.StashKey[tuple[tuple[str, int], ...]]()
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Let soak tests begin at another seed: `pytest -m soak tests/property --from 5000 --count 1000 -n 2`."""
     parser.addoption("--from", type=int, default=1000, help="first seed of the soak tests that take `seeds`")

@@ -837,7 +837,7 @@ async def test_the_report_is_well_formed_and_has_the_numbers(tmp_path):
 async def test_a_drive_that_takes_no_motion_over_its_line_has_the_steps_that_ask(tmp_path):
     config = tmp_path / "rig.toml"
     shutil.copy(ROOT / "config" / "mixed.toml", config)
-    async with running_rig(load_config(config)) as running:
+    async with running_rig(load_config(config).model_copy(update={"state_dir": tmp_path})) as running:
         rig = Rig(running.client, await running.client.daemon())
         answers = {"what falls": "brake", "a remark": "", "are the gains of feed tuned": "y"}
         checklist = Checklist(rig, config, "feed", ScriptedPerson(answers), by="ada")

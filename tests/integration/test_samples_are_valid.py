@@ -67,7 +67,8 @@ async def test_what_is_published_of_drives_that_move_stop_fail_and_fall_silent(e
 @pytest.mark.long
 async def test_what_is_published_of_smartsteps():
     taken: list[Publication] = []
-    async with running_rig(load_config(SIMULATED.with_name("mixed.toml"))) as rig:
+    mixed = load_config(SIMULATED.with_name("mixed.toml")).model_copy(update={"state_dir": None})
+    async with running_rig(mixed) as rig:
         await samples_of(rig, taken)
         await asyncio.sleep(10.0)
 

@@ -98,7 +98,7 @@ def trace_config(variant: SimulatedVariant, assumed: Mapping[str, object], *, lo
     quiet = tuple(axis.model_copy(update={"rates": SELDOM}) for axis in line.axis)
     line = line.model_copy(update={"axis": quiet})
     steps = steps.model_copy(update={"axis": tuple(traced(axis) for axis in steps.axis)})
-    return config.model_copy(update={"bus": (line, steps)})
+    return config.model_copy(update={"bus": (line, steps), "state_dir": None})
 
 
 @asynccontextmanager
