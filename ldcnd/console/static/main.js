@@ -19,7 +19,7 @@ import { StopAll, StopReport, Stops } from "./parts/stop_all.js";
 import { controlled, dismissLost, keepControl, lost, lostInWords } from "./session/control.js";
 import { loginIsGone } from "./session/api.js";
 import { feed } from "./session/feed.js";
-import { axesOf, axisNamed, changed, commissions, failure, isWhole, learnEvents, namesOf, rigs, titleOf, useRigs, watch } from "./session/rigs.js";
+import { axesOf, axisNamed, changed, commissions, failure, isWhole, namesOf, rigs, titleOf, useRigs, watch } from "./session/rigs.js";
 
 const PAGES = [
   ["rig", "Rig", RigPage],
@@ -66,7 +66,6 @@ function Summary() {
   </p>`;
 }
 
-const EVENTS_ASKED = 200;
 const MOST_MOVING = 6;
 
 /** What moves, where, and what is wrong, in sight wherever a page is scrolled to; the axis of its page with its ends. */
@@ -134,10 +133,6 @@ function Console() {
     addEventListener("hashchange", moved);
     return () => removeEventListener("hashchange", moved);
   }, []);
-  const connected = [...rigs.values()].filter((rig) => feed.live && rig.connected);
-  useEffect(() => {
-    for (const rig of connected) learnEvents(rig, EVENTS_ASKED).catch(console.debug); // without them no end is known
-  }, [connected.map((rig) => `${rig.name} ${rig.daemon?.instance}`).join()]);
   const frame = useRef();
   useEffect(() => {
     // whatever notices the frame holds: what gets the focus comes to lie below it

@@ -14,9 +14,12 @@ const GONE_MS = 3_000;
 export class Feed {
   /** Samples that the console process had to drop for this page, because it was too slow. */
   dropped = 0;
+  /** How many sockets have spoken: what happened between two of them came by none. */
+  spoken = 0;
   #listeners = new Set();
   #streams = [];
   #socket = null;
+  #coming = null;
   #silence = 0;
   #heardAtMs = -Infinity;
   #pauseMs = FIRST_PAUSE_MS;
@@ -39,23 +42,28 @@ export class Feed {
     this.open();
   }
 
-  /** Connect; an older socket is kept until the new one speaks. */
+  /** Connect; an older socket is heard until the new one speaks. */
   open() {
     const query = new URLSearchParams({ rate: RATE_HZ });
     if (this.#streams.length) query.set("stream", this.#streams.join());
     const socket = new WebSocket(`${location.origin.replace(/^http/, "ws")}/api/feed?${query}`);
-    const before = this.#socket;
-    this.#socket = socket;
+    this.#coming?.close();
+    this.#coming = socket;
     socket.binaryType = "arraybuffer";
     socket.onmessage = ({ data }) => {
-      if (socket !== this.#socket) return;
-      before?.close();
-      this.#take(decode(data));
+      if (socket === this.#coming) {
+        this.#socket?.close();
+        [this.#socket, this.#coming] = [socket, null];
+        this.spoken += 1;
+      }
+      if (socket === this.#socket) this.#take(decode(data));
     };
     socket.onclose = () => {
-      if (socket !== this.#socket) return;
-      before?.close();
-      this.#lost();
+      if (socket === this.#coming) this.#coming = null;
+      else if (socket === this.#socket) this.#socket = null;
+      else return;
+      if (!this.#socket) this.#lose();
+      if (!this.#coming) this.#openLater();
     };
   }
 
@@ -76,16 +84,20 @@ export class Feed {
   }
 
   #giveUp() {
-    const silent = this.#socket;
-    this.#socket = null; // what it still says counts no more
-    silent.close();
-    this.#lost();
+    const silent = [this.#socket, this.#coming];
+    this.#socket = this.#coming = null; // what they still say counts no more
+    for (const socket of silent) socket?.close();
+    this.#lose();
+    this.#openLater();
   }
 
-  #lost() {
+  #lose() {
     this.#heardAtMs = -Infinity;
     clearTimeout(this.#silence);
     for (const listener of this.#listeners) listener(null, "lost", null);
+  }
+
+  #openLater() {
     setTimeout(() => this.open(), this.#pauseMs);
     this.#pauseMs = Math.min(2 * this.#pauseMs, LONGEST_PAUSE_MS);
   }

@@ -17,6 +17,7 @@ const SLOPE_S = 0.3;
 const AT_REST = new Set(["disabled", "standstill", "error_stop"]);
 const REPORTS_KEPT = 61;
 const EVENTS_KEPT = 1_000;
+const EVENTS_ASKED = 200;
 const ENDS_KEPT = 20;
 /** Statuses with which a command is over. */
 const FINAL = new Set(["done", "aborted", "refused", "failed", "unknown"]);
@@ -300,6 +301,8 @@ export class Rig {
   canRun = { runnables: [], problem: null };
   /** How far a sequence is, or the last one was; null before the first. */
   run = null;
+  /** What was heard of it when its latest events were asked for; null before, and when they did not come. */
+  caughtUp = null;
   heardAtMs = performance.now();
   #newest = { ns: 0, atMs: 0 };
 
@@ -495,6 +498,7 @@ export const describe = unlessUnderWay(async () => {
   } catch (error) {
     failure = error;
   }
+  catchUp();
   changed();
 });
 
@@ -510,7 +514,10 @@ let describedSoon = 0;
 
 /** Begin to watch; once for a page. */
 export function watch() {
+  let spoken = 0;
   feed.listen((rig, topic, sample) => {
+    if (feed.spoken > spoken) catchUp();
+    spoken = feed.spoken;
     if (rig !== null) {
       if (topic === "rig") joined(rigNamed(rig), sample);
       else if (topic === "run") rigNamed(rig).run = sample; // of the console process: no sign of life of the daemon
@@ -536,6 +543,7 @@ function rigNamed(name) {
 function joined(rig, { connected, problem, attention }) {
   const came = connected && !rig.connected;
   Object.assign(rig, { connected, problem, attention });
+  if (came) rig.caughtUp = null;
   if (came) describe(); // another run of the daemon may have other axes
 }
 
@@ -553,8 +561,21 @@ export async function learnAllEvents(rig) {
   changed();
 }
 
-/** Ask a rig for its latest events: of what happened before this page was there, or while it slept. */
-export async function learnEvents(rig, count) {
+/** Ask rigs for their latest events: of what happened before this page heard them, or while it did not. */
+function catchUp() {
+  for (const rig of rigs.values()) {
+    const heard = `${feed.spoken} ${rig.daemon?.instance}`;
+    if (!feed.live || !rig.connected || !rig.daemon || rig.caughtUp === heard) continue;
+    rig.caughtUp = heard;
+    learnEvents(rig, EVENTS_ASKED).catch((error) => {
+      rig.caughtUp = null; // it is asked again: without them no end is known
+      console.debug(error);
+    });
+  }
+}
+
+/** Ask a rig for its latest events. */
+async function learnEvents(rig, count) {
   const { events } = await ask(`${rigPath(rig.name)}/rig/events`, { count });
   for (const event of events) rig.happened(event);
   changed();

@@ -1,0 +1,93 @@
+"""What happens while a page hears nothing, or changes what it hears: it is told afterwards."""
+
+import re
+
+import pytest
+
+from ldcnd.contract.commands import Power
+
+playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
+expect = playwright.expect
+
+pytestmark = [
+    pytest.mark.system,
+    pytest.mark.real_time,
+    pytest.mark.asyncio(loop_scope="package"),
+    pytest.mark.timeout(240),
+]
+
+FEED, EVENTS = re.compile("/api/feed"), re.compile("/rigs/sim/rig/events$")
+
+
+class Wire:
+    """The way between a page and the console's feed: it can be cut, and made to let nothing through."""
+
+    def __init__(self):
+        self.open, self.sockets = True, []
+
+    def connect(self, socket):
+        if self.open:
+            self.sockets.append(socket)
+            socket.connect_to_server()
+
+    async def cut(self):
+        self.open = False
+        for each in self.sockets:
+            await each.close()
+
+
+async def test_an_event_of_a_gap_is_told_although_the_first_question_for_it_fails(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        wire, failed = Wire(), []
+
+        async def lost(route):
+            if wire.open and not failed:
+                failed.append(route.request.url)
+                await route.abort()
+            else:
+                await route.continue_()
+
+        await desk.page.route_web_socket(FEED, wire.connect)
+        await desk.page.reload()
+        await desk.open("events")
+        rows = desk.page.locator("tbody tr")
+        turned_on = rows.filter(has_text="power on").filter(has_text="done")
+        await expect(rows.first).to_be_visible()
+        await desk.page.route(EVENTS, lost)
+        await wire.cut()
+        await expect(desk.page.get_by_text("No data from the console process")).to_be_visible()
+        before = await turned_on.count()
+        await house.sim.rig.command("x", Power(on=True))
+        wire.open = True
+
+        await expect(desk.page.get_by_text("No data from the console process")).to_have_count(0)
+        await expect(turned_on).to_have_count(before + 1)
+        assert failed
+    await house.sim.quiet("x")
+
+
+async def test_a_page_hears_on_while_what_it_hears_is_changed(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        wire = Wire()
+        await desk.page.route_web_socket(FEED, wire.connect)
+        await desk.page.reload()
+        await desk.open("axis/sim/x")
+        place = desk.page.get_by_label("Position", exact=True)
+        await expect(place).not_to_contain_text("(")
+        wire.open = False
+        await desk.page.evaluate(
+            """() => {
+              window.silent = 0;
+              const look = () => {
+                window.silent += document.body.innerText.includes("No data from the console process");
+                requestAnimationFrame(look);
+              };
+              look();
+            }"""
+        )
+        await desk.open("scope/sim/x")
+        await desk.page.wait_for_timeout(2_500)
+        wire.open = True
+        assert await desk.page.evaluate("() => window.silent") == 0
