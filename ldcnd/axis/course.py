@@ -7,7 +7,7 @@ lost. So what a drive has acknowledged is believed once readings show it.
 import math
 from dataclasses import dataclass, replace
 
-from ldcnd.axis.rest import REST_COUNTS, REST_S
+from ldcnd.axis.rest import REST_COUNTS, REST_S, is_fast
 from ldcnd.drives.driver import AxisReading, StopMode
 
 LAG_S = 0.1
@@ -28,16 +28,14 @@ LAGS_S = 0.02
 """Shortest time over which a way is compared with its speed."""
 CLOCK_SHARE = 1.1
 """Longest braking as a multiple of the computed one: a drive has a clock of its own, and rounds its profile."""
-SWINGS_ABOVE = 1.5
-"""A shaft swings by less than half of its speed when it was this much faster at most."""
+SWINGS_ABOVE, SWINGS_S = 1.5, 0.5
+"""A shaft swings by less than half of its speed when it was this much faster at most, and has ceased to by then."""
 RUNAWAY_SHARE = 4.0
 """Factor by which a shaft swings above its speed at most, even where it sticks and breaks free."""
 LEAST_COAST_S = 0.01
 """Readings that follow each other sooner tell nothing of how a shaft slows down."""
 COASTS_S = 0.3
 """Time after which it is known how a shaft slows down, seconds: just switched off, it may brake at first."""
-SLOW_SHARE, SLOW_COUNTS_PER_S = 3.0, 200.0
-"""Below this share of the resolution of its velocity, and this speed, a shaft may stand at once."""
 SUDDEN_SHARE = 5.0
 """How much faster than before a shaft may slow down in the end: friction grows, up to the force that sticks."""
 PACE_S = 0.2
@@ -153,6 +151,7 @@ class Following:
         least_counts_per_s: that the positions have shown when it was first seen there, if it braked meanwhile.
         fastest_counts_per_s: of the profiles that went over into this one; 0 without one.
         there_until_s: the latest instant at which it can have been where it was first seen, in loop time.
+        swings_until_s: until when it may be slowed down, and swing to a stand at its new speed, in loop time.
     """
 
     command_id: str
@@ -174,6 +173,7 @@ class Following:
     least_counts_per_s: float = 0.0
     fastest_counts_per_s: float = 0.0
     there_until_s: float = 0.0
+    swings_until_s: float = -math.inf
 
     @property
     def is_missed(self) -> bool:
@@ -209,7 +209,28 @@ class Following:
             return None
         slowest, fastest = sorted((self.velocity_counts_per_s, velocity_counts_per_s))
         fastest = max(fastest, self.fastest_counts_per_s)
-        return replace(self, velocity_counts_per_s=slowest, fastest_counts_per_s=fastest)
+        braking_s = CLOCK_SHARE * (fastest + slowest) / acceleration_counts_per_s2
+        swings_s = self.since_s + braking_s + SWINGS_S if fastest > SWINGS_ABOVE * slowest else -math.inf
+        return replace(
+            self,
+            velocity_counts_per_s=slowest,
+            fastest_counts_per_s=fastest,
+            swings_until_s=max(self.swings_until_s, swings_s),
+        )
+
+    def let_go(self, *, at_velocity: bool) -> "Coast | None":
+        """Return how the shaft coasts once its loop has opened; None if it was not seen to turn.
+
+        Args:
+            at_velocity: the profile has kept its velocity, or gone up to it.
+        """
+        braking = 0.0 if at_velocity and self.coasts else self.speed_counts_per_s
+        speed = max(self.least_counts_per_s, braking)
+        if not speed:
+            return None
+        at_counts = round(self.low) if self.coasts else None
+        braked = 0.0 if at_velocity else BRAKES_SHARE * self.acceleration_counts_per_s2
+        return Coast(self.since_s, speed, self.since_s, speed, 0.0, at_counts, self.there_until_s, braked)
 
     def observe(
         self, reading: AxisReading, at_s: float, true_until_s: float = 0.0, *, at_velocity: bool = False
@@ -257,15 +278,20 @@ class Following:
     def _has_missed_counts(self, reading: AxisReading, at_s: float, *, brakes: bool) -> bool:
         """Tell whether the encoder of a shaft that cannot stand at once has ceased to count, if only for a while."""
         position = reading.position_counts
-        if self._runs_away(reading):
+        if self._runs_away(reading, at_s):
             return True
+        if at_s < self.swings_until_s:
+            return False
         if max(self.high, position) - min(self.low, position) > REST_COUNTS:
             return self._lags(position, at_s, brakes=brakes)
         return self._stands_at_once(at_s, brakes=brakes)
 
-    def _runs_away(self, reading: AxisReading) -> bool:
+    def _runs_away(self, reading: AxisReading, at_s: float) -> bool:
         """Tell whether a shaft is too fast for its profiles: its loop makes up for counts that were missed."""
-        fastest = max(self.fastest_counts_per_s, self.velocity_counts_per_s)
+        fastest = self.velocity_counts_per_s
+        if not self.counted:  # its profile has begun then
+            fastest = min(fastest, self.acceleration_counts_per_s2 * (at_s - self.since_s))
+        fastest = max(self.fastest_counts_per_s, fastest)
         most = RUNAWAY_SHARE * (fastest + reading.velocity_resolution_counts_per_s)
         return self.coasts and abs(reading.velocity_counts_per_s) > most
 
@@ -284,8 +310,6 @@ class Following:
         took_s = at_s - max(self.since_s, self.there_until_s)
         if not (self.coasts and self.counted) or took_s < LAGS_S:
             return False
-        if self.fastest_counts_per_s > SWINGS_ABOVE * self.velocity_counts_per_s:
-            return False  # it may have been slowed down, and swing to a stand at its new speed
         least = min(self._least_counts_per_s(at_s, brakes=brakes), self.velocity_counts_per_s) * took_s
         return 2 * (abs(position - self.low) + 2 * self.least_counts) < least
 
@@ -318,6 +342,7 @@ class Following:
             coasts=self.coasts,
             least_counts_per_s=least,
             fastest_counts_per_s=self.fastest_counts_per_s,
+            swings_until_s=self.swings_until_s,
         )
 
     def _least_counts_per_s(self, at_s: float, *, brakes: bool) -> float:
@@ -340,38 +365,70 @@ class Following:
 
 @dataclass(frozen=True, slots=True)
 class Coast:
-    """How a shaft slows down whose motor is off: an encoder that ceases to count looks like rest.
+    """How a shaft slows down that cannot stand at once: an encoder that ceases to count looks like rest.
 
-    So does a brake that closes, or a crash; which of them it was only a look at the machine tells.
+    So does a brake that closes, or a crash; which of them it was only a look at the machine tells. Every shaft is
+    followed so whose motor was switched off while it turned, and under voltage one whose acceleration is bounded.
 
     Attributes:
         since_s: since when it coasts, in loop time.
         from_counts_per_s: speed that it had then.
         at_s: when the shaft was read last.
-        speed_counts_per_s: that it had then.
+        speed_counts_per_s: the least speed that it can have had then.
+        resolution_counts_per_s: of the velocity that its drive shows.
+        at_counts: where it was then; None where that is not known.
+        until_s: the latest instant at which it can have been there, in loop time.
+        braked_counts_per_s2: how fast its loop has slowed it down at most, which has opened since.
     """
 
     since_s: float
     from_counts_per_s: float
     at_s: float
     speed_counts_per_s: float
+    resolution_counts_per_s: float = 0.0
+    at_counts: int | None = None
+    until_s: float = 0.0
+    braked_counts_per_s2: float = 0.0
 
-    def observe(self, reading: AxisReading, at_s: float, most_counts_per_s2: float | None = None) -> "Coast | bool":
+    @classmethod
+    def of(cls, reading: AxisReading, at_s: float, true_until_s: float) -> "Coast | None":
+        """Return it of a shaft in a motion, or that a reading shows to turn; None of another."""
+        speed, step = abs(reading.velocity_counts_per_s), reading.velocity_resolution_counts_per_s
+        if speed <= step and not reading.enabled:
+            return None
+        # under voltage it may have broken free a moment ago: the next reading tells its speed
+        known = 0.0 if reading.enabled else speed
+        return cls(at_s, known, at_s, known, step, reading.position_counts, true_until_s)
+
+    @property
+    def is_fast(self) -> bool:
+        """Whether it is too fast to stand at once."""
+        return is_fast(self.speed_counts_per_s, self.resolution_counts_per_s)
+
+    def observe(
+        self, reading: AxisReading, at_s: float, true_until_s: float, most_counts_per_s2: float | None = None
+    ) -> "Coast | bool":
         """Take a reading; return how it goes on, True once the shaft stands, or False: it stands all too suddenly.
 
         Args:
             reading: of the shaft.
             at_s: when it was requested, in loop time.
+            true_until_s: the latest instant at which it can have been true.
             most_counts_per_s2: how fast it slows down at most; None where that is not known.
         """
-        took_s, speed = at_s - self.at_s, abs(reading.velocity_counts_per_s)
-        if took_s < LEAST_COAST_S:
+        if at_s - max(self.at_s, self.until_s) < LEAST_COAST_S:
             return self
+        if most_counts_per_s2 is not None and self.at_counts is not None:
+            way_counts = abs(reading.position_counts - self.at_counts)
+            fastest = max(most_counts_per_s2, self.braked_counts_per_s2)
+            return self._observe_way(reading, at_s, true_until_s, fastest, way_counts)
+        took_s, speed = at_s - self.at_s, abs(reading.velocity_counts_per_s)
         step = reading.velocity_resolution_counts_per_s
         if speed > step:
-            return Coast(self.since_s, self.from_counts_per_s, at_s, speed)
+            since_s, at_counts = self.since_s, reading.position_counts
+            return Coast(since_s, self.from_counts_per_s, at_s, speed, step, at_counts, true_until_s)
         coasted_s, most = self.at_s - self.since_s, most_counts_per_s2
-        if self.speed_counts_per_s < SLOW_SHARE * step + SLOW_COUNTS_PER_S:
+        if not is_fast(self.speed_counts_per_s, step):
             return True
         if most is None and coasted_s < COASTS_S:
             return True
@@ -379,6 +436,26 @@ class Coast:
             slowing = (max(0.0, self.from_counts_per_s - self.speed_counts_per_s) + step) / coasted_s
             most = SUDDEN_SHARE * slowing
         return most * took_s > self.speed_counts_per_s / 2
+
+    def _observe_way(
+        self, reading: AxisReading, at_s: float, true_until_s: float, most: float, way_counts: int
+    ) -> "Coast | bool":
+        """Compare its way, which is exact, and its velocity, which is coarse, with the least that they can be."""
+        took_s, speed = at_s - max(self.at_s, self.until_s), self.speed_counts_per_s
+        braking_s = min(took_s, speed / most)
+        if 2 * (way_counts + 4 * REST_COUNTS) < braking_s * (speed - most * braking_s / 2):
+            return False
+        longest_s = max(at_s, true_until_s) - self.at_s
+        least = max(0.0, speed - most * longest_s)
+        shown, step = abs(reading.velocity_counts_per_s), reading.velocity_resolution_counts_per_s
+        if 2 * shown < least and is_fast(least, step):
+            return False
+        if way_counts <= REST_COUNTS and shown <= step:
+            return True
+        # where the counter is set its positions jump
+        least = max(least, min(way_counts / longest_s, shown + step) - most * longest_s)
+        since_s, at_counts = self.since_s, reading.position_counts
+        return Coast(since_s, self.from_counts_per_s, at_s, least, step, at_counts, true_until_s)
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,8 @@ REST_S = 0.25
 REST_COUNTS = 5
 """Highest less lowest position of a shaft at rest: a closed loop hunts by some counts. More than 20 counts/s never pass
 for rest."""
+SLOW_SHARE, SLOW_COUNTS_PER_S = 3.0, 200.0
+"""Below this share of the resolution of its velocity, and this speed, a shaft may stand at once."""
 MOST_REST_S = 2.0
 """A shaft that crept out of that band must stay in it for twice as long as it took, at most this."""
 LEAST_WINDOW_COUNTS = 5.0
@@ -38,6 +40,8 @@ class RestEvidence:
         unseen_s: for how long at least with the motor off, because the shaft may turn unseen; 0 once its encoder has
             counted with the motor off, and for a motion of this daemon.
         left_turning: it turned when it was read last, or an earlier daemon has left it so.
+        at_once: a motion of this daemon was ended at once, at a speed from which the shaft cannot stand at once: it
+            was not seen to become slow since.
     """
 
     rests: bool | None = None
@@ -49,26 +53,40 @@ class RestEvidence:
     quiet_s: float = REST_S
     unseen_s: float = 0.0
     left_turning: bool = False
+    at_once: bool = False
+
+    @property
+    def is_done_at_rest(self) -> bool:
+        """Whether a closed loop rests as soon as its drive says that its profile is done."""
+        return self.commanded and not self.at_once
 
     def observe(self, reading: AxisReading, at_s: float) -> "RestEvidence":
         """Return the evidence with a reading that was requested at an instant, in loop time."""
         position = reading.position_counts
-        runs = reading.enabled and not reading.profile_done
+        runs = reading.enabled and not reading.profile_done and not self.at_once
         # `shows_velocity`, written out: every poll passes here
         if runs or abs(reading.velocity_counts_per_s) > reading.velocity_resolution_counts_per_s:
             if self.rests is False and self.turns and self.since_s is None and self.quiet_s == REST_S:
                 return self
+            if self.at_once and is_fast(abs(reading.velocity_counts_per_s), reading.velocity_resolution_counts_per_s):
+                return replace(self, rests=False, turns=True, since_s=at_s, low=position, high=position)
             return RestEvidence(rests=False, turns=True, commanded=self.commanded, unseen_s=self._unseen_s(reading))
-        if self.commanded and reading.enabled:
+        if self.is_done_at_rest and reading.enabled:
             return self if self.rests else replace(self, rests=True)
         if self.since_s is None:
             return replace(self, turns=False, since_s=at_s, low=position, high=position)
         low, high, held_s = min(self.low, position), max(self.high, position), at_s - self.since_s
         if high - low > REST_COUNTS:
             quiet_s = min(max(2 * held_s, REST_S), MOST_REST_S)
-            unseen_s = self._unseen_s(reading)
             return replace(
-                self, rests=False, quiet_s=quiet_s, unseen_s=unseen_s, since_s=at_s, low=position, high=position
+                self,
+                rests=False,
+                quiet_s=quiet_s,
+                unseen_s=self._unseen_s(reading),
+                at_once=False,
+                since_s=at_s,
+                low=position,
+                high=position,
             )
         least_s = self.quiet_s if reading.enabled else max(self.quiet_s, self.unseen_s)
         rests = True if held_s >= least_s else self.rests
@@ -91,6 +109,11 @@ class RestEvidence:
 
 NOTHING_SEEN = RestEvidence()
 """Of a drive that was out of reach, or that was not read since something was commanded."""
+
+
+def is_fast(speed_counts_per_s: float, resolution_counts_per_s: float) -> bool:
+    """Tell whether a shaft of such a speed is too fast to stand at once."""
+    return speed_counts_per_s >= SLOW_SHARE * resolution_counts_per_s + SLOW_COUNTS_PER_S
 
 
 def shows_velocity(reading: AxisReading) -> bool:

@@ -11,7 +11,7 @@ from enum import Enum
 from operator import attrgetter
 from typing import Any
 
-from ldcnd.axis.course import Braking, Coast, Following, Pace, Way
+from ldcnd.axis.course import BRAKES_SHARE, Braking, Coast, Following, Pace, Way
 from ldcnd.axis.faults import NOT_FOLLOWED, READINGS_CONTRADICT, REPLIES_UNUSABLE
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling, window_counts
 from ldcnd.axis.scale import AxisScale
@@ -50,6 +50,7 @@ class SoftLimits:
         high: highest position; infinity without one.
         window_counts: how far beyond them an axis may stand that was sent to one, in counts.
         slowing_counts_per_s2: how fast its shaft slows down at most with its motor off; None where that is not known.
+        braking_counts_per_s2: how fast it slows down at most in a motion; None where either is not known.
         unseen: what is known of the rest of its shaft before it is first read.
     """
 
@@ -57,18 +58,21 @@ class SoftLimits:
     high: float = math.inf
     window_counts: float = 0.0
     slowing_counts_per_s2: float | None = None
+    braking_counts_per_s2: float | None = None
     unseen: RestEvidence = NOTHING_SEEN
 
     @classmethod
     def of(cls, config: AxisConfig) -> "SoftLimits":
         """Return those that an axis is configured with."""
         low, high = config.limits.position_min, config.limits.position_max
-        speed = abs(config.signed_counts_per_unit) * (config.limits.velocity or config.velocity)
+        scale, acceleration = abs(config.signed_counts_per_unit), config.limits.acceleration
+        speed = scale * (config.limits.velocity or config.velocity)
         return cls(
             -math.inf if low is None else low,
             math.inf if high is None else high,
             window_counts(config),
             speed / config.coast_s if config.coast_s else None,
+            BRAKES_SHARE * scale * acceleration if config.coast_s and acceleration else None,
             RestEvidence(unseen_s=UNSEEN_SHARE * config.coast_s) if config.coast_s else NOTHING_SEEN,
         )
 
@@ -250,7 +254,7 @@ class AxisStatus:
         failure: why that will fail once the axis has come to rest.
         way: where it may be until then; None before the first reading, and without a target.
         following: by what its encoder is to be seen to count in a motion; None once it has.
-        coast: how it slows down while its motor is off; None while it does not turn.
+        coast: how it slows down, in a motion where that is bounded, and with its motor off; None while it stands.
         pace: how fast it may be, once it has taken a new speed or target in motion; None otherwise.
         settle: how far it has settled; None before the end of its profile, and without a target.
         ends_at_s: when its profile should end, in loop time.
@@ -409,7 +413,7 @@ class AxisStatus:
     def unseen(self) -> Unseen | None:
         """Why the shaft may turn though it shows no count; None where something has shown that its encoder counts."""
         rest = self.rest
-        if not rest.unseen_s or (rest.commanded if self.enabled else rest.rests):
+        if not rest.unseen_s or (rest.is_done_at_rest if self.enabled else rest.rests):
             return None
         if self.enabled:
             return Unseen.UNDER_POWER

@@ -10,7 +10,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from ldcnd.axis.course import Braking, Coast, Following, Pace, Way
+from ldcnd.axis.course import BRAKES_SHARE, Braking, Coast, Following, Pace, Way
 from ldcnd.axis.events import (
     AxisEvent,
     CommandBegun,
@@ -152,8 +152,7 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     reading, at_s, now_ns = event.reading, event.sent_at_s, event.now_ns
     rest, enabled, command = status.rest.observe(reading, at_s), reading.enabled, status.command
     if rest is not status.rest or enabled is not status.enabled:
-        let_go = status.enabled and not enabled and status.limits.unseen.unseen_s
-        status = replace(status, rest=rest.let_go() if let_go else rest, enabled=enabled)
+        status = _see_rest(status, rest, at_s, enabled=enabled)
     if status.unsure and status.unsure.from_rest and (shows_velocity(reading) or not reading.profile_done):
         status = _with(status, unsure=None)
     # the command fails when it comes to rest, not before: until then it may still move
@@ -162,7 +161,7 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     # nothing holds it there any more
     if not enabled and status.target is not None:
         status = replace(status, target=None)
-    if status.following or status.coast or (rest.turns and not enabled):
+    if status.following or status.coast or (rest.turns and (not enabled or status.limits.braking_counts_per_s2)):
         before, status = status, _watch_encoder(status, event, faults)
         if status.own is not before.own and NOT_FOLLOWED in status.own:
             return status
@@ -183,6 +182,12 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
 
 
+def _see_rest(status: AxisStatus, rest: RestEvidence, at_s: float, *, enabled: bool) -> AxisStatus:
+    if status.enabled and not enabled and status.limits.slowing_counts_per_s2:
+        return replace(status, rest=rest.let_go(), enabled=enabled, coast=_let_go(status, at_s))
+    return replace(status, rest=rest, enabled=enabled)
+
+
 def _fail_by_fault(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     if status.enabled and any(fault.stops and fault.hides_motion for fault in event.reading.faults):
         status = _keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, CLOSED_AGAIN))
@@ -190,16 +195,34 @@ def _fail_by_fault(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     return _fail(status, f"the drive reports a fault{lost}")
 
 
+def _let_go(status: AxisStatus, at_s: float) -> Coast | None:
+    """Return how a shaft coasts whose loop opens at an instant, by what was seen of it last; None if it stood."""
+    following, coast, most = status.following, status.coast, _braking_counts_per_s2(status)
+    coast = replace(coast, braked_counts_per_s2=most) if coast and most else None
+    told = following.let_go(at_velocity=_is_at_velocity(status, following, at_s)) if following else None
+    return max(coast, told, key=lambda each: each.speed_counts_per_s) if coast and told else coast or told
+
+
+def _is_at_velocity(status: AxisStatus, following: Following, at_s: float) -> bool:
+    """Tell whether the profile of a motion keeps its velocity at an instant, or goes up to it."""
+    command, ends_at_s = status.command, status.ends_at_s
+    return (
+        command is not None
+        and command.verb is Verb.MOVE_VELOCITY
+        and command.state is AxisState.CONTINUOUS_MOTION
+        # a run with an end is a long move to its drive
+        and (ends_at_s is None or at_s < ends_at_s - following.brakes_within_s)
+    )
+
+
 def _watch_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
     """Find an encoder that may have ceased to count: in a motion, and while a shaft coasts."""
-    following = status.following
-    if following and following.speed_counts_per_s and status.coast is None and not event.reading.enabled:
-        # it turned when its loop opened
-        since_s, speed = following.since_s, following.speed_counts_per_s
-        status = replace(status, coast=Coast(since_s, speed, since_s, speed))
-    if following:
-        status = _watch_following(status, following, event, faults)
-    return _watch_coast(status, event, faults)
+    enabled = event.reading.enabled
+    if status.coast is None and not enabled:
+        status = _with(status, coast=_let_go(status, event.sent_at_s))
+    if status.following:
+        status = _watch_following(status, status.following, event, faults)
+    return status if enabled and NOT_FOLLOWED in status.own else _watch_coast(status, event, faults)
 
 
 def _watch_following(
@@ -208,46 +231,57 @@ def _watch_following(
     """Have a motor switched off whose encoder has not counted behind a motion."""
     # its drive knows more of it, and has switched the motor off
     tripped = any(fault.stops for fault in event.reading.faults)
-    command = status.command
-    at_velocity = (
-        command is not None
-        and command.verb is Verb.MOVE_VELOCITY
-        and command.state is AxisState.CONTINUOUS_MOTION
-        # a run with an end is a long move to its drive
-        and (status.ends_at_s is None or event.sent_at_s < status.ends_at_s - following.brakes_within_s)
-    )
+    at_velocity = _is_at_velocity(status, following, event.sent_at_s)
     seen = tripped or following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
     if isinstance(seen, Following):
         return status if seen is following else replace(status, following=seen)
     if seen and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
         return replace(status, following=replace(following, until_s=math.inf)) if following.is_missed else status
-    status = replace(status, following=None)
-    if seen:
-        return status
+    return replace(status, following=None) if seen else _lose_encoder(status, event, faults)
+
+
+def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
     if status.energised:  # its loop pushes on, against a jam or unseen, as far as it can
         status = _keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNFOLLOWED))
-    status = replace(_place_lost(status), own=_own_and(status, NOT_FOLLOWED), position_lost=True, target=None)
+    own = _own_and(status, NOT_FOLLOWED)
+    status = replace(_place_lost(status), own=own, position_lost=True, target=None, following=None, coast=None)
     return _fail(_with_faults(status, (*faults, NOT_FOLLOWED), event.now_ns), NOT_FOLLOWED.text)
 
 
 def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
-    """Find a shaft that turned with its motor off, and stands so suddenly that it may only seem to."""
-    reading, at_s, coast = event.reading, event.sent_at_s, status.coast
-    if reading.enabled or (status.command and status.command.opens_loop):
-        return status if coast is None else replace(status, coast=None)
+    """Find a shaft that turned and stands so suddenly that it may only seem to."""
+    reading, at_s, coast, command = event.reading, event.sent_at_s, status.coast, status.command
+    most = status.limits.slowing_counts_per_s2
+    if reading.enabled or (command and command.opens_loop):
+        most = None if reading.cut_short else _braking_counts_per_s2(status)
+        if most is None:
+            return status if coast is None else replace(status, coast=None)
     if coast is None:
-        speed = abs(reading.velocity_counts_per_s)
-        return replace(status, coast=Coast(at_s, speed, at_s, speed)) if shows_velocity(reading) else status
-    seen = coast.observe(reading, at_s, status.limits.slowing_counts_per_s2)
+        found = Coast.of(reading, at_s, event.true_until_s)
+        return replace(status, coast=found) if found else status
+    seen = coast.observe(reading, at_s, event.true_until_s, most)
     if isinstance(seen, Coast):
         return status if seen is coast else replace(status, coast=seen)
+    if not seen and reading.enabled:
+        return _lose_encoder(status, event, faults)
     status = replace(status, coast=None)
     if seen or STOOD_AT_ONCE in status.own:
         return status
     status = _with_faults(replace(status, own=_own_and(status, STOOD_AT_ONCE)), (*faults, STOOD_AT_ONCE), event.now_ns)
     # at once, for a reset may come before the next reading
     return replace(_place_lost(status), position_lost=True, target=None)
+
+
+def _braking_counts_per_s2(status: AxisStatus) -> float | None:
+    """Return how fast a loop slows down its shaft at most, None where that is not known: drives end some motions."""
+    command, braking, following = status.command, status.braking, status.following
+    most = status.limits.braking_counts_per_s2
+    if braking and braking.mode is StopMode.ABRUPT:
+        return None
+    if command and (command.opens_loop or command.verb is Verb.HOME):
+        return None
+    return min(most, BRAKES_SHARE * following.acceleration_counts_per_s2) if most and following else most
 
 
 def _watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
@@ -453,6 +487,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
             last_error = None
         elif before.state is not AxisState.STOPPING:  # a stop that gives way to another one has not failed
             last_error = status.last_error
+    rest = status.rest
     return replace(
         status,
         command=command,
@@ -472,7 +507,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
         way=command.way,
         pace=None,
         # it counts as moving before it does, so that nothing is decided by the rest of before
-        rest=RestEvidence(rests=False, commanded=status.rest.commanded, unseen_s=status.rest.unseen_s),
+        rest=RestEvidence(rests=False, commanded=rest.commanded, unseen_s=rest.unseen_s, at_once=rest.at_once),
     )
 
 
@@ -540,22 +575,26 @@ def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:
 
 
 def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
-    on = event.on
+    on, ended = event.on, _abort(status, Verb.POWER, event.by)
     # a loop that closes holds the shaft; one that is let go may coast, or fall; what was off before is as it was
-    rest = status.rest
+    rest = ended.rest
     if on:  # where nothing has shown that the encoder counts, its first motion does
         seen = status.unseen is None
         rest = RestEvidence(rests=True, commanded=seen, unseen_s=0.0 if seen else rest.unseen_s)
     elif status.enabled:
         rest = RestEvidence(unseen_s=rest.unseen_s)
+    coast = status.coast
+    if status.enabled and status.limits.slowing_counts_per_s2:
+        coast = _let_go(status, event.now_s)
     return replace(
-        _abort(status, Verb.POWER, event.by),
+        ended,
         state=_state_at_rest(status, enabled=on),
         enabled=on,
         effective_from_s=event.now_s,
         target_counts=None,
         braking=None,
         following=None if on else status.following,
+        coast=None if on else coast,
         rest=rest,
     )
 
@@ -564,7 +603,8 @@ def _switch_loop(status: AxisStatus, event: LoopSwitched) -> AxisStatus:
     rest = RestEvidence(rests=False, commanded=status.rest.commanded, unseen_s=status.rest.unseen_s)
     if not event.on:  # a load may fall; a shaft whose motor was off before is as it was
         rest = replace(rest, rests=None) if status.enabled else status.rest
-    return replace(status, effective_from_s=event.now_s, enabled=event.on, rest=rest)
+    coast = _let_go(status, event.now_s) if status.coast and status.enabled and not event.on else status.coast
+    return replace(status, effective_from_s=event.now_s, enabled=event.on, rest=rest, coast=coast)
 
 
 def _override_speed(status: AxisStatus, event: SpeedOverridden) -> AxisStatus:
@@ -628,7 +668,14 @@ def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus
     following = status.following
     if event.mode is StopMode.ABRUPT and not (following and following.gone_counts >= 4 * following.least_counts):
         following = None
-    return replace(status, braking=braking, off_again=False, following=following)
+    rest, coast = status.rest, status.coast
+    if event.mode is StopMode.ABRUPT:
+        at_once, coast = coast is not None and coast.is_fast and status.enabled, None
+    else:  # a loop that closes beside a shaft which a duty has driven
+        at_once = status.driven_open and event.mode is not StopMode.OFF
+    if at_once and status.limits.slowing_counts_per_s2:
+        rest = replace(status.limits.unseen, commanded=True, at_once=True)
+    return replace(status, braking=braking, off_again=False, following=following, rest=rest, coast=coast)
 
 
 def _confirm_stop(status: AxisStatus, event: StopConfirmed) -> AxisStatus:
@@ -821,9 +868,13 @@ def _end(
     )
     if command is None:
         return status
+    rest = status.rest
+    if command.opens_loop and status.limits.slowing_counts_per_s2:  # nothing tells how what it has driven is to turn
+        rest = replace(status.limits.unseen, left_turning=True)
     return replace(
         status,
         command=None,
+        rest=rest,
         last_error=f"{command.verb}: {reason}" if reason else status.last_error,
         last_end=CommandEnd(command, how, reason, settled, by),
     )

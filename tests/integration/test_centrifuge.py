@@ -16,6 +16,7 @@ from ldcnd.contract.errors import ErrorCode, InterlockViolated, LdcndError, Leas
 from ldcnd.contract.leases import Acquire
 from ldcnd.contract.rig_commands import OverrideInterlock
 from ldcnd.contract.samples import Moving, Quality
+from ldcnd.drives.axis_config import PwmConfig
 from ldcnd.drives.network import AdoptFallback, StartPolicy
 from ldcnd.sim.ldcn.drive import SimulatedDrive
 from ldcnd.sim.ldcn.io import SimulatedIo
@@ -130,11 +131,11 @@ def operated(what: Callable, without: str | None = None, rules=CENTRIFUGE.interl
     return run(program())
 
 
-def alone(what):
+def alone(what, config=CENTRIFUGE):
     """Return what an operation returns on the centrifuge; its rotor is left as it is."""
 
     async def program():
-        async with simulated_rig(CENTRIFUGE) as rig, rig.client.control("rotor", client="test") as rotor:
+        async with simulated_rig(config) as rig, rig.client.control("rotor", client="test") as rotor:
             return await what(await made_ready(rig, rotor))
 
     return run(program())
@@ -995,7 +996,6 @@ def test_an_output_that_is_high_refuses_a_spin_though_its_part_has_jammed(part):
             await unlocked(machine)
         machine.jam(part)
         await machine.high(output)
-        await machine.low(*{"unlock"} - {output})
         await asyncio.sleep(0.5)
         with pytest.raises(InterlockViolated, match=f"output {output} is high"):
             await machine.rotor.move_velocity(FAST, acceleration=10, duration_s=2)
@@ -1362,3 +1362,47 @@ def test_power_that_comes_as_an_encoder_dies_closes_no_loop_beside_a_rotor_that_
         return [each for each in (*closed_at, *written_at) if each > CREEPS]
 
     assert alone(switches_on) == []
+
+
+async def turns(machine, how):
+    """Turn the rotor fast: by one motion, by one that has replaced another, or by a raw duty."""
+    if how == "duty":
+        await machine.rotor.set_pwm(0.2, duration_s=10)
+        await machine.rig.until(lambda: machine.speed > 5)
+        return
+    await machine.rotor.move_velocity(16.0, acceleration=8)
+    await machine.rig.until(lambda: machine.speed > 15)
+    if how == "replaced":
+        await machine.rotor.move_velocity(16.0, acceleration=4, buffer_mode="aborting")
+        await asyncio.sleep(1.0)
+
+
+@pytest.mark.parametrize("dead_s", [-0.2, -0.06, -0.02, 0.0, 0.01, 0.02])
+@pytest.mark.parametrize("how", ["one motion", "replaced", "duty"])
+@pytest.mark.parametrize("ends", ["power off", "no supply", "quick stop"])
+@pytest.mark.sweep(4)
+def test_an_encoder_that_dies_as_its_motor_loses_its_voltage_opens_no_lock_and_closes_no_loop(ends, how, dead_s):
+    async def loses(machine):
+        await turns(machine, how)
+        machine.rig.faults.encoder_stuck("rotor", after_s=max(dead_s, 0.0))
+        await asyncio.sleep(max(-dead_s, 0.0))
+        if ends == "no supply":
+            machine.rig.faults.motor_supply_lost("rotor", for_s=5.0)
+        with suppress(LdcndError):
+            await (machine.rotor.quick_stop() if ends == "quick stop" else machine.rotor.power(on=False))
+        at = []
+        for _ in range(100):
+            if machine.rotor.state.sample.moving is Moving.NO:
+                at.append(machine.speed)
+            with suppress(LdcndError):  # a reset is believed for power, and for nothing else
+                await (machine.rotor.reset() if ends == "quick stop" else machine.rotor.power(on=True))
+                at.append(machine.speed if ends != "quick stop" else 0.0)
+            with suppress(LdcndError):
+                await machine.high("unlock")
+                at.append(machine.speed)
+            await asyncio.sleep(0.02)
+        return [each for each in at if each > CREEPS]
+
+    rotor = CENTRIFUGE.bus[0].axis[0].model_copy(update={"pwm": PwmConfig(duty=0.5)})
+    line = CENTRIFUGE.bus[0].model_copy(update={"axis": (rotor,)})
+    assert alone(loses, CENTRIFUGE.model_copy(update={"bus": (line,)})) == []
