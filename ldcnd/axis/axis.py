@@ -340,7 +340,7 @@ class AxisService:
                 yield error, guard
 
     def _while_it_coasts(self) -> Iterator[LdcndError]:
-        """Yield what forbids to close the loop of a shaft that still turns with it open; that passes by itself."""
+        """Yield what forbids to close the loop of a shaft that turns with it open, or may."""
         try:
             guards.check_does_not_coast(self.tracker)
         except LdcndError as error:
@@ -368,7 +368,8 @@ class AxisService:
                 causes.append((guards.error_stop(self.tracker, faults), False))
             elif error not in first:
                 if guard is guards.check_enabled:
-                    causes += [(each, True) for each in self._while_it_coasts()]
+                    passes = not self.tracker.status.motion_hidden_by
+                    causes += [(each, passes) for each in self._while_it_coasts()]
                 if guard is guards.check_referenced:  # what is in the way of a motion is in the way of homing, too
                     causes, forbidden = causes + forbidden, []
                     if any(not passes for _, passes in causes):

@@ -265,7 +265,7 @@ class SetIo(Command[IoReply]):
     """Configured name of the module."""
     high: tuple[Line, ...] = ()
     """Lines, by number or name, that are driven high. Only those that are configured as outputs can be; one that
-    becomes an output may be low for the time between two packets."""
+    becomes an output may be low for the time between two packets, and where that fails until it is written again."""
     low: tuple[Line, ...] = ()
     """Lines that are driven low."""
     inputs: tuple[Line, ...] = ()

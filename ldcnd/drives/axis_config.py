@@ -289,10 +289,10 @@ on their limit inputs."""
     coast_s: float | None = Field(default=None, gt=0, le=3600)
     """Shortest time from its velocity limit to rest with the motor off, in seconds: a shaft that stands sooner is not
     believed, nor for four times as long, until it has counted, one not read yet, lost in motion, or reset while it may
-    have moved."""
+    have moved. Within a motion `limits.acceleration` bounds it."""
     jog_reach_s: float = Field(default=5.0, gt=0, le=3600)
     """How far ahead the goal of a jog is, in seconds, in a drive that takes no other goal before it stands: if the \
-daemon dies it runs on for as long, and a jog that is held for longer pauses there. PIC-SERVO SC gets nearer goals."""
+daemon dies it runs on for as long, and a jog that is held for longer pauses there."""
     adc_volts: float = Field(default=5.0, gt=0)
     """Voltage at full scale of the A/D converter."""
     identity: DeviceIdentity | None = None
