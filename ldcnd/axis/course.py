@@ -132,7 +132,8 @@ class Following:
     Attributes:
         command_id: of the motion.
         velocity_counts_per_s: of the profile.
-        acceleration_counts_per_s2: of the profile.
+        acceleration_counts_per_s2: of the profile; the least of those that went over into each other.
+        braking_counts_per_s2: the most of those.
         way_counts: of the whole profile; infinite for one without an end.
         least_counts: part of a profile in which a shaft must have been seen to begin to move, and once it has, twice
             as much in which it must have been seen to go on.
@@ -157,6 +158,7 @@ class Following:
     command_id: str
     velocity_counts_per_s: float
     acceleration_counts_per_s2: float
+    braking_counts_per_s2: float
     way_counts: float
     least_counts: float
     since_s: float
@@ -188,7 +190,7 @@ class Following:
     @property
     def is_unseen(self) -> bool:
         """Whether a part of the profile has gone, or is over, in which the shaft was not seen to move."""
-        coming = self.speed_counts_per_s**2 / (4 * self.acceleration_counts_per_s2)
+        coming = self.speed_counts_per_s**2 / (4 * self.braking_counts_per_s2)
         return self.is_missed or self.gone_counts >= 2 * self.least_counts + coming
 
     @property
@@ -203,19 +205,19 @@ class Following:
             return self
         return replace(self, gone_counts=before.gone_counts, low=before.low, high=before.high)
 
-    def going_on(self, velocity_counts_per_s: float, acceleration_counts_per_s2: float) -> "Following | None":
-        """Return it for a profile that goes over into another one; None where that slows down otherwise."""
-        if acceleration_counts_per_s2 != self.acceleration_counts_per_s2:
-            return None
+    def going_on(self, velocity_counts_per_s: float, acceleration_counts_per_s2: float) -> "Following":
+        """Return it for a profile that goes over into another one."""
         slowest, fastest = sorted((self.velocity_counts_per_s, velocity_counts_per_s))
         fastest = max(fastest, self.fastest_counts_per_s)
-        braking_s = CLOCK_SHARE * (fastest + slowest) / acceleration_counts_per_s2
-        swings_s = self.since_s + braking_s + SWINGS_S if fastest > SWINGS_ABOVE * slowest else -math.inf
+        rate = min(self.acceleration_counts_per_s2, acceleration_counts_per_s2)
+        swings_s = self.since_s + CLOCK_SHARE * (fastest + slowest) / rate + SWINGS_S
         return replace(
             self,
             velocity_counts_per_s=slowest,
+            acceleration_counts_per_s2=rate,
+            braking_counts_per_s2=max(self.braking_counts_per_s2, acceleration_counts_per_s2),
             fastest_counts_per_s=fastest,
-            swings_until_s=max(self.swings_until_s, swings_s),
+            swings_until_s=max(self.swings_until_s, swings_s if fastest > SWINGS_ABOVE * slowest else -math.inf),
         )
 
     def let_go(self, *, at_velocity: bool) -> "Coast | None":
@@ -229,7 +231,7 @@ class Following:
         if not speed:
             return None
         at_counts = round(self.low) if self.coasts else None
-        braked = 0.0 if at_velocity else BRAKES_SHARE * self.acceleration_counts_per_s2
+        braked = 0.0 if at_velocity else BRAKES_SHARE * self.braking_counts_per_s2
         return Coast(self.since_s, speed, self.since_s, speed, 0.0, at_counts, self.there_until_s, braked)
 
     def observe(
@@ -329,13 +331,14 @@ class Following:
             self.command_id,
             self.velocity_counts_per_s,
             self.acceleration_counts_per_s2,
+            self.braking_counts_per_s2,
             self.way_counts,
             self.least_counts,
             at_s,
             counted=True,
             speed_counts_per_s=speed,
             error_counts=self.error_counts if error is None else error,
-            gone_counts=speed**2 / (4 * self.acceleration_counts_per_s2),  # half of what it needs to brake
+            gone_counts=speed**2 / (4 * self.braking_counts_per_s2),  # half of what it needs to brake
             low=reading.position_counts,
             high=reading.position_counts,
             faults=self.faults,
@@ -350,7 +353,7 @@ class Following:
 
     def _braked_counts_per_s(self, at_s: float) -> float:
         """Return by how much a profile makes the shaft slower at most since it is where it is."""
-        return BRAKES_SHARE * self.acceleration_counts_per_s2 * (at_s - self.since_s)
+        return BRAKES_SHARE * self.braking_counts_per_s2 * (at_s - self.since_s)
 
     def _gone_counts(self, at_s: float) -> float:
         """Return the least way of a profile that runs since the shaft is where it is."""

@@ -581,6 +581,7 @@ class AxisMotion:
             permit.command_id,
             abs(motion.velocity_counts_per_s),
             motion.acceleration_counts_per_s2,
+            motion.acceleration_counts_per_s2,
             way_counts=math.inf if target is None else abs(target - reading.position_counts),
             least_counts=max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
             since_s=self.clock.now_s(),

@@ -71,7 +71,7 @@ class RestEvidence:
             if self.at_once and is_fast(abs(reading.velocity_counts_per_s), reading.velocity_resolution_counts_per_s):
                 return replace(self, rests=False, turns=True, since_s=at_s, low=position, high=position)
             return RestEvidence(rests=False, turns=True, commanded=self.commanded, unseen_s=self._unseen_s(reading))
-        if self.is_done_at_rest and reading.enabled:
+        if self.commanded and reading.enabled and not self.at_once:  # `is_done_at_rest`, written out
             return self if self.rests else replace(self, rests=True)
         if self.since_s is None:
             return replace(self, turns=False, since_s=at_s, low=position, high=position)

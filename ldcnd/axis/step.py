@@ -281,7 +281,7 @@ def _braking_counts_per_s2(status: AxisStatus) -> float | None:
         return None
     if command and (command.opens_loop or command.verb is Verb.HOME):
         return None
-    return min(most, BRAKES_SHARE * following.acceleration_counts_per_s2) if most and following else most
+    return min(most, BRAKES_SHARE * following.braking_counts_per_s2) if most and following else most
 
 
 def _watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:

@@ -568,12 +568,11 @@ class Dispatcher:
         self._refuse_rival(axis)
         if command.instance not in (None, self._instance):
             raise CommandExpired(
-                f"axis {axis}: {command.verb} was sent to another run of the daemon;"
-                " it is unknown whether it was carried out",
+                f"axis {axis}: {command.verb} is meant for another run of the daemon; this one does nothing of it",
                 axis=axis,
                 value=command.instance,
                 limit=self._instance,
-                remedy="look where the axis is, then send a new command to this run",
+                remedy="look where the axis is, and whether that run has carried it out, then send it to this one",
             )
         # before the lease: what is refused here must use up none of its sequence
         self._refuse_late(axis, command)
