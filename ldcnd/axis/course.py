@@ -370,8 +370,9 @@ class Following:
 class Coast:
     """How a shaft slows down that cannot stand at once: an encoder that ceases to count looks like rest.
 
-    So does a brake that closes, or a crash; which of them it was only a look at the machine tells. Every shaft is
-    followed so whose motor was switched off while it turned, and under voltage one whose acceleration is bounded.
+    So does a brake that closes, or a crash; which of them it was only a look at the machine tells. It is kept of every
+    shaft that turns with its motor off, and in motions of one with `coast_s` and a limit of its acceleration: whatever
+    opens the loop then, its speed of before is known.
 
     Attributes:
         since_s: since when it coasts, in loop time.
@@ -455,8 +456,8 @@ class Coast:
             return False
         if way_counts <= REST_COUNTS and shown <= step:
             return True
-        # where the counter is set its positions jump
-        least = max(least, min(way_counts / longest_s, shown + step) - most * longest_s)
+        # from its mean speed; where the counter is set its positions jump
+        least = max(least, min(way_counts / longest_s - most * longest_s / 2, shown + step))
         since_s, at_counts = self.since_s, reading.position_counts
         return Coast(since_s, self.from_counts_per_s, at_s, least, step, at_counts, true_until_s)
 

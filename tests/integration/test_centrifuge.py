@@ -1406,3 +1406,26 @@ def test_an_encoder_that_dies_as_its_motor_loses_its_voltage_opens_no_lock_and_c
     rotor = CENTRIFUGE.bus[0].axis[0].model_copy(update={"pwm": PwmConfig(duty=0.5)})
     line = CENTRIFUGE.bus[0].model_copy(update={"axis": (rotor,)})
     assert alone(loses, CENTRIFUGE.model_copy(update={"bus": (line,)})) == []
+
+
+@pytest.mark.parametrize("speed", [0.65, 0.8, 1.5, 2.5])
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.sweep(3)
+def test_an_encoder_that_dies_beside_a_rotor_that_has_coasted_down_opens_no_lock(speed, seed):
+    async def coasts(machine):
+        await machine.rotor.move_velocity(5.0, acceleration=10)
+        await asyncio.sleep(1.0 + 0.013 * seed)
+        await machine.rotor.power(on=False)
+        await machine.rig.until(lambda: machine.speed < speed)
+        machine.rig.faults.encoder_stuck("rotor")
+        at = []
+        while machine.speed > CREEPS:
+            if machine.rotor.state.sample.moving is Moving.NO:
+                at.append(machine.speed)
+            with suppress(LdcndError):
+                await machine.high("unlock")
+                at.append(machine.speed)
+            await asyncio.sleep(0.02)
+        return at, machine.rotor.state.sample.referenced
+
+    assert alone(coasts) == ([], False)
