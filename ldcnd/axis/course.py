@@ -24,6 +24,8 @@ BRAKES_SHARE = 1.5
 """Most that a deceleration is taken for of what a profile has: shafts swing."""
 FOLLOWS_WITHIN_S = 1.0
 """Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
+BREAKS_FREE_SHARE = 8.0
+"""No shaft that coasts sticks for longer than its profile needs for so many times the part in which it must move."""
 LAGS_S = 0.02
 """Shortest time over which a way is compared with its speed."""
 CLOCK_SHARE = 1.1
@@ -205,8 +207,10 @@ class Following:
             return self
         return replace(self, gone_counts=before.gone_counts, low=before.low, high=before.high)
 
-    def going_on(self, velocity_counts_per_s: float, acceleration_counts_per_s2: float) -> "Following":
-        """Return it for a profile that goes over into another one."""
+    def going_on(
+        self, velocity_counts_per_s: float, acceleration_counts_per_s2: float, *, reverses: bool = False
+    ) -> "Following":
+        """Return it for a profile that goes over into another one, in the other direction if it reverses."""
         slowest, fastest = sorted((self.velocity_counts_per_s, velocity_counts_per_s))
         fastest = max(fastest, self.fastest_counts_per_s)
         rate = min(self.acceleration_counts_per_s2, acceleration_counts_per_s2)
@@ -217,7 +221,9 @@ class Following:
             acceleration_counts_per_s2=rate,
             braking_counts_per_s2=max(self.braking_counts_per_s2, acceleration_counts_per_s2),
             fastest_counts_per_s=fastest,
-            swings_until_s=max(self.swings_until_s, swings_s if fastest > SWINGS_ABOVE * slowest else -math.inf),
+            swings_until_s=max(
+                self.swings_until_s, swings_s if reverses or fastest > SWINGS_ABOVE * slowest else -math.inf
+            ),
         )
 
     def let_go(self, *, at_velocity: bool) -> "Coast | None":
@@ -262,7 +268,10 @@ class Following:
             return self.counted or gone < self.least_counts
         soon = 0 < (at_s - self.since_s) * self.speed_counts_per_s < 4 * REST_COUNTS  # it had no time to go on
         if runs:
-            if self.faults and self.is_unseen and at_s - self.since_s >= FOLLOWS_WITHIN_S:
+            lag = 0 if first is None or error is None else abs(error) - abs(first)
+            free = self.coasts and max(self._gone_counts(at_s), lag) >= BREAKS_FREE_SHARE * self.least_counts
+            sticks_s = 0.0 if free else FOLLOWS_WITHIN_S
+            if self.faults and self.is_unseen and at_s - self.since_s >= sticks_s:
                 return False
         elif not soon:
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
@@ -383,6 +392,7 @@ class Coast:
         at_counts: where it was then; None where that is not known.
         until_s: the latest instant at which it can have been there, in loop time.
         braked_counts_per_s2: how fast its loop has slowed it down at most, which has opened since.
+        shown_counts_per_s: velocity that its drive has shown then.
     """
 
     since_s: float
@@ -393,6 +403,7 @@ class Coast:
     at_counts: int | None = None
     until_s: float = 0.0
     braked_counts_per_s2: float = 0.0
+    shown_counts_per_s: float = 0.0
 
     @classmethod
     def of(cls, reading: AxisReading, at_s: float, true_until_s: float) -> "Coast | None":
@@ -402,7 +413,8 @@ class Coast:
             return None
         # under voltage it may have broken free a moment ago: the next reading tells its speed
         known = 0.0 if reading.enabled else speed
-        return cls(at_s, known, at_s, known, step, reading.position_counts, true_until_s)
+        at_counts = reading.position_counts
+        return cls(at_s, known, at_s, known, step, at_counts, true_until_s, shown_counts_per_s=speed)
 
     @property
     def is_fast(self) -> bool:
@@ -454,12 +466,23 @@ class Coast:
         shown, step = abs(reading.velocity_counts_per_s), reading.velocity_resolution_counts_per_s
         if 2 * shown < least and is_fast(least, step):
             return False
+        if reading.enabled and shown > self.shown_counts_per_s + RUNAWAY_SHARE * most * longest_s + 2 * step:
+            return False  # its loop makes up for counts that were missed
         if way_counts <= REST_COUNTS and shown <= step:
             return True
         # from its mean speed; where the counter is set its positions jump
         least = max(least, min(way_counts / longest_s - most * longest_s / 2, shown + step))
-        since_s, at_counts = self.since_s, reading.position_counts
-        return Coast(since_s, self.from_counts_per_s, at_s, least, step, at_counts, true_until_s)
+        at_counts = reading.position_counts
+        return Coast(
+            self.since_s,
+            self.from_counts_per_s,
+            at_s,
+            least,
+            step,
+            at_counts,
+            true_until_s,
+            shown_counts_per_s=shown,
+        )
 
 
 @dataclass(frozen=True, slots=True)

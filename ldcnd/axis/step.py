@@ -210,6 +210,7 @@ def _is_at_velocity(status: AxisStatus, following: Following, at_s: float) -> bo
         command is not None
         and command.verb is Verb.MOVE_VELOCITY
         and command.state is AxisState.CONTINUOUS_MOTION
+        and at_s >= following.swings_until_s
         # a run with an end is a long move to its drive
         and (ends_at_s is None or at_s < ends_at_s - following.brakes_within_s)
     )
@@ -544,9 +545,10 @@ def _next_following(status: AxisStatus, event: MotionStarted) -> Following | Non
         return None
     # what brings a motion to rest goes on with its profile, and so does a shaft that cannot stand at once
     if command.state is not AxisState.STOPPING and command.command_id != before.command_id:
-        if not (before.coasts and event.onwards):
+        if not (before.coasts and event.profile):
             return None
         before = replace(before, command_id=command.command_id)
+        return before.going_on(*event.profile, reverses=not event.onwards)
     return before.going_on(*event.profile) if event.profile else before
 
 

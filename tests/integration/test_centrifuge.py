@@ -1429,3 +1429,22 @@ def test_an_encoder_that_dies_beside_a_rotor_that_has_coasted_down_opens_no_lock
         return at, machine.rotor.state.sample.referenced
 
     assert alone(coasts) == ([], False)
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "speed", "cut_s"), [(1, 0.3, 0.25), (3, 0.5, 0.16), (10, 0.6, 0.35), (10, 1.0, 0.25)]
+)
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.sweep(3)
+def test_an_encoder_that_was_cut_as_a_spin_is_reversed_costs_the_reference(acceleration, speed, cut_s, seed):
+    async def reverses(machine):
+        await machine.rotor.move_velocity(5.0, acceleration=acceleration)
+        await machine.rig.until(lambda: machine.speed > 4.9)
+        await asyncio.sleep(0.3 + 0.017 * seed)
+        await machine.rotor.move_velocity(-5.0, acceleration=acceleration, buffer_mode="aborting")
+        await machine.rig.until(lambda: machine.speed < speed)
+        machine.rig.faults.encoder_stuck("rotor", for_s=cut_s)
+        await asyncio.sleep(cut_s + 2.0)
+        return machine.rotor.state.sample.referenced
+
+    assert alone(reverses) is False
