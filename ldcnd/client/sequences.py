@@ -10,7 +10,8 @@ from ldcnd.client.rig import Rig
 from ldcnd.contract.catalogue import AXIS_COMMANDS
 from ldcnd.contract.commands import Effect, Verb
 from ldcnd.contract.condition import way_to_rest
-from ldcnd.contract.errors import ConfigError, LdcndError, WrongState
+from ldcnd.contract.errors import ConfigError, LdcndError, Remedy, WrongState
+from ldcnd.contract.errors import step as remedy_step
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import IoSample, Moving, StateSample, TelemetryItem
 from ldcnd.contract.sequences import NamedPosition, SequenceConfig, SequenceStep, StepReport
@@ -18,6 +19,8 @@ from ldcnd.contract.units import POSITION, quantity_text
 
 LEASE_S = 2.0
 """The daemon applies `loss.client` so soon when this program disappears, seconds."""
+STOPS_SEEN_EACH_S = 0.1
+"""Time between two looks for a stop, seconds."""
 
 
 class SequenceRun:
@@ -79,8 +82,32 @@ class SequenceRun:
             self._axes = {axis.name: axis for axis in controlled}
             self._units = {info.axis: info for info in await self._rig.describe()}
             self._modules = await self._lines()
-            for number in range(first, len(steps) + 1):
-                await self._carry_out(number, steps[number - 1])
+            try:
+                async with asyncio.TaskGroup() as group:
+                    stops = group.create_task(self._see_stops(), name="stops of a sequence")
+                    for number in range(first, len(steps) + 1):
+                        await self._carry_out(number, steps[number - 1])
+                    stops.cancel()
+            except* LdcndError as errors:
+                raise errors.exceptions[0] from None
+
+    async def _see_stops(self) -> None:
+        """End the sequence when one of its axes is stopped, whoever has stopped it: another would be moved beside it.
+
+        Raises:
+            WrongState: one is.
+        """
+        known: set[str] | None = None
+        while True:
+            latched = {name for name, axis in self._axes.items() if axis.state.sample.stop_latched}
+            known = latched if known is None else known & latched
+            for name in sorted(latched - known):
+                raise WrongState(
+                    f"axis {name} was stopped; sequence {self._sequence.name} ends",
+                    axis=name,
+                    remedy=Remedy("look why, then {}", remedy_step("reset")),
+                )
+            await asyncio.sleep(STOPS_SEEN_EACH_S)
 
     async def _check_stand(self, steps: Sequence[SequenceStep]) -> None:
         """Refuse to control an axis that another program moves: to give up its control again would halt that motion."""

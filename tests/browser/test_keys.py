@@ -79,6 +79,17 @@ DROPPED = f"""() => {{
 }}"""
 
 
+AT_ONCE = f"""(text) => {{
+  const field = {FIND};
+  field.focus();
+  field.select();
+  document.execCommand("insertText", false, text);
+  field.dispatchEvent(new KeyboardEvent("keydown", {{ key: "Enter", bubbles: true, cancelable: true }}));
+  return true;
+}}"""
+"""Type a text and Enter in one turn of the browser, as programs do that type for a person."""
+
+
 async def axis_page(window, house):
     await window.open("about:blank")
     await window.open(f"{house.url}/#/axis/sim/x")
@@ -179,6 +190,14 @@ async def test_at_twice_the_size_the_number_and_the_stop_are_seen(house, window)
             assert await window.evaluate(SEEN) == {"field": True, "whole": True, "stop": True}, size
     finally:
         await window.resize(1400, 900)
+
+
+async def test_what_a_program_types_with_enter_in_one_turn_is_what_moves(house, window):
+    await ready(window, house)
+    for text, where in (("1", 1.0), ("2", 2.0), ("-1.5", -1.5), ("0.5", 0.5)):
+        assert await window.evaluate(AT_ONCE, text)
+        await house.sim.reaches("x", where, 0.02)
+        await until(window, windows.PRESSABLE, "+0.1 mm")
 
 
 async def test_the_enter_that_ends_a_composition_sends_nothing(house, window):

@@ -156,6 +156,9 @@ async def test_a_spin_waits_between_its_steps_and_goes_on(tmp_path):
         await bench.spins()
         await bench.desk.button("Pause").click()
         await expect(bench.progress).to_contain_text("paused since")
+        for place in ("scope", "events", "rig"):
+            await bench.desk.open(place)
+            await expect(bench.desk.page.locator(".summary")).to_contain_text("sequence spin is paused")
         await bench.desk.button("Go on").focus()
         await bench.desk.page.keyboard.press("Enter")
         await expect(bench.progress).to_contain_text("sequence spin: done")

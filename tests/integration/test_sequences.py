@@ -8,7 +8,7 @@ import pytest
 
 from ldcnd.client.sequences import SequenceRun
 from ldcnd.config.rig import RigConfig, load_config
-from ldcnd.contract.commands import Halt, MoveVelocity, Power
+from ldcnd.contract.commands import Halt, MoveVelocity, Power, Stop
 from ldcnd.contract.errors import (
     CommandAborted,
     ConfigError,
@@ -299,6 +299,35 @@ def test_axes_go_to_a_position_one_after_the_other_in_the_order_of_the_configura
 
     assert order == [(axis, status) for axis in "yx" for status in ("accepted", "executing", "done")]
     assert there == pytest.approx([2.0, 10.0], abs=0.05)
+
+
+@pytest.mark.parametrize(
+    "doing",
+    [SequenceStep(pause_s=5.0), SequenceStep(do="move_relative", axis="x", arguments={"distance": 20, "velocity": 4})],
+)
+def test_a_stop_of_an_axis_that_stands_ends_the_sequence_that_would_move_another(doing):
+    later = SequenceStep(do="move_relative", axis="y", arguments={"distance": 2.0})
+
+    async def program():
+        async with simulated_rig(ROOT / "config" / "simulated.toml") as rig:
+            async with rig.client.control("x", "y", client="test") as axes:
+                for axis in axes:
+                    await axis.set_position(0.0)
+                    await axis.power(on=True)
+            running = SequenceRun(
+                rig.client, SequenceConfig(name="part", step=(doing, later)), {}, lambda _: None, lambda: 0
+            )
+            run_of_it = asyncio.create_task(running.run())
+            await asyncio.sleep(1.0)
+            await rig.client.client.command("y", Stop(client="anna"))
+            with pytest.raises(WrongState, match="axis y was stopped; sequence part ends"):
+                await run_of_it
+            await rig.at_rest("x")
+            return rig.truth("x").position, rig.truth("y").position
+
+    x, y = run(program())
+
+    assert (x < 10, y) == (True, pytest.approx(0.0, abs=0.05))
 
 
 @pytest.mark.parametrize("ending", [Halt(client="anna"), Power(on=False, client="anna")])

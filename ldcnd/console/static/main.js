@@ -62,6 +62,8 @@ function Summary() {
       ${wrong.length ? `${wrong.length} need${wrong.length === 1 ? "s" : ""} attention` : calm("Nothing needs attention")}<//>
     ${[...rigs.values()].filter((rig) => !rig.worth && slowed(rig)).map((rig) => html`<${Mark} level="warn"
       >${rigs.size > 1 ? `${rig.name}: ` : ""}speed override ${number(overrideOf(rig), 0)} %${overrideOf(rig) === 0 ? ": no command moves anything" : ""}<//> `)}
+    ${[...rigs.values()].filter((rig) => rig.runs).map(({ run }) => html` <a href="#/rig"><${Mark} level="warn"
+      >${run.kind} ${run.name} ${run.waits ? "is paused" : "runs"}<//></a> `)}
     ${mine.length > 0 && html` <span class="mine">You control ${namesOf(mine)}</span>`}
   </p>`;
 }

@@ -18,25 +18,28 @@ export function Action({ act, of = null, obstacle = null, reason = null, kind = 
   const own = useId();
   const [underWay, setUnderWay] = useState(false);
   const pressed = useRef(false); // a second press comes before the first is drawn
+  const drawn = useRef();
+  drawn.current = { act, obstacle, onDone, onRefused };
   const [refusal, setRefusal] = useState(null);
   useEffect(() => setRefusal(null), [of]);
 
   async function press(event) {
     const came = cameUnderHand(event);
-    if (obstacle || pressed.current || event.detail > 1) return;
-    if (came && !calms) {
-      const said = { message: came, nearest: null };
-      return onRefused ? onRefused(said) : setRefusal(said);
-    }
+    if (pressed.current || event.detail > 1) return;
     pressed.current = true;
-    setUnderWay(true);
-    setRefusal(null);
+    // what was typed in the same turn, as by a program that types, is drawn behind it: that is what is sent
+    if (!calms) await Promise.resolve();
+    const now = drawn.current;
+    const refused = (error) => (now.onRefused ? now.onRefused(error) : setRefusal(error));
     try {
-      const reply = await act();
-      onDone?.(reply);
+      if (now.obstacle) return;
+      if (came && !calms) return refused({ message: came, nearest: null });
+      setUnderWay(true);
+      setRefusal(null);
+      const reply = await now.act();
+      now.onDone?.(reply);
     } catch (error) {
-      if (onRefused) onRefused(error);
-      else setRefusal(error);
+      refused(error);
     } finally {
       pressed.current = false;
       setUnderWay(false);

@@ -56,7 +56,7 @@ function TextQuestion({ question, answer }) {
   const likely = question.choices ?? [];
   return html`<form class="row" onSubmit=${(event) => {
     event.preventDefault();
-    answer(text);
+    answer(field.current.value);
   }}>
     <div class="field">
       <label for=${id}>${question.text}</label>
