@@ -293,7 +293,7 @@ async def test_the_first_program_runs(tmp_path: Path):
                 print("jogged")
         """
         blocked = await run_program(inspect.cleandoc(quietly), endpoint)
-        async with process("axis", "at", "y", "--ago", "0.5", "--json", "-e", endpoint) as asked:
+        async with process("axis", "at", "y", "--ago", "0.1", "--json", "-e", endpoint) as asked:
             assert asked.stdout
             was = json.loads(await asked.stdout.read())
 

@@ -305,6 +305,7 @@ NOT_RUN = {
     ),
     "ldcnd halt AXIS, wait until it stands, then ldcnd reset AXIS": "a shaft that turns without its drive",
     "wait until it stands, then ldcnd power on AXIS": "a shaft that turns without its drive",
+    "look why, then ldcnd reset AXIS": "a sequence of which an axis is stopped, which their tests run",
     "ldcnd home AXIS and wait until it is homed": "an interlock, with the centrifuge",
     "ldcnd power off AXIS and wait until it stands, or ldcnd home AXIS if nothing is in the way of that": (
         "a shaft that was taken over under power, with the centrifuge"

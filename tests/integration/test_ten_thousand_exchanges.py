@@ -6,7 +6,7 @@ from collections import Counter
 
 import pytest
 
-from ldcnd.contract.errors import BusError, OutcomeUnknown, ReplyTimeout
+from ldcnd.contract.errors import AxisUnreachable, BusError, OutcomeUnknown, ReplyTimeout
 from ldcnd.drives.driver import AxisSpec, CountsMotion, Gains
 from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node
@@ -73,7 +73,7 @@ async def test_every_caller_gets_one_outcome_and_no_value_of_another_node(seed):
                 if abs(status.position - 10_000 * number) > 2:
                     foreign.append((number, status))
             outcomes["answered"] += 1
-        except BusError as error:
+        except (AxisUnreachable, BusError) as error:
             outcomes[type(error).__name__] += 1
 
     async with asyncio.TaskGroup() as group:
@@ -102,7 +102,8 @@ async def test_every_caller_gets_one_outcome_and_no_value_of_another_node(seed):
     assert sum(outcomes.values()) == EXCHANGES
     assert foreign == []
     assert outcomes["answered"] > 0.97 * EXCHANGES
-    assert set(outcomes) <= {"answered", OutcomeUnknown.__name__, ReplyTimeout.__name__}
+    # nothing is written to a drive that was silent for all attempts: that it is the same one is proven by its network
+    assert set(outcomes) <= {"answered", *(each.__name__ for each in (OutcomeUnknown, ReplyTimeout, AxisUnreachable))}
     statistics = bus.statistics
     assert statistics.timeouts > 100
     assert statistics.corrupt_replies > 50
