@@ -25,7 +25,7 @@ BRAKES_SHARE = 1.5
 FOLLOWS_WITHIN_S = 1.0
 """Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
 BREAKS_FREE_SHARE = 8.0
-"""No shaft that coasts sticks for longer than its profile needs for so many times the part in which it must move."""
+"""No shaft that coasts sticks while its profile goes on by as many times the part in which it must move."""
 LAGS_S = 0.02
 """Shortest time over which a way is compared with its speed."""
 CLOCK_SHARE = 1.1

@@ -92,7 +92,7 @@ class SequenceRun:
                 raise errors.exceptions[0] from None
 
     async def _see_stops(self) -> None:
-        """End the sequence when one of its axes is stopped, whoever has stopped it: another would be moved beside it.
+        """End the sequence when one of its axes is stopped, by any client: others would be moved beside it.
 
         Raises:
             WrongState: one is.
