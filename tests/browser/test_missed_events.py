@@ -1,4 +1,4 @@
-"""What happens while a page hears nothing, or changes what it hears: it is told afterwards."""
+"""Events during a gap of the feed of a page, or while it changes its streams, are shown on the page."""
 
 import re
 
@@ -20,7 +20,7 @@ FEED, EVENTS = re.compile("/api/feed"), re.compile("/rigs/sim/rig/events$")
 
 
 class Wire:
-    """The way between a page and the console's feed: it can be cut, and made to let nothing through."""
+    """The connection between a page and the feed of the console, which can be cut and blocked."""
 
     def __init__(self):
         self.open, self.sockets = True, []
@@ -36,7 +36,7 @@ class Wire:
             await each.close()
 
 
-async def test_an_event_of_a_gap_is_told_although_the_first_question_for_it_fails(house):
+async def test_an_event_of_a_gap_is_shown_although_the_first_request_for_it_fails(house):
     await house.sim.quiet("x")
     async with house.desk() as desk:
         wire, failed = Wire(), []
@@ -66,7 +66,7 @@ async def test_an_event_of_a_gap_is_told_although_the_first_question_for_it_fail
     await house.sim.quiet("x")
 
 
-async def test_a_page_hears_on_while_what_it_hears_is_changed(house):
+async def test_a_page_keeps_its_values_while_it_changes_its_streams(house):
     await house.sim.quiet("x")
     async with house.desk() as desk:
         wire = Wire()
