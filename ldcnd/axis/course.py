@@ -141,14 +141,14 @@ class Following:
             as much in which it must have been seen to go on.
         since_s: since when the shaft is where it is, in loop time; before it was seen to move, when the drive had the
             motion: its profile runs from then on, if not before.
+        low: lowest position since; before it was seen to move, since the reading before its motion.
+        high: highest.
         counted: the shaft was seen to move.
         speed_counts_per_s: that it was seen to have when it was first seen there: it goes on for a braking distance.
         error_counts: following error when it was first seen there, or before; None where its drive does not tell.
         gone_counts: the least way that the profile has gone since, or goes; or has in an earlier motion of the command.
         until_s: when the shaft must have been seen to move again; infinite while the profile runs.
         given_up: it was not seen in time.
-        low: lowest position since; infinite before the first.
-        high: highest.
         faults: it is a fault then; else the axis may only move unseen, until its encoder counts again.
         coasts: the shaft cannot stand at once: where it seems to, at a speed, its encoder has missed counts.
         least_counts_per_s: that the positions have shown when it was first seen there, if it braked meanwhile.
@@ -164,14 +164,14 @@ class Following:
     way_counts: float
     least_counts: float
     since_s: float
+    low: float
+    high: float
     counted: bool = False
     speed_counts_per_s: float = 0.0
     error_counts: int | None = None
     gone_counts: float = 0.0
     until_s: float = math.inf
     given_up: bool = False
-    low: float = math.inf
-    high: float = -math.inf
     faults: bool = True
     coasts: bool = False
     least_counts_per_s: float = 0.0
@@ -344,12 +344,12 @@ class Following:
             self.way_counts,
             self.least_counts,
             at_s,
+            low=reading.position_counts,
+            high=reading.position_counts,
             counted=True,
             speed_counts_per_s=speed,
             error_counts=self.error_counts if error is None else error,
             gone_counts=speed**2 / (4 * self.braking_counts_per_s2),  # half of what it needs to brake
-            low=reading.position_counts,
-            high=reading.position_counts,
             faults=self.faults,
             coasts=self.coasts,
             least_counts_per_s=least,

@@ -576,15 +576,18 @@ class AxisMotion:
         reading = self.tracker.reading
         if reading is None:
             return None
-        target = motion.target_counts
+        target, begins = motion.target_counts, reading.position_counts
         return Following(
             permit.command_id,
             abs(motion.velocity_counts_per_s),
             motion.acceleration_counts_per_s2,
             motion.acceleration_counts_per_s2,
-            way_counts=math.inf if target is None else abs(target - reading.position_counts),
+            way_counts=math.inf if target is None else abs(target - begins),
             least_counts=max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
             since_s=self.clock.now_s(),
+            # one that is halted soon has its way behind it when it is read first
+            low=begins,
+            high=begins,
             # what a search finds makes a reference: of an encoder that does not count it is none
             faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
             coasts=self.config.coast_s is not None,

@@ -1,6 +1,7 @@
 """Commands of one axis, from query to drive and back, on the jumping clock."""
 
 import asyncio
+import random
 
 import pytest
 
@@ -142,6 +143,22 @@ async def test_halt_brings_an_axis_to_rest_and_lets_it_move_again():
         reply = await rig.client.command("c", MoveAbsolute(position=0.0))
         await rig.client.wait_for_end("c", reply.command_id)
         assert await settled(rig, "c") == pytest.approx(0.0, abs=0.011)
+
+
+async def test_an_axis_is_known_to_rest_behind_every_halt_however_short_its_motion_was():
+    rng = random.Random(1)
+    async with running_rig() as rig:
+        await powered(rig, "x")
+        for _ in range(60):
+            await asyncio.sleep(rng.uniform(0.0, 0.3))
+            velocity = rng.choice((0.5, 1.0, 2.0))
+            await rig.client.command("x", MoveRelative(distance=rng.choice((-20.0, 20.0)), velocity=velocity))
+            await asyncio.sleep(rng.uniform(0.0, 0.07))
+            await rig.client.command("x", Halt())
+            await rig.until("x", lambda state: state.command is None)
+            await asyncio.sleep(1.5)
+            state = await rig.client.state("x")
+            assert (state.moving, state.state) == (Moving.NO, AxisState.STANDSTILL)
 
 
 async def test_a_second_move_in_mid_move_is_refused():
