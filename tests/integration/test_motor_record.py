@@ -375,6 +375,22 @@ async def test_a_text_may_carry_a_unit_and_the_velocity_is_in_that_of_people():
         assert metadata.units == b"m/min"
 
 
+@pytest.mark.parametrize("pace_s", [0.0, 0.003, 0.012])
+async def test_a_put_that_a_jog_overtakes_leaves_the_motor_done_in_the_end(pace_s: float):
+    async with records() as (_, made):
+        async with asyncio.TaskGroup() as group:
+            group.create_task(put(made, "T:x", -8.0), name="under way")
+            await asyncio.sleep(0.3)
+            group.create_task(put(made, "T:x", 15.0), name="overtaken")
+            await asyncio.sleep(pace_s)
+            group.create_task(put(made, "T:x.JOGR", 1), name="jog")
+            await asyncio.sleep(1.0)
+            await put(made, "T:x.STOP", 1)
+
+        await shows(made, "T:x.DMOV", 1)
+        assert values(made, "SEVR", "VAL") == ("NO_ALARM", pytest.approx(made.variables["T:x.RBV"].value, abs=0.05))
+
+
 @pytest.mark.record("VAL", "of values that are put right behind each other the newest is where the motor goes")
 @pytest.mark.parametrize("pace_s", [0.0, 0.005, 0.02])
 async def test_of_puts_right_behind_each_other_the_newest_wins(pace_s: float):

@@ -164,6 +164,7 @@ class Campaign:
                 await put(self.made, f"T:x.{jog}", 0)
         await self.running.until("x", lambda state: state.moving is Moving.NO and state.command is None)
         await asyncio.sleep(SETTLING_S)
+        assert self.made.variables["T:x.DMOV"].value == 1
         target, here = (float(self.made.variables[f"T:x.{name}"].value) for name in ("VAL", "RBV"))
         assert abs(target - here) <= SETTLING_COUNTS / COUNTS_PER_UNIT, f"stopped: {stops}"
         self.compared += 1

@@ -422,18 +422,17 @@ class MovedRecord(MotorRecord):
         try:
             await self._movable()
             motion = await starting() if self._halts == halts else None
-        except CommandAborted:
-            if self._halts == halts:
-                raise
-            motion = None  # a halt was put while the motion was on its way to the daemon
         except BaseException as error:
-            self._refused = self._halts == halts
-            await self.show_alarm()
             self._pending -= 1
+            # a halt was put while it was on its way to the daemon, or another motion, and has overtaken it
+            halted = self._halts != halts and isinstance(error, CommandAborted | RequestRefused)
+            overtaken = halted or (isinstance(error, CommandAborted) and self._pending > 0)
+            self._refused = not overtaken
+            await self.show_alarm()
             await self["LVIO"].show(int(getattr(error, "code", "") == "position_limit"))
             await self.show_motion()
-            if self._halts != halts and isinstance(error, RequestRefused):
-                return Put()  # it was to be halted: that has overtaken it
+            if overtaken:
+                return Put()
             raise
         if motion is None:
             self._pending -= 1
