@@ -6,7 +6,7 @@ import os
 import signal
 from asyncio.subprocess import Process
 from collections.abc import AsyncIterator, Callable
-from contextlib import AsyncExitStack, asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -17,7 +17,7 @@ from playwright.async_api import Browser, ConsoleMessage, Locator, Page, async_p
 from ldcnd.client.lease import Control, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import Halt, Power, Reset
-from ldcnd.contract.errors import StopLatched
+from ldcnd.contract.errors import CommandAborted, StopLatched
 from ldcnd.contract.samples import PositionSample, StateSample, TelemetryItem
 from tests.support.process import ROOT, answering, client, free_port, process
 
@@ -133,10 +133,10 @@ class DaemonUnderTest:
 
 
 async def is_reset(held: Control, axis: str) -> bool:
-    """Reset an axis; return whether it was: the stop of a page that has gone may be on its way."""
+    """Reset an axis; return whether it was: the stop or halt of a page that has gone may be on its way."""
     try:
         await held.command(axis, Reset())
-    except StopLatched:
+    except (StopLatched, CommandAborted):
         return False
     return True
 
@@ -198,6 +198,18 @@ class House:
     alpha: DaemonUnderTest
     link: str
     _cookies: list[dict[str, object]] = field(default_factory=list)
+
+    @asynccontextmanager
+    async def beside_alpha(self) -> AsyncIterator["House"]:
+        """Run alpha until the context ends, and a console of its own: the other would go on telling that it is gone."""
+        await self.alpha.start()
+        try:
+            async with console(self.alpha.endpoint) as link:
+                yield House(self.browser, self.sim, self.mixed, self.alpha, link)
+        finally:
+            with suppress(ProcessLookupError):  # it has ended already
+                self.alpha.pause(on=False)
+            await self.alpha.end()
 
     @property
     def url(self) -> str:
@@ -306,7 +318,6 @@ async def open_house(folder: Path) -> AsyncIterator[House]:
         async with asyncio.TaskGroup() as group:
             for daemon in (sim, mixed):
                 group.create_task(daemon.start(), name=daemon.endpoint)
-        endpoints = [daemon.endpoint for daemon in (sim, mixed, alpha)]
-        link = await stack.enter_async_context(console(*endpoints, commission=sim_config))
+        link = await stack.enter_async_context(console(sim.endpoint, mixed.endpoint, commission=sim_config))
         expect.set_options(timeout=PATIENCE_S * 1e3)
         yield House(browser, sim, mixed, alpha, link)

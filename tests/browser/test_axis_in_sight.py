@@ -35,11 +35,13 @@ COVERED = """() => {
   return wrong;
 }"""
 """What is not in sight while a field has the focus, field by field."""
-JUMP = """(title) => {
+JUMP = """async (title) => {
+  for (let frame = 0; frame < 3; frame += 1) await new Promise(requestAnimationFrame);
   const button = [...document.querySelectorAll(".jumps button")].find((each) => each.textContent === title);
   const box = button.getBoundingClientRect();
   return [box.left + box.width / 2, box.top + box.height / 2];
 }"""
+"""Where a button is, some frames after the page got another size."""
 WHERE = """(title) => {
   const heading = [...document.querySelectorAll("main h2")].find((each) => each.textContent === title);
   const box = heading.getBoundingClientRect();

@@ -6,10 +6,12 @@ import re
 import pytest
 import serial
 
+from ldcnd.client.traces import trace_header
 from ldcnd.contract.commands import Halt, SetPosition
 from ldcnd.contract.leases import Acquire, ListHolders
-from ldcnd.contract.traces import TakeTrace
+from ldcnd.contract.traces import TakeTrace, TracePhase
 from ldcnd.drives.ldcn.packet import CommandCode, Packet, encode_packet
+from tests.browser.house import LOOKED_EACH_S, PATIENCE_S
 
 playwright = pytest.importorskip("playwright.async_api", reason="the browser tests need playwright")
 expect = playwright.expect
@@ -351,7 +353,14 @@ async def test_an_event_leads_to_its_packets_and_to_the_trace_of_that_moment(hou
     await house.sim.quiet("x")
     async with house.desk() as desk:
         trace = TakeTrace(channels=("position",), samples=200, interval_s=0.01)
-        await house.sim.rig.command("x", trace)
+        taken = await house.sim.rig.command("x", trace)
+        async with asyncio.timeout(PATIENCE_S):
+            while (
+                (header := await trace_header(house.sim.rig, "x")) is None
+                or header.trace_id != taken.trace_id
+                or (header.phase is not TracePhase.RECORDING)
+            ):
+                await asyncio.sleep(LOOKED_EACH_S)
         await house.sim.rig.command("x", Halt())
         await desk.open("events")
         panel = desk.panel("Commands and how they ended")

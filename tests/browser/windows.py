@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 from playwright.async_api import CDPSession, Error, Page
 
-from tests.browser.house import House, console
+from tests.browser.house import PATIENCE_S, House, console
 from tests.support.marionette import CONTROL, DELETE, DOWN, ENTER, ESCAPE, SHIFT, TAB, Firefox, firefox, open_firefox
 
 __all__ = ["PRESS", "PRESSABLE", "Chromium", "Window", "console", "gecko_with", "open_chromium", "open_gecko", "until"]
-PATIENCE_S = 45.0
 NAMED = {
     CONTROL: "Control",
     DELETE: "Delete",

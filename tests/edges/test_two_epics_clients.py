@@ -24,7 +24,7 @@ LONGEST_S = 60.0
 SETTLES_MM = 0.05
 STANDS_MM_PER_S = 0.05
 QUIET_S = 0.5
-"""Time in which a motion that nobody put would have begun."""
+"""Time in which a motion that was not put would have begun."""
 STEPS = 40
 MOTIONS = {"move_absolute", "home", "jog"}
 STARTS = (
@@ -226,11 +226,11 @@ def test_what_two_clients_put_moves_the_axis_there_and_nothing_else_moves_it(see
             day.step()
         day.stop()
         day.compare()
-        told = subprocess.run(  # noqa: S603
+        log = subprocess.run(  # noqa: S603
             [*LDCND, "log", "-e", rig.endpoint, "--json", "--count", "1000", "--axis", "x"],
             check=True, capture_output=True, text=True, timeout=60,
         ).stdout  # fmt: skip
-    begun = {row["command_id"] for row in map(json.loads, told.splitlines()) if row["what"] in MOTIONS}
+    begun = {row["command_id"] for row in map(json.loads, log.splitlines()) if row["what"] in MOTIONS}
     print(f"seed {seed}: {day.started} puts, {len(begun)} motions, {day.stopped} stops, {day.compared} comparisons")
     assert 0 < len(begun) <= day.started
     assert day.compared > 1

@@ -16,13 +16,13 @@ pytestmark = [pytest.mark.system, pytest.mark.real_time]
 
 
 PAGE = (ROOT / "docs" / "how-to" / "replay-a-capture.md").read_text(encoding="utf-8")
-ON_PAGE = re.findall(r"^ldcnd bus wire-log .+$", PAGE, re.MULTILINE)
+ON_LINES = re.findall(r"^ldcnd bus wire-log line0 .+$", PAGE, re.MULTILINE)
 ON_FILES = re.findall(r"^ldcnd bus wire-log fault\.capture .+$", PAGE, re.MULTILINE)
 
 
 async def test_a_line_is_dumped_as_a_capture_in_words_as_json_and_for_wireshark(tmp_path):
     async with daemon(ROOT / "config" / "simulated.toml") as endpoint:
-        asked = [f"{command} -e {endpoint}" for command in ON_PAGE]
+        asked = [f"{command} -e {endpoint}" for command in ON_LINES]
         as_json = f"ldcnd bus wire-log line0 --seconds 3 --json -e {endpoint}"
         refused = f"ldcnd bus wire-log nowhere -e {endpoint}"
         *ran, jsons, refusal = await run_all(tmp_path, *asked, as_json, refused)
