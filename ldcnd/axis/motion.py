@@ -10,7 +10,8 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.course import Following, Pace, Way, pace_of
+from ldcnd.axis.counting import Following
+from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
 from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
 from ldcnd.axis.permit import Permit

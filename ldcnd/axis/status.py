@@ -11,7 +11,8 @@ from enum import Enum
 from operator import attrgetter
 from typing import Any
 
-from ldcnd.axis.course import BRAKES_SHARE, Braking, Coast, Following, Pace, Way
+from ldcnd.axis.counting import BRAKES_SHARE, Coast, Following
+from ldcnd.axis.course import Braking, Pace, Way
 from ldcnd.axis.faults import NOT_FOLLOWED, READINGS_CONTRADICT, REPLIES_UNUSABLE
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling, window_counts
 from ldcnd.axis.scale import AxisScale

@@ -10,7 +10,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Any
 
-from ldcnd.axis.course import BRAKES_SHARE, Braking, Coast, Following, Pace, Way
+from ldcnd.axis.course import Braking
 from ldcnd.axis.events import (
     AxisEvent,
     CommandBegun,
@@ -57,47 +57,46 @@ from ldcnd.axis.faults import (
     READINGS_CONTRADICT,
     REFERENCE_REFUSED,
     REPLIES_UNUSABLE,
-    STOOD_AT_ONCE,
     STOP_UNCONFIRMED,
     entry_again,
     entry_of,
+)
+from ldcnd.axis.outcome import (
+    abort,
+    changed,
+    fail,
+    finished,
+    keep_stop,
+    own_and,
+    place_lost,
+    send_stop,
+    state_at_rest,
+    with_faults,
+    with_how,
 )
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, shows_velocity
 from ldcnd.axis.status import (
     STRENGTH,
     ActiveCommand,
-    AskedStop,
     AxisStatus,
-    CommandEnd,
     Completion,
-    OpenStop,
-    aborted_by,
 )
+from ldcnd.axis.watch import let_go, next_following, parted, watch_braking, watch_course, watch_encoder
 from ldcnd.contract.commands import Verb
-from ldcnd.contract.events import CommandStatus
-from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Unseen
+from ldcnd.contract.samples import AxisState, LinkState, Unseen
 from ldcnd.drives.driver import Fault, StopMode
 
 MISSES_UNTIL_DOWN = 3
 """Consecutive polls without a reply after which the drive counts as lost, or with replies that cannot be used after
 which what it does is not understood."""
 
-NAMED_STOPS = frozenset({Verb.HALT, Verb.QUICK_STOP})
-"""Commands that are under way while a drive brakes, and that are sent again by their own name."""
-WENT_ON = "sent again, because the axis went on for longer than it should need to come to rest"
-STRAYED = "sent because the axis was not on the way to its target"
 LEFT = "sent before the drive was read: what it did while no daemon read it is not known"
 CLOSED_AGAIN = "sent because its drive had opened its loop, and what was sent before that was seen has closed it again"
-UNFOLLOWED = "sent because the profile of a motion has run and the encoder has not counted"
-OUTRUN = "sent because the axis stayed faster than it was told"
 
 
 def step(status: AxisStatus, event: AxisEvent) -> AxisStatus:
     """Return the status after an event; the same object where nothing changes."""
     return STEPS[type(event)](status, event)
-
-
-# -- the steps -------------------------------------------------------------------------------------------------------
 
 
 def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
@@ -116,35 +115,17 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     if status.misses or status.in_vain or status.link is not LinkState.UP:
         status = replace(status, misses=0, in_vain=0, link=LinkState.UP, was_read=True)
     if status.braking:
-        status = _watch_braking(status, status.braking, event)
+        status = watch_braking(status, status.braking, event)
     if faults or status.faults or status.stop:
-        lost = any(fault.loses_position for fault in faults) or _parted(status, event, faults)
-        status = _with(_with_faults(status, faults, now_ns), position_lost=lost)
+        lost = any(fault.loses_position for fault in faults) or parted(status, event, faults)
+        status = changed(with_faults(status, faults, now_ns), position_lost=lost)
         if lost:
-            status = _with(_place_lost(status), target=None)
+            status = changed(place_lost(status), target=None)
     if event.sent_at_s >= status.effective_from_s:  # else it says nothing about the latest command
         status = _take_effective(status, event, faults)
     if status.target is None and status.enabled and _came_to_rest(status):
         return replace(status, target=status.scale.shown_at(reading.position_counts))
     return status
-
-
-def _parted(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> bool:
-    """Tell whether a shaft that cannot stand at once has left its encoder behind, which has missed counts then."""
-    coasts_on = status.limits.slowing_counts_per_s2 is not None
-    return coasts_on and not event.reading.enabled and any(fault.hides_motion for fault in faults)
-
-
-def _watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) -> AxisStatus:
-    seen = braking.observe(event.reading, event.sent_at_s, driven_open=status.driven_open)
-    if isinstance(seen, Braking):
-        return status if seen is braking else replace(status, braking=seen)
-    if seen:
-        return replace(status, braking=None, driven_open=False)
-    if status.driven_open and braking.mode is StopMode.OFF:
-        return replace(status, braking=None, off_again=True)  # a rotor that coasts for a minute is no fault
-    verb = status.command.verb if status.command and status.command.verb in NAMED_STOPS else Verb.STOP
-    return _keep_stop(replace(status, braking=None), StopUnconfirmed(event.now_ns, braking.mode, WENT_ON, verb))
 
 
 def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -154,15 +135,15 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
     if rest is not status.rest or enabled is not status.enabled:
         status = _see_rest(status, rest, at_s, enabled=enabled)
     if status.unsure and status.unsure.from_rest and (shows_velocity(reading) or not reading.profile_done):
-        status = _with(status, unsure=None)
+        status = changed(status, unsure=None)
     # the command fails when it comes to rest, not before: until then it may still move
     if reading.cut_short and command:
-        status = _with(status, failure=reading.cut_short)
+        status = changed(status, failure=reading.cut_short)
     # nothing holds it there any more
     if not enabled and status.target is not None:
         status = replace(status, target=None)
     if status.following or status.coast or (rest.turns and (not enabled or status.limits.braking_counts_per_s2)):
-        before, status = status, _watch_encoder(status, event, faults)
+        before, status = status, watch_encoder(status, event, faults)
         if status.own is not before.own and NOT_FOLLOWED in status.own:
             return status
     if faults and any(fault.stops for fault in faults):
@@ -173,151 +154,26 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
             status = replace(status, driven_open=False)
         before = status
         if command and (status.way or status.pace):
-            status = _watch_course(status, event)
+            status = watch_course(status, event)
         # a stop that this reading has called for has ended the command, and the axis is in error_stop
         return _take_enabled(status, event, faults) if status.stop is before.stop else status
     # an open loop is no failure where it was asked for, or is known already
     if (command and command.opens_loop) or status.state in (AxisState.DISABLED, AxisState.ERROR_STOP):
         return status
-    return _fail(_with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
+    return fail(with_faults(status, (*faults, LOOP_OPENED), now_ns), LOOP_OPENED.text)
 
 
 def _see_rest(status: AxisStatus, rest: RestEvidence, at_s: float, *, enabled: bool) -> AxisStatus:
     if status.enabled and not enabled and status.limits.slowing_counts_per_s2:
-        return replace(status, rest=rest.let_go(), enabled=enabled, coast=_let_go(status, at_s))
+        return replace(status, rest=rest.let_go(), enabled=enabled, coast=let_go(status, at_s))
     return replace(status, rest=rest, enabled=enabled)
 
 
 def _fail_by_fault(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     if status.enabled and any(fault.stops and fault.hides_motion for fault in event.reading.faults):
-        status = _keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, CLOSED_AGAIN))
+        status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, CLOSED_AGAIN))
     lost = "; its position is lost" if status.position_lost else ""
-    return _fail(status, f"the drive reports a fault{lost}")
-
-
-def _let_go(status: AxisStatus, at_s: float) -> Coast | None:
-    """Return how a shaft coasts whose loop opens at an instant, by what was seen of it last; None if it stood."""
-    following, coast, most = status.following, status.coast, _braking_counts_per_s2(status)
-    coast = replace(coast, braked_counts_per_s2=most) if coast and most else None
-    told = following.let_go(at_velocity=_is_at_velocity(status, following, at_s)) if following else None
-    return max(coast, told, key=lambda each: each.speed_counts_per_s) if coast and told else coast or told
-
-
-def _is_at_velocity(status: AxisStatus, following: Following, at_s: float) -> bool:
-    """Tell whether the profile of a motion keeps its velocity at an instant, or goes up to it."""
-    command, ends_at_s = status.command, status.ends_at_s
-    return (
-        command is not None
-        and command.verb is Verb.MOVE_VELOCITY
-        and command.state is AxisState.CONTINUOUS_MOTION
-        and at_s >= following.swings_until_s
-        # a run with an end is a long move to its drive
-        and (ends_at_s is None or at_s < ends_at_s - following.brakes_within_s)
-    )
-
-
-def _watch_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
-    """Find an encoder that may have ceased to count: in a motion, and while a shaft coasts."""
-    enabled = event.reading.enabled
-    if status.coast is None and not enabled:
-        status = _with(status, coast=_let_go(status, event.sent_at_s))
-    if status.following:
-        status = _watch_following(status, status.following, event, faults)
-    return status if enabled and NOT_FOLLOWED in status.own else _watch_coast(status, event, faults)
-
-
-def _watch_following(
-    status: AxisStatus, following: Following, event: ReadingTaken, faults: tuple[Fault, ...]
-) -> AxisStatus:
-    """Have a motor switched off whose encoder has not counted behind a motion."""
-    # its drive knows more of it, and has switched the motor off
-    tripped = any(fault.stops for fault in event.reading.faults)
-    at_velocity = _is_at_velocity(status, following, event.sent_at_s)
-    seen = tripped or following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
-    if isinstance(seen, Following):
-        return status if seen is following else replace(status, following=seen)
-    if seen and status.command and not tripped:
-        # at a velocity that it has reached its drive says that its profile is done
-        return replace(status, following=replace(following, until_s=math.inf)) if following.is_missed else status
-    return replace(status, following=None) if seen else _lose_encoder(status, event, faults)
-
-
-def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
-    if status.energised:  # its loop pushes on, against a jam or unseen, as far as it can
-        status = _keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, UNFOLLOWED))
-    own = _own_and(status, NOT_FOLLOWED)
-    status = replace(_place_lost(status), own=own, position_lost=True, target=None, following=None, coast=None)
-    return _fail(_with_faults(status, (*faults, NOT_FOLLOWED), event.now_ns), NOT_FOLLOWED.text)
-
-
-def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
-    """Find a shaft that turned and stands so suddenly that it may only seem to."""
-    reading, at_s, coast, command = event.reading, event.sent_at_s, status.coast, status.command
-    most = status.limits.slowing_counts_per_s2
-    if reading.enabled or (command and command.opens_loop):
-        most = None if reading.cut_short else _braking_counts_per_s2(status)
-        if most is None:
-            return status if coast is None else replace(status, coast=None)
-    if coast is None:
-        found = Coast.of(reading, at_s, event.true_until_s)
-        return replace(status, coast=found) if found else status
-    seen = coast.observe(reading, at_s, event.true_until_s, most)
-    if isinstance(seen, Coast):
-        return status if seen is coast else replace(status, coast=seen)
-    if not seen and reading.enabled:
-        return _lose_encoder(status, event, faults)
-    status = replace(status, coast=None)
-    if seen or STOOD_AT_ONCE in status.own:
-        return status
-    status = _with_faults(replace(status, own=_own_and(status, STOOD_AT_ONCE)), (*faults, STOOD_AT_ONCE), event.now_ns)
-    # at once, for a reset may come before the next reading
-    return replace(_place_lost(status), position_lost=True, target=None)
-
-
-def _braking_counts_per_s2(status: AxisStatus) -> float | None:
-    """Return how fast a loop slows down its shaft at most, None where that is not known: drives end some motions."""
-    command, braking, following = status.command, status.braking, status.following
-    most = status.limits.braking_counts_per_s2
-    if braking and braking.mode is StopMode.ABRUPT:
-        return None
-    if command and (command.opens_loop or command.verb is Verb.HOME):
-        return None
-    return min(most, BRAKES_SHARE * following.braking_counts_per_s2) if most and following else most
-
-
-def _watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
-    """Have a shaft stopped that goes elsewhere than it was sent, or faster than it was told."""
-    reading, way, pace = event.reading, status.way, status.pace
-    on_way = way.observe(reading) if way else True
-    if on_way is False:
-        return _stray(status, event)
-    if isinstance(on_way, Way):
-        status = replace(status, way=on_way)
-    if pace is None:
-        return status
-    seen = pace.observe(reading, event.sent_at_s)
-    if seen is False:
-        return _outrun(status, pace, event)
-    return status if seen is pace else replace(status, pace=seen if isinstance(seen, Pace) else None)
-
-
-def _stray(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
-    """Have a shaft stopped that is not on the way to its target."""
-    here = status.scale.shown_at(event.reading.position_counts)
-    return _fail(
-        _keep_stop(status, StopUnconfirmed(event.now_ns, how=STRAYED)),
-        f"it is at {here:.12g} {status.scale.unit}, where no way to its target leads, and was stopped: look at the"
-        " machine before you send it again",
-    )
-
-
-def _outrun(status: AxisStatus, pace: Pace, event: ReadingTaken) -> AxisStatus:
-    """Have a shaft stopped that is faster than it was told in mid-motion."""
-    most = pace.most_counts_per_s / abs(status.scale.counts_per_unit)
-    return _fail(
-        _keep_stop(replace(status, pace=None), StopUnconfirmed(event.now_ns, how=OUTRUN)),
-        f"it is faster than {most:.4g} {status.scale.unit}/s, to which its speed was changed, and was stopped",
-    )
+    return fail(status, f"the drive reports a fault{lost}")
 
 
 def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -336,7 +192,7 @@ def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
         case Completion.PROFILE if reading.profile_done:
             return _take_profile_end(status, command, event, faults)
         case Completion.REST if reading.profile_done and rests:
-            return _finished(status)
+            return finished(status)
         case _:
             return status
 
@@ -347,27 +203,27 @@ def _take_profile_end(
     settling, reading, at_s = command.settling, event.reading, event.sent_at_s
     # what has failed need not settle
     if settling is None or status.failure:
-        return _finished(status)
+        return finished(status)
     progress, settled = (status.settle or SettleProgress(at_s + settling.timeout_s)).observe(settling, reading, at_s)
     if settled is None:
-        return _with(status, settle=progress)
+        return changed(status, settle=progress)
     # it may never have begun, so that it stands elsewhere is no fault of the axis
     if not settled and status.unsure:
-        return _finished(status, status.unsure.why, settled=False)
+        return finished(status, status.unsure.why, settled=False)
     if settled or not settling.faults:
-        return _finished(status, settled=settled)
-    status = replace(status, own=_own_and(status, NOT_SETTLED))
-    status = _with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
+        return finished(status, settled=settled)
+    status = replace(status, own=own_and(status, NOT_SETTLED))
+    status = with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
     off = (settling.target_counts - reading.position_counts) / status.scale.counts_per_unit
-    return _fail(status, f"{command.verb} did not settle: {off:.4g} {status.scale.unit} off", settled=False)
+    return fail(status, f"{command.verb} did not settle: {off:.4g} {status.scale.unit} off", settled=False)
 
 
 def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     """Take a reading of a drive that others command: it alone shows whether it is disabled, stands, moves or failed."""
     reading = event.reading
     faults = (*reading.faults, DRIVE_CHANGED) if reading.altered else reading.faults
-    status = _with(status, misses=0, in_vain=0, link=LinkState.UP, was_read=True)
-    status = _with_faults(status, faults, event.now_ns)
+    status = changed(status, misses=0, in_vain=0, link=LinkState.UP, was_read=True)
+    status = with_faults(status, faults, event.now_ns)
     # such a drive shows the speed in coarse steps, and its position comes from another poll
     rest = replace(status.rest, rests=not shows_velocity(reading))
     state = AxisState.STANDSTILL if rest.rests else AxisState.DISCRETE_MOTION
@@ -377,19 +233,19 @@ def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
         state = AxisState.DISABLED
     # no reset of this daemon ends it: it goes with its faults
     first = status.first_fault if status.active_faults else None
-    return _with(status, first_fault=first, rest=rest, enabled=reading.enabled, state=state)
+    return changed(status, first_fault=first, rest=rest, enabled=reading.enabled, state=state)
 
 
 def _take_look(status: AxisStatus, event: LookTaken) -> AxisStatus:
-    return _with(status, rest=replace(status.rest, turns=shows_velocity(event.reading)))
+    return changed(status, rest=replace(status.rest, turns=shows_velocity(event.reading)))
 
 
 def _see_loop(status: AxisStatus, event: LoopSeen) -> AxisStatus:
-    return _with(status, enabled=event.enabled)
+    return changed(status, enabled=event.enabled)
 
 
 def _miss(status: AxisStatus, event: PollMissed) -> AxisStatus:
-    status = _with(status, misses=min(status.misses + 1, MISSES_UNTIL_DOWN))
+    status = changed(status, misses=min(status.misses + 1, MISSES_UNTIL_DOWN))
     if status.misses >= MISSES_UNTIL_DOWN:
         return _lose_drive(status, DriveLost(event.now_ns, event.another, event.before, asked=True))
     return replace(status, link=LinkState.DEGRADED) if status.link is LinkState.UP else status
@@ -400,15 +256,15 @@ def _lose_drive(status: AxisStatus, event: DriveLost) -> AxisStatus:
     lost = replace(LINK_LOST, text=LINK_BLOCKED.format(before=event.before)) if event.before else LINK_LOST
     fault = NOT_IDENTIFIED if event.another else lost
     if not was_up and any(entry.code == fault.code for entry in status.faults):
-        return _with_faults(status, (fault,), event.now_ns)  # what is before it is known by now, or answers again
+        return with_faults(status, (fault,), event.now_ns)  # what is before it is known by now, or answers again
     if not was_up and not event.another and not event.asked:
         return status
     # a counter that is not read may have been set, so what it shows later is no place
     rest = _out_of_sight(status) if was_up else status.rest
-    status = replace(_place_lost(status), link=LinkState.DOWN, target=None, rest=rest, coast=None)
-    status = _with_faults(status, (fault,), event.now_ns)
+    status = replace(place_lost(status), link=LinkState.DOWN, target=None, rest=rest, coast=None)
+    status = with_faults(status, (fault,), event.now_ns)
     # it stays as the reason of error_stop when the drive answers again
-    return _fail(status, "the drive did not answer") if was_up and status.state is not AxisState.DISABLED else status
+    return fail(status, "the drive did not answer") if was_up and status.state is not AxisState.DISABLED else status
 
 
 def _out_of_sight(status: AxisStatus) -> RestEvidence:
@@ -421,33 +277,33 @@ def _out_of_sight(status: AxisStatus) -> RestEvidence:
 
 def _take_unusable(status: AxisStatus, event: ReplyUnusable) -> AxisStatus:
     link = LinkState.DEGRADED if status.link is LinkState.UP else status.link
-    status = _with(status, misses=0, in_vain=min(status.in_vain + 1, MISSES_UNTIL_DOWN), link=link)
+    status = changed(status, misses=0, in_vain=min(status.in_vain + 1, MISSES_UNTIL_DOWN), link=link)
     if status.in_vain < MISSES_UNTIL_DOWN or status.replies_unusable or link is LinkState.DOWN:
         return status
-    own = _own_and(status, REPLIES_UNUSABLE)
-    status = _with_faults(replace(status, rest=_out_of_sight(status), own=own), own, event.now_ns)
-    return status if status.state is AxisState.DISABLED else _fail(status, REPLIES_UNUSABLE.text)
+    own = own_and(status, REPLIES_UNUSABLE)
+    status = with_faults(replace(status, rest=_out_of_sight(status), own=own), own, event.now_ns)
+    return status if status.state is AxisState.DISABLED else fail(status, REPLIES_UNUSABLE.text)
 
 
 def _take_contradiction(status: AxisStatus, event: ReadingsContradicted) -> AxisStatus:
     # what has proved its rest before was of the same encoder
     rest = replace(status.limits.unseen, left_turning=True)
     if not status.contradicts:
-        own = _own_and(status, READINGS_CONTRADICT)
-        status = _with_faults(replace(status, own=own), own, event.now_ns)
-    status = _with(_place_lost(status), misses=0, in_vain=0, link=LinkState.UP, rest=rest, position_lost=True)
-    return status if status.state is AxisState.DISABLED else _fail(status, READINGS_CONTRADICT.text)
+        own = own_and(status, READINGS_CONTRADICT)
+        status = with_faults(replace(status, own=own), own, event.now_ns)
+    status = changed(place_lost(status), misses=0, in_vain=0, link=LinkState.UP, rest=rest, position_lost=True)
+    return status if status.state is AxisState.DISABLED else fail(status, READINGS_CONTRADICT.text)
 
 
 def _find_fault(status: AxisStatus, event: FaultFound) -> AxisStatus:
-    return _with(status, target=None, own=_own_and(status, event.fault))
+    return changed(status, target=None, own=own_and(status, event.fault))
 
 
 def _refuse_reference(status: AxisStatus, event: ReferenceRefused) -> AxisStatus:
     if status.referenced:
         return status  # there is another one
     text = f"{REFERENCE_REFUSED.text}: {event.reason}; home the axis, or set its position"
-    own = _own_and(status, replace(REFERENCE_REFUSED, text=text))
+    own = own_and(status, replace(REFERENCE_REFUSED, text=text))
     # it was left in a motion, or something has moved it since: it may turn still, and its encoder may be dead
     return replace(
         status, refused=event.reason, reference_lost=True, own=own, rest=replace(status.rest, left_turning=True)
@@ -471,11 +327,11 @@ def _know_place(status: AxisStatus, event: PlaceKnown) -> AxisStatus:
 
 
 def _set_limits(status: AxisStatus, event: LimitsSet) -> AxisStatus:
-    return _with(status, limits=event.limits, span=event.limits.span(status.scale))
+    return changed(status, limits=event.limits, span=event.limits.span(status.scale))
 
 
 def _unknow_place(status: AxisStatus, _event: PlaceUnknown) -> AxisStatus:
-    return _place_lost(status)
+    return place_lost(status)
 
 
 def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
@@ -483,7 +339,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
     if before is None:
         last_error = None
     elif before.command_id != command.command_id:
-        status = _abort(status, command.verb, command.command_id)
+        status = abort(status, command.verb, command.command_id)
         if command.state is not AxisState.STOPPING:  # what takes a motion over goes on with it as another command's
             last_error = None
         elif before.state is not AxisState.STOPPING:  # a stop that gives way to another one has not failed
@@ -514,7 +370,7 @@ def _begin(status: AxisStatus, event: CommandBegun) -> AxisStatus:
 
 def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
     command, ends_at_s = status.command, status.ends_at_s
-    following, rest = _next_following(status, event), RestEvidence(rests=False, commanded=True)
+    following, rest = next_following(status, event), RestEvidence(rests=False, commanded=True)
     if status.unseen:  # its encoder proves nothing before it has counted in a motion that is long enough for that
         if event.following and following and following.is_long:
             following = replace(following, gone_counts=math.inf)
@@ -537,21 +393,6 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
     return replace(status, target_counts=event.target_counts, approached=event.approached)
 
 
-def _next_following(status: AxisStatus, event: MotionStarted) -> Following | None:
-    if event.following:
-        return event.following.after(status.following)
-    before, command = status.following, status.command
-    if before is None or command is None or command.opens_loop:
-        return None
-    # what brings a motion to rest goes on with its profile, and so does a shaft that cannot stand at once
-    if command.state is not AxisState.STOPPING and command.command_id != before.command_id:
-        if not (before.coasts and event.profile):
-            return None
-        before = replace(before, command_id=command.command_id)
-        return before.going_on(*event.profile, reverses=not event.onwards)
-    return before.going_on(*event.profile) if event.profile else before
-
-
 def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
     command = status.command
     if command is None:
@@ -569,15 +410,15 @@ def _change_speed(status: AxisStatus, event: SpeedChanged) -> AxisStatus:
 
 
 def _note_failure(status: AxisStatus, event: CommandFailing) -> AxisStatus:
-    return _with(status, failure=event.reason, interlock=event.interlock or status.interlock)
+    return changed(status, failure=event.reason, interlock=event.interlock or status.interlock)
 
 
 def _end_command(status: AxisStatus, event: CommandOver) -> AxisStatus:
-    return _finished(status, event.error)
+    return finished(status, event.error)
 
 
 def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
-    on, ended = event.on, _abort(status, Verb.POWER, event.by)
+    on, ended = event.on, abort(status, Verb.POWER, event.by)
     # a loop that closes holds the shaft; one that is let go may coast, or fall; what was off before is as it was
     rest = ended.rest
     if on:  # where nothing has shown that the encoder counts, its first motion does
@@ -587,10 +428,10 @@ def _switch_power(status: AxisStatus, event: PowerSwitched) -> AxisStatus:
         rest = RestEvidence(unseen_s=rest.unseen_s)
     coast = status.coast
     if status.enabled and status.limits.slowing_counts_per_s2:
-        coast = _let_go(status, event.now_s)
+        coast = let_go(status, event.now_s)
     return replace(
         ended,
-        state=_state_at_rest(status, enabled=on),
+        state=state_at_rest(status, enabled=on),
         enabled=on,
         effective_from_s=event.now_s,
         target_counts=None,
@@ -605,16 +446,16 @@ def _switch_loop(status: AxisStatus, event: LoopSwitched) -> AxisStatus:
     rest = RestEvidence(rests=False, commanded=status.rest.commanded, unseen_s=status.rest.unseen_s)
     if not event.on:  # a load may fall; a shaft whose motor was off before is as it was
         rest = replace(rest, rests=None) if status.enabled else status.rest
-    coast = _let_go(status, event.now_s) if status.coast and status.enabled and not event.on else status.coast
+    coast = let_go(status, event.now_s) if status.coast and status.enabled and not event.on else status.coast
     return replace(status, effective_from_s=event.now_s, enabled=event.on, rest=rest, coast=coast)
 
 
 def _override_speed(status: AxisStatus, event: SpeedOverridden) -> AxisStatus:
-    return _with(status, speed_share=event.share)
+    return changed(status, speed_share=event.share)
 
 
 def _change_control(status: AxisStatus, event: ControlChanged) -> AxisStatus:
-    return _with(status, holder=event.holder)
+    return changed(status, holder=event.holder)
 
 
 def _latch(status: AxisStatus, _event: StopLatch) -> AxisStatus:
@@ -625,36 +466,12 @@ def _name_latch(status: AxisStatus, event: LatchNamed) -> AxisStatus:
     return replace(status, latched_by=event.by) if status.stop_latched and status.latched_by is None else status
 
 
-def _send_stop(status: AxisStatus, event: StopSent) -> AxisStatus:
-    stop, asked = status.stop or OpenStop(event.mode), AskedStop(event.verb, event.mode)
-    known = next((each for each in stop.asked if each.verb is event.verb), None)
-    mode = max(stop.mode, event.mode, key=STRENGTH.__getitem__)
-    if known is None:
-        return replace(status, stop=replace(stop, mode=mode, asked=(*stop.asked, asked)))
-    return status if mode is stop.mode else replace(status, stop=replace(stop, mode=mode))
-
-
-def _keep_stop(status: AxisStatus, event: StopUnconfirmed) -> AxisStatus:
-    status = _send_stop(status, StopSent(event.mode, event.verb))
-    stop = status.stop
-    if stop is None or (stop.fault and all(each.how for each in stop.asked)):
-        return status
-    # the fault keeps the instant from which the stop was wanted
-    fault = stop.fault or entry_of(STOP_UNCONFIRMED, event.now_ns)
-    return replace(status, stop=replace(stop, fault=fault, asked=_with_how(stop.asked, event.how)))
-
-
 def _take_due_stop(status: AxisStatus, event: StopDue) -> AxisStatus:
-    status = _send_stop(status, StopSent(event.mode, event.verb))
+    status = send_stop(status, StopSent(event.mode, event.verb))
     stop = status.stop
     if stop is None:
         return status
-    return _with(status, stop=replace(stop, unread=True, asked=_with_how(stop.asked, event.how)))
-
-
-def _with_how(asked: tuple[AskedStop, ...], how: str) -> tuple[AskedStop, ...]:
-    """Return what was asked for, with why it is sent where that is not known yet."""
-    return tuple(each if each.how else replace(each, how=how) for each in asked)
+    return changed(status, stop=replace(stop, unread=True, asked=with_how(stop.asked, event.how)))
 
 
 def _note_overdue(status: AxisStatus, event: StopOverdue) -> AxisStatus:
@@ -695,7 +512,7 @@ def _recall_latch(status: AxisStatus, event: LatchRecalled) -> AxisStatus:
         # it may have been moved since: that is not known, and no failure of a stop
         status = _take_due_stop(status, StopDue(event.again, LEFT))
     elif event.again is not None:
-        status = _keep_stop(status, StopUnconfirmed(event.now_ns, event.again))
+        status = keep_stop(status, StopUnconfirmed(event.now_ns, event.again))
     if not event.in_error:
         return status
     return replace(status, state=AxisState.ERROR_STOP, first_fault=entry_again(event.first) if event.first else None)
@@ -749,9 +566,9 @@ STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType
         ControlChanged: _change_control,
         StopLatch: _latch,
         LatchNamed: _name_latch,
-        StopSent: _send_stop,
+        StopSent: send_stop,
         StopAcknowledged: _acknowledge_stop,
-        StopUnconfirmed: _keep_stop,
+        StopUnconfirmed: keep_stop,
         StopDue: _take_due_stop,
         StopOverdue: _note_overdue,
         StopConfirmed: _confirm_stop,
@@ -761,46 +578,6 @@ STEPS: Mapping[type, Callable[[AxisStatus, Any], AxisStatus]] = MappingProxyType
 )
 
 
-# -- parts of steps --------------------------------------------------------------------------------------------------
-
-
-def _with(status: AxisStatus, **changes: Any) -> AxisStatus:  # noqa: ANN401 - fields of a status
-    """Return a status with other fields; the same object where they have these values already."""
-    for name, value in changes.items():
-        if getattr(status, name) != value:
-            return replace(status, **changes)
-    return status
-
-
-def _with_faults(status: AxisStatus, faults: tuple[Fault, ...], now_ns: int) -> AxisStatus:
-    """Return a status in which these faults stand; one that stood before keeps its instant."""
-    known = {entry.code: entry for entry in status.faults}
-    entries = tuple(_entry(known.get(fault.code), fault, now_ns) for fault in faults)
-    first = status.first_fault
-    if first is None:
-        pending = (status.stop.fault,) if status.stop and status.stop.fault else ()
-        first = next((entry for entry in (*entries, *pending) if entry.code != REFERENCE_REFUSED.code), None)
-    if first and not first.stops:  # a warning puts no axis into error stop, and would hide what does
-        first = next((entry for entry in entries if entry.stops), first)
-    return _with(status, faults=entries, first_fault=first)
-
-
-def _entry(known: FaultEntry | None, fault: Fault, now_ns: int) -> FaultEntry:
-    """Return the entry of a fault; one that stood before says what is known of it by now."""
-    if known is None:
-        return entry_of(fault, now_ns)
-    return known if known.text == fault.text else known.model_copy(update={"text": fault.text})
-
-
-def _own_and(status: AxisStatus, fault: Fault) -> tuple[Fault, ...]:
-    """Return the faults that this daemon has found, and another one; each stands once."""
-    return (*(own for own in status.own if own.code != fault.code), fault)
-
-
-def _place_lost(status: AxisStatus) -> AxisStatus:
-    return _with(status, referenced=False, reference_lost=status.referenced or status.reference_lost)
-
-
 def _came_to_rest(status: AxisStatus) -> bool:
     """Tell whether a closed loop stands at a place to which no command has sent it."""
     return (
@@ -808,75 +585,4 @@ def _came_to_rest(status: AxisStatus) -> bool:
         and not status.position_lost
         and status.rest.rests is True
         and (status.link is LinkState.UP)
-    )
-
-
-def _fail(status: AxisStatus, reason: str, *, settled: bool | None = None) -> AxisStatus:
-    if status.command is None and status.state is not AxisState.ERROR_STOP:  # the first cause stays
-        status = _with(status, last_error=reason)
-    return _end(_with(status, state=AxisState.ERROR_STOP), CommandStatus.FAILED, reason, settled=settled)
-
-
-def _abort(status: AxisStatus, by: Verb, command_id: str | None) -> AxisStatus:
-    """Return the status of a command that another one ends, with the reason where something is wrong, too."""
-    if by is Verb.HALT and status.command and status.command.verb is Verb.JOG and not status.failure:
-        return _end(status, CommandStatus.DONE)  # MC_Jog: a jog has no other end than to be let go
-    when = " while it settled: its profile was over" if status.settle else ""
-    failing = f"; it was failing already: {status.failure}" if status.failure else ""
-    why = f", because of interlock {status.interlock}" if failing and status.interlock else failing
-    return _end(
-        status,
-        CommandStatus.ABORTED,
-        f"{aborted_by(by)}{when}{why}",
-        by=(by, command_id) if command_id else None,
-    )
-
-
-def _finished(status: AxisStatus, error: str | None = None, *, settled: bool | None = None) -> AxisStatus:
-    error = error or status.failure
-    status = _end(status, CommandStatus.FAILED if error else CommandStatus.DONE, error, settled=settled)
-    return _with(status, state=_state_at_rest(status, enabled=status.enabled))
-
-
-def _state_at_rest(status: AxisStatus, *, enabled: bool) -> AxisState:
-    """Return the state without a command. MC_Reset alone leads out of ErrorStop (PLCopen part 1, state diagram)."""
-    if status.state is AxisState.ERROR_STOP:
-        return AxisState.ERROR_STOP
-    return AxisState.STANDSTILL if enabled else AxisState.DISABLED
-
-
-def _end(
-    status: AxisStatus,
-    how: CommandStatus,
-    reason: str | None = None,
-    *,
-    settled: bool | None = None,
-    by: tuple[Verb, str] | None = None,
-) -> AxisStatus:
-    """Return the status behind the command under way, if there is one."""
-    command = status.command
-    # what no drive has taken has no effect to wait for: readings count
-    effective_from_s = 0.0 if math.isinf(status.effective_from_s) else status.effective_from_s
-    # what ended otherwise stands elsewhere: where, the first reading at rest tells
-    target = status.target if how is CommandStatus.DONE else None
-    status = _with(
-        status,
-        failure=None,
-        unsure=None,
-        settle=None,
-        ends_at_s=None,
-        effective_from_s=effective_from_s,
-        target=target,
-    )
-    if command is None:
-        return status
-    rest = status.rest
-    if command.opens_loop and status.limits.slowing_counts_per_s2:  # nothing tells how what it has driven is to turn
-        rest = replace(status.limits.unseen, left_turning=True)
-    return replace(
-        status,
-        command=None,
-        rest=rest,
-        last_error=f"{command.verb}: {reason}" if reason else status.last_error,
-        last_end=CommandEnd(command, how, reason, settled, by),
     )
