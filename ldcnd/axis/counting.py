@@ -11,6 +11,8 @@ BRAKES_SHARE = 1.5
 """Most that a deceleration is taken for of what a profile has: shafts swing."""
 FOLLOWS_WITHIN_S = 1.0
 """Longest time from the end of a profile until its shaft is seen to have moved, seconds."""
+BEHIND_SHARE = 1.5
+"""Most by which friction holds a shaft behind the end of its profile, as a multiple of its settle window."""
 BREAKS_FREE_SHARE = 8.0
 """No shaft that coasts sticks while its profile goes on by as many times the part in which it must move."""
 LAGS_S = 0.02
@@ -44,6 +46,7 @@ class Following:
         way_counts: of the whole profile; infinite for one without an end.
         least_counts: part of a profile in which a shaft must have been seen to begin to move, and once it has, twice
             as much in which it must have been seen to go on.
+        window_counts: how far from its place a shaft may be that has settled.
         since_s: since when the shaft is where it is, in loop time; before it was seen to move, when the drive had the
             motion: its profile runs from then on, if not before.
         low: lowest position since; before it was seen to move, since the reading before its motion.
@@ -68,6 +71,7 @@ class Following:
     braking_counts_per_s2: float
     way_counts: float
     least_counts: float
+    window_counts: float
     since_s: float
     low: float
     high: float
@@ -180,7 +184,10 @@ class Following:
                 return False
         elif not soon:
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
-            if gone < self.least_counts * (2 if self.counted else 1):
+            # the loop of a shaft that is to stand where its profile has ended pulls it there, or it sticks
+            untold = error is None and self.error_counts is not None  # a drive tells it in each second reading
+            behind = self.coasts and (untold or abs(error or 0) > BEHIND_SHARE * self.window_counts)
+            if gone < self.least_counts * (2 if self.counted else 1) and not behind:
                 return True
             given_up = at_s >= until_s
             if given_up and self.faults:
@@ -248,6 +255,7 @@ class Following:
             self.braking_counts_per_s2,
             self.way_counts,
             self.least_counts,
+            self.window_counts,
             at_s,
             low=reading.position_counts,
             high=reading.position_counts,

@@ -585,6 +585,7 @@ class AxisMotion:
             motion.acceleration_counts_per_s2,
             way_counts=math.inf if target is None else abs(target - begins),
             least_counts=max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
+            window_counts=self.window_counts,
             since_s=self.clock.now_s(),
             # one that is halted soon has its way behind it when it is read first
             low=begins,

@@ -1448,3 +1448,34 @@ def test_an_encoder_that_was_cut_as_a_spin_is_reversed_costs_the_reference(accel
         return machine.rotor.state.sample.referenced
 
     assert alone(reverses) is False
+
+
+@pytest.mark.parametrize("end", ["halt", "timed", "override"])
+@pytest.mark.parametrize(
+    ("acceleration", "speed"), [(1, 0.1), (1, 0.3), (1, 0.6), (1, 1.0), (10, 0.4), (10, 0.6), (10, 1.0)]
+)
+@pytest.mark.sweep(4)
+def test_an_encoder_that_dies_at_the_end_of_a_ramp_opens_no_lock_beside_a_shaft_that_its_loop_pushes(
+    end, acceleration, speed
+):
+    async def stands(machine):
+        duration = {"duration_s": 6.0} if end == "timed" else {}
+        await machine.rotor.move_velocity(5.0, acceleration=acceleration, **duration)
+        await machine.rig.until(lambda: machine.speed > 4.9)
+        if end == "halt":
+            await machine.rotor.halt()
+        elif end == "override":
+            await machine.rig.client.set_speed_override(0)
+        await machine.rig.until(lambda: machine.speed < speed)
+        machine.rig.faults.encoder_stuck("rotor")
+        at = []
+        for _ in range(200):
+            await asyncio.sleep(0.02)
+            if machine.speed > 2 * CREEPS and machine.rotor.state.sample.moving is Moving.NO:
+                at.append(machine.speed)
+            with suppress(LdcndError):
+                await machine.high("unlock")
+                at += [machine.speed] if machine.speed > 2 * CREEPS else []
+        return at, machine.rotor.state.sample.referenced
+
+    assert alone(stands) == ([], False)
