@@ -5,7 +5,7 @@ from contextlib import suppress
 from itertools import pairwise
 
 import pytest
-from caproto import AccessRights, AlarmSeverity, ChannelType
+from caproto import AccessRights, AlarmSeverity, ChannelType, SubscriptionType
 
 from ldcnd.client.axis import Axis
 from ldcnd.config.plan import plan_rig
@@ -167,16 +167,20 @@ async def test_set_and_use_have_a_field_each():
         assert (was, made.variables["T:x.SET"].value) == ("Set", "Use")
 
 
-@pytest.mark.record("MDEL", "monitors of RBV are sent only what differs by more from what they were sent before")
-async def test_a_deadband_thins_what_monitors_get_and_not_what_is_read():
+@pytest.mark.record("MDEL", "monitors of RBV are sent only what differs by more from before, archivers by ADEL")
+@pytest.mark.parametrize(("values_mm", "archive_mm"), [(2.0, 0.25), (0.25, 2.0)])
+async def test_a_deadband_thins_what_monitors_get_and_not_what_is_read(values_mm: float, archive_mm: float):
     async with records() as (_, made):
-        await put(made, "T:x.MDEL", 1.0)
-        sent = await monitored(made, "T:x.RBV", ChannelType.DOUBLE)
+        await put(made, "T:x.MDEL", values_mm)
+        await put(made, "T:x.ADEL", archive_mm)
+        masks = {values_mm: SubscriptionType.DBE_VALUE, archive_mm: SubscriptionType.DBE_LOG}
+        sent = {each: await monitored(made, "T:x.RBV", ChannelType.DOUBLE, mask) for each, mask in masks.items()}
         await put(made, "T:x", 5.0)
-        got = [sent.get_nowait().values[0] for _ in range(sent.qsize())]
+        got = {each: [queue.get_nowait().values[0] for _ in range(queue.qsize())] for each, queue in sent.items()}
 
-        assert all(abs(after - before) > 1 for before, after in pairwise(got[1:]))
-        assert 3 <= len(got) <= 7
+        for deadband, of in got.items():
+            assert all(abs(after - before) > deadband for before, after in pairwise(of[1:]))
+        assert 2 <= len(got[2.0]) <= 4 < len(got[0.25])
         assert made.variables["T:x.RBV"].value == pytest.approx(5, abs=0.02)
 
 

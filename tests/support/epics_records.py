@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from random import Random
 from types import SimpleNamespace
 
-from caproto import ChannelType
+from caproto import ChannelType, SubscriptionType
 
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig
@@ -51,20 +51,25 @@ async def records(
             yield running, made
 
 
-async def monitored(made: Gateway, name: str, kind: ChannelType = ChannelType.LONG) -> "asyncio.Queue[SimpleNamespace]":
-    """Return the queue of all that a client is sent who monitors a variable."""
-    sent: asyncio.Queue[SimpleNamespace] = asyncio.Queue()
-    wanted = SimpleNamespace(channel_filter=SimpleNamespace(sync=None), data_type_name=kind.name)
-    await made.variables[name].subscribe(sent, _Hashed(wanted), None)
-    return sent
-
-
-class _Hashed:
+class Wanted:
     """What a subscription asks for."""
 
-    def __init__(self, wanted: SimpleNamespace) -> None:
-        self.channel_filter = wanted.channel_filter
-        self.data_type_name = wanted.data_type_name
+    def __init__(self, kind: ChannelType, mask: SubscriptionType) -> None:
+        self.channel_filter = SimpleNamespace(sync=None)
+        self.data_type_name = kind.name
+        self.mask = mask
+
+
+async def monitored(
+    made: Gateway,
+    name: str,
+    kind: ChannelType = ChannelType.LONG,
+    mask: SubscriptionType = SubscriptionType.DBE_VALUE | SubscriptionType.DBE_ALARM,
+) -> "asyncio.Queue[SimpleNamespace]":
+    """Return the queue of all that a client is sent who monitors a variable."""
+    sent: asyncio.Queue[SimpleNamespace] = asyncio.Queue()
+    await made.variables[name].subscribe(sent, Wanted(kind, mask), None)
+    return sent
 
 
 async def put(made: Gateway, name: str, value: float | str) -> None:

@@ -5,7 +5,9 @@ field without an action is read-only, and says so to its clients. An action rais
 a failed put.
 """
 
+import functools
 import math
+import operator
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
@@ -36,6 +38,7 @@ LONGEST_STRING = 39
 """Bytes of an EPICS string."""
 LONGEST_UNIT = 7
 """Bytes of a unit in what describes a number to its clients; a longer one would fail the read."""
+ALL_EVENTS = functools.reduce(operator.or_, SubscriptionType)
 UTF_8 = "utf-8"
 
 Value = float | int | str
@@ -158,13 +161,18 @@ class Number(RecordField, ChannelDouble):  # type: ignore[misc]
     """A number with a unit; a client may put it as a text, read as everywhere a person types one.
 
     Attributes:
-        deadband: monitors are sent no value that differs by no more from the one before, unless its alarm does.
+        deadbands: who monitors for one of these events is sent no value that differs by no more from the one before,
+            unless its alarm does.
         convert: reads a number with a unit; None where only `units` may stand behind it.
     """
 
-    deadband = 0.0
     convert: Callable[[str], float] | None = None
-    _sent: tuple[float, RecordAlarm] | None = None
+
+    def __init__(self, **given: Any) -> None:  # noqa: ANN401
+        super().__init__(**given)
+        self.deadbands = {SubscriptionType.DBE_VALUE: 0.0, SubscriptionType.DBE_LOG: 0.0}
+        self._sent: dict[SubscriptionType, tuple[float, RecordAlarm]] = {}
+        self._due = ALL_EVENTS
 
     def mean(self, unit: str, precision: int, limits: tuple[float, float]) -> bool:
         """Say what the value means, and tell whether that is new.
@@ -188,15 +196,24 @@ class Number(RecordField, ChannelDouble):  # type: ignore[misc]
         return await super().write_from_dbr(data, data_type, metadata, flags=flags)
 
     async def publish(self, flags: Any) -> None:  # noqa: ANN401
-        """Send the value to those who monitor it, if it has left the deadband or its description is new."""
-        alarm = RecordAlarm(self.status, self.severity)
-        if self._sent and not flags & SubscriptionType.DBE_PROPERTY:
-            before, its_alarm = self._sent
-            if alarm == its_alarm and abs(self.value - before) <= self.deadband:
-                self._content.clear()  # of the value before, which a read would return
-                return
-        self._sent = self.value, alarm
-        await super().publish(flags)
+        """Send the value to those who monitor it, if it has left their deadband or its description is new."""
+        alarm, due = RecordAlarm(self.status, self.severity), flags & SubscriptionType.DBE_PROPERTY
+        for event, deadband in self.deadbands.items():
+            before, its_alarm = self._sent.get(event, (math.nan, None))
+            if due & SubscriptionType.DBE_PROPERTY or alarm != its_alarm or not abs(self.value - before) <= deadband:
+                due |= event
+                self._sent[event] = self.value, alarm
+        if not due:
+            self._content.clear()  # of the value before, which a read would return
+            return
+        self._due = due | (flags & SubscriptionType.DBE_ALARM)
+        try:
+            await super().publish(self._due)
+        finally:
+            self._due = ALL_EVENTS  # a monitor begins with the value of then
+
+    def _is_eligible(self, ss: Any) -> bool:  # noqa: ANN401 - caproto's hook asks no mask
+        return bool(ss.mask & self._due) and bool(super()._is_eligible(ss))
 
     def native(self, value: Any) -> Value:  # noqa: ANN401
         """Return a number or the number that a text stands for.

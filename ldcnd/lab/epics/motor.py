@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 from contextlib import suppress
 from functools import partial
 
-from caproto import AlarmSeverity, AlarmStatus
+from caproto import AlarmSeverity, AlarmStatus, SubscriptionType
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.motion import Motion, Sent
@@ -25,8 +25,8 @@ from ldcnd.contract.errors import (
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.samples import Sample, StateSample
 from ldcnd.lab.borrowed_control import BorrowedControl
-from ldcnd.lab.epics.fields import Action, Number, Put, RecordAlarm, RecordField, Value
-from ldcnd.lab.epics.record import NO_LIMIT, Defaults, MotorRecord
+from ldcnd.lab.epics.fields import Action, Put, RecordAlarm, RecordField, Value
+from ldcnd.lab.epics.record import DEADBANDS, NO_LIMIT, Defaults, MotorRecord
 
 MOTIONS = frozenset({".VAL", ".RLV", ".TWF", ".TWR", ".HOMF", ".HOMR", ".JOGF", ".JOGR"})
 REFUSED = RecordAlarm(AlarmStatus.STATE, AlarmSeverity.MINOR_ALARM)
@@ -73,7 +73,7 @@ class MovedRecord(MotorRecord):
         others: dict[str, Action] = {}
         if Verb.MOVE_ABSOLUTE in can:
             others |= {
-                ".MDEL": self._put_deadband,
+                **{f".{name}": partial(self._put_deadband, event) for name, event in DEADBANDS.items()},
                 ".VAL": self._put_val,
                 ".RLV": lambda asked: self._put_step(float(asked)),
                 ".TWV": self._keep,
@@ -356,11 +356,10 @@ class MovedRecord(MotorRecord):
             await self["SET"].show(to)
         return Put(0)
 
-    async def _put_deadband(self, asked: Value) -> Put:
-        position = self["RBV"]
-        if isinstance(position, Number):
-            position.deadband = max(0.0, float(asked))
-        return Put(max(0.0, float(asked)))
+    async def _put_deadband(self, event: SubscriptionType, asked: Value) -> Put:
+        deadband = max(0.0, float(asked))
+        self._thin(event, deadband)
+        return Put(deadband)
 
     async def _put_cnen(self, asked: Value) -> Put:
         if asked == "Enable":

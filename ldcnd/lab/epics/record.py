@@ -7,7 +7,7 @@ software"; "User" and "dial" coordinates are the same here: OFF is 0 and DIR is 
 import math
 from functools import partial
 
-from caproto import AlarmSeverity, AlarmStatus
+from caproto import AlarmSeverity, AlarmStatus, SubscriptionType
 
 from ldcnd.client.motion import Sent, set_point
 from ldcnd.contract.commands import Verb
@@ -85,6 +85,8 @@ VELOCITIES = ("VELO", "BVEL", "JVEL", "HVEL", "VMAX", "VBAS")
 MEASURED = {Dimension.POSITION: PLACES, Dimension.VELOCITY: VELOCITIES, Dimension.ACCELERATION: ("JAR",)}
 SPEEDS = (("VELO", "BVEL", "S", "SBAK"), ("ACCL", "BACC"), ("JVEL",), ("JAR",), ("HVEL",), ("TWV",))
 """Fields that follow the defaults of the axis until a client puts another value to the first of them."""
+DEADBANDS = {"MDEL": SubscriptionType.DBE_VALUE, "ADEL": SubscriptionType.DBE_LOG}
+"""Fields by which those who monitor RBV are sent less, and the event for which they do."""
 TO_BE_LIMITED = frozenset({"VELO", "JVEL", "HVEL"})
 DURATIONS = ("ACCL", "BACC", "DLY")
 MSTA_PLUS, MSTA_DONE, MSTA_HIGH_SWITCH, MSTA_POSITION = 0x1, 0x2, 0x4, 0x20
@@ -266,13 +268,17 @@ class MotorRecord:
         """Show that nothing is known of the axis in its unit of now."""
         self.state = self._sent = None
         await self["UDF"].show(1)
-        await self["MDEL"].show(0.0)
-        position = self["RBV"]
-        if isinstance(position, Number):
-            position.deadband = 0.0
+        for name, event in DEADBANDS.items():
+            await self[name].show(0.0)
+            self._thin(event, 0.0)
         await self.grow_old()
         for field in (self["VAL"], self["DIFF"]):
             await field.show(field.value, SILENT)
+
+    def _thin(self, event: SubscriptionType, deadband: float) -> None:
+        position = self["RBV"]
+        if isinstance(position, Number):
+            position.deadbands[event] = deadband
 
     # -- what the axis says ------------------------------------------------------------------------------------------
 
