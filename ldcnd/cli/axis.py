@@ -24,7 +24,8 @@ from ldcnd.cli.sending import (
     halted,
     halting,
 )
-from ldcnd.cli.typed import Finite, Quantity, axis_of, in_units
+from ldcnd.cli.there import axis_of
+from ldcnd.cli.typed import Finite, Quantity, in_units
 from ldcnd.client.lease import Control, control
 from ldcnd.client.motion import Jogging
 from ldcnd.client.rig_client import RigClient

@@ -21,16 +21,8 @@ from ldcnd.cli.connection import AXIS, AxisName, Target, with_target
 from ldcnd.cli.output import FAILED, end_as_interrupted, on_end, show_lines
 from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.terminal_person import AssentingPerson, TerminalPerson
-from ldcnd.cli.typed import (
-    CONFIGURATION,
-    Finite,
-    NewFile,
-    Quantity,
-    TypedNumber,
-    axis_of,
-    force_option,
-    in_unit,
-)
+from ldcnd.cli.there import axis_of
+from ldcnd.cli.typed import CONFIGURATION, Finite, NewFile, Quantity, TypedNumber, force_option, in_unit
 from ldcnd.client.kept_gains import KeptGains, file_of, kept_for
 from ldcnd.client.kept_gains import put_back as put_back_gains
 from ldcnd.client.lease import program_name

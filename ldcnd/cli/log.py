@@ -11,7 +11,8 @@ import click
 from typing_extensions import override
 
 from ldcnd.cli.connection import AXIS, Target, with_target
-from ldcnd.cli.typed import WholeNumber, check_there
+from ldcnd.cli.there import check_there
+from ldcnd.cli.typed import WholeNumber
 from ldcnd.client.events import follow_events
 from ldcnd.client.history import Beginning, HistoryKind, HistoryRow, beginning, clock_time, history, row_of
 from ldcnd.client.rig_client import RigClient

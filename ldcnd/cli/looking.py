@@ -13,7 +13,8 @@ from click.shell_completion import CompletionItem
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.names import typed
 from ldcnd.cli.quantities import decimals, sample_text
-from ldcnd.cli.typed import Finite, WholeNumber, axis_of, check_there
+from ldcnd.cli.there import axis_of, check_there
+from ldcnd.cli.typed import Finite, WholeNumber
 from ldcnd.client.fleet import AxisReport, RigReport, survey
 from ldcnd.client.overview import AxisNow, AxisSeen, last_health, modules_now, overview
 from ldcnd.client.rig_client import RigClient

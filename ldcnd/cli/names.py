@@ -10,9 +10,9 @@ from ldcnd.contract.errors import Argument, RemedyCommand
 GROUPS: Final[Mapping[str, Mapping[str, tuple[str, str]]]] = {
     "Run": {
         "run": ("ldcnd.cli.run", "Run the daemon."),
-        "check-config": ("ldcnd.cli.run:check_config", "Validate a configuration without opening anything."),
+        "check-config": ("ldcnd.cli.plan:check_config", "Validate a configuration without opening anything."),
         "plan": (
-            "ldcnd.cli.run:plan",
+            "ldcnd.cli.plan:plan",
             "Show what the lines of a configuration promise, before any hardware is there.",
         ),
         "reload": ("ldcnd.cli.rig:reload", "Have a daemon read its configuration again."),

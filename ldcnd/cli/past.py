@@ -9,7 +9,8 @@ import click
 from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.quantities import decimals
 from ldcnd.cli.record import RECORDING, a_failure, tell_damages
-from ldcnd.cli.typed import Finite, axis_of
+from ldcnd.cli.there import axis_of
+from ldcnd.cli.typed import Finite
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.history import AxisInstant, time_of
 from ldcnd.contract.meta import AxisInfo

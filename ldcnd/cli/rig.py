@@ -17,7 +17,8 @@ from ldcnd.cli.nearest import Typed, naming_nearest
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines
 from ldcnd.cli.quantities import outcome, rounded, values_of
 from ldcnd.cli.sending import NAME, Sender, Shown, commanding, derived_for_all, derived_question, halted
-from ldcnd.cli.typed import Finite, Quantity, axis_of, in_units, number_of
+from ldcnd.cli.there import axis_of
+from ldcnd.cli.typed import Finite, Quantity, in_units, number_of
 from ldcnd.client.lease import acquire, control
 from ldcnd.client.rig_client import RigClient
 from ldcnd.contract.commands import CommandReply, MoveVelocity, Power, Reset

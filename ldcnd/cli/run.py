@@ -1,4 +1,4 @@
-"""`ldcnd run`, the daemon in the foreground; and what a configuration is, before it runs."""
+"""`ldcnd run`, the daemon in the foreground."""
 
 import asyncio
 import contextlib
@@ -6,7 +6,6 @@ import json
 import shlex
 import signal
 import sys
-import time
 from asyncio.subprocess import PIPE, Process
 from collections.abc import AsyncIterator, Callable
 from functools import partial
@@ -17,18 +16,14 @@ import click
 
 from ldcnd.cli.output import Terminal, show_lines
 from ldcnd.cli.typed import CONFIGURATION, CONSOLE_ADDRESS, parsed_address
-from ldcnd.config.plan import plan_rig, require_plan
+from ldcnd.config.plan import require_plan
 from ldcnd.config.rig import RigConfig, example, load_config, single_line
-from ldcnd.contract.condition import certificate_troubles
-from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import build_models
-from ldcnd.contract.plan import BusPlan
-from ldcnd.daemon.assembly import open_daemon, session_settings
+from ldcnd.daemon.assembly import open_daemon
 from ldcnd.daemon.daemon import Daemon
 from ldcnd.daemon.service import Service, held_awake, last_words, loop_factory, require_writable, settle_heap
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 from ldcnd.log import configure_logging, get_logger
-from ldcnd.net.zenoh_config import certificate_in_use, zenoh_config
 from ldcnd.net.zenoh_settings import DEFAULT_ENDPOINT, reached_at
 from ldcnd.net.zenoh_threads import senders_wait
 from ldcnd.systemd import Notifier
@@ -226,76 +221,3 @@ def write_captures(daemon: Daemon) -> None:
     """Leave behind what was on the lines, where there is a place for it."""
     if daemon.captures:
         daemon.captures.write_all("aborted, as by a watchdog")
-
-
-@click.command()
-@click.argument("config", type=CONFIGURATION)
-@click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
-def check_config(config: Path, *, as_json: bool) -> None:
-    """Validate CONFIG whole, without opening anything; exits with 78 when it cannot work."""
-    try:
-        rig = load_config(config)
-        require_plan(rig)
-        certificate = certificate_in_use(zenoh_config(session_settings(rig)))
-    except ConfigError as error:
-        if not as_json:
-            raise
-        print(json.dumps({"valid": False, "errors": error.message.splitlines()}))
-        sys.exit(78)
-    axes = [axis.name for bus in rig.bus for axis in bus.axis]
-    warnings = certificate_troubles(certificate, time.time_ns())
-    if as_json:
-        buses = [bus.name for bus in rig.bus]
-        print(json.dumps({"valid": True, "rig": rig.rig, "buses": buses, "axes": axes, "warnings": warnings}))
-    else:
-        for each in warnings:
-            show_lines(f"warning: {each}", err=True)
-        print(f"{config}: rig {rig.rig}, {len(rig.bus)} bus(es), axes {', '.join(axes)}: valid")
-
-
-EXIT_OVERFULL = 1
-
-
-@click.command()
-@click.argument("config", type=CONFIGURATION)
-@click.option("--json", "as_json", is_flag=True, help="Print the plan as JSON.")
-def plan(config: Path, *, as_json: bool) -> None:
-    """Show how much of each line CONFIG uses and how late polls and stops can be; exits with 1 when it cannot hold."""
-    plan = plan_rig(load_config(config))
-    if as_json:
-        print(plan.model_dump_json())
-    else:
-        print("\n\n".join(_table(bus) for bus in plan.buses))
-    if not plan.holds:
-        sys.exit(EXIT_OVERFULL)
-
-
-def _table(bus: BusPlan) -> str:
-    assumed = f"{_ms(bus.turnaround_s)} host, {_ms(bus.adapter_latency_s)} adapter, for each exchange"
-    stops = [
-        f"  stop         {_ms(bus.stop_wait_s)} to its first bit, {_ms(bus.stop_s)} to the drive's answer",
-        f"               {_ms(bus.stop_after_loss_s)} to the answer after a lost reply",
-    ]
-    lines = [
-        f"bus {bus.bus}, {bus.baud} baud (drives: {bus.node_baud:.0f}): {'holds' if bus.holds else 'CANNOT HOLD'}",
-        f"  load         {bus.load:6.1%} at worst, {bus.mean_load:.1%} on average",
-        f"  commands     {bus.commands_per_s:6.0f} /s before a poll misses its turn",
-        *(stops if bus.stops else ["  stop         nothing on this line can move or stop a drive"]),
-        f"  assumed      {assumed}",
-        f"  {'axis':12} {'item':20} {'rate':>8} {'bytes':>7} {'on line':>10} {'read within':>12}",
-    ]
-    for poll in bus.polls:
-        size = f"{poll.request_bytes}/{poll.reply_bytes}"
-        remarks = f"{'' if poll.priority == 'normal' else f'  {poll.priority}'}{'' if poll.holds else '  late'}"
-        lines += [
-            f"  {poll.axis:12} {item.item:20} {item.rate_hz:5g} Hz {size:>7} {_ms(poll.longest_s):>10}"
-            f" {_ms(item.response_s):>12}{remarks}"
-            for item in poll.items
-        ]
-    if bus.remedies:
-        lines += ["  would hold with any of:", *(f"    {remedy}" for remedy in bus.remedies)]
-    return "\n".join(lines)
-
-
-def _ms(seconds: float | None) -> str:
-    return "unbounded" if seconds is None else f"{seconds * 1e3:.2f} ms"

@@ -18,7 +18,8 @@ from ldcnd.cli.names import typed, whose
 from ldcnd.cli.nearest import Typed, naming_nearest, nearest_lines
 from ldcnd.cli.output import FAILED, UNREACHABLE, end_as_interrupted, show_error, show_lines, show_passing
 from ldcnd.cli.quantities import number, outcome, sample_text, values_of
-from ldcnd.cli.typed import Finite, Quantity, WholeNumber, axis_of, in_units
+from ldcnd.cli.there import axis_of
+from ldcnd.cli.typed import Finite, Quantity, WholeNumber, in_units
 from ldcnd.client.motion import failure
 from ldcnd.client.rig_client import RigClient, Samples
 from ldcnd.contract.commands import LONGEST_NAME, About, AxisCommand, Command, CommandReply, Halt, Verb

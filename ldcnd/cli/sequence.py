@@ -13,14 +13,8 @@ from ldcnd.cli.connection import AXIS, Target, with_target
 from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import end_as_interrupted, keys, show_lines
 from ldcnd.cli.quantities import decimals, seconds
-from ldcnd.cli.typed import (
-    CONFIGURATION,
-    NewFile,
-    WholeNumber,
-    axis_of,
-    force_option,
-    unknown,
-)
+from ldcnd.cli.there import axis_of, unknown
+from ldcnd.cli.typed import CONFIGURATION, NewFile, WholeNumber, force_option
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.sequences import SequenceRun

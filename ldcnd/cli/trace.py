@@ -11,7 +11,8 @@ from ldcnd.cli.main import CommandGroup
 from ldcnd.cli.output import end_as_interrupted, show_passing
 from ldcnd.cli.quantities import save_figure, stacked_rows
 from ldcnd.cli.sending import Shown, derived_question
-from ldcnd.cli.typed import Finite, NewFile, WholeNumber, axis_of, force_option, is_file
+from ldcnd.cli.there import axis_of
+from ldcnd.cli.typed import Finite, NewFile, WholeNumber, force_option, is_file
 from ldcnd.client.rig_client import RigClient
 from ldcnd.client.traces import (
     Trace,

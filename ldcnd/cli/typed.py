@@ -1,17 +1,14 @@
-"""Typed input: names with the nearest right one, and numbers as `ldcnd.contract.number_text` reads them."""
+"""Typed input: files, and numbers as `ldcnd.contract.number_text` reads them."""
 
 import os
-from collections.abc import Callable, Iterable, Mapping
-from difflib import get_close_matches
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
 import click
 from typing_extensions import override
 
-from ldcnd.client.overview import last_bus_health
-from ldcnd.client.rig_client import RigClient
-from ldcnd.contract.errors import ConfigError, UnknownAxis
+from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.frozen import Frozen
 from ldcnd.contract.meta import AxisInfo
 from ldcnd.contract.number_text import NotANumber, behind_number, read_number, read_whole
@@ -19,51 +16,12 @@ from ldcnd.contract.units import DIMENSIONS, Dimension, read_quantity
 from ldcnd.listen_address import ListenAddress, parse_listen_address
 
 CommandT = TypeVar("CommandT", bound=Frozen)
-NEAR = 0.4
-"""How alike two names must be, from 0 to 1."""
 
 
 class TypedNumber(float):
     """A number of an axis as it was typed, with its unit if it has one; the axis says what it is in its own unit."""
 
     text: str
-
-
-def unknown(what: str, name: str, known: Iterable[str]) -> UnknownAxis:
-    """Return the refusal of a name."""
-    names = sorted(known)
-    by_fold = {each.casefold(): each for each in names}
-    near = by_fold.get(name.casefold()) or next(iter(get_close_matches(name, names, 1, NEAR)), None)
-    meant = f"; did you mean {near!r}?" if near else ""
-    return UnknownAxis(
-        f"there is no {what} {name!r}{meant}", value=name, remedy=f"there are: {', '.join(names) or 'none'}"
-    )
-
-
-async def axis_of(client: RigClient, name: str) -> AxisInfo:
-    """Return what an axis is.
-
-    Raises:
-        UnknownAxis: the rig has none of that name.
-    """
-    axes = {info.axis: info for info in await client.axes()}
-    if name not in axes:
-        raise unknown("axis", name, axes)
-    return axes[name]
-
-
-async def check_there(client: RigClient, name: str, *, lines: bool = False) -> None:
-    """Refuse the name of nothing that the rig has: an axis, an I/O module or, with `lines`, a line.
-
-    Raises:
-        UnknownAxis: the rig has none of that name.
-    """
-    buses = await client.buses()
-    known = {module.name for bus in buses for module in bus.modules}  # none while the line is down
-    known |= {module.module for report in await last_bus_health(client) for module in report.modules}
-    known |= {bus.bus for bus in buses} if lines else set()
-    if name not in known:
-        await axis_of(client, name)
 
 
 def number_of(text: str, written: str) -> TypedNumber:

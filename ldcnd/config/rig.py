@@ -17,6 +17,7 @@ from ldcnd.contract.sequences import NamedPosition, SequenceConfig
 from ldcnd.drives import known
 from ldcnd.drives.line_config import BusConfig
 from ldcnd.drives.toml import NAME_CHARACTERS, Name, Variants, read_toml, refuse_duplicates
+from ldcnd.net.zenoh_settings import ZenohSettings
 
 Bus = Annotated[SerializeAsAny[BusConfig], Variants(known.bus_config, known.bus_configs)]
 
@@ -38,6 +39,10 @@ class ZenohConfig(Frozen):
         if isinstance(document, dict) and document.get("config_file"):
             return {"listen": (), **document}
         return document
+
+    def session(self) -> ZenohSettings:
+        """Return how the daemon joins the network."""
+        return ZenohSettings(mode="peer", listen=self.listen, connect=self.connect, config_file=self.config_file)
 
 
 class DaemonConfig(Frozen):

@@ -40,7 +40,6 @@ from ldcnd.line.transport import Opener
 from ldcnd.net.publisher import Publisher
 from ldcnd.net.session import Session
 from ldcnd.net.zenoh_session import open_zenoh_session
-from ldcnd.net.zenoh_settings import ZenohSettings
 
 ENCODINGS = {"msgpack": Encoding.MSGPACK, "json": Encoding.JSON}
 
@@ -52,16 +51,10 @@ async def open_daemon(config: RigConfig) -> AsyncIterator[Daemon]:
     Raises:
         SessionError: the session cannot be opened.
     """
-    async with open_zenoh_session(session_settings(config)) as session:
+    async with open_zenoh_session(config.zenoh.session()) as session:
         stops = EarlyStops()
         await stops.declare(session, Keys(config.rig))  # clients can connect by now; a daemon takes a while
         yield build_daemon(config, session, time.time_ns, secrets.token_hex(4), stops=stops)
-
-
-def session_settings(config: RigConfig) -> ZenohSettings:
-    """Return how the daemon of a rig joins the network."""
-    zenoh = config.zenoh
-    return ZenohSettings(mode="peer", listen=zenoh.listen, connect=zenoh.connect, config_file=zenoh.config_file)
 
 
 def build_daemon(
