@@ -343,6 +343,9 @@ _UNCOMMANDED = Trouble(
     "moves without a command",
 )
 _PUSHED = Trouble(TroubleKind.UNCOMMANDED, _NOTICE, "it moves, and no command is under way", "moves without a command")
+_COASTS = Trouble(
+    TroubleKind.UNCOMMANDED, _NOTICE, "its motor is off, and it moves: it coasts, or is pushed", "moves with motor off"
+)
 _OVERRIDE_ZERO = Trouble(
     TroubleKind.STANDS_BY_OVERRIDE, _NOTICE, "the speed override is 0 %: no command moves it", f"{_OVERRIDE} 0 %"
 )
@@ -365,7 +368,7 @@ PAGES: Mapping[str, str] = {
     **dict.fromkeys((_NOT_HOMED.short, _REFERENCE_LOST.short, _HOMING.short), "not_referenced"),
     **dict.fromkeys((_POSITION_LOST, Place.CONTRADICTED.value), "readings_contradict"),
     **dict.fromkeys((_ERROR_STOP, _OVERRIDE), "wrong_state"),
-    _UNCOMMANDED.short: "drive_changed",
+    **dict.fromkeys((_UNCOMMANDED.short, _COASTS.short), "drive_changed"),
     _MAY_MOVE.short: "position_error",
     **{each.short: "stood_at_once" for each in _UNSEEN.values()},
     _BY_INTERLOCK: "interlock_violated",
@@ -609,7 +612,7 @@ def _found(state: KnownState, faults: Faults | None, health: AxisHealth | None, 
         found.append(_LATCHED)
     if state.moving is Moving.YES and state.command is None:
         if state.state not in _DRIVEN:
-            found.append(_PUSHED)
+            found.append(_COASTS if state.state is AxisState.DISABLED else _PUSHED)
         elif state.has_reference:  # without: a drive that takes no motion over its line; others move it
             found.append(_UNCOMMANDED)
     if not state.speed_override and state.has_reference:  # as above
