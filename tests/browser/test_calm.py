@@ -226,6 +226,7 @@ async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_t
             await playwright.expect(story).to_contain_text("not known how far it is")
             await playwright.expect(preview).to_contain_text("Not known")
             house.alpha.pause(on=False)
+            await playwright.expect(story).not_to_contain_text("not known how far it is")
             await house.alpha.end()
             await playwright.expect(desk.page.get_by_label("Position", exact=True)).to_have_text(
                 re.compile(r"\(.*\d.*\)")
