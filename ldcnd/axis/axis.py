@@ -425,6 +425,7 @@ class AxisService:
         Raises:
             StopLatched: a stop came first.
             CommandAborted: a halt, or a later aborting move, came first.
+            StopNotConfirmed: the drive has not confirmed the halt of what goes before it.
             LdcndError: as the move itself, and as `Permit.ask_to_move`: also what has changed while it waited.
         """
         # now, not at its turn: a stop that is latched may be reset while it waits
@@ -489,6 +490,8 @@ class AxisService:
     def _ask_in_turn(self, permit: Permit) -> None:
         """Raise when a move must not wait for its turn any more."""
         permit.ask()
+        # its sender has been told that the axis cannot be stopped: when it can be again nothing may set off by itself
+        guards.check_stop_confirmed(self.tracker)
         if permit.number < self._newest_aborting:
             name = self.config.name
             raise CommandAborted(f"axis {name}: {permit.verb} was overtaken by a later motion", axis=name)
