@@ -179,7 +179,8 @@ def _fail_by_fault(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
 def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
     """Take a reading of a closed loop that nothing has stopped; `faults` are warnings."""
     command, rests, reading = status.command, status.rest.rests, event.reading
-    if status.following and status.following.is_missed and not status.following.given_up:
+    awaited = status.following and status.following.is_missed and not status.following.given_up
+    if awaited:
         rests = None
     if command is None:
         # nothing but a reset leads out of error_stop, and what is not known to rest or to move changes nothing
@@ -189,7 +190,7 @@ def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, 
         state = AxisState.STANDSTILL if rests else AxisState.DISCRETE_MOTION
         return status if status.state is state else replace(status, state=state)
     match command.completion:
-        case Completion.PROFILE if reading.profile_done:
+        case Completion.PROFILE if reading.profile_done and not awaited:
             return _take_profile_end(status, command, event, faults)
         case Completion.REST if reading.profile_done and rests:
             return finished(status)

@@ -310,6 +310,10 @@ async def test_a_daemon_with_another_unit_is_described_anew_and_not_moved_by_num
             with suppress(Exception):  # while the node is away, and until it is described anew
                 there.setParameter("x", "target", 50.0)
             time.sleep(0.2)
+        there.until("x", "status", lambda status: "its unit is um now and was mm" in status[1])
+        with pytest.raises(ImpossibleError, match="restart its session"):  # of a client that goes on with mm
+            there.setParameter("x", "target", 50.0)
+        there.execCommand("x", "reset")
         there.until("x", "status", lambda status: status[0] == DISABLED)
         there.disconnect()
 

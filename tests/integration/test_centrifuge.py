@@ -1479,3 +1479,17 @@ def test_an_encoder_that_dies_at_the_end_of_a_ramp_opens_no_lock_beside_a_shaft_
         return at, machine.rotor.state.sample.referenced
 
     assert alone(stands) == ([], False)
+
+
+@pytest.mark.parametrize("bucket", [0.1, 0.33, 0.6])
+def test_a_lock_opens_as_soon_as_a_healthy_rotor_has_reached_its_bucket(bucket):
+    async def unlocks(machine):
+        await (await machine.rotor.move_velocity(5.0, acceleration=10, duration_s=2)).done()
+        for place in (bucket, bucket + 0.2, bucket + 0.35, bucket):
+            await (await machine.rotor.move_absolute(place)).done()
+            await machine.high("unlock")
+            await machine.sees(locked=False)
+            await machine.low("unlock")
+            await machine.sees(locked=True)
+
+    alone(unlocks)

@@ -9,7 +9,7 @@ import pytest
 from ldcnd.client.rig import Rig
 from ldcnd.client.rig_client import RigClient
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.errors import LdcndError, LeaseRequired, PositionLimit
+from ldcnd.contract.errors import LdcndError, LeaseRequired, PositionLimit, WrongState
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.samples import LinkState, Moving
 from ldcnd.lab.secop.link import StatusCode, linked
@@ -19,13 +19,13 @@ from tests.support.rig import running_rig, two_axes
 
 
 @asynccontextmanager
-async def linked_x(chains=MappingProxyType({})):
+async def linked_x(chains=MappingProxyType({}), former_units=MappingProxyType({})):
     updates = []
     async with running_rig(two_axes(), chains) as running:
         await running.until("x", lambda state: state.link is LinkState.UP)
         rig = Rig(running.client, await running.client.daemon())
         infos = {info.axis: info for info in await rig.describe() if info.axis == "x"}
-        async with linked(rig, infos, updates.append, ("x",)) as links:
+        async with linked(rig, infos, updates.append, ("x",), former_units) as links:
             await links["x"].enable(on=True)
             yield running, links["x"], updates
 
@@ -179,6 +179,23 @@ async def test_the_target_is_where_the_axis_was_sent_last_by_any_program_or_came
         assert under_way == 9
         assert shown_target(updates).value == pytest.approx(9 if ending == "end" else place, abs=0.05)
         assert (abs(place - 9) < 0.05) == (ending == "end")
+
+
+async def test_an_axis_that_has_got_another_unit_takes_no_target_before_a_reset():
+    async with linked_x(former_units={"x": "um", "y": "um"}) as (running, link, _):
+        said = await becomes(link, StatusCode.ERROR)
+        with pytest.raises(WrongState, match="its unit is mm now and was um"):
+            await link.go(5.0)
+        await asyncio.sleep(1)
+        state = await running.client.state("x")
+        await link.clear_errors()
+        await becomes(link, StatusCode.IDLE)
+        await link.go(5.0)
+        target = (await running.client.state("x")).target
+
+    assert said == "its unit is mm now and was um, reset it"
+    assert (state.moving, state.command) == (Moving.NO, None)
+    assert target == pytest.approx(5)
 
 
 @pytest.mark.long

@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from enum import IntEnum
+from types import MappingProxyType
 
 from ldcnd.client.axis import Axis
 from ldcnd.client.fresh import fresh_samples
@@ -74,11 +75,15 @@ class AxisLink:
         info: what it is, as the module is described.
         moves: whether clients may move it.
         speed: of its moves, in units a second; None for the default of the axis.
+        former_unit: in which the numbers of its clients may still be: it is not moved before a reset; else None.
     """
 
-    def __init__(self, rig: Rig, info: AxisInfo, announce: Announce, *, moves: bool) -> None:
+    def __init__(
+        self, rig: Rig, info: AxisInfo, announce: Announce, *, moves: bool, former_unit: str | None = None
+    ) -> None:
         self.info = info
         self.moves = moves
+        self.former_unit = former_unit
         self.speed: float | None = None
         self._rig = rig
         self._announce = announce
@@ -205,6 +210,8 @@ class AxisLink:
             return StatusCode.BUSY, unknown + self._condition.summary
         if state.moving is Moving.UNKNOWN:
             return StatusCode.ERROR, said or "its state is not known"
+        if self.former_unit:
+            return StatusCode.ERROR, ", ".join((self._unit_text, "reset it", *([said] if said else [])))
         if state.state is AxisState.ERROR_STOP or self._condition.alarm is Alarm.MAJOR or state.stop_latched:
             return StatusCode.ERROR, said
         if self.moves and self.is_busy():
@@ -218,8 +225,24 @@ class AxisLink:
 
     # -- what is done to it ------------------------------------------------------------------------------------------
 
+    @property
+    def _unit_text(self) -> str:
+        return f"its unit is {self.info.unit} now and was {self.former_unit}"
+
     async def go(self, target: float) -> float:
-        """Send the axis to a target; returns once the drive has acknowledged it, or has another one that came later."""
+        """Send the axis to a target; returns once the drive has acknowledged it, or has another one that came later.
+
+        Raises:
+            WrongState: its unit has changed, and it was not reset since then.
+            LdcndError: as the move itself.
+        """
+        if self.former_unit:
+            name, unit = self.info.axis, self.info.unit
+            raise WrongState(
+                f"axis {name}: {self._unit_text}",
+                axis=name,
+                remedy=f"see that your client shows {unit}, restart its session if it does not, then send `reset`",
+            )
         self._goals += 1
         own = self._goals
         try:
@@ -240,7 +263,9 @@ class AxisLink:
         await self.control.halt()
 
     async def clear_errors(self) -> None:
-        """Clear the latch and faults; nothing moves."""
+        """Clear the latch and faults, and take numbers in the unit of now; nothing moves."""
+        self.former_unit = None
+        self._show_status()
         await self.control.prepare(lambda axis: axis.reset())
 
     async def enable(self, *, on: bool) -> bool:
@@ -307,10 +332,27 @@ def described_by(info: AxisInfo) -> tuple[object, ...]:
 
 @asynccontextmanager
 async def linked(
-    rig: Rig, infos: Mapping[str, AxisInfo], announce: Announce, moves: tuple[str, ...]
+    rig: Rig,
+    infos: Mapping[str, AxisInfo],
+    announce: Announce,
+    moves: tuple[str, ...],
+    former_units: Mapping[str, str] = MappingProxyType({}),
 ) -> AsyncIterator[dict[str, AxisLink]]:
-    """Follow axes, and control those that are moved, until the context ends."""
-    links = {name: AxisLink(rig, info, announce, moves=name in moves) for name, info in infos.items()}
+    """Follow axes, and control those that are moved, until the context ends.
+
+    Args:
+        rig: the rig.
+        infos: its axes.
+        announce: is called with each new value.
+        moves: those that clients may move.
+        former_units: of axes whose clients may still send numbers in another unit.
+    """
+    links = {
+        name: AxisLink(
+            rig, info, announce, moves=name in moves, former_unit=former_units.get(name) if name in moves else None
+        )
+        for name, info in infos.items()
+    }
     tasks: list[asyncio.Task[None]] = []
     async with asyncio.TaskGroup() as group:
         for name, link in links.items():

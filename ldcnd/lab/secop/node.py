@@ -253,15 +253,16 @@ class SecNodeServer(Server):  # type: ignore[misc]
 
 
 def _as_secop(error: LdcndError) -> SECoPError:
+    text = f"{error}; {error.remedy}" if error.remedy else str(error)
     match error:
         case PositionLimit() | ValueOutOfRange():
-            return RangeError(str(error))
+            return RangeError(text)
         case DriveFault() | AxisUnreachable():
-            return HardwareError(str(error))
+            return HardwareError(text)
         case SessionError() | OutcomeUnknown():
-            return CommunicationFailedError(str(error))
+            return CommunicationFailedError(text)
         case _:
-            return ImpossibleError(str(error))
+            return ImpossibleError(text)
 
 
 async def serve(
@@ -287,11 +288,12 @@ async def serve(
         raise UnknownAxis(
             f"rig {rig.name} has no axis {unknown[0]!r}; it has {', '.join(infos)}", axis=unknown[0], value=unknown[0]
         )
+    former_units: dict[str, str] = {}
     while True:
         chosen = {name: info for name, info in infos.items() if not axes or name in axes}
         can_move = tuple(name for name in moves if name in chosen and Verb.MOVE_ABSOLUTE in chosen[name].capabilities)
         node = SecNodeServer(rig.name, address, LoopThread(asyncio.get_running_loop()))
-        async with linked(rig, chosen, node.announce, can_move) as links:
+        async with linked(rig, chosen, node.announce, can_move, former_units) as links:
             for link in links.values():
                 node.add(link)
             try:
@@ -301,6 +303,11 @@ async def serve(
                     infos = dict(again)
                     if _is_other(chosen, infos, axes):
                         break
+                former_units = {
+                    name: link.former_unit or link.info.unit
+                    for name, link in links.items()
+                    if name in infos and (link.former_unit or link.info.unit != infos[name].unit)
+                }
             finally:
                 await asyncio.to_thread(node.end)
 
