@@ -204,7 +204,8 @@ class House:
         """Run alpha until the context ends, and a console of its own: the other would go on telling that it is gone."""
         await self.alpha.start()
         try:
-            async with console(self.alpha.endpoint) as link:
+            endpoints = [daemon.endpoint for daemon in (self.sim, self.mixed, self.alpha)]
+            async with console(*endpoints, commission=self.sim.config) as link:
                 yield House(self.browser, self.sim, self.mixed, self.alpha, link)
         finally:
             with suppress(ProcessLookupError):  # it has ended already

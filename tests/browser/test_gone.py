@@ -86,10 +86,9 @@ NAMED = (
 @asynccontextmanager
 async def lost_alpha(house, window, page, way):
     """Look at a page of a rig, then lose its daemon."""
-    await house.alpha.start()
-    try:
-        await window.open("about:blank")
-        await window.open(f"{house.url}/#/rig")
+    async with house.beside_alpha() as beside:
+        await window.open(beside.link)
+        await window.open(f"{beside.url}/#/rig")
         await until(window, "() => document.querySelector('[aria-label=\"Rig alpha\"]')?.dataset.stale === 'no'")
         await window.evaluate("(page) => { location.hash = `#/${page}`; }", page)
         await until(window, "() => document.querySelector('h1') !== null")
@@ -99,10 +98,6 @@ async def lost_alpha(house, window, page, way):
             house.alpha.pause(on=True)
         await until(window, NAMED)
         yield
-    finally:
-        if way == "silent":
-            house.alpha.pause(on=False)
-        await house.alpha.end()
 
 
 @pytest.mark.parametrize("way", ["gone", "silent"])
@@ -143,23 +138,22 @@ async def test_a_module_without_power_is_named_and_shows_no_value_and_its_loss_a
     text = house.sim.config.read_text(encoding="utf-8").partition("[[port]]")[0].replace('rig = "sim"', 'rig = "alpha"')
     config.write_text(text + "".join(EVENT.format(*each) for each in ((20, "off"), (40, "on"))), encoding="utf-8")
     house.alpha.config = config
-    await house.alpha.start()
     try:
-        await window.open("about:blank")
-        await window.open(f"{house.url}/#/network")
-        await until(window, MODULE)
-        await until(window, MODULE, wanted=lambda found: "1 low" in found or "1 high" in found)
-        await until(window, MODULE, wanted=lambda found: "The module does not answer" in found)
-        await until(window, MODULE, wanted=lambda found: "1 low" not in found and "1 high" not in found)
-        await window.evaluate("() => { location.hash = '#/rig'; }")
-        await until(window, ATTENTION, wanted=lambda found: "alpha · cabinet" in found)
-        await until(window, ON_THE_RIG, wanted=lambda found: "unknown" in found)
-        await until(window, ATTENTION, wanted=lambda found: "alpha · cabinet" not in found)
-        await until(
-            window, ON_THE_RIG, wanted=lambda found: "unknown" not in found and ("on" in found or "off" in found)
-        )
-        await window.evaluate("() => { location.hash = '#/events'; }")
-        await until(window, EVENTS, wanted=lambda found: "link lost" in found and "link back" in found)
+        async with house.beside_alpha() as beside:
+            await window.open(beside.link)
+            await window.open(f"{beside.url}/#/network")
+            await until(window, MODULE)
+            await until(window, MODULE, wanted=lambda found: "1 low" in found or "1 high" in found)
+            await until(window, MODULE, wanted=lambda found: "The module does not answer" in found)
+            await until(window, MODULE, wanted=lambda found: "1 low" not in found and "1 high" not in found)
+            await window.evaluate("() => { location.hash = '#/rig'; }")
+            await until(window, ATTENTION, wanted=lambda found: "alpha · cabinet" in found)
+            await until(window, ON_THE_RIG, wanted=lambda found: "unknown" in found)
+            await until(window, ATTENTION, wanted=lambda found: "alpha · cabinet" not in found)
+            await until(
+                window, ON_THE_RIG, wanted=lambda found: "unknown" not in found and ("on" in found or "off" in found)
+            )
+            await window.evaluate("() => { location.hash = '#/events'; }")
+            await until(window, EVENTS, wanted=lambda found: "link lost" in found and "link back" in found)
     finally:
-        await house.alpha.end()
         house.alpha.config = before
