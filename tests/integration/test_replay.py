@@ -1,6 +1,7 @@
 """Captures that are kept as test data are played to the daemon: it publishes what it published then, bit for bit."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -20,6 +21,11 @@ def kept(name):
     return capture, tuple((FOLDER / f"{name}.jsonl").read_text(encoding="utf-8").splitlines())
 
 
+def of_any_version(published):
+    """Return what was published without the version of the daemon, which tells of it in its health."""
+    return tuple(re.sub(r'"version":"[^"]*"', "", line) for line in published)
+
+
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.sweep(2)
 def test_a_capture_brings_back_every_sample_and_event_bit_for_bit_and_again(name):
@@ -27,7 +33,7 @@ def test_a_capture_brings_back_every_sample_and_event_bit_for_bit_and_again(name
 
     once, again = replayed(capture), replayed(capture)
 
-    assert once == published
+    assert of_any_version(once) == of_any_version(published)
     assert again == once
 
 
