@@ -319,6 +319,7 @@ async def open_house(folder: Path) -> AsyncIterator[House]:
         async with asyncio.TaskGroup() as group:
             for daemon in (sim, mixed):
                 group.create_task(daemon.start(), name=daemon.endpoint)
-        link = await stack.enter_async_context(console(sim.endpoint, mixed.endpoint, commission=sim_config))
+        endpoints = [daemon.endpoint for daemon in (sim, mixed, alpha)]
+        link = await stack.enter_async_context(console(*endpoints, commission=sim_config))
         expect.set_options(timeout=PATIENCE_S * 1e3)
         yield House(browser, sim, mixed, alpha, link)
