@@ -172,8 +172,8 @@ async def test_a_stop_is_in_the_headline_until_reset_whoever_has_stopped(house):
 
 
 async def test_the_answer_to_a_stop_is_gone_with_what_the_axis_tells_since_and_a_new_press_is_not_answered_by_it(house):
-    async with house.beside_alpha() as beside:
-        async with beside.desk() as desk:
+    async with house.beside_alpha() as own:
+        async with own.desk() as desk:
             await desk.open("axis/alpha/x")
             strip = desk.page.locator(".strip.of-axis")
             await desk.button("Stop x").click()
@@ -198,8 +198,8 @@ async def test_the_answer_to_a_stop_is_gone_with_what_the_axis_tells_since_and_a
 
 
 async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_the_daemon(house):
-    async with house.beside_alpha() as beside:
-        async with beside.desk() as desk:
+    async with house.beside_alpha() as own:
+        async with own.desk() as desk:
             await desk.open("axis/alpha/x")
             story, preview = desk.panel("Move").locator(".story"), desk.panel("Move").locator(".preview")
             await desk.button("Take control").click()
@@ -213,7 +213,7 @@ async def test_what_became_of_a_move_is_said_after_a_stop_and_after_the_end_of_t
             await house.alpha.rig.stop("x")
             await playwright.expect(story).to_contain_text("move absolute to 80.000, stopped at")
             await playwright.expect(desk.panel("Now")).to_contain_text("move absolute to 80.000, stopped at")
-            async with beside.desk() as another:  # it was not there when that happened
+            async with own.desk() as another:  # it was not there when that happened
                 await another.open("axis/alpha/x")
                 await playwright.expect(another.panel("Now")).to_contain_text("move absolute to 80.000, stopped at")
             await desk.button("Reset").click()

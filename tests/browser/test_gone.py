@@ -86,9 +86,9 @@ NAMED = (
 @asynccontextmanager
 async def lost_alpha(house, window, page, way):
     """Look at a page of a rig, then lose its daemon."""
-    async with house.beside_alpha() as beside:
-        await window.open(beside.link)
-        await window.open(f"{beside.url}/#/rig")
+    async with house.beside_alpha() as own:
+        await window.open(own.link)
+        await window.open(f"{own.url}/#/rig")
         await until(window, "() => document.querySelector('[aria-label=\"Rig alpha\"]')?.dataset.stale === 'no'")
         await window.evaluate("(page) => { location.hash = `#/${page}`; }", page)
         await until(window, "() => document.querySelector('h1') !== null")
@@ -139,9 +139,9 @@ async def test_a_module_without_power_is_named_and_shows_no_value_and_its_loss_a
     config.write_text(text + "".join(EVENT.format(*each) for each in ((20, "off"), (40, "on"))), encoding="utf-8")
     house.alpha.config = config
     try:
-        async with house.beside_alpha() as beside:
-            await window.open(beside.link)
-            await window.open(f"{beside.url}/#/network")
+        async with house.beside_alpha() as own:
+            await window.open(own.link)
+            await window.open(f"{own.url}/#/network")
             await until(window, MODULE)
             await until(window, MODULE, wanted=lambda found: "1 low" in found or "1 high" in found)
             await until(window, MODULE, wanted=lambda found: "The module does not answer" in found)
