@@ -234,10 +234,12 @@ def test_a_move_that_begins_before_its_caller_goes_on_ends_as_any_other(lab: Lab
     began = LoopThread.start
     with lab.powered("x") as (x,):
         x.set(0.0).wait(60)
-        monkeypatch.setattr(LoopThread, "start", start)
-        moves = [x.set(40.0), x.set(30.0)]
-        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
-        lab.loop.run(lab.running.client.stop("x"))
+        with lab.caught_moving("x", 30.0) as wait_until_moving:
+            monkeypatch.setattr(LoopThread, "start", start)
+            moves = [x.set(40.0), x.set(30.0)]
+            wait_until_moving()
+            stopping = lab.loop.start(lab.running.client.stop("x"))
+        stopping.result(60)
         ended = [move.exception(20) for move in moves]
         x.reset().wait(10)
 
@@ -700,8 +702,9 @@ def test_a_move_that_a_stop_overtakes_ends_with_the_axis_at_rest(lab: Laboratory
 
 def test_an_aborted_plan_halts_without_the_latch(lab: Laboratory):
     def pause_while_moving():
-        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
-        lab.engine.request_pause()
+        with lab.caught_moving("x") as wait_until_moving:
+            wait_until_moving()
+            lab.engine.request_pause()
 
     with lab.powered("x") as (x,):
         pausing = threading.Thread(target=pause_while_moving)
@@ -724,8 +727,9 @@ def test_a_flight_is_halted_while_its_plan_is_paused_and_begun_anew_when_it_goes
     lab: Laboratory, several, checkpoint, ending
 ):
     def pause_in_flight():
-        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
-        lab.engine.request_pause()
+        with lab.caught_moving("x", for_s=1.0) as wait_until_moving:
+            wait_until_moving()
+            lab.engine.request_pause()
 
     def plan(device, flight):
         yield from bps.open_run()
@@ -770,9 +774,11 @@ def test_a_stop_that_was_meant_is_a_success(lab: Laboratory):
     with lab.powered("x") as (x,):
         meant, unmeant = [], []
         for success, ends in ((True, meant), (False, unmeant)):
-            status = x.set(50 if lab.truth("x") < 0 else -50)
-            lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
-            x.stop(success=success).wait(20)
+            with lab.caught_moving("x") as wait_until_moving:
+                status = x.set(50 if lab.truth("x") < 0 else -50)
+                wait_until_moving()
+                stopped = x.stop(success=success)
+            stopped.wait(20)
             ends.append(status.exception(20))
 
     assert meant == [None]
@@ -781,8 +787,11 @@ def test_a_stop_that_was_meant_is_a_success(lab: Laboratory):
 
 def test_a_stop_that_overtakes_its_move_leaves_the_axis_at_rest(lab: Laboratory):
     with lab.powered("x") as (x,):
-        status = x.set(40)
-        x.stop(success=True).wait(20)
+        x.set(0.0).wait(60)
+        with lab.clock_standing():
+            status = x.set(40)
+            stopped = x.stop(success=True)
+        stopped.wait(20)
         ended = status.exception(20)
 
         assert ended is None
@@ -793,8 +802,10 @@ def test_a_stop_that_overtakes_its_move_leaves_the_axis_at_rest(lab: Laboratory)
 def test_a_kickoff_that_a_stop_overtakes_is_no_failure_of_a_plan_that_was_paused(lab: Laboratory):
     with lab.powered("x") as (x,):
         x.prepare(Fly(0, 30)).wait(60)
-        kicked_off = x.kickoff()
-        x.stop(success=True).wait(20)
+        with lab.clock_standing():
+            kicked_off = x.kickoff()
+            stopped = x.stop(success=True)
+        stopped.wait(20)
 
         assert kicked_off.exception(20) is None
         assert x.complete().exception(20) is None
@@ -823,9 +834,10 @@ def test_a_stop_at_the_prompt_halts_without_anybody_who_awaits_it(lab: Laborator
     with lab.powered("x") as (x,):
         x.set(0.0).wait(60)
         device = lab.devices.flight(x) if several else x
-        moving = x.set(40.0)
-        lab.loop.run(lab.running.until("x", lambda state: state.moving is Moving.YES))
-        said = device.stop()
+        with lab.caught_moving("x") as wait_until_moving:
+            moving = x.set(40.0)
+            wait_until_moving()
+            said = device.stop()
 
         moving.wait(60)
         said.wait(20)

@@ -1,7 +1,7 @@
 """A RunEngine, a whole daemon and devices on one loop whose clock jumps: a scan takes as long as it computes."""
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -13,7 +13,7 @@ from event_model import DocumentNames, schema_validators
 from ldcnd.client.loop_thread import LoopThread
 from ldcnd.client.rig import Rig
 from ldcnd.config.rig import RigConfig
-from ldcnd.contract.samples import LinkState
+from ldcnd.contract.samples import LinkState, Moving, StateSample
 from ldcnd.lab.bluesky import Devices, PlanAxis
 from ldcnd.sim.chain import Chain
 from ldcnd.sim.ldcn.chain import ChainSpec, ModuleSpec, build_chain
@@ -64,6 +64,7 @@ class Laboratory:
     devices: Devices
     running: RunningRig
     loop: LoopThread
+    clock: JumpingLoop
     documents: Documents
     chain: Chain
 
@@ -74,6 +75,34 @@ class Laboratory:
             for axis in held:
                 axis.power(on=True).wait(20)
             yield held
+
+    @contextmanager
+    def clock_standing(self) -> Iterator[None]:
+        """Let the clock stand until the context ends: what a thread begins in it begins at one instant."""
+        self.loop.call(self.clock.hold, 1)
+        yield
+        self.loop.call(self.clock.hold, -1)
+
+    @contextmanager
+    def caught_moving(self, axis: str, target: float | None = None, for_s: float = 0.0) -> Iterator[Callable[[], None]]:
+        """Yield a function that waits until an axis has moved for so long; then the clock stands until the end.
+
+        A motion for which a thread only looks may be over before the thread runs.
+        """
+
+        def is_wanted(state: StateSample) -> bool:
+            return state.moving is Moving.YES and (
+                target is None or (state.command is not None and state.command.target == target)
+            )
+
+        async def catch() -> None:
+            await self.running.until(axis, is_wanted)
+            await asyncio.sleep(for_s)
+            self.clock.hold(1)
+
+        catching = self.loop.start(catch())
+        yield lambda: catching.result(60)
+        self.loop.call(self.clock.hold, -1)
 
     def truth(self, axis: str) -> float:
         """Return where the simulated motor of an axis of the simulated rig is, in axis units."""
@@ -121,7 +150,7 @@ def laboratory(config: RigConfig | None = None) -> Iterator[Laboratory]:
                     await running.until(name, lambda state: state.link is LinkState.UP)
                 return Rig(running.client, await running.client.daemon())
 
-            yield Laboratory(engine, Devices(there.run(rig()), there), running, there, documents, chain)
+            yield Laboratory(engine, Devices(there.run(rig()), there), running, there, loop, documents, chain)
     finally:
         loop.call_soon_threadsafe(loop.stop)
         engine._th.join()
