@@ -37,6 +37,25 @@ FAULTS_OF_A_DRIVE = """async ({ reset }) => {
 }"""
 
 
+class HeldFeed:
+    """The feed of a page of which nothing comes through until it is let go."""
+
+    def __init__(self):
+        self.held, self.sockets = True, []
+
+    def connect(self, socket):
+        server = socket.connect_to_server()
+        kept = []
+        server.on_message(lambda message: kept.append(message) if self.held else socket.send(message))
+        self.sockets.append((socket, kept))
+
+    def let_go(self):
+        self.held = False
+        for socket, kept in self.sockets:
+            for message in kept:
+                socket.send(message)
+
+
 async def test_a_reset_is_offered_only_where_the_drive_has_one(house):
     async with house.desk() as desk:
         await desk.open("rig")
@@ -161,6 +180,29 @@ async def test_what_was_read_says_when_and_that_another_client_has_written_since
                 await again.click()
                 await expect(gains.get_by_label(re.compile("^Pn102 "))).to_have_value("61")
                 await asyncio.sleep(LOOKED_EACH_S)
+
+
+async def test_when_something_was_read_is_not_known_before_the_daemon_has_told_the_time(house):
+    """A page that counted from 1970 until then took every event on record for one since the reading."""
+    await house.mixed.rig.command("spool", WriteParameter(parameter="Pn102", value=61, client="ann"), 60)
+    feed = HeldFeed()
+    async with house.desk() as desk:
+        await desk.page.route_web_socket(re.compile("/api/feed"), feed.connect)
+        await desk.page.reload()
+        await desk.open("tuning/mixed/spool")
+        gains = desk.panel("Gains")
+        await expect(gains).to_contain_text("Read at --:--:--.")
+        await asyncio.sleep(1.0)  # what was read is older than the first sample
+        feed.let_go()
+
+        read_at = gains.get_by_text(re.compile(r"Read at \d\d:\d\d:\d\d\."))
+        await read_at.wait_for()
+        told, now = await read_at.inner_text(), await desk.page.evaluate("Date.now()")
+        times = await desk.page.evaluate(
+            "(now) => [...Array(60)].map((_, s) => new Date(now - 1e3 * s).toTimeString().slice(0, 8))", now
+        )
+        assert any(time in told for time in times)
+        await expect(gains).not_to_contain_text("old values")
 
 
 async def test_the_alarm_history_is_numbered_as_in_the_manual(house):

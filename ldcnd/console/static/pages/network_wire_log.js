@@ -55,7 +55,7 @@ export function WireLog({ rig, bus, instant }) {
 
 /** Fetch what was on the line around a moment. */
 async function fetchAround(rig, bus, instant) {
-  const agoS = (rig.nowNs() - instant) / 1e9;
+  const agoS = (rig.nowNs() - instant) / 1e9 || LONGEST_AGO_S; // of a daemon whose clock is not known yet
   return fetchLog(rig, bus, agoS + 2 * AROUND_S, instant);
 }
 

@@ -60,7 +60,7 @@ function Memories({ axis }) {
           kind="main">${values ? "Read all again" : "Read all"}<//>
         <${Action} act=${() => save(new Blob([asToml(axis.name, dump)], { type: "text/plain" }), `${axis.name}.toml`)}
           obstacle=${values ? null : "Read all first."}>Save to a file<//>
-        ${dump && html`<span class="quiet">Read at ${clock(dump.read.t).slice(0, -4)}.</span>`}
+        ${dump && html`<span class="quiet">Read at ${clock(axis.rig.nsAt(dump.read.atMs)).slice(0, -4)}.</span>`}
       </p>
       <${FilePicker} file=${file} onFile=${setFile} />
       <div class="fields">

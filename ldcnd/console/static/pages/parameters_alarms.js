@@ -20,7 +20,7 @@ export function AlarmPanel({ axis }) {
     <p class="row">
       <${Action} act=${read} onDone=${setReport}
         obstacle=${obstacle(axis, "parameters")}>Read alarms<//>
-      ${report && html`<span class="quiet">Read at ${clock(report.at.t).slice(0, -4)}.</span>`}
+      ${report && html`<span class="quiet">Read at ${clock(axis.rig.nsAt(report.at.atMs)).slice(0, -4)}.</span>`}
     </p>
     <p class="row">${["command", "feedback"].map(
       (counter) => html`<${Action} act=${() => command(axis, "clear_counter", { counter })} onDone=${setCleared}

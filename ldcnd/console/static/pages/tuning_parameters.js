@@ -38,7 +38,7 @@ export function ParameterBench({ axis }) {
     <${Panel} title="Gains" of=${axis.rig} old=${readAt && axis.doubt(readAt, client)} note="Written to RAM: in use at once, lost at power-off. Save them on the parameters page.">
       <${RefusalText} refusal=${refusal} />
       ${readAt && html`<p class="row"><${Action} act=${read} obstacle=${obstacle(axis, "parameters")}>Read again<//>
-        <span class="quiet">Read at ${clock(readAt.t).slice(0, -4)}.</span></p>`}
+        <span class="quiet">Read at ${clock(axis.rig.nsAt(readAt.atMs)).slice(0, -4)}.</span></p>`}
       ${gains.map((value) => html`<${Gain} key=${value.parameter} axis=${axis} value=${value} onWritten=${renew} />`)}
     <//>
     <${Record} axis=${axis} gains=${gains} onRun=${keep} />

@@ -18,7 +18,7 @@ const asked = new Map();
  */
 export async function askEach(place, title, axes, send) {
   const parts = axes.map((axis) => ({ axis, run: axis.rig.daemon?.instance, sent: null, error: null, atMs: 0 }));
-  asked.set(place, { title: `${title} at ${clock(axes[0].rig.nowNs()).split(".")[0]}`, parts });
+  asked.set(place, { title, rig: axes[0].rig, atMs: performance.now(), parts });
   changed();
   await Promise.all(
     parts.map(async (part) => {
@@ -36,7 +36,7 @@ export async function askEach(place, title, axes, send) {
 
 /** What became of it, axis by axis, as far as that is known now. */
 export function Fates({ place }) {
-  const { title, parts } = asked.get(place) ?? {};
+  const { title, rig, atMs, parts } = asked.get(place) ?? {};
   const alike = new Map();
   for (const part of parts ?? []) {
     const { level, text } = fateOf(part);
@@ -44,7 +44,7 @@ export function Fates({ place }) {
     if (!alike.has(key)) alike.set(key, { level, text, names: [] });
     alike.get(key).names.push(part.axis.name);
   }
-  return html`<p class="told" role="status">${parts?.length > 0 && html`${title}: ${[...alike.values()].map(
+  return html`<p class="told" role="status">${parts?.length > 0 && html`${title} at ${clock(rig.nsAt(atMs)).split(".")[0]}: ${[...alike.values()].map(
     ({ level, text, names }, at) => html`${at > 0 && "; "}<${Mark} level=${level}>${names.join(", ")} ${text}<//>`)}.`}</p>`;
 }
 

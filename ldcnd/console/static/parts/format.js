@@ -36,6 +36,7 @@ export function percent(share) {
 
 /** An instant in ns since 1970 as local time of day, to the millisecond. */
 export function clock(ns) {
+  if (Number.isNaN(ns)) return "--:--:--.---";
   const at = new Date(ns / 1e6);
   const two = (value) => String(value).padStart(2, "0");
   const time = [at.getHours(), at.getMinutes(), at.getSeconds()].map(two).join(":");

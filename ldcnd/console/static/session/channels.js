@@ -83,7 +83,7 @@ export class Recording {
       if (!sample || (sample.unit && sample.unit !== channel.unit)) continue; // of a daemon that is not described yet
       const { field, axis: { rig } } = channel;
       const good = sample.quality !== "bad" && sample[field] !== null;
-      if (!this.#zeroNs.has(rig)) this.#zeroNs.set(rig, rig.nowNs() - this.now() * 1e9);
+      if (!this.#zeroNs.has(rig)) this.#zeroNs.set(rig, rig.nsAt(this.#zeroMs));
       curve.push((sample.t - this.#zeroNs.get(rig)) / 1e9, good ? sample[field] : NaN);
     }
   }

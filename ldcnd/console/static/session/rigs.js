@@ -11,6 +11,8 @@ const DRAWN_EACH_MS = 100;
 const SILENT_AFTER_S = 3;
 /** What is shown of an axis of which no condition came yet. */
 const NOTHING_KNOWN = { known: false, live: false, mark: "no data", state: "unknown", alarm: "invalid", troubles: [] };
+/** Of a daemon of which no sample has come yet. */
+const CLOCK_UNKNOWN = { ns: NaN, atMs: 0 };
 /** Long enough for a slow axis to count something, short enough to follow a change of velocity. */
 const SLOPE_S = 0.3;
 /** The drive's latest velocity may be older than its state. */
@@ -36,10 +38,11 @@ export class Axis {
   unitChange = null;
   /** How often its units have changed: what was typed before means something else now. */
   unitChanges = 0;
-  #outNs = 0;
-  /** When the latch that stands was first told of, when this page was pressed last to end motions, and the last reading. */
+  /** When it was last known not to answer, and when this page was pressed last to end motions, by this page's clock. */
+  #outMs = -Infinity;
+  #pressedMs = -Infinity;
+  /** When the latch that stands was first told of, and the last reading, by the daemon's clock. */
   #latchedNs = 0;
-  #pressedNs = 0;
   #readNs = 0;
   #info = null;
   #units = null;
@@ -124,12 +127,12 @@ export class Axis {
     const { state } = this;
     if (!state?.stop_latched || state.stop_pending) return false;
     const answers = this.condition.live && state.link === "up" && state.was_read !== false;
-    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.#pressedNs);
+    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.rig.nsAt(this.#pressedMs));
   }
 
   /** Note a press that is to end its motion: nothing that was read before it shows that the axis stands. */
   notePress() {
-    this.#pressedNs = this.rig.nowNs();
+    this.#pressedMs = performance.now();
     changed();
   }
 
@@ -144,7 +147,7 @@ export class Axis {
       this.#keep(this.#told, item, sample?.unit ? sample : null); // what has a unit is judged anew by each description
       this.#judge(item, sample);
     }
-    if ((item === "state" && sample?.link === "down") || (item === "condition" && sample?.live === false)) this.#outNs = this.rig.nowNs();
+    if ((item === "state" && sample?.link === "down") || (item === "condition" && sample?.live === false)) this.#outMs = performance.now();
     if (item === "position") this.#remember(sample);
     if (item === "state" && sample) this.#noteMotion(sample);
     if (item === "shadow" && sample) this.shadows = [...this.shadows, sample].slice(-SHADOWS_KEPT);
@@ -159,18 +162,19 @@ export class Axis {
 
   /** When something is read of its drive, for `doubt`. */
   now() {
-    return { t: this.rig.nowNs(), run: this.rig.daemon?.instance };
+    return { atMs: performance.now(), run: this.rig.daemon?.instance };
   }
 
   /** Why what was read of its drive at `now()` may not hold any more; null while nothing tells so.
    *
    * `client` is the one whose own writes are known here.
    */
-  doubt({ t, run }, client) {
+  doubt({ atMs, run }, client) {
     if (run !== this.rig.daemon?.instance) return "the daemon was started again since then.";
     if (!this.condition.live) return "the drive does not answer.";
-    if (this.#outNs > t) return "the drive did not answer for a while since then, and may have lost its power.";
-    const since = this.rig.events.filter((event) => event.axis === this.name && event.t > t);
+    if (this.#outMs > atMs) return "the drive did not answer for a while since then, and may have lost its power.";
+    const readNs = this.rig.nsAt(atMs);
+    const since = this.rig.events.filter((event) => event.axis === this.name && event.t > readNs);
     if (since.some(({ verb }) => verb === "drive_changed")) return "the drive was reset or changed since then.";
     const other = since.findLast((event) => event.verb === "write_parameter" && event.client !== client && event.status !== "refused");
     return other ? `${other.client ?? "another client"} has written since then.` : null;
@@ -304,7 +308,7 @@ export class Rig {
   /** What was heard of it when its latest events were asked for; null before, and when they did not come. */
   caughtUp = null;
   heardAtMs = performance.now();
-  #newest = { ns: 0, atMs: 0 };
+  #newest = CLOCK_UNKNOWN;
 
   constructor(name) {
     this.name = name;
@@ -345,7 +349,7 @@ export class Rig {
     this.connected = told.connected;
     this.problem = told.problem;
     this.attention = told.attention;
-    if (told.daemon?.instance !== this.daemon?.instance) this.#newest = { ns: 0, atMs: 0 }; // its clock may be another
+    if (told.daemon?.instance !== this.daemon?.instance) this.#newest = CLOCK_UNKNOWN; // its clock may be another
     this.daemon = told.daemon ?? this.daemon;
     this.plan = told.plan ?? this.plan;
     this.canRun = told.can_run;
@@ -366,16 +370,24 @@ export class Rig {
 
   take(topic, sample) {
     this.heardAtMs = performance.now();
-    if (sample?.t > this.nowNs()) this.#newest = { ns: sample.t, atMs: this.heardAtMs };
+    if (sample?.t && !(sample.t <= this.nowNs())) this.#newest = { ns: sample.t, atMs: this.heardAtMs };
     const [root, name, ...rest] = topic.split("/");
     if (root === "tele") this.#telemetry(name, rest.join("/"), sample);
     else if (topic === "meta/health") this.health = sample;
     else if (root === "meta" && name === "health") this.bus(rest[0]).report(sample);
   }
 
-  /** The time by the daemon's own clock, as late as its news are here: that of another host may differ. */
+  /** The time by the daemon's own clock, as late as its news are here: that of another host may differ.
+   *
+   * NaN until the first sample has told it: what is compared with it is neither before nor after.
+   */
   nowNs() {
-    return this.#newest.ns + (performance.now() - this.#newest.atMs) * 1e6;
+    return this.nsAt(performance.now());
+  }
+
+  /** The same of an instant by this page's clock. */
+  nsAt(atMs) {
+    return this.#newest.ns + (atMs - this.#newest.atMs) * 1e6;
   }
 
   /** Add an event unless it is known. */
