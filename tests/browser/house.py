@@ -200,13 +200,19 @@ class House:
     _cookies: list[dict[str, object]] = field(default_factory=list)
 
     @asynccontextmanager
+    async def that_expects_alpha(self) -> AsyncIterator["House"]:
+        """Run one more console, which looks for alpha too: the shared one would go on telling that alpha is gone."""
+        endpoints = [daemon.endpoint for daemon in (self.sim, self.mixed, self.alpha)]
+        async with console(*endpoints, commission=self.sim.config) as link:
+            yield House(self.browser, self.sim, self.mixed, self.alpha, link)
+
+    @asynccontextmanager
     async def beside_alpha(self) -> AsyncIterator["House"]:
-        """Run alpha until the context ends, and a console of its own: the other would go on telling that it is gone."""
+        """Run such a console, and alpha until the context ends."""
         await self.alpha.start()
         try:
-            endpoints = [daemon.endpoint for daemon in (self.sim, self.mixed, self.alpha)]
-            async with console(*endpoints, commission=self.sim.config) as link:
-                yield House(self.browser, self.sim, self.mixed, self.alpha, link)
+            async with self.that_expects_alpha() as own:
+                yield own
         finally:
             with suppress(ProcessLookupError):  # it has ended already
                 self.alpha.pause(on=False)
@@ -319,7 +325,6 @@ async def open_house(folder: Path) -> AsyncIterator[House]:
         async with asyncio.TaskGroup() as group:
             for daemon in (sim, mixed):
                 group.create_task(daemon.start(), name=daemon.endpoint)
-        endpoints = [daemon.endpoint for daemon in (sim, mixed, alpha)]
-        link = await stack.enter_async_context(console(*endpoints, commission=sim_config))
+        link = await stack.enter_async_context(console(sim.endpoint, mixed.endpoint, commission=sim_config))
         expect.set_options(timeout=PATIENCE_S * 1e3)
         yield House(browser, sim, mixed, alpha, link)

@@ -180,7 +180,7 @@ async def test_the_answer_to_a_stop_is_gone_with_what_the_axis_tells_since_and_a
             await house.alpha.until("x", lambda state: state.stop_latched)
             await house.alpha.rig.command("x", Reset())
             await house.alpha.until("x", lambda state: not state.stop_latched)
-            await playwright.expect(desk.page.locator(".stops")).to_have_count(0)
+            await playwright.expect(desk.page.locator(".stops").filter(has_text="alpha: ")).to_have_count(0)
             house.alpha.pause(on=True)
             await playwright.expect(strip).to_contain_text("daemon silent")
             await playwright.expect(strip).not_to_contain_text("confirmed by")

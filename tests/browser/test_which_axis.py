@@ -126,17 +126,19 @@ async def test_the_scope_keeps_its_channels_when_another_rig_joins(house, window
 
 @pytest.mark.parametrize("page", ["axis", "trace", "tuning", "parameters", "scope"])
 async def test_an_axis_that_goes_is_said_and_not_replaced(house, window, page):
-    async with alpha_runs(house):
-        await go(window, house, f"{page}/alpha/feed")
-        await until(window, TEXT, wanted=lambda text: "not known" not in text and re.search("feed|Pn100", text))
+    async with house.that_expects_alpha() as own:
+        async with alpha_runs(house):
+            await window.open(own.link)
+            await go(window, own, f"{page}/alpha/feed")
+            await until(window, TEXT, wanted=lambda text: "not known" not in text and re.search("feed|Pn100", text))
 
-    async with started_again(house, without_feed):
-        said = "Rig alpha has no axis feed"
-        text = await until(window, TEXT, wanted=lambda text: said in text)
-        assert await window.evaluate(HASH) == f"#/{page}/alpha/feed"
-        for label in ("Record", "Take control", "Read all", "Power"):
-            assert label not in await window.evaluate(BUTTONS)
-        assert "Record x" not in text
+        async with started_again(house, without_feed):
+            said = "Rig alpha has no axis feed"
+            text = await until(window, TEXT, wanted=lambda text: said in text)
+            assert await window.evaluate(HASH) == f"#/{page}/alpha/feed"
+            for label in ("Record", "Take control", "Read all", "Power"):
+                assert label not in await window.evaluate(BUTTONS)
+            assert "Record x" not in text
 
 
 async def test_an_address_of_an_axis_that_is_not_there_shows_no_other(house, window):
@@ -197,7 +199,7 @@ def x_in_cm(text):
 
 
 async def test_what_was_typed_for_one_unit_is_not_there_for_another(house):
-    async with house.desk() as desk:
+    async with house.that_expects_alpha() as own, own.desk() as desk:
         async with alpha_runs(house):
             await desk.open("axis/alpha/x")
             await desk.panel("Move").get_by_label("Position mm").fill("12")
@@ -212,7 +214,7 @@ async def test_what_was_typed_for_one_unit_is_not_there_for_another(house):
 
 
 async def test_the_scope_says_values_in_the_unit_that_they_have(house):
-    async with house.desk() as desk:
+    async with house.that_expects_alpha() as own, own.desk() as desk:
         async with alpha_runs(house):
             await desk.open("scope/alpha/x")
             live = desk.panel("Live")
