@@ -187,16 +187,16 @@ def instant_of(past: Past, t: int) -> AxisInstant:
         return _unknown(t, coordinates, "the drive did not answer then")
     if abs(start.origin - end.origin) > SAME_ORIGIN_COUNTS:
         return _unknown(t, coordinates, "the axis got other coordinates just then")
-    fastest = 0.0
+    fastest, alike = 0.0, True
     if longest_ns > SELDOM_NS and _altered(courses, before.t, after.t + SEEN_LATE_NS):
         if coordinates.fastest is None:
             reason = "its motion was altered between two readings, and it has no limit of velocity"
             return _unknown(t, coordinates, reason)
-        fastest = coordinates.fastest * OVERSPEED
+        fastest, alike = coordinates.fastest * OVERSPEED, False  # a curve through readings of two motions is none
         if longest_ns > RARE_NS:
             return _reached(start, end, t, coordinates, fastest)
     first, last = _apart(readings, earlier, -1, apart_ns), _apart(readings, later, 1, apart_ns)
-    outer = (readings[first], readings[last]) if first < earlier and later < last else None
+    outer = (readings[first], readings[last]) if alike and first < earlier and later < last else None
     return _between(around, outer, t, coordinates, fastest)
 
 

@@ -27,7 +27,7 @@ LOOKS = 8
 KNOWN_AFTER_S = 4.0
 """By then two polls have followed an instant, also of a SmartStep."""
 FAST_HZ = 20
-SLOW_RATIO = 2.6
+SLOW_RATIO = 2.7
 """Where ramps begin and end between two polls, see `judge`."""
 KINDS = {"move_absolute": "move", "move_relative": "move", "move_velocity": "jog", "home": "home", "halt": "stop"}
 
@@ -157,8 +157,8 @@ def _ratio(judged: Sequence[Judged], least: float) -> float:
     return statistics.median(each.half / max(each.error, least) for each in judged)
 
 
-def judge(name: str, hz: float, count: int, seed: int, share: float, most_ratio: float = 2.0) -> None:
-    """Judge a rig that polls so often, and say how its bounds were.
+def judge(name: str, hz: float, count: int, seed: int, share: float, most_ratio: float = 2.0) -> list[Judged]:
+    """Judge a rig that polls so often, say how its bounds were, and return all instants.
 
     Their ratio is half the width between the bounds over the error of the value, |value - truth|, in the median of all
     instants. An error of less than a count counts as one, for a counter tells no less; the ratio to fractions of a
@@ -180,6 +180,7 @@ def judge(name: str, hz: float, count: int, seed: int, share: float, most_ratio:
     assert statistics.fmean(each.inside for each in judged) >= share
     assert statistics.fmean(each.speed_inside for each in judged) >= share - 0.002
     assert _ratio(judged, 1.0) <= most_ratio
+    return judged
 
 
 def with_rate(config: RigConfig, hz: float) -> RigConfig:
@@ -205,9 +206,14 @@ def test_the_shaft_was_within_the_bounds_of_4000_instants(hz: float):
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize(("rig", "hz"), [*(("simulated", hz) for hz in (5, 10, 20, 50, 100)), ("mixed", 20)])
-def test_the_shaft_was_within_the_bounds_of_100000_instants(rig: str, hz: float):
-    judge(rig, hz, 17_000, 4, 0.999, 2.0 if hz >= FAST_HZ else SLOW_RATIO)
+def test_the_shaft_was_within_the_bounds_of_100000_instants():
+    judged: list[Judged] = []
+    for rig, hz in (*(("simulated", hz) for hz in (5, 10, 20, 50, 100)), ("mixed", 20)):
+        judged += judge(rig, hz, 17_000, 4, 0.999, 2.0 if hz >= FAST_HZ else SLOW_RATIO)
+    inside, ratio = statistics.fmean(each.inside for each in judged), _ratio(judged, 1.0)
+    print(f"all rates: {len(judged)} instants, {inside:.4%} inside, ratio {ratio:.3f}")
+    assert inside >= 0.999
+    assert ratio <= 2.0
 
 
 def test_a_query_of_an_instant_answers_with_bounds_and_refuses_what_is_none():
