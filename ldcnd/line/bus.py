@@ -21,10 +21,11 @@ from ldcnd.contract.errors import (
 from ldcnd.line.adapter import LineErrors
 from ldcnd.line.exchange import Exchange, Lane, Poller, Resync, Timing
 from ldcnd.line.flight_recorder import BusStatistics, LatencyHistogram, WireEvent, WireLog
-from ldcnd.line.line import Line, Listener, Phase, Transaction
+from ldcnd.line.line import Line, Listener, Phase
 from ldcnd.line.proof import ALWAYS_SENT, MISSES_UNTIL_LOST, Condition, Proofs
 from ldcnd.line.schedule import Schedule
 from ldcnd.line.settings import BusSettings
+from ldcnd.line.transaction import Transaction
 from ldcnd.line.transport import Opener, Transport
 from ldcnd.log import get_logger
 

@@ -5,9 +5,10 @@ import asyncio
 from ldcnd.contract.errors import BusError
 from ldcnd.line.exchange import Exchange, Lane, Resync, Timing
 from ldcnd.line.flight_recorder import BusStatistics, WireLog
-from ldcnd.line.line import Line, Transaction
+from ldcnd.line.line import Line
 from ldcnd.line.schedule import Schedule
 from ldcnd.line.settings import BusSettings
+from ldcnd.line.transaction import Transaction
 from tests.support import toy_family as toy
 from tests.support.scripted_line import Say, ScriptedLine
 

@@ -4,7 +4,7 @@ from collections.abc import Callable
 import pytest
 
 from ldcnd.line.exchange import NEVER_S
-from ldcnd.line.line import Watchdog
+from ldcnd.line.watchdog import Watchdog
 
 
 class CountingLoop:
