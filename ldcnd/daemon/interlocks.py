@@ -7,89 +7,42 @@ lines they are.
 
 import asyncio
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
 
 from ldcnd.axis import guards
 from ldcnd.axis.axis import AxisService
 from ldcnd.axis.events import CommandFailing
-from ldcnd.axis.rest import REST_COUNTS
 from ldcnd.axis.status import AxisStatus
 from ldcnd.config.interlocks import LOOKS, MOTIONS, InterlockConfig, InterlockKind, Requirement
 from ldcnd.contract.commands import Verb, kind_of
-from ldcnd.contract.errors import InterlockViolated, LdcndError, Remedy, ValueOutOfRange, step
+from ldcnd.contract.errors import InterlockViolated, LdcndError, Remedy, ValueOutOfRange
 from ldcnd.contract.events import INTERLOCK, CommandStatus
 from ldcnd.contract.rig_commands import OverrideInterlock, OverrideReply
-from ldcnd.contract.samples import AxisState, LinkState, Unseen
-from ldcnd.contract.units import Dimension
+from ldcnd.contract.samples import AxisState, LinkState
 from ldcnd.daemon.leases import STOP_MODES, Authority
 from ldcnd.daemon.ledger import EventLog
-from ldcnd.daemon.modules import ModuleService, level_word, setting
+from ldcnd.daemon.modules import ModuleService, setting
+from ldcnd.daemon.requirements import (
+    NOW,
+    WATCHED,
+    Asked,
+    Lack,
+    in_words,
+    is_commanded,
+    lack_of_axis,
+    lack_of_line,
+    lack_of_module,
+    speed_of,
+)
 from ldcnd.daemon.rig import OwnedRig
 from ldcnd.drives.axis_config import LossPolicy
 from ldcnd.log import get_logger
 
 log = get_logger("interlocks")
 
-NOT_HOMED = "is not homed"
-HUNTING = 0.1
-"""Share of its speed by which a servo may be faster than its profile, between two readings."""
-
-
-@dataclass(frozen=True, slots=True)
-class Lack:
-    """A requirement that does not hold, or is not known to.
-
-    Attributes:
-        of: what it is required of.
-        text: how that is instead.
-        wanted: how it is required to be.
-        because: why it is not known, in words that are the same for all of which that is so.
-        sets: the module and the levels of its output that have it hold, if writing it may.
-        axis: the axis that a way out is about.
-        way: what has it hold, if a command of that axis does.
-    """
-
-    of: str
-    text: str
-    wanted: str
-    because: str = ""
-    sets: tuple[ModuleService, Mapping[str, bool]] | None = None
-    axis: str | None = None
-    way: Remedy | None = None
-
-
-def in_words(lacks: Iterable[Lack]) -> str:
-    """Return all that is lacking; what is not known for one cause is said once."""
-    alike: dict[str, list[Lack]] = {}
-    for each in lacks:
-        alike.setdefault(each.because or f"{each.of} {each.text}", []).append(each)
-    texts = []
-    for group in alike.values():
-        names, first = list(dict.fromkeys(each.of for each in group)), group[0]
-        text = f"{', '.join(names)} {first.text if len(names) == 1 else 'are not known'}"
-        texts.append(f"{text}: {first.because}" if first.because else text)
-    return "; ".join(texts)
-
-
-@dataclass(frozen=True, slots=True)
-class Asked:
-    """What a requirement is asked for.
-
-    Attributes:
-        levels: of the outputs that are to be written, by name, None to let go of one: they count as they will be.
-        watched: a motion is only watched: an output that is being written counts with its last reading, as long as
-            that is not too old.
-    """
-
-    levels: Mapping[str, bool | None] = field(default_factory=dict)
-    watched: bool = False
-
-
-NOW = Asked()
-WATCHED = Asked(watched=True)
 Obstacle = Callable[[Asked], Lack | None]
 """Returns how a requirement does not hold, or is not known to; None when it does."""
 
@@ -224,12 +177,13 @@ class Interlocks:
 
     def _requirement(self, each: Requirement, age_s: float) -> Obstacle:
         if each.axis is not None:
-            return partial(self._lack_of_axis, self._rig.axes[each.axis], each, age_s)
+            axis = self._rig.axes[each.axis]
+            return lambda _: lack_of_axis(axis, each, self._now_s(), age_s, self._may_home)
         if each.module is not None:
-            return partial(self._lack_of_module, self._rig.modules[each.module], age_s)
-        name, what = (each.input, "input") if each.input else (each.output, "output")
-        assert name is not None  # noqa: S101 - a requirement names one of the four
-        return partial(self._lack_of_line, self._modules[name], name, what, each.value, age_s)
+            required = self._rig.modules[each.module]
+            return lambda _: lack_of_module(required, self._now_s(), age_s)
+        module = self._modules[each.input or each.output or ""]
+        return lambda asked: lack_of_line(module, each, self._now_s(), age_s, asked)
 
     # -- the way out -------------------------------------------------------------------------------------------------
 
@@ -351,83 +305,6 @@ class Interlocks:
         rules = (rule for rule in self._rules.values() if rule.axis is axis and InterlockKind.HOME in rule.kinds)
         return Verb.HOME in axis.driver.capabilities and not any(self._lacks(rule) for rule in rules)
 
-    # -- what is lacking ---------------------------------------------------------------------------------------------
-
-    def _lack_of_module(self, module: ModuleService, age_s: float, _asked: Asked) -> Lack | None:
-        of = f"module {module.name}"
-        return None if self._now_s() - module.read_at_s <= age_s else Lack(of, "does not answer", f"{of} answers")
-
-    def _lack_of_line(
-        self,
-        module: ModuleService,
-        name: str,
-        what: str,
-        wanted: bool,  # noqa: FBT001 - of a configuration
-        age_s: float,
-        asked: Asked,
-    ) -> Lack | None:
-        of, word = f"{what} {name}", _word(what, wanted)
-        if self._now_s() - module.read_at_s > age_s:
-            return Lack(of, "is not known", f"{of} is {word}", f"module {module.name} does not answer")
-        value = asked.levels.get(name, module.values[name])
-        if asked.watched and value is None and name in module.before:
-            before, read_at_s = module.before[name]
-            value = before if self._now_s() - read_at_s <= age_s else None
-        if value is wanted:
-            return None
-        text = "is not known" if value is None else f"is {_word(what, not wanted)}"
-        if what == "input":
-            return Lack(of, text, f"{of} is {word}")
-        why = module.why_unknown(name) if value is None else ""
-        return Lack(of, text, f"{of} is {word}", why, None if why else (module, {name: wanted}))
-
-    def _lack_of_axis(self, axis: AxisService, each: Requirement, age_s: float, _asked: Asked) -> Lack | None:
-        if not (text := self._is_instead(axis, each, age_s)):
-            return None
-        name, status = axis.config.name, axis.tracker.status
-        way: Remedy | None = None
-        off = step("power", 'send power {"on": false}', on=False)
-        if (each.standstill or each.below is not None) and _unproven(status):
-            if status.rest_unproven_by:
-                resets = "look whether it stands, then {}"
-                way = (
-                    Remedy(f"{{}}, {resets}", off, step("reset")) if status.energised else Remedy(resets, step("reset"))
-                )
-            elif status.unseen is Unseen.UNDER_POWER:
-                waits = f"{{}} and wait until it stands, for {status.rest.unseen_s:g} s"
-                way = Remedy(f"{{}}, or {waits}", step("home"), off) if self._may_home(axis) else Remedy(waits, off)
-        elif text == NOT_HOMED and self._may_home(axis):
-            way = Remedy("{} and wait until it is homed", step("home"))
-        return Lack(f"axis {name}", text, f"axis {name} {_required(status, each)}", axis=name, way=way)
-
-    def _is_instead(self, axis: AxisService, each: Requirement, age_s: float) -> str:
-        """Return how an axis is that is required to be another way; empty when it is as required."""
-        tracker = axis.tracker
-        status, reading = tracker.status, tracker.reading
-        if (
-            reading is None
-            or not tracker.proof.holds
-            or status.link is LinkState.DOWN
-            or self._now_s() - tracker.read_at_s > age_s
-        ):
-            return "is not known: its drive does not answer"
-        # a counter that stands still beside a shaft that turns looks like rest, as a jam does
-        if (each.standstill or each.below is not None) and (unproven := _unproven(status)):
-            return unproven
-        if each.standstill and not (status.rest.rests is True and not _commanded(status)):
-            return "does not stand, or is not known to"
-        if each.below is not None and (speed := _speed(axis)) >= each.below:
-            now, limit = (status.scale.text(value, Dimension.VELOCITY) for value in (speed, each.below))
-            return f"may be at {now}, which is not below {limit}"
-        in_range = (each.min, each.max) != (None, None)
-        if (each.homed or in_range) and (not status.referenced or status.position_lost):
-            return NOT_HOMED
-        if in_range:
-            here = status.scale.shown_at(reading.position_counts)
-            if (each.min is not None and here < each.min) or (each.max is not None and here > each.max):
-                return f"is at {here:.6g} {status.unit}, outside {each.min} to {each.max}"
-        return ""
-
     # -- asked -------------------------------------------------------------------------------------------------------
 
     def _violations_of_axis(
@@ -479,7 +356,7 @@ class Interlocks:
         status = axis.tracker.status
         # a drive that is out of reach takes nothing; it is looked at when it answers again
         moves = status.energised and status.link is not LinkState.DOWN
-        moves = moves and (status.rest.rests is False or _commanded(status))
+        moves = moves and (status.rest.rests is False or is_commanded(status))
         moves = moves and not own.hold(self._version, self._now_s())
         for rule in own.rules:
             lacks = self._lacks(rule, WATCHED) if moves and self._binds(rule, axis, status) else ()
@@ -508,7 +385,7 @@ class Interlocks:
                 return False
         elif InterlockKind(kind_of(command.verb)) not in kinds:
             return False
-        return rule.config.above is None or _speed(axis) > rule.config.above
+        return rule.config.above is None or speed_of(axis) > rule.config.above
 
     # -- overridden --------------------------------------------------------------------------------------------------
 
@@ -567,60 +444,3 @@ class Interlocks:
         log.warning("interlock override", interlock=rule.config.name, reason=reason, client=client)
         reason = f"interlock {rule.config.name} {reason}"
         self._events.note(rule.holders[0], OverrideInterlock.verb, status, reason, client=client)
-
-
-def _unproven(status: AxisStatus) -> str:
-    """Return why readings do not prove how fast a shaft is; empty where they do."""
-    if fault := status.rest_unproven_by:
-        return f"may move: after fault {fault} its encoder does not prove that it stands"
-    if status.unseen is Unseen.UNDER_POWER:
-        return "may turn: its encoder is yet to count in a motion of this daemon"
-    if status.unseen:
-        seconds = f"{status.rest.unseen_s:g} s"
-        return f"may coast: nothing has shown yet that it stands; it does once it has not counted for {seconds}"
-    return ""
-
-
-def _required(status: AxisStatus, each: Requirement) -> str:
-    """Return in words how an axis is required to be."""
-    parts = ["stands"] if each.standstill else []
-    parts += [] if each.below is None else [f"is below {status.scale.text(each.below, Dimension.VELOCITY)}"]
-    parts += ["is homed"] if each.homed else []
-    if (each.min, each.max) != (None, None):
-        parts.append(f"is between {each.min} and {each.max} {status.unit}")
-    return " and ".join(parts) or "answers"
-
-
-def _word(what: str, value: bool) -> str:  # noqa: FBT001 - of a line
-    return str(value).lower() if what == "input" else level_word(value)
-
-
-def _commanded(status: AxisStatus) -> bool:
-    return status.command is not None and status.state.is_motion
-
-
-def _speed(axis: AxisService) -> float:
-    """Return how fast an axis is at most, in units a second.
-
-    What a drive shows is whole counts in a servo cycle. Of a slow motion its command says more, once two positions show
-    that it is not faster any more.
-    """
-    tracker, told = axis.tracker, axis.told
-    status, reading, (earlier, earlier_at_s) = tracker.status, tracker.reading, tracker.earlier
-    if reading is None:
-        return math.inf
-    counts = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
-    told_s = max(told.at_s, status.effective_from_s)
-    if _commanded(status) and tracker.read_at_s < told_s:  # nothing shows yet what the drive makes of it
-        counts = max(told.most_counts_per_s, counts if status.state is AxisState.STOPPING else 0.0)
-    elif _commanded(status) and status.state is not AxisState.STOPPING:
-        counts = max(told.counts_per_s, counts)
-        if earlier and (earlier_at_s >= told_s or not told.replaced_counts_per_s):
-            way, took_s = abs(reading.position_counts - earlier.position_counts), tracker.read_at_s - earlier_at_s
-            if way <= told.counts_per_s * (1 + HUNTING) * took_s + REST_COUNTS:
-                counts = told.counts_per_s
-    elif status.at_rest:
-        counts = 0.0
-    if status.following and status.following.coasts:  # as fast as it was seen to move last, until it is again
-        counts = max(counts, status.following.speed_counts_per_s)
-    return counts / abs(status.scale.counts_per_unit)
