@@ -19,8 +19,6 @@ from ldcnd.contract.units import POSITION, quantity_text
 
 LEASE_S = 2.0
 """The daemon applies `loss.client` so soon when this program disappears, seconds."""
-STOPS_SEEN_EACH_S = 0.1
-"""Time between two looks for a stop, seconds."""
 
 
 class SequenceRun:
@@ -84,30 +82,34 @@ class SequenceRun:
             self._modules = await self._lines()
             try:
                 async with asyncio.TaskGroup() as group:
-                    stops = group.create_task(self._see_stops(), name="stops of a sequence")
+                    stops = [
+                        group.create_task(self._see_stop(axis), name=f"stops of {axis.name}")
+                        for axis in self._axes.values()
+                    ]
                     for number in range(first, len(steps) + 1):
                         await self._carry_out(number, steps[number - 1])
-                    stops.cancel()
+                    for each in stops:
+                        each.cancel()
             except* LdcndError as errors:
                 raise errors.exceptions[0] from None
 
-    async def _see_stops(self) -> None:
+    async def _see_stop(self, axis: Axis) -> None:
         """End the sequence when one of its axes is stopped, by any client: others would be moved beside it.
 
         Raises:
-            WrongState: one is.
+            WrongState: it is.
+            LeaseExpired: control was lost.
         """
-        known: set[str] | None = None
+        latched = axis.state.sample.stop_latched
         while True:
-            latched = {name for name, axis in self._axes.items() if axis.state.sample.stop_latched}
-            known = latched if known is None else known & latched
-            for name in sorted(latched - known):
+            await axis.news(None)
+            before, latched = latched, axis.state.sample.stop_latched
+            if latched and not before:
                 raise WrongState(
-                    f"axis {name} was stopped; sequence {self._sequence.name} ends",
-                    axis=name,
+                    f"axis {axis.name} was stopped; sequence {self._sequence.name} ends",
+                    axis=axis.name,
                     remedy=Remedy("look why, then {}", remedy_step("reset")),
                 )
-            await asyncio.sleep(STOPS_SEEN_EACH_S)
 
     async def _check_stand(self, steps: Sequence[SequenceStep]) -> None:
         """Refuse to control an axis that another program moves: to give up its control again would halt that motion."""
