@@ -1,6 +1,5 @@
 """NICOS's own device classes, unmodified, on `ldcnd secop` and `ldcnd epics`; the simulated shaft decides."""
 
-import os
 import subprocess
 import sys
 import time
@@ -13,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from ldcnd.testing import ServedRig, Truth, served_rig
-from tests.support.process import LDCND, ROOT, free_port
+from tests.support.process import LDCND, ROOT, free_port, piped
 
 pytestmark = [
     pytest.mark.edges,
@@ -85,22 +84,6 @@ def setup_on(page: str) -> str:
 
 
 @contextmanager
-def program(*command: str, **environment: str) -> "Iterator[subprocess.Popen[str]]":
-    pipe = subprocess.PIPE
-    with subprocess.Popen(  # noqa: S603
-        command, stdin=pipe, stdout=pipe, text=True, cwd=ROOT, env={**os.environ, **environment}
-    ) as running:
-        try:
-            yield running
-        finally:
-            assert running.stdin
-            running.stdin.close()
-            if command[: len(LDCND)] == LDCND:
-                running.terminate()
-            running.wait(LONGEST_S)
-
-
-@contextmanager
 def nicos(folder: Path, setup: str, **environment: str) -> Iterator[Nicos]:
     port = free_port()
     setups = folder / "setups"
@@ -109,17 +92,17 @@ def nicos(folder: Path, setup: str, **environment: str) -> Iterator[Nicos]:
         (setups / f"{name}.py").write_text(text.replace("{port}", str(port)).replace("{folder}", str(folder)))
     command = (sys.executable, "-m", "tests.edges.nicos_session", str(folder))
     environment |= {"INSTRUMENT": "nicos_demo.demo"}
-    with program(*command, "cache", **environment) as cache:
+    with piped(*command, "cache", **environment) as cache:
         assert cache.stdout
         assert cache.stdout.readline() == "ready\n"
-        with program(*command, "axes", **environment) as running:
+        with piped(*command, "axes", **environment) as running:
             yield Nicos(running)
 
 
 @contextmanager
 def over_secop(rig: ServedRig, folder: Path) -> Iterator[Nicos]:
     port = free_port()
-    with program(*LDCND, "secop", "x", "z", "-e", rig.endpoint, "--address", f"127.0.0.1:{port}", "--moves") as node:
+    with piped(*LDCND, "secop", "x", "z", "-e", rig.endpoint, "--address", f"127.0.0.1:{port}", "--moves") as node:
         assert node.stdout
         assert "SECoP modules {x,z}" in node.stdout.readline()
         with nicos(folder, setup_on("use-secop.md").replace("10767", str(port))) as session:
@@ -136,7 +119,7 @@ def over_epics(rig: ServedRig, folder: Path) -> Iterator[Nicos]:
         "EPICS_CA_SERVER_PORT": str(port),
         "EPICS_CA_REPEATER_PORT": str(free_port()),
     }
-    with program(*LDCND, *arguments) as gateway:
+    with piped(*LDCND, *arguments) as gateway:
         assert gateway.stdout
         assert "motor records lab:{x}" in gateway.stdout.readline()
         with nicos(folder, setup_on("use-epics.md"), **addresses) as session:

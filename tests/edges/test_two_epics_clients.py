@@ -1,7 +1,6 @@
 """Two Channel Access clients put into one motor record while others stop the rig and reload it; the shaft decides."""
 
 import json
-import os
 import subprocess
 import sys
 import time
@@ -16,7 +15,7 @@ import pytest
 from ldcnd.config.plan import plan_rig
 from ldcnd.testing import ServedRig, Truth, served_rig
 from ldcnd.testing.rig import SimulatedRig
-from tests.support.process import LDCND, ROOT, free_port
+from tests.support.process import LDCND, ROOT, free_port, piped
 
 pytestmark = [pytest.mark.edges, pytest.mark.real_time, pytest.mark.timeout(600)]
 
@@ -185,26 +184,11 @@ def reloaded(inside: SimulatedRig, velocity: float) -> None:
 
 
 @contextmanager
-def running(*command: str, **environment: str) -> "Iterator[subprocess.Popen[str]]":
-    pipe = subprocess.PIPE
-    with subprocess.Popen(  # noqa: S603
-        command, stdin=pipe, stdout=pipe, text=True, cwd=ROOT, env={**os.environ, **environment}
-    ) as program:
-        try:
-            yield program
-        finally:
-            assert program.stdin
-            program.stdin.close()
-            program.terminate()
-            program.wait(LONGEST_S)
-
-
-@contextmanager
 def two_clients(rig: ServedRig) -> Iterator[tuple[Putting, Putting]]:
     port = free_port()
     arguments = ("epics", "x", "-e", rig.endpoint, "--address", f"127.0.0.1:{port}", "--prefix", "T:", "--moves")
     with ExitStack() as stack:
-        gateway = stack.enter_context(running(*LDCND, *arguments))
+        gateway = stack.enter_context(piped(*LDCND, *arguments))
         assert gateway.stdout
         assert "motor records T:{x}" in gateway.stdout.readline()
         addresses = {
@@ -213,7 +197,7 @@ def two_clients(rig: ServedRig) -> Iterator[tuple[Putting, Putting]]:
             "EPICS_CA_SERVER_PORT": str(port),
             "EPICS_CA_REPEATER_PORT": str(free_port()),
         }
-        one, two = (Putting(stack.enter_context(running(sys.executable, "-c", CLIENT, **addresses))) for _ in range(2))
+        one, two = (Putting(stack.enter_context(piped(sys.executable, "-c", CLIENT, **addresses))) for _ in range(2))
         yield one, two
 
 

@@ -6,10 +6,11 @@ import json
 import os
 import signal
 import socket
+import subprocess
 import sys
 from asyncio.subprocess import PIPE, Process
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
 
 from ldcnd.client.rig_client import RigClient, find_rigs
@@ -58,6 +59,23 @@ async def process(*arguments: str, tree: Path = ROOT) -> AsyncIterator[Process]:
             running.kill()
             await running.communicate()
             raise
+
+
+@contextmanager
+def piped(*command: str, **environment: str) -> Iterator["subprocess.Popen[str]"]:
+    """Run a program that reads lines and writes lines until the context ends; it ends with its input, or is ldcnd."""
+    pipe = subprocess.PIPE
+    with subprocess.Popen(  # noqa: S603
+        command, stdin=pipe, stdout=pipe, text=True, cwd=ROOT, env={**os.environ, **environment}
+    ) as running:
+        try:
+            yield running
+        finally:
+            assert running.stdin
+            running.stdin.close()
+            if command[: len(LDCND)] == LDCND:
+                running.terminate()
+            running.wait(2 * END_TIME_S)
 
 
 @asynccontextmanager
