@@ -32,10 +32,11 @@ def pytest_configure(config: pytest.Config) -> None:
     )
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+@pytest.hookimpl(wrapper=True)  # before that of pytest-asyncio, whichever of the two was loaded first
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> Generator[None]:
     """Let pytest-asyncio find the clock of tests on a rig, also where it runs only what is marked."""
     _mark(metafunc.definition)
+    return (yield)
 
 
 @pytest.hookimpl(wrapper=True, trylast=True)

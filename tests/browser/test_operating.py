@@ -117,6 +117,27 @@ async def test_the_key_stops_even_while_somebody_types(house):
         assert state.stop_latched
 
 
+AT_ONCE = """new MutationObserver((_, looking) => {
+  if (!document.querySelector("#console > *")) return;
+  looking.disconnect();
+  location.hash = "#/axis/sim/x";
+  document.documentElement.dispatchEvent(new KeyboardEvent("keydown", { key: "Escape", bubbles: true }));
+}).observe(document, { childList: true, subtree: true })"""
+"""As soon as a page has drawn something, and before anybody can see that."""
+
+
+async def test_the_key_stops_and_an_address_counts_from_the_first_moment_of_a_page_on(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.page.add_init_script(AT_ONCE)
+        await desk.page.goto("about:blank")
+        await desk.open("rig")
+        await expect(desk.page.get_by_role("heading", level=1)).to_contain_text("x")
+        await house.sim.until("x", lambda state: state.stop_latched)
+    await house.sim.quiet("x", "y", "z", "c")
+    await house.mixed.quiet("x")
+
+
 async def test_a_stop_that_gets_lost_is_told_at_once(house):
     await house.sim.quiet("x")
     async with house.desk() as desk:

@@ -1,6 +1,6 @@
 /** The frame round every page: where one is, what is wrong, the stop; and the routes. */
 
-import { html, render, useEffect, useErrorBoundary, useRef, useState } from "./html.js";
+import { html, render, useEffect, useErrorBoundary, useLayoutEffect, useRef, useState } from "./html.js";
 import { AxisPage } from "./pages/axis.js";
 import { CommissioningPage } from "./pages/commissioning.js";
 import { EventsPage } from "./pages/events.js";
@@ -126,7 +126,7 @@ function Console() {
   const [at, setAt] = useState(place());
   const main = useRef();
   useRigs();
-  useEffect(() => {
+  useLayoutEffect(() => { // an address that is changed before the page is painted counts, too
     const moved = () => {
       setAt(place());
       main.current.focus();

@@ -1,6 +1,6 @@
 /** Motions of an axis, each previewed by the daemon before it is commanded. */
 
-import { html, useEffect, useId, useState } from "../html.js";
+import { html, useId, useLayoutEffect, useState } from "../html.js";
 import { Action, Choice, enterSends, Panel, Reason, RefusalText, useOnce } from "../parts/controls.js";
 import { decimalsOf, duration, number } from "../parts/format.js";
 import { StoryOf } from "../parts/motion_story.js";
@@ -162,7 +162,7 @@ function Preview({ axis, body, field, onNearest }) {
   // what a motion would do depends on where the axis is, which a motion or a stop has changed, and on how fast it may be
   const situation = JSON.stringify([state?.state, state?.command?.command_id, state?.referenced, state?.stop_latched,
     state?.enabled, state?.link, state?.speed_override, axis.holder, controls(axis)]);
-  useEffect(() => {
+  useLayoutEffect(() => { // what it said of another text is never shown beside this one
     setPlan(null);
     setRefusal(null);
     if (!asked) return undefined;

@@ -1,6 +1,6 @@
 /** A button that lets something move while it is held, whatever ends that: finger, key, focus, window or page. */
 
-import { html, useEffect, useRef } from "../html.js";
+import { html, useLayoutEffect, useRef } from "../html.js";
 import { cameUnderHand } from "./under_hand.js";
 
 /** `begin` and `end` come in turn; `keys` are held like the space bar; `obstacle` says why it cannot be held now. */
@@ -19,7 +19,7 @@ export function HoldButton({ begin, end, keys = [], obstacle = null, reason = nu
     holding.current = false;
     act.current.end();
   }
-  useEffect(() => {
+  useLayoutEffect(() => {
     const hidden = () => document.hidden && letGo();
     addEventListener("blur", letGo);
     addEventListener("pagehide", letGo);

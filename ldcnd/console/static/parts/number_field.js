@@ -1,6 +1,6 @@
 /** Fields that people type into: the text in a field belongs to the person, and only what it means goes to the page. */
 
-import { html, useEffect, useId, useLayoutEffect, useRef, useState } from "../html.js";
+import { html, useId, useLayoutEffect, useRef, useState } from "../html.js";
 import { range, readNumber, Unread } from "./number_text.js";
 
 /** A labelled field for a number.
@@ -81,7 +81,7 @@ function useText(value, write, read, onShown = () => {}) {
   }
 
   useLayoutEffect(show);
-  useEffect(() => {
+  useLayoutEffect(() => {
     const field = input.current;
     const typed = (event) => {
       if (!event.isComposing) state.current.reported = now.current.read(field.value);

@@ -1,6 +1,6 @@
 /** The stop of every page: a button and a key, and what came of it. It is software, no emergency stop, and says so. */
 
-import { html, useEffect } from "../html.js";
+import { html } from "../html.js";
 import { askAtOnce, rigPath } from "../session/api.js";
 import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
@@ -40,17 +40,15 @@ async function stop() {
   }
 }
 
-/** The button and the key. */
+// from the first moment on, not only once something is drawn
+addEventListener("keydown", (event) => {
+  if (event.key !== KEY || event.repeat) return;
+  event.preventDefault();
+  stop();
+}, true);
+
+/** The button. */
 export function StopAll() {
-  useEffect(() => {
-    const pressed = (event) => {
-      if (event.key !== KEY || event.repeat) return;
-      event.preventDefault();
-      stop();
-    };
-    addEventListener("keydown", pressed, true);
-    return () => removeEventListener("keydown", pressed, true);
-  }, []);
   return html`<div class="stop-all">
     <button type="button" class="stop" aria-keyshortcuts=${KEY} ...${useAtOnce(stop)}>
       <b>Stop all axes</b> <kbd>Esc</kbd><small>software stop, not an emergency stop</small>

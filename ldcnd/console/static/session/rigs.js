@@ -1,6 +1,6 @@
 /** What is known of every rig: descriptions by GET, latest values by the feed, and how old they are. */
 
-import { useEffect, useState } from "../html.js";
+import { useLayoutEffect, useState } from "../html.js";
 import { ask, read, rigPath } from "./api.js";
 import { feed } from "./feed.js";
 
@@ -13,6 +13,8 @@ const SILENT_AFTER_S = 3;
 const NOTHING_KNOWN = { known: false, live: false, mark: "no data", state: "unknown", alarm: "invalid", troubles: [] };
 /** Of a daemon of which no sample has come yet. */
 const CLOCK_UNKNOWN = { ns: NaN, atMs: 0 };
+/** By so much the daemon's clock may be ahead of what its news have told of it here, ns: the quickest of them took less. */
+const NEWS_TAKE_NS = 250e6;
 /** Long enough for a slow axis to count something, short enough to follow a change of velocity. */
 const SLOPE_S = 0.3;
 /** The drive's latest velocity may be older than its state. */
@@ -127,7 +129,7 @@ export class Axis {
     const { state } = this;
     if (!state?.stop_latched || state.stop_pending) return false;
     const answers = this.condition.live && state.link === "up" && state.was_read !== false;
-    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.rig.nsAt(this.#pressedMs));
+    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.rig.nsAt(this.#pressedMs) + NEWS_TAKE_NS);
   }
 
   /** Note a press that is to end its motion: nothing that was read before it shows that the axis stands. */
@@ -476,7 +478,7 @@ export function changed() {
 /** Redraw this component when something of any rig has changed. */
 export function useRigs() {
   const [, redraw] = useState(0);
-  useEffect(() => {
+  useLayoutEffect(() => {
     const watcher = () => redraw((count) => count + 1);
     watchers.add(watcher);
     return () => watchers.delete(watcher);
