@@ -49,6 +49,7 @@ class Following:
         window_counts: how far from its place a shaft may be that has settled.
         since_s: since when the shaft is where it is, in loop time; before it was seen to move, when the drive had the
             motion: its profile runs from then on, if not before.
+        asked_s: when the drive was sent the motion: its profile has not begun before.
         low: lowest position since; before it was seen to move, since the reading before its motion.
         high: highest.
         counted: the shaft was seen to move.
@@ -63,6 +64,7 @@ class Following:
         fastest_counts_per_s: of the profiles that went over into this one; 0 without one.
         there_until_s: the latest instant at which it can have been where it was first seen, in loop time.
         swings_until_s: until when it may be slowed down, and swing to a stand at its new speed, in loop time.
+        settled: its drive has told that the shaft stands where its profile has ended, and it has not moved since.
     """
 
     command_id: str
@@ -73,6 +75,7 @@ class Following:
     least_counts: float
     window_counts: float
     since_s: float
+    asked_s: float
     low: float
     high: float
     counted: bool = False
@@ -87,6 +90,7 @@ class Following:
     fastest_counts_per_s: float = 0.0
     there_until_s: float = 0.0
     swings_until_s: float = -math.inf
+    settled: bool = False
 
     @property
     def is_missed(self) -> bool:
@@ -163,10 +167,11 @@ class Following:
         position, error = reading.position_counts, reading.following_error_counts
         low, high = min(self.low, position), max(self.high, position)
         runs = reading.enabled and not reading.profile_done
-        if runs and self._has_missed_counts(reading, at_s, brakes=not at_velocity):
+        by_s = max(at_s, true_until_s)
+        if runs and self._has_missed_counts(reading, at_s, by_s, brakes=not at_velocity):
             return False
         if high - low > REST_COUNTS:
-            seen = self._seen_to_move(reading, at_s, runs=runs, brakes=not at_velocity)
+            seen = self._seen_to_move(reading, at_s, by_s, runs=runs, brakes=not at_velocity)
             return replace(seen, there_until_s=true_until_s) if self.coasts else seen
         gone = max(self.gone_counts, self._gone_counts(at_s) if runs else 0.0)
         first = error if self.error_counts is None else self.error_counts
@@ -185,11 +190,13 @@ class Following:
         elif not soon:
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
             # the loop of a shaft that is to stand where its profile has ended pulls it there, or it sticks
-            untold = error is None and self.error_counts is not None  # a drive tells it in each second reading
+            # a drive tells it in each second reading
+            untold = error is None and self.error_counts is not None and not self.settled
             behind = self.coasts and (untold or abs(error or 0) > BEHIND_SHARE * self.window_counts)
-            if gone < self.least_counts * (2 if self.counted else 1) and not behind:
+            short = gone < self.least_counts * (2 if self.counted else 1)
+            if short and not behind:
                 return True
-            given_up = at_s >= until_s
+            given_up = at_s >= until_s and not (short and untold)
             if given_up and self.faults:
                 return False
             if given_up is self.given_up and self.is_missed:
@@ -198,55 +205,58 @@ class Following:
             self, error_counts=first, gone_counts=gone, until_s=until_s, given_up=given_up, low=low, high=high
         )
 
-    def _has_missed_counts(self, reading: AxisReading, at_s: float, *, brakes: bool) -> bool:
+    def _has_missed_counts(self, reading: AxisReading, at_s: float, by_s: float, *, brakes: bool) -> bool:
         """Tell whether the encoder of a shaft that cannot stand at once has ceased to count, if only for a while."""
         position = reading.position_counts
-        if self._runs_away(reading, at_s):
+        if self._runs_away(reading, by_s):
             return True
         if at_s < self.swings_until_s:
             return False
         if max(self.high, position) - min(self.low, position) > REST_COUNTS:
-            return self._lags(position, at_s, brakes=brakes)
-        return self._stands_at_once(at_s, brakes=brakes)
+            return self._lags(position, at_s, by_s, brakes=brakes)
+        return self._stands_at_once(at_s, by_s, brakes=brakes)
 
-    def _runs_away(self, reading: AxisReading, at_s: float) -> bool:
+    def _runs_away(self, reading: AxisReading, by_s: float) -> bool:
         """Tell whether a shaft is too fast for its profiles: its loop makes up for counts that were missed."""
         fastest = self.velocity_counts_per_s
-        if not self.counted:  # its profile has begun then
-            fastest = min(fastest, self.acceleration_counts_per_s2 * (at_s - self.since_s))
+        if not self.counted:
+            fastest = min(fastest, self.acceleration_counts_per_s2 * (by_s - self.asked_s))
         fastest = max(self.fastest_counts_per_s, fastest)
         most = RUNAWAY_SHARE * (fastest + reading.velocity_resolution_counts_per_s)
         return self.coasts and abs(reading.velocity_counts_per_s) > most
 
-    def _stands_at_once(self, at_s: float, *, brakes: bool) -> bool:
+    def _stands_at_once(self, at_s: float, by_s: float, *, brakes: bool) -> bool:
         """Tell whether a shaft that cannot has come to stand: its profile has left it behind since it was seen here."""
         if not (self.coasts and self.counted):
             return False
-        stood_s, least = at_s - self.since_s, self._least_counts_per_s(at_s, brakes=brakes)
+        stood_s, least = self._since_then_s(at_s), self._least_counts_per_s(by_s, brakes=brakes)
         if not brakes:  # on average, and half of what the profile gets faster
             least += self.acceleration_counts_per_s2 * stood_s / 4
         return min(least, self.velocity_counts_per_s) * stood_s >= 2 * self.least_counts
 
-    def _lags(self, position: int, at_s: float, *, brakes: bool) -> bool:
+    def _lags(self, position: int, at_s: float, by_s: float, *, brakes: bool) -> bool:
         """Tell whether a shaft that cannot slow down at once has gone less than half of its least way since."""
-        # of a request that was held up behind its time stamp the reply is late, too
-        took_s = at_s - max(self.since_s, self.there_until_s)
+        took_s = self._since_then_s(at_s)
         if not (self.coasts and self.counted) or took_s < LAGS_S:
             return False
-        least = min(self._least_counts_per_s(at_s, brakes=brakes), self.velocity_counts_per_s) * took_s
+        least = min(self._least_counts_per_s(by_s, brakes=brakes), self.velocity_counts_per_s) * took_s
         return 2 * (abs(position - self.low) + 2 * self.least_counts) < least
 
-    def _seen_to_move(self, reading: AxisReading, at_s: float, *, runs: bool, brakes: bool) -> "Following":
+    def _since_then_s(self, at_s: float) -> float:
+        """Return for how long at least the shaft was seen where it is: a request may go later than its time stamp."""
+        return at_s - max(self.since_s, self.there_until_s)
+
+    def _seen_to_move(self, reading: AxisReading, at_s: float, by_s: float, *, runs: bool, brakes: bool) -> "Following":
         speed = max(0.0, abs(reading.velocity_counts_per_s) - reading.velocity_resolution_counts_per_s)
         if runs:  # it may have ceased to count since
-            speed = max(speed, self.speed_counts_per_s - self._braked_counts_per_s(at_s))
+            speed = max(speed, self.speed_counts_per_s - self._braked_counts_per_s(by_s))
         error, least = reading.following_error_counts, 0.0
         if self.coasts and self.counted:
             # positions are exact, where the velocity of a status packet is coarse; a new origin makes them jump
             shown = abs(reading.position_counts - self.low) / (at_s - self.since_s) if at_s > self.since_s else 0.0
             most = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
-            braked = self._braked_counts_per_s(at_s) if brakes else 0.0
-            least = max(0.0, min(shown, most) - braked, self._least_counts_per_s(at_s, brakes=brakes))
+            braked = self._braked_counts_per_s(by_s) if brakes else 0.0
+            least = max(0.0, min(shown, most) - braked, self._least_counts_per_s(by_s, brakes=brakes))
             least = min(least, self.velocity_counts_per_s)  # it may be on its way to another profile
         return Following(
             self.command_id,
@@ -257,6 +267,7 @@ class Following:
             self.least_counts,
             self.window_counts,
             at_s,
+            self.asked_s,
             low=reading.position_counts,
             high=reading.position_counts,
             counted=True,
@@ -270,12 +281,12 @@ class Following:
             swings_until_s=self.swings_until_s,
         )
 
-    def _least_counts_per_s(self, at_s: float, *, brakes: bool) -> float:
-        return self.least_counts_per_s - (self._braked_counts_per_s(at_s) if brakes else 0.0)
+    def _least_counts_per_s(self, by_s: float, *, brakes: bool) -> float:
+        return self.least_counts_per_s - (self._braked_counts_per_s(by_s) if brakes else 0.0)
 
-    def _braked_counts_per_s(self, at_s: float) -> float:
+    def _braked_counts_per_s(self, by_s: float) -> float:
         """Return by how much a profile makes the shaft slower at most since it is where it is."""
-        return BRAKES_SHARE * self.braking_counts_per_s2 * (at_s - self.since_s)
+        return BRAKES_SHARE * self.braking_counts_per_s2 * (by_s - self.since_s)
 
     def _gone_counts(self, at_s: float) -> float:
         """Return the least way of a profile that runs since the shaft is where it is."""

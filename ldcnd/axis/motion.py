@@ -532,6 +532,7 @@ class AxisMotion:
         permit.ask_to_move()
         in_motion = self.tracker.status.command is not None and not self.tracker.status.at_rest
         self.begin(permit.command_id, permit.verb, state, completion, opens_loop=opens_loop, plan=plan)
+        asked_s = self.clock.now_s()
         try:
             await permit.start()
         except (OutcomeUnknown, asyncio.CancelledError) as error:
@@ -558,7 +559,7 @@ class AxisMotion:
                 target_counts,
                 approached,
                 pace,
-                following=self._following(permit, loaded) if loaded and follows and not in_motion else None,
+                following=self._following(permit, loaded, asked_s) if loaded and follows and not in_motion else None,
                 profile=(abs(loaded.velocity_counts_per_s), loaded.acceleration_counts_per_s2) if loaded else None,
                 onwards=loaded is not None and in_motion and self._turns_towards(loaded),
             )
@@ -572,8 +573,8 @@ class AxisMotion:
         leads = motion.velocity_counts_per_s if target is None else target - reading.position_counts
         return reading.velocity_counts_per_s * leads > 0
 
-    def _following(self, permit: Permit, motion: CountsMotion) -> Following | None:
-        """Return by what the encoder is to be seen to count in the motion that a permit has loaded."""
+    def _following(self, permit: Permit, motion: CountsMotion, asked_s: float) -> Following | None:
+        """Return by what the encoder is to be seen to count in the motion that a permit has loaded and sent."""
         reading = self.tracker.reading
         if reading is None:
             return None
@@ -587,6 +588,7 @@ class AxisMotion:
             least_counts=max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
             window_counts=self.window_counts,
             since_s=self.clock.now_s(),
+            asked_s=asked_s,
             # one that is halted soon has its way behind it when it is read first
             low=begins,
             high=begins,

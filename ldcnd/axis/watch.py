@@ -66,7 +66,9 @@ def _watch_following(
         return status if seen is following else replace(status, following=seen)
     if seen and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
-        return replace(status, following=replace(following, until_s=math.inf)) if following.is_missed else status
+        if following.settled and not following.is_missed:
+            return status
+        return replace(status, following=replace(following, until_s=math.inf, settled=event.reading.enabled))
     return replace(status, following=None) if seen else _lose_encoder(status, event, faults)
 
 

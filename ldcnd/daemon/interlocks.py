@@ -205,7 +205,9 @@ class Interlocks:
         name = rule.config.name
         axis = rule.axis.config.name if rule.axis else next((each.axis for each in lacks if each.way), None)
         wanted = {output: level for output, level in levels.items() if level is not None}
-        if wanted and wanted.keys() == levels.keys():
+        if unknown := [each for each in lacks if each.because]:
+            stages = self._to_wait(unknown)  # what else is to be done only what is known tells
+        elif wanted and wanted.keys() == levels.keys():
             stages = self._to_set(self._modules[rule.config.of], wanted, axis)
         else:
             stages = self._to_hold(lacks, axis, waits=False)
@@ -253,6 +255,8 @@ class Interlocks:
         What only the machine can bring about, such as a door that is to fall shut, another output may have to bring
         about first: an output that waits for an input is written behind all others.
         """
+        if unknown := [each for each in self._forbidden(wanted) if each.because]:
+            return self._to_wait(unknown)
         levels = dict(wanted)
         for _ in self._rules:  # what one rule wants another may bind
             more = {

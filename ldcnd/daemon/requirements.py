@@ -25,7 +25,7 @@ class Lack:
     Attributes:
         of: what it is required of.
         text: how that is instead.
-        wanted: how it is required to be.
+        wanted: how it is required to be; where it is not known, what is to be so first.
         because: why it is not known, in words that are the same for all of which that is so.
         sets: the module and the levels of its output that have it hold, if writing it may.
         axis: the axis that a way out is about.
@@ -84,7 +84,7 @@ def lack_of_line(module: ModuleService, each: Requirement, now_s: float, age_s: 
     assert name is not None  # noqa: S101 - a requirement names one of the four
     of, word = f"{what} {name}", _word(what, wanted)
     if now_s - module.read_at_s > age_s:
-        return Lack(of, "is not known", f"{of} is {word}", f"module {module.name} does not answer")
+        return Lack(of, "is not known", f"module {module.name} answers", f"module {module.name} does not answer")
     value = asked.levels.get(name, module.values[name])
     if asked.watched and value is None and name in module.before:
         before, read_at_s = module.before[name]
@@ -94,8 +94,9 @@ def lack_of_line(module: ModuleService, each: Requirement, now_s: float, age_s: 
     text = "is not known" if value is None else f"is {_word(what, not wanted)}"
     if what == "input":
         return Lack(of, text, f"{of} is {word}")
-    why = module.why_unknown(name) if value is None else ""
-    return Lack(of, text, f"{of} is {word}", why, None if why else (module, {name: wanted}))
+    if value is None and (why := module.why_unknown(name)):
+        return Lack(of, text, f"{of} is known", why)
+    return Lack(of, text, f"{of} is {word}", sets=(module, {name: wanted}))
 
 
 def lack_of_axis(
@@ -116,7 +117,7 @@ def lack_of_axis(
     way: Remedy | None = None
     off = step("power", 'send power {"on": false}', on=False)
     if (each.standstill or each.below is not None) and _unproven(status):
-        if status.rest_unproven_by:
+        if status.motion_hidden_by:
             resets = "look whether it stands, then {}"
             way = Remedy(f"{{}}, {resets}", off, step("reset")) if status.energised else Remedy(resets, step("reset"))
         elif status.unseen is Unseen.UNDER_POWER:
@@ -153,8 +154,10 @@ def _is_instead(axis: AxisService, each: Requirement, now_s: float, age_s: float
 
 def _unproven(status: AxisStatus) -> str:
     """Return why readings do not prove how fast a shaft is; empty where they do."""
-    if fault := status.rest_unproven_by:
+    if fault := status.motion_hidden_by:
         return f"may move: after fault {fault} its encoder does not prove that it stands"
+    if status.rest_unproven_by:
+        return "may move: its encoder is yet to show that it has followed its motion"
     if status.unseen is Unseen.UNDER_POWER:
         return "may turn: its encoder is yet to count in a motion of this daemon"
     if status.unseen:

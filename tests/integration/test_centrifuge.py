@@ -803,6 +803,29 @@ def test_what_is_named_leads_out_of_a_bolt_that_has_sprung_in_beside_an_open_doo
     assert operated(springs) == []
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_why_names_no_output_to_write_beside_a_rotor_that_a_killed_daemon_has_left_before_its_cabinet_is_read(seed):
+    async def program():
+        async with simulated_rig(CENTRIFUGE, seed=seed) as rig:
+            with suppress(LeaseExpired):  # with the daemon
+                async with rig.client.control("rotor", client="test") as rotor:
+                    await (await made_ready(rig, rotor)).spin()
+                    await rig.kill_daemon()
+                    await asyncio.sleep(0.3)
+                    await rig.start_daemon()
+            named = []
+            async with rig.client.watch("rotor") as rotor:
+                for _ in range(60):
+                    with suppress(LdcndError):
+                        named += [each.remedy for each in (await rotor.why()).causes]
+                    await asyncio.sleep(0.005)
+            return named
+
+    named = run(program())
+    assert any("module cabinet answers" in each for each in named)
+    assert [each for each in named if "set output" in each] == []
+
+
 @pytest.mark.parametrize("open_s", [0.7, 3.0])
 def test_the_steps_that_why_names_lead_out_of_a_daemon_that_was_killed_beside_an_open_door(open_s):
     (line,) = CENTRIFUGE.bus
@@ -1487,6 +1510,21 @@ def test_a_lock_opens_as_soon_as_a_healthy_rotor_has_reached_its_bucket(bucket):
         await (await machine.rotor.move_velocity(5.0, acceleration=10, duration_s=2)).done()
         for place in (bucket, bucket + 0.2, bucket + 0.35, bucket):
             await (await machine.rotor.move_absolute(place)).done()
+            await machine.high("unlock")
+            await machine.sees(locked=False)
+            await machine.low("unlock")
+            await machine.sees(locked=True)
+
+    alone(unlocks)
+
+
+@pytest.mark.parametrize("verb", ["move", "home"])
+@pytest.mark.parametrize("later_s", [0.03, 0.06, 0.09, 0.12])
+def test_a_lock_opens_at_whichever_instant_behind_a_motion_of_a_healthy_rotor(verb, later_s):
+    async def unlocks(machine):
+        for number in range(6):
+            await (await (machine.rotor.home() if verb == "home" else machine.rotor.move_relative(0.1))).done()
+            await asyncio.sleep(later_s + 0.007 * number)
             await machine.high("unlock")
             await machine.sees(locked=False)
             await machine.low("unlock")
