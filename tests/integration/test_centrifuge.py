@@ -581,7 +581,7 @@ def test_the_steps_that_why_names_lead_out_of_a_loss_in_a_spin(lost, for_s):
 @pytest.mark.parametrize("off", [False, True])
 @pytest.mark.parametrize(("speed", "dead_s"), [(2.0, 0.3), (2.0, 0.6), (5.0, 0.85), (10.0, 0.45), (25.0, 0.1)])
 @pytest.mark.parametrize("then", [None, "cable", "silence", "noise", "power"])
-@pytest.mark.sweep(3)
+@pytest.mark.sweep(7)
 def test_a_daemon_that_begins_beside_a_rotor_whose_encoder_has_died_opens_no_lock(start, off, speed, dead_s, then):
     (line,) = CENTRIFUGE.bus
     config = CENTRIFUGE.model_copy(

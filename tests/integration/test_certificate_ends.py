@@ -84,6 +84,7 @@ def test_each_face_tells_of_a_certificate_that_ends_soon(tmp_path: Path, monkeyp
     ] == [True]
 
 
+@pytest.mark.long
 def test_a_daemon_tells_that_its_certificate_has_ended_while_it_ran(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
