@@ -177,7 +177,7 @@ class Following:
         first = error if self.error_counts is None else self.error_counts
         if first is not None and error is not None:
             gone = max(gone, abs(error) - abs(first))
-        until_s, given_up = math.inf, False
+        until_s, given_up, behind = math.inf, False, False
         if not reading.enabled:  # nothing pushes a shaft any more that has never moved; another may stop at once
             return self.counted or gone < self.least_counts
         soon = 0 < (at_s - self.since_s) * self.speed_counts_per_s < 4 * REST_COUNTS  # it had no time to go on
@@ -189,9 +189,9 @@ class Following:
                 return False
         elif not soon:
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
-            # the loop of a shaft that is to stand where its profile has ended pulls it there, or it sticks
             # a drive tells it in each second reading
             untold = error is None and self.error_counts is not None and not self.settled
+            # the loop of a shaft that is to stand where its profile has ended pulls it there, or it sticks
             behind = self.coasts and (untold or abs(error or 0) > BEHIND_SHARE * self.window_counts)
             short = gone < self.least_counts * (2 if self.counted else 1)
             if short and not behind:
@@ -202,7 +202,14 @@ class Following:
             if given_up is self.given_up and self.is_missed:
                 return self
         return replace(
-            self, error_counts=first, gone_counts=gone, until_s=until_s, given_up=given_up, low=low, high=high
+            self,
+            error_counts=first,
+            gone_counts=gone,
+            until_s=until_s,
+            given_up=given_up,
+            low=low,
+            high=high,
+            settled=self.settled and not behind,
         )
 
     def _has_missed_counts(self, reading: AxisReading, at_s: float, by_s: float, *, brakes: bool) -> bool:
