@@ -1,5 +1,6 @@
 """What an operator does in the browser; each result is asked of the daemon, too."""
 
+import asyncio
 import re
 
 import pytest
@@ -134,6 +135,28 @@ async def test_the_key_stops_and_an_address_counts_from_the_first_moment_of_a_pa
         await desk.open("rig")
         await expect(desk.page.get_by_role("heading", level=1)).to_contain_text("x")
         await house.sim.until("x", lambda state: state.stop_latched)
+    await house.sim.quiet("x", "y", "z", "c")
+    await house.mixed.quiet("x")
+
+
+async def test_the_key_stops_while_a_page_is_still_on_its_way(house):
+    """As over a slow network: the page has come, and its scripts have not."""
+    await house.sim.quiet("x")
+    arrive = asyncio.Event()
+
+    async def late(route):
+        await arrive.wait()
+        await route.continue_()
+
+    async with house.desk() as desk:
+        await desk.page.goto("about:blank")
+        await desk.page.route("**/main.js", late)
+        await desk.page.goto(f"{desk.url}/#/axis/sim/x", wait_until="commit")
+        await desk.page.wait_for_function("() => window.keepEarlyPress && document.body")
+        await desk.page.keyboard.press("Escape")
+        arrive.set()
+        await house.sim.until("x", lambda state: state.stop_latched)
+        await expect(desk.page.locator(".stops").filter(has_text="sim: ")).to_contain_text("latched: x")
     await house.sim.quiet("x", "y", "z", "c")
     await house.mixed.quiet("x")
 

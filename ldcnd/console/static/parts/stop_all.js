@@ -40,7 +40,9 @@ async function stop() {
   }
 }
 
-// from the first moment on, not only once something is drawn
+// from the first moment on, not only once something is drawn; what came before this module `early.js` has kept
+removeEventListener("keydown", window.keepEarlyPress, true);
+if (window.keepEarlyPress?.came) stop();
 addEventListener("keydown", (event) => {
   if (event.key !== KEY || event.repeat) return;
   event.preventDefault();
