@@ -33,6 +33,8 @@ from ldcnd.contract.samples import AxisState, FaultEntry, LinkState, Moving, Uns
 from ldcnd.contract.units import Dimension
 from ldcnd.drives.driver import QuietDrive
 
+_POWER_ON = step("power", 'send power {"on": true}', on=True)
+
 
 def check_reachable(axis: AxisTracker) -> None:
     """Refuse when the drive does not answer, or is not known to be the one that is configured."""
@@ -49,7 +51,7 @@ def check_not_latched(axis: AxisTracker) -> None:
     if axis.status.stop:
         check_stop_confirmed(axis)
     if axis.status.stop_latched:
-        raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy=Remedy("{}", step("reset")))
+        raise StopLatched(f"axis {axis.name}: a stop is latched", axis=axis.name, remedy=_reset(axis.status))
 
 
 def check_stop_confirmed(axis: AxisTracker) -> None:
@@ -84,7 +86,7 @@ def check_enabled(axis: AxisTracker) -> None:
             f"axis {axis.name} is disabled",
             axis=axis.name,
             value=AxisState.DISABLED,
-            remedy=Remedy("{}", step("power", 'send power {"on": true}', on=True)),
+            remedy=Remedy(f"{'wait until it stands, then ' if status.coasts else ''}{{}}", _POWER_ON),
         )
 
 
@@ -118,13 +120,13 @@ def check_does_not_coast(axis: AxisTracker) -> None:
             f" counted since; it stands once it has not counted for {axis.status.rest.unseen_s:g} s",
             axis=axis.name,
             limit=axis.status.rest.unseen_s,
-            remedy=Remedy("wait until it stands, then {}", step("power", 'send power {"on": true}', on=True)),
+            remedy=Remedy("wait until it stands, then {}", _POWER_ON),
         )
     if axis.status.coasts:
         raise WrongState(
             f"axis {axis.name} turns with its motor off: its drive would hold it at once, whatever its speed",
             axis=axis.name,
-            remedy=Remedy("wait until it stands, then {}", step("power", 'send power {"on": true}', on=True)),
+            remedy=Remedy("wait until it stands, then {}", _POWER_ON),
         )
 
 
@@ -230,16 +232,26 @@ def check_speed(axis: AxisTracker) -> None:
 def check_not_forced(axis: AxisTracker) -> None:
     """Refuse to reset a faulted axis whose motor has voltage and turns, or may, whatever the state says."""
     status = axis.status
-    # a shaft that was only not seen to count may coast: behind the reset `coast_s` tells when it stands
-    stands = status.moving is Moving.NO or (status.unseen and status.at_rest and not status.rest_unproven_by)
-    if status.state is AxisState.ERROR_STOP and status.energised and not stands:
-        waits = Remedy("{}, wait until it stands, then {}", step("halt"), step("reset"))
+    if _is_forced(status):
         raise WrongState(
             f"axis {axis.name} still moves, or may: a reset would switch its motor off at speed",
             axis=axis.name,
             value=axis.status.moving.value,
-            remedy=_way_out(axis.status) if axis.status.motion_hidden_by else waits,
+            remedy=_way_out(axis.status) if axis.status.motion_hidden_by else _reset(status),
         )
+
+
+def _is_forced(status: AxisStatus) -> bool:
+    # a shaft that was only not seen to count may coast: behind the reset `coast_s` tells when it stands
+    stands = status.moving is Moving.NO or (status.unseen and status.at_rest and not status.rest_unproven_by)
+    return status.state is AxisState.ERROR_STOP and status.energised and not stands
+
+
+def _reset(status: AxisStatus) -> Remedy:
+    """Return the step that clears a latch or error_stop, behind those without which it would be refused."""
+    if _is_forced(status):
+        return Remedy("{}, wait until it stands, then {}", step("halt"), step("reset"))
+    return Remedy(f"{'wait until it stands, then ' if status.state.is_motion else ''}{{}}", step("reset"))
 
 
 def check_has_gains(drive: QuietDrive) -> None:
@@ -272,7 +284,7 @@ def error_stop(axis: AxisTracker, said: Collection[FaultEntry] = ()) -> WrongSta
     """Return the refusal of an axis in error_stop, with its causes but for those that were said before."""
     status, first, in_error = axis.status, axis.status.first_fault, f"axis {axis.name} is in error stop"
     if first and not status.active_faults and is_over(first, (), status.link):
-        text, remedy = f"{in_error} because of {over_in_words(first)}", Remedy("{}", step("reset"))
+        text, remedy = f"{in_error} because of {over_in_words(first)}", _reset(status)
     else:
         causes = _said(axis, said) or ("" if said else "a command ended badly")
         text, remedy = (

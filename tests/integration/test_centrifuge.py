@@ -1531,3 +1531,44 @@ def test_a_lock_opens_at_whichever_instant_behind_a_motion_of_a_healthy_rotor(ve
             await machine.sees(locked=True)
 
     alone(unlocks)
+
+
+@pytest.mark.parametrize("ended", ["stop", "unplugged"])
+def test_the_reset_that_why_names_beside_a_rotor_that_turns_comes_behind_what_brings_it_to_rest(ended):
+    async def named(machine):
+        await machine.spin()
+        if ended == "stop":
+            await machine.rotor.stop()
+            await asyncio.sleep(0.5)
+        else:
+            pulled = machine.rig.faults.unplug()
+            await asyncio.sleep(6.0)
+            pulled.end()
+            await asyncio.sleep(2.0)
+        assert machine.speed > 1.0
+        first, *_ = (await machine.rotor.why()).causes
+        return first.remedy
+
+    waits = "wait until it stands, then send reset"
+    assert alone(named) == (waits if ended == "stop" else f"send halt, {waits}")
+
+
+def test_why_names_power_behind_what_a_row_wants_of_a_rotor_that_may_coast():
+    async def program():
+        async with simulated_rig(CENTRIFUGE) as rig:
+            async with rig.client.control("rotor", client="test") as rotor:
+                machine = await made_ready(rig, rotor)
+                await machine.high("unlock")
+                await machine.sees(locked=False)
+                await machine.high("door")
+                await machine.sees(door_open=True)
+            await rig.kill_daemon()
+            await asyncio.sleep(2.0)
+            await rig.start_daemon()
+            await asyncio.sleep(2.0)
+            async with rig.client.watch("rotor") as rotor:
+                return [each.code for each in (await rotor.why()).causes]
+
+    first, *others = run(program())
+    assert first == "interlock_violated"
+    assert "wrong_state" in others
