@@ -47,6 +47,8 @@ STRANGER_PAGE = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>ldcnd console</title>
 <link rel="stylesheet" href="/static/style/base.css"><script src="/static/again.js"></script></head>
 <body><main><h1>This browser is not let in yet</h1>
+<p><strong>This page stops nothing</strong>: use <code>ldcnd stop</code>, a page that is open, or the emergency stop
+of the machine.</p>
 <p>Open the console with the link that <code>ldcnd console</code> prints when it starts. A link works once, within ten
 minutes. For another one, press <i>Let another browser in</i> on a page that is open, or send the console's process the
 signal USR1: it then prints one.</p>
