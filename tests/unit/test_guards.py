@@ -4,6 +4,7 @@ import pytest
 
 from ldcnd.axis import guards
 from ldcnd.axis.faults import STOP_UNCONFIRMED, entry_of
+from ldcnd.axis.rest import RestEvidence
 from ldcnd.axis.status import OpenStop
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import Verb
@@ -70,7 +71,7 @@ SILENT = FaultEntry(code="link_lost", text="the drive does not answer", since=0,
 
 
 def test_a_fault_that_is_over_is_not_said_to_be_there():
-    answers_again = ready(state=AxisState.ERROR_STOP, first_fault=SILENT)
+    answers_again = ready(state=AxisState.ERROR_STOP, first_fault=SILENT, rest=RestEvidence(rests=True))
 
     with pytest.raises(WrongState, match="in error stop because of link lost, which is over") as refusal:
         guards.check(Verb.MOVE_RELATIVE, answers_again)
