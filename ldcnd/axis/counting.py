@@ -64,6 +64,7 @@ class Following:
         fastest_counts_per_s: of the profiles that went over into this one; 0 without one.
         there_until_s: the latest instant at which it can have been where it was first seen, in loop time.
         swings_until_s: until when it may be slowed down, and swing to a stand at its new speed, in loop time.
+        held_counts: how far behind its end friction may hold a shaft.
         settled: its drive has told that the shaft stands where its profile has ended, and it has not moved since.
     """
 
@@ -90,6 +91,7 @@ class Following:
     fastest_counts_per_s: float = 0.0
     there_until_s: float = 0.0
     swings_until_s: float = -math.inf
+    held_counts: float = math.inf
     settled: bool = False
 
     @property
@@ -192,7 +194,8 @@ class Following:
             # a drive tells it in each second reading
             untold = error is None and self.error_counts is not None and not self.settled
             # the loop of a shaft that is to stand where its profile has ended pulls it there, or it sticks
-            behind = self.coasts and (untold or abs(error or 0) > BEHIND_SHARE * self.window_counts)
+            told = self.coasts and self.held_counts < math.inf
+            behind = told and (untold or abs(error or 0) > self.held_counts)
             short = gone < self.least_counts * (2 if self.counted else 1)
             if short and not behind:
                 return True
@@ -286,6 +289,7 @@ class Following:
             least_counts_per_s=least,
             fastest_counts_per_s=self.fastest_counts_per_s,
             swings_until_s=self.swings_until_s,
+            held_counts=self.held_counts,
         )
 
     def _least_counts_per_s(self, by_s: float, *, brakes: bool) -> float:

@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.counting import Following
+from ldcnd.axis.counting import BEHIND_SHARE, Following
 from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
 from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
@@ -595,7 +595,16 @@ class AxisMotion:
             # what a search finds makes a reference: of an encoder that does not count it is none
             faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
             coasts=self.config.coast_s is not None,
+            held_counts=BEHIND_SHARE * self.window_counts if self._pulls() else math.inf,
         )
+
+    def _pulls(self) -> bool:
+        """Tell whether the loop pulls its shaft into the settle window, whatever friction holds it: it integrates.
+
+        Of other gains that a client has set nothing tells; those of the configuration are made for the window.
+        """
+        gains, sets = self.driver.wanted_gains, (self.config.gains, *self.config.gain_sets.values())
+        return gains is not None and (bool(gains.ki and gains.il) or gains in [each.registers for each in sets if each])
 
     def pace(self, permit: Permit) -> Pace | None:
         """Return how fast the axis may be whose motion was given the speed of a permit; None if that is not known."""
