@@ -60,7 +60,7 @@ def set_io(
 
 
 def _shown(reply: IoReply) -> tuple[IoReply, str]:
-    # the level of a pin is not the value of an input, which may be inverted and debounced: `axis watch` shows that
+    # the level of a pin is not the value of an input, which may be inverted and debounced: topics have that
     names = {line: name for name, line in reply.names.items() if line in (reply.outputs or ())}
     known = None if reply.outputs is None else ", ".join(names.get(line, str(line)) for line in reply.outputs)
     outputs = "not known" if known is None else known or "none"

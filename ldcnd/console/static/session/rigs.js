@@ -13,8 +13,8 @@ const SILENT_AFTER_S = 3;
 const NOTHING_KNOWN = { known: false, live: false, mark: "no data", state: "unknown", alarm: "invalid", troubles: [] };
 /** Of a daemon of which no sample has come yet. */
 const CLOCK_UNKNOWN = { ns: NaN, atMs: 0 };
-/** By so much the daemon's clock may be ahead of what its news have told of it here, ns: the quickest of them took less. */
-const NEWS_TAKE_NS = 250e6;
+/** How far the daemon's clock may be ahead of `nsAt`, ns: longer than the quickest sample takes to this page. */
+const CLOCK_AHEAD_NS = 250e6;
 /** Long enough for a slow axis to count something, short enough to follow a change of velocity. */
 const SLOPE_S = 0.3;
 /** The drive's latest velocity may be older than its state. */
@@ -129,7 +129,7 @@ export class Axis {
     const { state } = this;
     if (!state?.stop_latched || state.stop_pending) return false;
     const answers = this.condition.live && state.link === "up" && state.was_read !== false;
-    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.rig.nsAt(this.#pressedMs) + NEWS_TAKE_NS);
+    return answers && state.moving === "no" && this.#readNs > Math.max(this.#latchedNs, this.rig.nsAt(this.#pressedMs) + CLOCK_AHEAD_NS);
   }
 
   /** Note a press that is to end its motion: nothing that was read before it shows that the axis stands. */
@@ -379,7 +379,7 @@ export class Rig {
     else if (root === "meta" && name === "health") this.bus(rest[0]).report(sample);
   }
 
-  /** The time by the daemon's own clock, as late as its news are here: that of another host may differ.
+  /** The time by the daemon's own clock, as late as its samples are here: that of another host may differ.
    *
    * NaN until the first sample has told it: what is compared with it is neither before nor after.
    */
