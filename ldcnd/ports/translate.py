@@ -118,7 +118,9 @@ class GuestServo:
 
     def __init__(self, drive: LdcnAxis, status: Callable[[], StatusView], client: str) -> None:
         self.drive, self._status, self._client = drive, status, client
-        self.zero = self._home_zero = 0  # a home position keeps its number when the counter gets another zero
+        # a home position keeps its number when the counter gets another zero, and when the next search begins
+        self.zero = self._home_zero = self._search_zero = 0
+        self._home_counts: int | None = None  # as the drive showed it last
         self._has_home = True  # its home register is 0 from a Hard Reset until its next search is over
         self.homing = ""
         self.restart()
@@ -140,12 +142,16 @@ class GuestServo:
 
     def home(self, wire_counts: int) -> int:
         """Return the guest's home register for that of the drive."""
+        if self.homing and self._home_counts not in (None, wire_counts):  # it was captured
+            self._has_home, self._home_zero = True, self._search_zero
         if self.homing and not self._status().is_at(self.homing):
             self._home_is_over()
+        self._home_counts = wire_counts
         return self._shown(wire_counts, self._home_zero) if self._has_home else 0
 
     def _home_is_over(self) -> None:
-        self._has_home = self._has_home or bool(self.homing)
+        if self.homing:
+            self._has_home, self._home_zero = True, self._search_zero
         self.homing = ""
 
     def counter(self, wire_counts: int) -> int:
@@ -165,7 +171,7 @@ class GuestServo:
         self._home_is_over()
         self.running = ""
         if isinstance(command, Home):
-            self.homing, self.armed, self._home_zero = command_id, _NO_HOMING, self.zero
+            self.homing, self.armed, self._search_zero = command_id, _NO_HOMING, self.zero
         if isinstance(command, Home | MoveVelocity) and self._registers.mode is ProfileMode.VELOCITY:
             self.running = command_id
             self.slews_at_s = now_s + abs(command.velocity or 0.0) / (command.acceleration or math.inf)

@@ -72,7 +72,8 @@ GAIN_BYTES = (
     *(GAINS["ol"], 0, *GAINS["el"].to_bytes(2, "little"), 1, 0, 1),
 )
 NOP = servo(CommandCode.NO_OPERATION)
-PLACE = StatusItem.POSITION | StatusItem.HOME
+HOME = StatusItem.HOME
+PLACE = StatusItem.POSITION | HOME
 
 
 def places(when: str) -> Row:
@@ -114,6 +115,11 @@ def rows(profile: Profile) -> tuple[Row, ...]:
         places("after the search"),
         Row("Reset Position to the home position", servo(CommandCode.RESET_POSITION, 1)),
         places("after Reset Position"),
+        Row("Reset Position, away from home", servo(CommandCode.RESET_POSITION)),
+        Row("Set Homing Mode, once more", servo(CommandCode.SET_HOMING_MODE, 0x28)),
+        Row("Load Trajectory, the second search", load(0xB6, speed=0.5)),
+        Row("Read Status, home, in the search", servo(CommandCode.READ_STATUS, int(HOME)), items=HOME, then_s=6),
+        places("after the second search"),
         Row("Save Current Position as Home", servo(CommandCode.SAVE_CURRENT_POSITION_AS_HOME)),
         Row("I/O Control", servo(CommandCode.IO_CONTROL, 0)),
         Row("Add Path Points", servo(CommandCode.ADD_PATH_POINTS, 0, 0, 0, 0)),
