@@ -66,7 +66,7 @@ dist-check: dist
 	$(MAKE) --no-print-directory dist SOURCE=build/again OUT=build/again/dist
 	diff $(OUT)/SHA256SUMS build/again/dist/SHA256SUMS
 
-# the check list of a release, in hours: everything that is checked before a tag, with times; ARGS=--help
+# the check list of a release, in two hours: everything that is checked before a tag, with times; ARGS=--help
 release: .venv/ready
 	$(PY) -m tools.release $(ARGS)
 
@@ -74,10 +74,11 @@ release: .venv/ready
 test-drivers: .venv/ready
 	$(PY) -m pytest -m guest tests/guest
 
-# properties on cases that were never tried, for as long as an hour, and what takes minutes
+# properties on cases that were never tried, for as long as an hour, and what takes minutes; a day, with SHARE=0.02 half an
+# hour: so much of the rows of each test, others each time
 soak: .venv/ready
 	$(PY) -m pytest tests/property tests/fuzz -n 2 --timeout 3600 --hypothesis-profile new
-	$(PY) -m pytest -m soak -n 2 --timeout 3600
+	$(PY) -m pytest -m soak -n 2 --timeout 3600 $(if $(SHARE),--share $(SHARE))
 
 # other people's clients, unmodified, in an environment of their own: Bluesky, EPICS, SECoP, ROS 2; minutes
 test-edges: .venv-edges/ready

@@ -2,10 +2,11 @@
 
 import asyncio
 import gc
+import random
 import re
 import signal
 import sys
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import AsyncIterator, Callable, Mapping
 from pathlib import Path
 
@@ -14,6 +15,7 @@ import structlog
 from hypothesis import settings
 from pytest_asyncio import is_async_test
 from structlog._config import BoundLoggerLazyProxy
+from xdist.workermanage import WorkerController
 
 from ldcnd.testing.jumping_loop import JumpingLoop
 
@@ -24,10 +26,29 @@ settings.register_profile("new", deadline=None, print_blob=True)
 settings.load_profile("same")
 
 
-def pytest_configure() -> None:
-    """Let programs that tests start take an interrupt, also where the tests themselves run in the background."""
+def pytest_configure(config: pytest.Config) -> None:
+    """Let programs that tests start take an interrupt, also where the tests themselves run in the background.
+
+    All processes of a run draw the same share of the soak.
+    """
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
+    if hasattr(config, "workerinput"):
+        config.option.draw = config.workerinput["draw"]
+    elif config.option.draw is None:
+        config.option.draw = random.randrange(1_000_000)
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_configure_node(node: WorkerController) -> None:
+    """Have a further process draw what this one draws."""
+    node.workerinput["draw"] = node.config.option.draw
+
+
+def pytest_report_header(config: pytest.Config) -> list[str]:
+    """Say how to draw the same share of the soak once more."""
+    share, draw = config.option.share, config.option.draw
+    return [f"soak: --share {share:g} --draw {draw}"] if share < 1 else []
 
 
 def kept_here() -> tuple[tuple[str, int], ...]:
@@ -54,6 +75,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     """Let soak tests begin at another seed: `pytest -m soak tests/property --from 5000 --count 1000 -n 2`."""
     parser.addoption("--from", type=int, default=1000, help="first seed of the soak tests that take `seeds`")
     parser.addoption("--count", type=int, default=1000, help="how many seeds")
+    parser.addoption(
+        "--share", type=float, default=1.0, help="take so much of the rows of each soak test, at least one"
+    )
+    parser.addoption("--draw", type=int, help="which rows; others in each run if missing")
 
 
 SEEDS_OF_A_TEST = 250
@@ -104,11 +129,12 @@ def pytest_asyncio_loop_factories(
 
 
 @pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark as long what is left out of a sweep, before tests are chosen by their marks.
 
     Have every test that runs on a loop looked at; a loop for each of the thousands of others costs ten seconds.
     """
+    take_share_of_soak(config, items)
     rows = Counter[tuple[Path, str]]()
     for item in items:
         if (sweep := item.get_closest_marker("sweep")) and not item.get_closest_marker("soak"):
@@ -118,6 +144,21 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             rows[function] += 1
         if is_async_test(item) and no_task_is_left.__name__ not in item.fixturenames:
             item.fixturenames.insert(0, no_task_is_left.__name__)
+
+
+def take_share_of_soak(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave some rows of each soak test, drawn by `--draw`."""
+    rows = defaultdict[str, list[pytest.Item]](list)
+    for item in items:
+        if item.get_closest_marker("soak"):
+            rows[item.nodeid.partition("[")[0]].append(item)
+    left = set[pytest.Item]()
+    for test, its in rows.items():
+        taken = max(1, round(config.option.share * len(its)))
+        left.update(set(its).difference(random.Random(f"{config.option.draw} {test}").sample(its, taken)))
+    if left:
+        config.hook.pytest_deselected(items=list(left))
+        items[:] = [item for item in items if item not in left]
 
 
 def pytest_collection_finish() -> None:

@@ -555,6 +555,20 @@ def test_a_healthy_rotor_that_is_stopped_at_speed_has_no_fault(rpm, ended):
     assert not alone(stops)
 
 
+def test_a_healthy_rotor_has_no_fault_that_the_gains_of_a_client_leave_where_friction_holds_it():
+    async def stops(machine):
+        await machine.rotor.set_gains(kp=5, kd=100, ki=0, il=0, ol=253, el=16000, gain_set="spin")
+        await machine.rotor.move_velocity(5.0, acceleration=10, duration_s=60)
+        await machine.rig.until(lambda: machine.speed > 4.9)
+        await machine.rotor.halt()
+        await machine.rig.until(lambda: machine.rotor.state.sample.moving is Moving.NO)
+        await asyncio.sleep(3.0)
+        faults = await machine.rig.client.client.last("rotor", "fault")
+        return faults.active, machine.rotor.state.sample.referenced
+
+    assert alone(stops) == ((), True)
+
+
 @pytest.mark.parametrize("lost", ["cable_cut", "mute", "power_loss"])
 @pytest.mark.parametrize("for_s", [0.5, 3.0])
 @pytest.mark.sweep(2)
@@ -1168,6 +1182,7 @@ def test_the_command_line_shows_who_wrote_outputs(monkeypatch):
 
     assert codes == [0, 0, 2]
     assert re.search(r"cabinet: .*\bpin=low .*\bunlock=high\b.*; outputs: (\w+, )*unlock\b", now)
+    assert re.search(r"cabinet: 1=.* 3=.* 5=", now), "the level of a pin passes for the value of an input"
     assert f"cabinet  set_io           done       by {getpass.getuser()} (ldcnd)" in shown
     assert "unlock high, door_ajar input" in shown or "unlock high, line 12 input" in shown
 

@@ -282,6 +282,6 @@ def test_a_lock_is_not_released_by_the_speed_of_a_slow_motion_that_has_just_repl
 
 @pytest.mark.soak
 @pytest.mark.timeout(3600 * 6)
-@pytest.mark.parametrize("batch", range(20))
+@pytest.mark.parametrize("batch", range(200))
 def test_no_history_ever_opens_the_door_of_a_fast_rotor_or_writes_an_output_that_nobody_wrote(batch):
-    live_through(range(1000 * batch, 1000 * (batch + 1)))
+    live_through(range(100 * batch, 100 * (batch + 1)))

@@ -291,10 +291,10 @@ def test_no_module_gets_the_address_of_another_place_on_a_chain_with_more_module
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("first", range(0, 20_000, 500))
+@pytest.mark.parametrize("first", range(0, 20_000, 100))
 def test_the_same_in_histories_without_end(first: int) -> None:
-    print(f"seeds {first} to {first + 499}")
-    assert flaws_of(range(first, first + 500)) == []
+    print(f"seeds {first} to {first + 99}")
+    assert flaws_of(range(first, first + 100)) == []
 
 
 class CutShort:
@@ -370,6 +370,6 @@ def test_a_line_whose_bring_up_was_cut_short_is_taken_over_or_says_what_to_do() 
 
 
 @pytest.mark.soak
-@pytest.mark.parametrize("first", range(0, 4000, 500))
+@pytest.mark.parametrize("first", range(0, 4000, 100))
 def test_the_same_at_more_instants(first: int) -> None:
-    assert cut_short(range(first, first + 500)) == []
+    assert cut_short(range(first, first + 100)) == []
