@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from ldcnd.axis.counting import Following
 from ldcnd.axis.course import Pace
+from ldcnd.axis.following import Following
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, LatchedBy, SoftLimits, Unsure
 from ldcnd.contract.commands import Verb

@@ -10,9 +10,9 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, replace
 
 from ldcnd.axis.clock import Clock
-from ldcnd.axis.counting import BEHIND_SHARE, Following
 from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
+from ldcnd.axis.following import Following, Leeway, RunningProfile, Sighting
 from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
 from ldcnd.axis.permit import Permit
 from ldcnd.axis.reference import ReferenceKeeper
@@ -38,6 +38,8 @@ from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, QuietDrive, StopMode
 
+BEHIND_SHARE = 1.5
+"""Most by which friction holds a shaft behind the end of its profile, as a multiple of its settle window."""
 COUNTER_SHARE = 0.99
 """Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
 LATENCY_S = 0.2
@@ -579,23 +581,25 @@ class AxisMotion:
         if reading is None:
             return None
         target, begins = motion.target_counts, reading.position_counts
+        rate = motion.acceleration_counts_per_s2
         return Following(
             permit.command_id,
-            abs(motion.velocity_counts_per_s),
-            motion.acceleration_counts_per_s2,
-            motion.acceleration_counts_per_s2,
-            way_counts=math.inf if target is None else abs(target - begins),
-            least_counts=max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
-            window_counts=self.window_counts,
-            since_s=self.clock.now_s(),
-            asked_s=asked_s,
+            RunningProfile(
+                abs(motion.velocity_counts_per_s),
+                rate,
+                rate,
+                way_counts=math.inf if target is None else abs(target - begins),
+                asked_s=asked_s,
+            ),
+            Leeway(
+                max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
+                held_counts=BEHIND_SHARE * self.window_counts if self._pulls() else math.inf,
+                # what a search finds makes a reference: of an encoder that does not count it is none
+                faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
+                coasts=self.config.coast_s is not None,
+            ),
             # one that is halted soon has its way behind it when it is read first
-            low=begins,
-            high=begins,
-            # what a search finds makes a reference: of an encoder that does not count it is none
-            faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
-            coasts=self.config.coast_s is not None,
-            held_counts=BEHIND_SHARE * self.window_counts if self._pulls() else math.inf,
+            Sighting(self.clock.now_s(), 0.0, low=begins, high=begins),
         )
 
     def _pulls(self) -> bool:

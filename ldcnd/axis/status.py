@@ -11,9 +11,10 @@ from enum import Enum
 from operator import attrgetter
 from typing import Any
 
-from ldcnd.axis.counting import BRAKES_SHARE, Coast, Following
+from ldcnd.axis.coast import Coast
 from ldcnd.axis.course import Braking, Pace, Way
 from ldcnd.axis.faults import NOT_FOLLOWED, READINGS_CONTRADICT, REPLIES_UNUSABLE
+from ldcnd.axis.following import BRAKES_SHARE, Following
 from ldcnd.axis.rest import NOTHING_SEEN, RestEvidence, SettleProgress, Settling, window_counts
 from ldcnd.axis.scale import AxisScale
 from ldcnd.contract.commands import Verb

@@ -486,7 +486,7 @@ def _acknowledge_stop(status: AxisStatus, event: StopAcknowledged) -> AxisStatus
     braking = Braking(event.mode, event.now_s, event.deceleration_counts_per_s2)
     # a profile that ends at once has no way in which the shaft was to be seen to move
     following = status.following
-    if event.mode is StopMode.ABRUPT and not (following and following.gone_counts >= 4 * following.least_counts):
+    if event.mode is StopMode.ABRUPT and not (following and following.gone_counts >= 4 * following.leeway.least_counts):
         following = None
     rest, coast = status.rest, status.coast
     if event.mode is StopMode.ABRUPT:

@@ -1,16 +1,17 @@
 """What a reading shows of what a drive was told: whether it brakes, counts, and goes where it was sent. Pure.
 
-Each takes a status and a reading, and returns the status behind it; what is compared are the values in `course` and
-`counting`.
+Each takes a status and a reading, and returns the status behind it; what is compared are the values in `course`,
+`following` and `coast`.
 """
 
 import math
 from dataclasses import replace
 
-from ldcnd.axis.counting import BRAKES_SHARE, Coast, Following
+from ldcnd.axis.coast import Coast
 from ldcnd.axis.course import Braking, Pace, Way
 from ldcnd.axis.events import MotionStarted, ReadingTaken, StopUnconfirmed
 from ldcnd.axis.faults import NOT_FOLLOWED, STOOD_AT_ONCE
+from ldcnd.axis.following import BRAKES_SHARE, Following
 from ldcnd.axis.outcome import changed, fail, keep_stop, own_and, place_lost, with_faults
 from ldcnd.axis.status import AxisStatus
 from ldcnd.contract.commands import Verb
@@ -112,7 +113,7 @@ def _braking_counts_per_s2(status: AxisStatus) -> float | None:
         return None
     if command and (command.opens_loop or command.verb is Verb.HOME):
         return None
-    return min(most, BRAKES_SHARE * following.braking_counts_per_s2) if most and following else most
+    return min(most, BRAKES_SHARE * following.profile.braking_counts_per_s2) if most and following else most
 
 
 def let_go(status: AxisStatus, at_s: float) -> Coast | None:
@@ -130,9 +131,9 @@ def _is_at_velocity(status: AxisStatus, following: Following, at_s: float) -> bo
         command is not None
         and command.verb is Verb.MOVE_VELOCITY
         and command.state is AxisState.CONTINUOUS_MOTION
-        and at_s >= following.swings_until_s
+        and at_s >= following.profile.swings_until_s
         # a run with an end is a long move to its drive
-        and (ends_at_s is None or at_s < ends_at_s - following.brakes_within_s)
+        and (ends_at_s is None or at_s < ends_at_s - following.profile.brakes_within_s)
     )
 
 
@@ -145,7 +146,7 @@ def next_following(status: AxisStatus, event: MotionStarted) -> Following | None
         return None
     # what brings a motion to rest goes on with its profile, and so does a shaft that cannot stand at once
     if command.state is not AxisState.STOPPING and command.command_id != before.command_id:
-        if not (before.coasts and event.profile):
+        if not (before.leeway.coasts and event.profile):
             return None
         before = replace(before, command_id=command.command_id)
         return before.going_on(*event.profile, reverses=not event.onwards)

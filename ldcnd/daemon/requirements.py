@@ -207,6 +207,6 @@ def speed_of(axis: AxisService) -> float:
                 counts = told.counts_per_s
     elif status.at_rest:
         counts = 0.0
-    if status.following and status.following.coasts:  # as fast as it was seen to move last, until it is again
-        counts = max(counts, status.following.speed_counts_per_s)
+    if status.following and status.following.leeway.coasts:  # as fast as it was seen to move last, until it is again
+        counts = max(counts, status.following.seen.speed_counts_per_s)
     return counts / abs(status.scale.counts_per_unit)
