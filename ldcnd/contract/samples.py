@@ -32,7 +32,7 @@ class AxisState(StrEnum):
 
 _MOTIONS = frozenset({AxisState.HOMING, AxisState.DISCRETE_MOTION, AxisState.CONTINUOUS_MOTION, AxisState.STOPPING})
 _STATE_WORDS = {
-    AxisState.DISCRETE_MOTION: "moving to a target",
+    AxisState.DISCRETE_MOTION: "moving",  # others may move a drive, and nothing tells of a target then
     AxisState.CONTINUOUS_MOTION: "moving at a velocity",
 }
 

@@ -331,11 +331,11 @@ async def test_the_velocity_never_contradicts_the_state(house):
         seen = await desk.page.evaluate("window.seen")
 
     values = [(state, abs(float(text.replace("\u2212", "-")))) for state, text in seen if text != "\u2013"]
-    last = max(nth for nth, (state, _) in enumerate(values) if state == "moving to a target")
+    last = max(nth for nth, (state, _) in enumerate(values) if state == "moving")
     assert max(value for _, value in values[last + 1 :]) < 0.2
     # a motion that begins can be seen in the positions one frame before the state says so
     assert sum(state == "standstill" and value > 0.2 for state, value in values) <= 3
-    moving = [value for state, value in values if state == "moving to a target"]
+    moving = [value for state, value in values if state == "moving"]
     assert len(moving) > 5
     assert sorted(moving)[len(moving) // 2] == pytest.approx(5, abs=0.3)
     assert sum(value < 4 for value in moving) <= 4  # while it begins and while it settles

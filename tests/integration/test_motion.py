@@ -166,7 +166,7 @@ async def test_a_second_move_in_mid_move_is_refused():
         await powered(rig, "x")
         reply = await rig.client.command("x", MoveAbsolute(position=50.0))
 
-        with pytest.raises(WrongState, match="moving to a target"):
+        with pytest.raises(WrongState, match="is moving"):
             await rig.client.command("x", MoveAbsolute(position=0.0))
 
         await rig.client.wait_for_end("x", reply.command_id)

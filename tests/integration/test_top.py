@@ -35,10 +35,10 @@ async def test_a_rig_is_watched_and_stopped_with_one_key_and_printed_where_there
 
             await until(pilot, lambda: states().get("x") == "standstill")
             await rig.command("x", MoveAbsolute(position=90.0, velocity=5.0))
-            await until(pilot, lambda: states()["x"] == "moving to a target")
+            await until(pilot, lambda: states()["x"] == "moving")
             await pilot.press("escape")
             await until(pilot, lambda: "stop latched, confirmed by x, y, z, c" in str(answer.content))
-            await until(pilot, lambda: states()["x"] != "moving to a target")
+            await until(pilot, lambda: states()["x"] != "moving")
 
             await pilot.resize_terminal(80, 24)
             await until(pilot, lambda: len(axes.columns) == len(NARROW))
