@@ -78,7 +78,8 @@ class OutputConfig(Frozen):
     line: int = Field(ge=1, le=12)
     """Line of the module."""
     start: OutputLevel = "keep"
-    """Level after the reset of the module at the start of the daemon; a module that is taken over keeps its outputs."""
+    """Level after the reset at the start of the daemon, which lets outputs go first; a module that is taken over \
+keeps them."""
     reset: OutputLevel = "keep"
     """Level after the module has lost its power or was reset later on."""
     loss: OutputLossConfig = OutputLossConfig()
