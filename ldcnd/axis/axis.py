@@ -363,6 +363,9 @@ class AxisService:
         faults = [each for each in self.tracker.status.active_faults if each.source == "drive" and each.stops]
         causes = [(error, False) for error in (*first, *(guards.fault(self.tracker, each) for each in faults))]
         forbidden = self._violations(verb, speed) if moves else []
+        if self.tracker.status.unseen and not self.tracker.status.energised:
+            # it is waited for until it stands, which power would begin anew: what rules want comes before that
+            causes, forbidden = forbidden + causes, []
         for error, guard in found:
             if guard is guards.check_not_in_error:
                 causes.append((guards.error_stop(self.tracker, faults), False))

@@ -14,7 +14,6 @@ from ldcnd.contract.catalogue import AXIS_COMMANDS, verbs_for
 from ldcnd.contract.codec import remedy_steps
 from ldcnd.contract.commands import AxisCommand, Capability, Command, CommandReply, Effect, Verb
 from ldcnd.contract.errors import (
-    InterlockViolated,
     InternalError,
     LdcndError,
     NotSupported,
@@ -427,7 +426,7 @@ def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyRe
     asked = request.command or (Verb.MOVE_ABSOLUTE if request.absolute else Verb.MOVE_RELATIVE)
     takes = request.command is None or asked in axis.driver.capabilities
     if takes and AXIS_COMMANDS[asked].effect is Effect.MOTION:
-        causes = _causes(axis, _in_order(axis, not_admitted + axis.obstacles_to_motion(asked)))
+        causes = _causes(axis, not_admitted + axis.obstacles_to_motion(asked))
     else:
         causes = causes_of(asked)
     status = axis.tracker.status
@@ -439,16 +438,6 @@ def explain(axis: AxisService, request: Why, admit: Callable[[], None]) -> WhyRe
         first_fault=guards.in_words(status, first) if first else None,
         commands=tuple(alike.values()),
     )
-
-
-def _in_order(axis: AxisService, obstacles: list[tuple[LdcndError, bool]]) -> list[tuple[LdcndError, bool]]:
-    """Return obstacles such that the way out of none undoes that of another.
-
-    A shaft that may coast with its motor off is waited for; power before that would have the wait begin anew.
-    """
-    if not axis.tracker.status.unseen or axis.tracker.status.energised:
-        return obstacles
-    return sorted(obstacles, key=lambda each: not isinstance(each[0], InterlockViolated))
 
 
 def _causes(axis: AxisService, obstacles: Iterable[tuple[LdcndError, bool]]) -> tuple[Cause, ...]:
