@@ -26,9 +26,10 @@ from ldcnd.axis.events import (
 from ldcnd.axis.faults import REFERENCE_REFUSED
 from ldcnd.axis.host_tracer import HostTracer, host_channels
 from ldcnd.axis.kept import KeptFiles
-from ldcnd.axis.motion import LATENCY_S, AxisMotion, MotionPlan
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.parameters import Parameters
 from ldcnd.axis.permit import UNCONDITIONAL, Gate, Permit, Right, ToldSpeed, Violations
+from ldcnd.axis.plans import LATENCY_S, MotionPlan
 from ldcnd.axis.plausibility import PlausibilityGate
 from ldcnd.axis.preview import preview
 from ldcnd.axis.procedures.group import GroupMoveRequest
@@ -583,7 +584,9 @@ class AxisService:
             RequestRefused: its values are refused.
         """
         motion = self._motion
-        return motion, motion.plan_to(motion.unwrapped(move.position, move.direction), move.velocity, move.acceleration)
+        return motion, motion.plans.to(
+            motion.plans.unwrapped(move.position, move.direction), move.velocity, move.acceleration
+        )
 
     def preview(self, request: Preview, obstacles: tuple[str, ...]) -> PreviewReply:
         """Tell what a motion would do; no effect. See `preview`."""

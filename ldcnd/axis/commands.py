@@ -17,8 +17,9 @@ from ldcnd.axis.events import (
     SpeedChanged,
 )
 from ldcnd.axis.gains import AxisGains
-from ldcnd.axis.motion import LATENCY_S, AxisMotion, MotionPlan
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import LATENCY_S, MotionPlan
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.analog import AnalogMove
 from ldcnd.axis.procedures.approach import ApproachMove
@@ -168,7 +169,7 @@ class AxisCommands:
         now_s = self._motion.clock.now_s()
         hold.check(now_s)
         # before the hold is renewed: with a velocity that is refused it must run out
-        plan = self._motion.plan_at(request.velocity, request.acceleration)
+        plan = self._motion.plans.at(request.velocity, request.acceleration)
         hold.renew(request, now_s)
         if isinstance(procedure, HeldJog) and procedure.wants_step:
             self.step_due = True
@@ -355,13 +356,13 @@ class AxisCommands:
         if not self.retargets(request):
             return False
         if isinstance(request, MoveVelocity):
-            plan = self._motion.plan_at(request.velocity, request.acceleration)
+            plan = self._motion.plans.at(request.velocity, request.acceleration)
         else:
             plan = self._PLANNED[type(request)](self, request)
             if isinstance(request, MoveAbsolute | MoveRelative):
                 # its first motion may be the one away from the goal
-                plan = self._motion.before_approach(plan, request.velocity, request.acceleration) or plan
-        return self._motion.follows_on(plan.motion.acceleration_counts_per_s2, plan.motion.target_counts)
+                plan = self._motion.plans.before_approach(plan, request.velocity, request.acceleration) or plan
+        return self._motion.plans.follows_on(plan.motion.acceleration_counts_per_s2, plan.motion.target_counts)
 
     def _check_may_start(self, permit: Permit, request: Move) -> None:
         permit.check_state(follows=self.retargets(request))
@@ -375,7 +376,7 @@ class AxisCommands:
         guards.check(request.verb, self._tracker, follows=True)
         goal = self._PLANNED[type(request)](self, request)
         if isinstance(request, MoveAbsolute | MoveRelative):
-            self._motion.before_approach(goal, request.velocity, request.acceleration)
+            self._motion.plans.before_approach(goal, request.velocity, request.acceleration)
 
     async def _move_absolute(self, permit: Permit, request: MoveAbsolute) -> CommandReply:
         self._check_may_start(permit, request)
@@ -391,12 +392,12 @@ class AxisCommands:
         return await self._move_to(permit, request, self._from_now(request, self._plan_relative(request)))
 
     def _from_now(self, request: Move, plan: MotionPlan) -> MotionPlan:
-        return self._motion.in_mid_move(plan) if self.goes_on(request) else plan
+        return self._motion.plans.in_mid_move(plan) if self.goes_on(request) else plan
 
     async def _move_to(self, permit: Permit, request: MoveAbsolute | MoveRelative, goal: MotionPlan) -> CommandReply:
         """Go to a goal, from the configured side where there is one."""
         if self._motion.config.approach and (
-            first := self._motion.before_approach(goal, request.velocity, request.acceleration)
+            first := self._motion.plans.before_approach(goal, request.velocity, request.acceleration)
         ):
             return await self._undertake(ApproachMove(self._motion, permit, request, first, goal))
         return await self._move(permit, goal, AxisState.DISCRETE_MOTION)
@@ -408,7 +409,7 @@ class AxisCommands:
         in_motion = self.goes_on(request)
         velocity, bounded, ends = self._plan_velocity(request, in_motion=in_motion)
         if in_motion:
-            bounded = self._motion.in_mid_move(bounded)
+            bounded = self._motion.plans.in_mid_move(bounded)
         reply = await self._move(permit, bounded, AxisState.CONTINUOUS_MOTION)
         return reply.model_copy(update={"velocity": velocity, "ends": ends})
 
@@ -422,21 +423,21 @@ class AxisCommands:
         return await self._undertake(SetPoint(self._motion, permit, request, self.procedure))
 
     def _plan_absolute(self, request: MoveAbsolute) -> MotionPlan:
-        position = self._motion.unwrapped(request.position, request.direction)
-        return self._motion.plan_to(position, request.velocity, request.acceleration)
+        position = self._motion.plans.unwrapped(request.position, request.direction)
+        return self._motion.plans.to(position, request.velocity, request.acceleration)
 
     def _plan_relative(self, request: MoveRelative, here_counts: int | None = None) -> MotionPlan:
         motion = self._motion
-        from_counts = motion.commanded_counts if here_counts is None else here_counts
+        from_counts = motion.plans.commanded_counts if here_counts is None else here_counts
         position = motion.scale.position(from_counts) + request.distance
-        return motion.plan_to(position, request.velocity, request.acceleration)
+        return motion.plans.to(position, request.velocity, request.acceleration)
 
     def _plan_velocity(self, request: MoveVelocity, *, in_motion: bool) -> tuple[float, MotionPlan, str]:
         """Return the velocity as the drive will have it, a trapezoid that ends even if this host dies, and how."""
         motion = self._motion
-        plan = motion.plan_at(request.velocity, request.acceleration)
-        end, ends = motion.run(request.duration_s, plan, in_motion=in_motion)
-        return plan.velocity, motion.plan_to(end, abs(request.velocity), request.acceleration), ends
+        plan = motion.plans.at(request.velocity, request.acceleration)
+        end, ends = motion.plans.run(request.duration_s, plan, in_motion=in_motion)
+        return plan.velocity, motion.plans.to(end, abs(request.velocity), request.acceleration), ends
 
     async def _move(
         self,
@@ -476,7 +477,7 @@ class AxisCommands:
             or share == moved.share
         ):
             return False
-        changed = self._motion.quantise(
+        changed = self._motion.plans.quantise(
             replace(motion, velocity_counts_per_s=motion.velocity_counts_per_s * share / moved.share)
         )
         if command.state is AxisState.CONTINUOUS_MOTION and moved.farthest_counts is not None:
@@ -563,6 +564,6 @@ class AxisCommands:
         PathShareRequest: _plan_absolute,
         MoveRelative: _plan_relative,
         MoveVelocity: lambda self, request: self._plan_velocity(request, in_motion=self.goes_on(request))[1],
-        Jog: lambda self, request: self._motion.plan_at(request.velocity, request.acceleration),
+        Jog: lambda self, request: self._motion.plans.at(request.velocity, request.acceleration),
     }
     """How each move is planned that may wait for another one, or take it over."""

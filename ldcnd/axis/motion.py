@@ -1,93 +1,38 @@
-"""Motion of one axis, for all commands: plan, load, check the permit, start, bring to rest.
-
-A plan goes from a request in axis units to a motion in counts, checked against limits and quantised to the drive's
-registers; preview.py says with the same code what a motion would do.
-"""
+"""Motion of one axis, for all commands: load a plan, check the permit, start, bring to rest."""
 
 import asyncio
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, replace
 
 from ldcnd.axis.clock import Clock
 from ldcnd.axis.course import Pace, Way, pace_of
 from ldcnd.axis.events import CommandBegun, CommandFailing, CommandOver, LookTaken, MotionStarted, StopAcknowledged
 from ldcnd.axis.following import Following, Leeway, RunningProfile, Sighting
-from ldcnd.axis.guards import check_does_not_coast, check_position, check_rates
+from ldcnd.axis.guards import check_does_not_coast
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import AxisPlans, MotionPlan
 from ldcnd.axis.reference import ReferenceKeeper
 from ldcnd.axis.rest import Settling, window_counts
 from ldcnd.axis.scale import AxisScale
 from ldcnd.axis.status import ActiveCommand, Completion, Unsure
-from ldcnd.axis.straight import LineAxis
 from ldcnd.axis.telemetry import AxisTelemetry
 from ldcnd.axis.tracker import AxisTracker
-from ldcnd.axis.trapezoid import braking_way, duration_from_s, profile_duration_s
-from ldcnd.contract.commands import CommandReply, Direction, Verb
+from ldcnd.contract.commands import CommandReply, Verb
 from ldcnd.contract.errors import (
     BusError,
-    NotSupported,
     OutcomeUnknown,
-    PositionLimit,
-    Remedy,
     RequestRefused,
-    ValueOutOfRange,
-    step,
 )
 from ldcnd.contract.samples import AxisState
 from ldcnd.drives.axis_config import AxisConfig
-from ldcnd.drives.driver import LARGEST_COUNT, AxisReading, Ceiling, CountsMotion, QuietDrive, StopMode
+from ldcnd.drives.driver import AxisReading, CountsMotion, QuietDrive, StopMode
 
 BEHIND_SHARE = 1.5
 """Most by which friction holds a shaft behind the end of its profile, as a multiple of its settle window."""
-COUNTER_SHARE = 0.99
-"""Of the way to the end of the drive's position counter, which a motion in velocity mode would run through."""
-LATENCY_S = 0.2
-"""Longest time from a reading to the packet that follows it; what is gone meanwhile must not reach a software limit."""
 LEAST_FOLLOWED_COUNTS = 30.0
 """Way of a profile behind which a shaft was seen to move, whatever its settle window: friction holds it for less."""
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
-
-
-@dataclass(frozen=True, slots=True)
-class MotionPlan:
-    """A motion that may be loaded as it is.
-
-    Attributes:
-        motion: in counts, as the registers hold it.
-        scale: of the axis, as it was planned.
-        duration_s: of the profile, without settling; None for a motion without an end.
-    """
-
-    motion: CountsMotion
-    scale: AxisScale
-    duration_s: float | None
-
-    @property
-    def position(self) -> float | None:
-        """Its target in axis units; None for a motion without one."""
-        target = self.motion.target_counts
-        return None if target is None else self.scale.position(target)
-
-    @property
-    def velocity(self) -> float:
-        """Its velocity in units a second: positive to a target, signed without one."""
-        per_unit = self.scale.counts_per_unit
-        return self.motion.velocity_counts_per_s / (per_unit if self.motion.target_counts is None else abs(per_unit))
-
-    @property
-    def acceleration(self) -> float:
-        """Its acceleration in units a second squared."""
-        return self.motion.acceleration_counts_per_s2 / abs(self.scale.counts_per_unit)
-
-
-def both_s(first: MotionPlan, goal: MotionPlan) -> float:
-    """Return how long a motion and the approach that follows it take, without settling."""
-    way = abs((goal.motion.target_counts or 0) - (first.motion.target_counts or 0))
-    motion = goal.motion
-    last_s = profile_duration_s(way, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
-    return (first.duration_s or 0.0) + last_s
 
 
 class AxisMotion:
@@ -95,6 +40,7 @@ class AxisMotion:
 
     Attributes:
         config: of the axis, as it is now.
+        plans: its motions before they are loaded.
         window_counts: how far from its target an axis may be that has settled.
         driver: its drive.
         tracker: of its state.
@@ -126,6 +72,7 @@ class AxisMotion:
         """
         self.reference = reference
         self.config = config
+        self.plans = AxisPlans(config, driver, tracker, self.latest)
         self.window_counts = window_counts(config)
         self.driver = driver
         self.tracker = tracker
@@ -137,7 +84,7 @@ class AxisMotion:
 
     def reconfigure(self, config: AxisConfig) -> None:
         """Plan with other limits and speeds from now on."""
-        self.config = config
+        self.config = self.plans.config = config
         self.window_counts = window_counts(config)
 
     async def check_does_not_coast(self, within_s: float = 0.0) -> None:
@@ -179,335 +126,6 @@ class AxisMotion:
         if self._looked and self._looked[1] > self.tracker.read_at_s:
             return self._looked[0]
         return self.tracker.latest()
-
-    @property
-    def here(self) -> float:
-        """Where the axis is by its latest reading, in axis units, counted through all turns."""
-        return self.scale.position(self.latest().position_counts)
-
-    @property
-    def commanded_counts(self) -> int:
-        """Where the axis was sent last, counts; where it is when that has no end, or when something else followed."""
-        target_counts = self.tracker.status.target_counts
-        return self.latest().position_counts if target_counts is None else target_counts
-
-    def counts_of(self, position: float) -> int:
-        """Return the count of the drive that a position stands for; on an axis with a modulo the nearest of them."""
-        return self.scale.counts(self.unwrapped(position))
-
-    def unwrapped(
-        self, position: float, direction: Direction | None = None, *, from_counts: int | None = None
-    ) -> float:
-        """Return the position, counted through all turns, to which a request means to go.
-
-        Without a modulo that is the position itself. With one it is counted from the commanded position: a position
-        equal to that, to a count, is no distance in any direction.
-
-        Args:
-            position: in axis units; any turn of it is meant.
-            direction: in which the axis turns; the shortest way if missing.
-            from_counts: where the axis will be when it turns there, in counts of the drive; the commanded position if
-                missing.
-
-        Raises:
-            NotSupported: a direction, and the axis has no modulo.
-        """
-        modulo = self.config.modulo
-        if modulo is None:
-            if direction is not None:
-                raise NotSupported(
-                    f"axis {self.config.name} has no modulo: its positions have no direction",
-                    axis=self.config.name,
-                    value=direction.value,
-                    remedy="leave direction out, or configure modulo",
-                )
-            return position
-        here = self.scale.position(self.commanded_counts if from_counts is None else from_counts)
-        forward = (position - here) % modulo
-        count = 1.0 / abs(self.scale.counts_per_unit)
-        if forward < count or modulo - forward < count:
-            way = forward if forward < count else forward - modulo
-        elif direction is Direction.NEGATIVE or (direction is not Direction.POSITIVE and forward > modulo / 2):
-            way = forward - modulo
-        else:
-            way = forward
-        return here + way
-
-    def shown(self, position: float | None) -> float | None:
-        """Return a position as clients see it: on an axis with a modulo from 0 up to it."""
-        return None if position is None else self.scale.shown(position)
-
-    # -- plans -------------------------------------------------------------------------------------------------------
-
-    def plan_to(self, position: float, velocity: float | None, acceleration: float | None) -> MotionPlan:
-        """Plan a trapezoid from where the axis is to a position in axis units, counted through all turns.
-
-        Raises:
-            PositionLimit, VelocityLimit, AccelerationLimit: a software limit forbids it; names the nearest value.
-            ValueOutOfRange: a register cannot hold it.
-            WrongState: the position has not been read yet.
-        """
-        if velocity is not None and velocity <= 0:
-            raise ValueOutOfRange(
-                f"axis {self.tracker.name}: velocity {velocity:g} {self.tracker.status.unit}/s is not above 0;"
-                " the target gives the direction",
-                axis=self.tracker.name,
-                value=velocity,
-                limit=0.0,
-                nearest=-velocity if velocity < 0 else None,
-                remedy="send a velocity above 0",
-            )
-        tracker, scale, from_counts = self.tracker, self.scale, self.latest().position_counts
-        speed, rate = self._checked(velocity, acceleration)
-        if tracker.status.referenced:
-            check_position(tracker, self.config.limits, position)
-        target = scale.counts(position)
-        if abs(target - from_counts) > LARGEST_COUNT:
-            nearest = from_counts + math.copysign(LARGEST_COUNT, target - from_counts)
-            raise ValueOutOfRange(
-                f"axis {tracker.name}: target {position:g} {scale.unit} is {abs(target - from_counts)} counts away,"
-                " farther than the drive's 32-bit counter reaches",
-                axis=tracker.name,
-                value=position,
-                limit=LARGEST_COUNT,
-                nearest=scale.position(nearest),
-                remedy="move there in parts",
-            )
-        counts_per_unit = abs(scale.counts_per_unit)
-        motion = self.quantise(CountsMotion(target, speed * counts_per_unit, rate * counts_per_unit))
-        duration_s = profile_duration_s(
-            abs(target - from_counts), motion.velocity_counts_per_s, motion.acceleration_counts_per_s2
-        )
-        return MotionPlan(motion, scale, duration_s)
-
-    def plan_at(self, velocity: float, acceleration: float | None) -> MotionPlan:
-        """Plan a motion at a constant velocity in units a second, without an end.
-
-        Raises:
-            ValueOutOfRange: the velocity is 0, or a register cannot hold it.
-            VelocityLimit, AccelerationLimit: a software limit forbids it.
-        """
-        if velocity == 0:
-            raise ValueOutOfRange(
-                f"axis {self.tracker.name}: a velocity of 0 is not a motion",
-                axis=self.tracker.name,
-                value=0.0,
-                remedy=Remedy("{}", step("halt")),
-            )
-        speed, rate = self._checked(velocity, acceleration)
-        counts_per_unit = self.scale.counts_per_unit
-        motion = self.quantise(CountsMotion(None, speed * counts_per_unit, rate * abs(counts_per_unit)))
-        return MotionPlan(motion, self.scale, None)
-
-    def quantise(self, motion: CountsMotion) -> CountsMotion:
-        """Return a motion as the drive's registers will hold it, within the limits of the axis also after rounding.
-
-        Raises:
-            ValueOutOfRange: a register cannot hold it within the limits; names the nearest value.
-            RegisterUnknown: the scale of the registers is not known.
-        """
-        limits, counts = self.config.limits, abs(self.scale.counts_per_unit)
-        return self.driver.quantise(
-            motion,
-            Ceiling(
-                math.inf if limits.velocity is None else limits.velocity * counts,
-                math.inf if limits.acceleration is None else limits.acceleration * counts,
-            ),
-        )
-
-    def run_s(self, asked_s: float | None, counts_per_s: float) -> float:
-        """Return for how long a motion at a velocity goes on, within what the drive's counter holds.
-
-        Args:
-            asked_s: the requested duration; the longest one of the configuration when missing.
-            counts_per_s: the velocity.
-
-        Raises:
-            ValueOutOfRange: the requested duration is longer than the configuration or the counter allows.
-        """
-        config, counter_s = self.config, COUNTER_SHARE * LARGEST_COUNT / abs(counts_per_s)
-        longest_s = min(config.longest_run_s or config.jog_horizon_s, counter_s)
-        if asked_s is None:
-            return longest_s
-        if asked_s > longest_s:
-            raise ValueOutOfRange(
-                f"axis {config.name}: a motion at this velocity lasts at most {longest_s:g} s, not {asked_s:g} s",
-                axis=config.name,
-                value=asked_s,
-                limit=longest_s,
-                nearest=longest_s,
-                remedy="send it again before its end" if longest_s == counter_s else "configure longest_run_s",
-            )
-        return asked_s
-
-    def run(self, asked_s: float | None, plan: MotionPlan, *, in_motion: bool = False) -> tuple[float, str]:
-        """Return where a motion at a velocity ends that is about to begin, in axis units, and in words what ends it.
-
-        Args:
-            asked_s: for how long it is to have its velocity; None for as long as it may.
-            plan: of the velocity.
-            in_motion: it goes on from the velocity that the axis has.
-
-        Raises:
-            ValueOutOfRange: as `run_s`.
-            PositionLimit: as `end_ahead`.
-        """
-        run_s = self.run_s(asked_s, plan.motion.velocity_counts_per_s)
-        if asked_s is None and self.config.longest_run_s is None and self.limit_ahead(plan.velocity) is not None:
-            run_s = math.inf  # the limit is its end
-        begin = self.turned_from(plan.velocity, plan.acceleration) if in_motion else self.here
-        end, at_limit = self.end_ahead(begin, plan.velocity * (run_s + self.ramp_s(asked_s, plan)))
-        return end, self.end_in_words(run_s, plan.velocity, at_limit=at_limit)
-
-    def follows_on(self, acceleration_counts_per_s2: float, target_counts: int | None) -> bool:
-        """Tell whether a drive that takes another trapezoid in mid-move can be given one without leaving the limits.
-
-        It slows down at the new acceleration; where that is too low it overshoots its target, and the limit behind it.
-
-        Args:
-            acceleration_counts_per_s2: of the new motion.
-            target_counts: of the new motion; None for one at a velocity.
-        """
-        reading, scale = self.latest(), self.scale
-        speed = abs(reading.velocity_counts_per_s) + reading.velocity_resolution_counts_per_s
-        forward = reading.velocity_counts_per_s > 0
-        braking = speed * LATENCY_S + braking_way(speed, acceleration_counts_per_s2)
-        limit = self.limit_ahead(reading.velocity_counts_per_s / scale.counts_per_unit)
-        ends = [] if target_counts is None else [target_counts]
-        ways = [end - reading.position_counts if forward else reading.position_counts - end for end in ends]
-        # it can stop at its target, which is within the limits
-        if any(way >= braking for way in ways):
-            return True
-        if limit is not None:
-            room = scale.counts(limit) - reading.position_counts
-            if braking > (room if forward else -room):
-                return False
-        # a target ahead that is too near for that would be overshot
-        return not any(way > 0 for way in ways)
-
-    def in_mid_move(self, plan: MotionPlan) -> MotionPlan:
-        """Return a plan with the time that it takes from the velocity that the axis has."""
-        motion, reading, target = plan.motion, self.latest(), plan.motion.target_counts
-        if target is None:
-            return plan
-        way = target - reading.position_counts
-        before = math.copysign(reading.velocity_counts_per_s, reading.velocity_counts_per_s * way)
-        there_s = duration_from_s(abs(way), before, motion.velocity_counts_per_s, motion.acceleration_counts_per_s2)
-        return replace(plan, duration_s=there_s)
-
-    def turned_from(self, velocity: float, acceleration: float) -> float:
-        """Return from where a motion at a velocity counts that begins in mid-move, in axis units.
-
-        From there a motion from standstill would be at this velocity where and when this one is.
-
-        Args:
-            velocity: in units a second, negative backwards.
-            acceleration: in units a second squared.
-        """
-        before = self.latest().velocity_counts_per_s / self.scale.counts_per_unit
-        slewing = (velocity**2 - before**2) / math.copysign(2 * acceleration, velocity - before)
-        return self.here + slewing - math.copysign(braking_way(velocity, acceleration), velocity)
-
-    @staticmethod
-    def ramp_s(asked_s: float | None, plan: MotionPlan) -> float:
-        """Return what a duration at a velocity that was asked for lacks of the whole motion, seconds.
-
-        What is asked for is time at the velocity: both ramps together go as far as one of them lasts at it.
-        """
-        return 0.0 if asked_s is None else abs(plan.velocity) / plan.acceleration
-
-    def end_in_words(self, run_s: float, velocity: float, *, at_limit: bool) -> str:
-        """Return what ends a motion at a velocity that nobody stops; see `CommandReply.ends`."""
-        limit = self.limit_ahead(velocity)
-        if at_limit and limit is not None:
-            return f"runs until it is stopped, at most to its software limit {limit:g} {self.scale.unit}"
-        return f"runs until it is stopped, for at most {run_s:g} s unless it is sent again"
-
-    def limit_ahead(self, velocity: float) -> float | None:
-        """Return the software limit that a motion at this velocity runs towards, in axis units; None without one.
-
-        An axis that is not referenced does not know where its limits are.
-        """
-        limits = self.config.limits
-        if not self.tracker.status.referenced:
-            return None
-        return limits.position_max if velocity > 0 else limits.position_min
-
-    def end_ahead(self, here: float, way: float) -> tuple[float, bool]:
-        """Return where a motion at a velocity ends, in axis units, and whether that is the software limit ahead.
-
-        Args:
-            here: where it begins, in axis units.
-            way: that it would make without limits; negative backwards.
-
-        Raises:
-            PositionLimit: the limit ahead was reached: the motion would be none, or one the other way.
-        """
-        end, forward, limit = here + way, way > 0, self.limit_ahead(way)
-        if limit is not None and (here >= limit if forward else here <= limit):
-            raise PositionLimit(
-                f"axis {self.config.name} is at its limit {limit:g} {self.scale.unit}",
-                axis=self.config.name,
-                value=here,
-                limit=limit,
-                remedy="move it the other way",
-            )
-        if limit is not None and (end >= limit if forward else end <= limit):
-            return limit, True
-        behind = self.limit_ahead(-way)
-        if behind is not None and (end < behind if forward else end > behind):
-            end = behind  # from outside the limits at least to the nearest of them
-        return end, False
-
-    def _checked(self, velocity: float | None, acceleration: float | None) -> tuple[float, float]:
-        """Return the speed that the speed override leaves, and the acceleration, both within their limits."""
-        speed = self.config.velocity if velocity is None else velocity
-        rate = self.config.acceleration if acceleration is None else acceleration
-        check_rates(self.tracker, self.config.limits, speed, rate)
-        return speed * self.tracker.status.speed_share, rate
-
-    def before_approach(
-        self, goal: MotionPlan, velocity: float | None, acceleration: float | None
-    ) -> MotionPlan | None:
-        """Return the motion from which on a goal is approached from its side; None when one motion to it will do.
-
-        Args:
-            goal: the motion to it.
-            velocity: the requested one; None for the default of the axis.
-            acceleration: likewise.
-
-        Raises:
-            PositionLimit: that motion would leave the software limits.
-        """
-        approach = self.config.approach
-        if approach is None or goal.position is None:
-            return None
-        forward = approach.direction == "positive"
-        here = self.scale.position(self.commanded_counts)
-        way = goal.position - here if forward else here - goal.position
-        if way >= approach.distance or (way >= 0 and self.tracker.status.approached):
-            return None
-        begin = goal.position - approach.signed
-        return self.plan_to(begin, velocity, acceleration)
-
-    def on_line(self, plan: MotionPlan) -> LineAxis:
-        """Return the share of this axis in a straight line that ends where a plan does, no faster than the plan."""
-        motion = plan.motion
-        return LineAxis(
-            from_counts=self.commanded_counts,
-            target_counts=motion.target_counts or 0,
-            counts_per_unit=abs(self.scale.counts_per_unit),
-            most_velocity=motion.velocity_counts_per_s,
-            most_acceleration=motion.acceleration_counts_per_s2,
-            quantise=self.quantise,
-            cycle_s=self.driver.capture_s,
-        )
-
-    def replanned(self, plan: MotionPlan, motion: CountsMotion) -> MotionPlan:
-        """Return a plan with another velocity and acceleration, to the same target."""
-        share = self.on_line(replace(plan, motion=motion))
-        duration_s = profile_duration_s(share.way, share.most_velocity, share.most_acceleration)
-        return replace(plan, motion=motion, duration_s=duration_s)
 
     # -- motions -----------------------------------------------------------------------------------------------------
 
@@ -640,7 +258,7 @@ class AxisMotion:
         plan: MotionPlan | None = None,
     ) -> None:
         """Say what the axis is about to do; readings count again once it has started, see `MotionStarted`."""
-        target, duration_s = (self.shown(plan.position), plan.duration_s) if plan else (None, None)
+        target, duration_s = (self.plans.shown(plan.position), plan.duration_s) if plan else (None, None)
         if state is AxisState.CONTINUOUS_MOTION and self.config.modulo:
             target = None  # turns lie between: within one it would be passed again and again
         now_ns = self.clock.now_ns()
@@ -715,7 +333,7 @@ class AxisMotion:
         planned: dict[str, float | None] = {}
         if plan:
             planned = {
-                "position": self.shown(plan.position),
+                "position": self.plans.shown(plan.position),
                 "velocity": plan.velocity,
                 "acceleration": plan.acceleration,
                 "duration_s": plan.duration_s,

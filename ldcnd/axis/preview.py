@@ -1,6 +1,7 @@
 """What a motion would do: planned as the motion itself, and nothing is sent."""
 
-from ldcnd.axis.motion import AxisMotion, MotionPlan, both_s
+from ldcnd.axis.motion import AxisMotion
+from ldcnd.axis.plans import MotionPlan, both_s
 from ldcnd.contract.codec import error_reply
 from ldcnd.contract.errors import MalformedRequest, RequestRefused
 from ldcnd.contract.questions import Preview, PreviewReply
@@ -23,8 +24,8 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
     name = motion.config.name
     try:
         plan = _plan(motion, request)
-        ends = motion.run(None, plan)[1] if plan.position is None else None
-        first = motion.before_approach(plan, request.velocity, request.acceleration)
+        ends = motion.plans.run(None, plan)[1] if plan.position is None else None
+        first = motion.plans.before_approach(plan, request.velocity, request.acceleration)
     except MalformedRequest:
         raise
     except RequestRefused as error:
@@ -38,8 +39,8 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
         axis=name,
         refusal=None,
         obstacles=obstacles,
-        position=motion.shown(plan.position),
-        approach_from=motion.shown(first.position) if first else None,
+        position=motion.plans.shown(plan.position),
+        approach_from=motion.plans.shown(first.position) if first else None,
         ends=ends,
         velocity=plan.velocity,
         velocity_error=plan.velocity - asked_velocity,
@@ -54,12 +55,12 @@ def preview(motion: AxisMotion, bus: Bus, request: Preview, obstacles: tuple[str
 def _plan(motion: AxisMotion, request: Preview) -> MotionPlan:
     match request.position, request.distance, request.velocity:
         case float() as position, None, velocity:
-            return motion.plan_to(motion.unwrapped(position, request.direction), velocity, request.acceleration)
+            return motion.plans.to(motion.plans.unwrapped(position, request.direction), velocity, request.acceleration)
         case None, float() as distance, velocity:
-            here = motion.here
-            return motion.plan_to(here + distance, velocity, request.acceleration)
+            here = motion.plans.here
+            return motion.plans.to(here + distance, velocity, request.acceleration)
         case None, None, float() as velocity:
-            return motion.plan_at(velocity, request.acceleration)
+            return motion.plans.at(velocity, request.acceleration)
     raise MalformedRequest(
         f"axis {motion.config.name}: a plan needs exactly one of position, distance, or velocity alone",
         axis=motion.config.name,

@@ -114,7 +114,7 @@ def preview_together(rig: OwnedRig, request: PreviewTogether) -> PreviewTogether
     shares = tuple(
         AxisShare(
             axis=name,
-            position=axes[name][0].shown(plan.position) or 0.0,
+            position=axes[name][0].plans.shown(plan.position) or 0.0,
             velocity=plan.velocity,
             acceleration=plan.acceleration,
             duration_s=plan.duration_s or 0.0,

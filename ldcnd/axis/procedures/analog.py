@@ -7,8 +7,9 @@ limit switches stop it in the drive, where they are armed.
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import LATENCY_S, AxisMotion
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import LATENCY_S
 from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAnalog
@@ -41,7 +42,7 @@ class AnalogMove(EndlessMotion):
         self.permit.check_state()
         self._check_target()
         speed = motion.config.velocity if request.velocity is None else request.velocity
-        plan = motion.plan_at(speed, request.acceleration)
+        plan = motion.plans.at(speed, request.acceleration)
         self._speed, self.acceleration = abs(plan.velocity), plan.acceleration
         self._distance = self._distance or abs(plan.velocity) * self._timeout_s
         self._from_counts = motion.latest().position_counts

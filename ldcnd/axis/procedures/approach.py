@@ -9,8 +9,9 @@ from dataclasses import replace
 from typing_extensions import override
 
 from ldcnd.axis.events import CommandOver
-from ldcnd.axis.motion import AxisMotion, MotionPlan, both_s
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import MotionPlan, both_s
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveAbsolute, MoveRelative
@@ -54,7 +55,7 @@ class ApproachMove(Procedure):
             motion.tracker.take(CommandOver())
             return False
         # planned anew: limits and the speed override may be others by now
-        goal = motion.plan_to(self._goal.position or 0.0, self._request.velocity, self._request.acceleration)
+        goal = motion.plans.to(self._goal.position or 0.0, self._request.velocity, self._request.acceleration)
         await self.permit.load(goal.motion)
         await motion.start(self.permit, AxisState.DISCRETE_MOTION, Completion.PROFILE, plan=goal)
         return False

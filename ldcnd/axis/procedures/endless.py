@@ -8,8 +8,9 @@ from abc import abstractmethod
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import LATENCY_S, AxisMotion
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import LATENCY_S
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.axis.trapezoid import braking_way
@@ -79,10 +80,10 @@ class EndlessMotion(Procedure):
             PositionLimit: there is not enough way left.
         """
         motion, tracker = self._motion, self._motion.tracker
-        limit = motion.limit_ahead(velocity)
+        limit = motion.plans.limit_ahead(velocity)
         if limit is None:
             return
-        here, unit = motion.here, motion.scale.unit
+        here, unit = motion.plans.here, motion.scale.unit
         if self.ends_before_limit(motion.latest()) or (here >= limit if velocity > 0 else here <= limit):
             raise PositionLimit(
                 f"axis {tracker.name} is at {here:g} {unit}: its limit {limit:g} {unit} is too near",

@@ -12,8 +12,9 @@ from collections.abc import Mapping
 from typing_extensions import override
 
 from ldcnd.axis.events import CommandOver, MotionStarted
-from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit, start_together
+from ldcnd.axis.plans import MotionPlan
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion
 from ldcnd.axis.straight import straight_line
@@ -66,7 +67,7 @@ def plans_on_line(
     Raises:
         ValueOutOfRange: they would get farther from the line than that.
     """
-    line = straight_line({name: motion.on_line(plan) for name, (motion, plan) in axes.items()})
+    line = straight_line({name: motion.plans.on_line(plan) for name, (motion, plan) in axes.items()})
     if max_deviation is not None and line.deviation > max_deviation:
         raise ValueOutOfRange(
             f"axes {', '.join(sorted(axes))} would leave the line by {line.deviation:.4g}, more than {max_deviation:g}",
@@ -74,7 +75,9 @@ def plans_on_line(
             limit=max_deviation,
             remedy="move more slowly, or allow more",
         )
-    return {name: motion.replanned(plan, line.motions[name]) for name, (motion, plan) in axes.items()}, line.deviation
+    return {
+        name: motion.plans.replanned(plan, line.motions[name]) for name, (motion, plan) in axes.items()
+    }, line.deviation
 
 
 class Rendezvous(ABC):
@@ -242,8 +245,8 @@ class GroupMember(Procedure):
         Raises:
             RequestRefused: as `move_absolute`.
         """
-        position = self.motion.unwrapped(self._request.position, self._request.direction)
-        self.plan = self.motion.plan_to(position, self._request.velocity, self._request.acceleration)
+        position = self.motion.plans.unwrapped(self._request.position, self._request.direction)
+        self.plan = self.motion.plans.to(position, self._request.velocity, self._request.acceleration)
 
     def announce(self) -> None:
         """Say that the axis moves, before its drive does."""

@@ -11,8 +11,9 @@ from typing_extensions import override
 
 from ldcnd.axis import guards
 from ldcnd.axis.events import CommandFailing, CommandOver, LoopSwitched, PlaceKnown, PlaceUnknown
-from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import MotionPlan
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.probe import check_index_is_seen
 from ldcnd.axis.status import Completion
@@ -108,7 +109,7 @@ class HomeSequence(Procedure):
         self.permit.check_state()
         search = self._search
         guards.check_origin(tracker, motion.config.farthest, search.position)
-        plan = motion.plan_at(search.velocity, self._acceleration)
+        plan = motion.plans.at(search.velocity, self._acceleration)
         if search.method is HomeMethod.INDEX:
             check_index_is_seen(motion, plan, search.index_width)
         if search.move_to is not None:
@@ -163,7 +164,7 @@ class HomeSequence(Procedure):
         velocity = -search.velocity if away else search.velocity
         if leg is Leg.FIND and search.find_velocity is not None:
             velocity = math.copysign(search.find_velocity, search.velocity)
-        plan = motion.plan_at(velocity, self._acceleration)
+        plan = motion.plans.at(velocity, self._acceleration)
         capture = HomeCapture(search.method, STOPS[search.stop] if leg is Leg.SEARCH else StopMode.SMOOTH)
         leg_motion = replace(
             plan.motion,
@@ -238,7 +239,7 @@ class HomeSequence(Procedure):
         motion, move_to = self._motion, self._search.move_to
         if move_to is None or not motion.tracker.status.at_rest:
             return await self._give_up(f"not at rest within {self._search.timeout_s:g} s")
-        plan = motion.plan_to(motion.unwrapped(move_to), None, None)
+        plan = motion.plans.to(motion.plans.unwrapped(move_to), None, None)
         await self.permit.load(plan.motion)
         await motion.start(self.permit, AxisState.HOMING, Completion.PROFILE, plan=plan)
         return False

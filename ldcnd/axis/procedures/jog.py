@@ -14,8 +14,9 @@ from enum import Enum
 from typing_extensions import override
 
 from ldcnd.axis.events import CommandOver, MotionStarted
-from ldcnd.axis.motion import COUNTER_SHARE, LATENCY_S, AxisMotion, MotionPlan
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import COUNTER_SHARE, LATENCY_S, MotionPlan
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, Jog
@@ -212,8 +213,8 @@ class HeldJog(Procedure):
             return False
         by_s = motion.clock.now_s() + LATENCY_S
         await motion.read()  # the latest reading may be as old as the rates let it be
-        rate = motion.plan_at(asked.velocity, asked.acceleration).motion.acceleration_counts_per_s2
-        if not motion.follows_on(rate, None) or motion.clock.now_s() >= by_s:
+        rate = motion.plans.at(asked.velocity, asked.acceleration).motion.acceleration_counts_per_s2
+        if not motion.plans.follows_on(rate, None) or motion.clock.now_s() >= by_s:
             return False
         self.permit.by_s = by_s
         return True
@@ -242,14 +243,14 @@ class HeldJog(Procedure):
     def _plan(self, here: float, velocity: float, acceleration: float | None) -> tuple[MotionPlan, float, float, bool]:
         """Return the motion, its velocity, for how long it runs, and whether it ends at the software limit."""
         motion = self._motion
-        steady = motion.plan_at(velocity, acceleration)
+        steady = motion.plans.at(velocity, acceleration)
         forward = velocity > 0
         longest_s = COUNTER_SHARE * LARGEST_COUNT / abs(steady.motion.velocity_counts_per_s)
         reach_s = min(self._reach_s, longest_s)
         # with the ramp at its end behind it, so that it has its velocity for `reach_s`
         way = abs(steady.velocity) * reach_s + steady.velocity**2 / (2 * steady.acceleration)
-        end, at_limit = motion.end_ahead(here, way if forward else -way)
-        return motion.plan_to(end, abs(velocity), acceleration), steady.velocity, reach_s, at_limit
+        end, at_limit = motion.plans.end_ahead(here, way if forward else -way)
+        return motion.plans.to(end, abs(velocity), acceleration), steady.velocity, reach_s, at_limit
 
     @property
     def _reach_s(self) -> float:

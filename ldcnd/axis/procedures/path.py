@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 from typing_extensions import override
 
 from ldcnd.axis.events import CommandFailing, CommandOver, MotionStarted
-from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit, start_path
+from ldcnd.axis.plans import MotionPlan
 from ldcnd.axis.polyline import PathAxis, PathWalk, walk
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.procedures.group import Rendezvous, cut_short
@@ -326,8 +327,8 @@ class PathMember(Procedure):
         motion, request = self.motion, self._request
         corners = [self._here]
         for position in (*request.via, request.position):
-            corner = motion.unwrapped(position, request.direction, from_counts=corners[-1])
-            self.plan = motion.plan_to(corner, request.velocity, request.acceleration)
+            corner = motion.plans.unwrapped(position, request.direction, from_counts=corners[-1])
+            self.plan = motion.plans.to(corner, request.velocity, request.acceleration)
             corners.append(self.plan.motion.target_counts or 0)
         self._corners = tuple(map(float, corners))  # where the path turns, in counts of the drive
 

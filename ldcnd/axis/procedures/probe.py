@@ -8,8 +8,9 @@ import math
 
 from ldcnd.axis import guards
 from ldcnd.axis.events import CommandFailing
-from ldcnd.axis.motion import AxisMotion, MotionPlan
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import MotionPlan
 from ldcnd.axis.procedure import Procedure
 from ldcnd.axis.status import Completion
 from ldcnd.axis.unmoved import homing
@@ -123,7 +124,7 @@ class ProbeMove(Procedure):
         match request.position, request.distance:
             case float() as position, None:
                 guards.check_referenced(motion.tracker)
-                position = motion.unwrapped(position)
+                position = motion.plans.unwrapped(position)
             case None, float() as distance:
                 position = motion.scale.position(here_counts) + distance
             case _:
@@ -131,7 +132,7 @@ class ProbeMove(Procedure):
                     f"axis {motion.config.name}: a probe needs exactly one of position and distance",
                     axis=motion.config.name,
                 )
-        return motion.plan_to(position, request.velocity, request.acceleration)
+        return motion.plans.to(position, request.velocity, request.acceleration)
 
 
 def check_index_is_seen(motion: AxisMotion, plan: MotionPlan, width: int) -> None:

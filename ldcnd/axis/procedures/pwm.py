@@ -6,8 +6,9 @@ the axis must be configured for it.
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import LATENCY_S, AxisMotion
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import LATENCY_S
 from ldcnd.axis.procedures.endless import WATCH_S, EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.axis.tracker import AxisTracker
@@ -36,7 +37,7 @@ class PwmRun(EndlessMotion):
         self._check_bounds()
         speed, rate = motion.config.velocity, motion.config.acceleration
         counts_per_unit = abs(motion.scale.counts_per_unit)
-        acceleration = motion.quantise(CountsMotion(None, speed * counts_per_unit, rate * counts_per_unit))
+        acceleration = motion.plans.quantise(CountsMotion(None, speed * counts_per_unit, rate * counts_per_unit))
         self.acceleration = acceleration.acceleration_counts_per_s2 / counts_per_unit
         self.check_room(request.duty)
         duty = request.duty if motion.scale.counts_per_unit > 0 else -request.duty

@@ -51,7 +51,7 @@ class SetPoint(Procedure):
         self.permit.check_state()
         guards.check_position(tracker, motion.config.limits, position)
         self._check_rate(before, bounds)
-        target = motion.counts_of(position)
+        target = motion.plans.counts_of(position)
         self._check_step(target, bounds)
         self.permit.ask_to_move()
         if tracker.status.command and tracker.status.command.verb is Verb.TRACK:
@@ -78,7 +78,7 @@ class SetPoint(Procedure):
     async def step(self) -> bool:
         """See `Procedure`: nothing came any more; the axis holds the last set-point, and says whether it is there."""
         motion = self._motion
-        off = abs(motion.commanded_counts - motion.latest().position_counts) / abs(motion.scale.counts_per_unit)
+        off = abs(motion.plans.commanded_counts - motion.latest().position_counts) / abs(motion.scale.counts_per_unit)
         # a loop may be soft; half a step away the drive has not taken what it has acknowledged
         away = off > max(self._bounds().step / 2, motion.window_counts / abs(motion.scale.counts_per_unit))
         said = f"it is {off:.4g} {motion.scale.unit} away from its last set-point: read where it is before you go on"
@@ -111,7 +111,7 @@ class SetPoint(Procedure):
 
     def _check_step(self, target: int, bounds: TrackingConfig) -> None:
         motion = self._motion
-        last = motion.commanded_counts
+        last = motion.plans.commanded_counts
         step = (target - last) / motion.scale.counts_per_unit
         if abs(step) > bounds.step:
             nearest = motion.scale.position(last) + (bounds.step if step > 0 else -bounds.step)

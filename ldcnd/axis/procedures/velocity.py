@@ -8,8 +8,9 @@ that are armed do so without it. PIC-SERVO SC takes a new trapezoid at any time:
 
 from typing_extensions import override
 
-from ldcnd.axis.motion import COUNTER_SHARE, LATENCY_S, AxisMotion
+from ldcnd.axis.motion import AxisMotion
 from ldcnd.axis.permit import Permit
+from ldcnd.axis.plans import COUNTER_SHARE, LATENCY_S
 from ldcnd.axis.procedures.endless import EndlessMotion
 from ldcnd.axis.status import Completion
 from ldcnd.contract.commands import CommandReply, MoveVelocity
@@ -32,10 +33,10 @@ class VelocityChange(EndlessMotion):
         """
         motion, request = self._motion, self._request
         self.permit.check_state()
-        plan = motion.plan_at(request.velocity, request.acceleration)
+        plan = motion.plans.at(request.velocity, request.acceleration)
         self._velocity, self.acceleration = plan.velocity, plan.acceleration
         speed_counts = plan.motion.velocity_counts_per_s
-        run_s = motion.run_s(request.duration_s, speed_counts)
+        run_s = motion.plans.run_s(request.duration_s, speed_counts)
         by_s = motion.clock.now_s() + LATENCY_S
         await motion.read()  # the latest reading may be as old as the rates let it be
         self.permit.ask_to_move()
@@ -43,12 +44,12 @@ class VelocityChange(EndlessMotion):
         self.permit.by_s = by_s
         await self.permit.load(plan.motion)
         room_s = motion.driver.room_counts(forward=speed_counts > 0) / abs(speed_counts)
-        last_s = run_s + motion.ramp_s(request.duration_s, plan)
+        last_s = run_s + motion.plans.ramp_s(request.duration_s, plan)
         # before the start: if that is not confirmed the motion is ended all the same
         self._until_s = motion.clock.now_s() + min(last_s, COUNTER_SHARE * room_s)
         await motion.start(self.permit, AxisState.CONTINUOUS_MOTION, Completion.PROCEDURE)
-        _, at_limit = motion.end_ahead(motion.here, plan.velocity * last_s)
-        ends = motion.end_in_words(run_s, plan.velocity, at_limit=at_limit)
+        _, at_limit = motion.plans.end_ahead(motion.plans.here, plan.velocity * last_s)
+        ends = motion.plans.end_in_words(run_s, plan.velocity, at_limit=at_limit)
         return motion.reply(self.permit, ends=ends, velocity=plan.velocity, acceleration=plan.acceleration)
 
     @override
