@@ -86,7 +86,7 @@ def check_enabled(axis: AxisTracker) -> None:
             f"axis {axis.name} is disabled",
             axis=axis.name,
             value=AxisState.DISABLED,
-            remedy=Remedy(f"{'wait until it stands, then ' if status.coasts else ''}{{}}", _POWER_ON),
+            remedy=Remedy("wait until it stands, then {}", _POWER_ON) if status.coasts else Remedy("{}", _POWER_ON),
         )
 
 

@@ -81,7 +81,7 @@ from ldcnd.axis.status import (
     AxisStatus,
     Completion,
 )
-from ldcnd.axis.watch import let_go, next_following, parted, watch_braking, watch_course, watch_encoder
+from ldcnd.axis.watch import let_go, next_following, parted, stood, watch_braking, watch_course, watch_encoder
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import AxisState, LinkState, Unseen
 from ldcnd.drives.driver import Fault, StopMode
@@ -119,7 +119,7 @@ def take_reading(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     if faults or status.faults or status.stop:
         lost = any(fault.loses_position for fault in faults) or parted(status, event, faults)
         status = changed(with_faults(status, faults, now_ns), position_lost=lost)
-        if lost:
+        if lost or stood(status, event):
             status = changed(place_lost(status), target=None)
     if event.sent_at_s >= status.effective_from_s:  # else it says nothing about the latest command
         status = _take_effective(status, event, faults)
@@ -172,7 +172,7 @@ def _see_rest(status: AxisStatus, rest: RestEvidence, at_s: float, *, enabled: b
 def _fail_by_fault(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     if status.enabled and any(fault.stops and fault.hides_motion for fault in event.reading.faults):
         status = keep_stop(status, StopUnconfirmed(event.now_ns, StopMode.OFF, CLOSED_AGAIN))
-    lost = "; its position is lost" if status.position_lost else ""
+    lost = "; its position is lost" if status.position_lost or status.reference_lost else ""
     return fail(status, f"the drive reports a fault{lost}")
 
 
@@ -238,7 +238,11 @@ def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
 
 
 def _take_look(status: AxisStatus, event: LookTaken) -> AxisStatus:
-    return changed(status, rest=replace(status.rest, turns=shows_velocity(event.reading)))
+    braking = status.braking
+    # where it shows that the motor is off, the power that may follow is not what a stop was to take away
+    if braking and braking.mode is StopMode.OFF and not status.driven_open and not event.reading.enabled:
+        braking = None
+    return changed(status, rest=replace(status.rest, turns=shows_velocity(event.reading)), braking=braking)
 
 
 def _see_loop(status: AxisStatus, event: LoopSeen) -> AxisStatus:

@@ -13,6 +13,7 @@ from ldcnd.axis.events import MotionStarted, ReadingTaken, StopUnconfirmed
 from ldcnd.axis.faults import NOT_FOLLOWED, STOOD_AT_ONCE
 from ldcnd.axis.following import BRAKES_SHARE, Following
 from ldcnd.axis.outcome import changed, fail, keep_stop, own_and, place_lost, with_faults
+from ldcnd.axis.rest import shows_velocity
 from ldcnd.axis.status import AxisStatus
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import AxisState
@@ -30,6 +31,17 @@ def parted(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -
     """Tell whether a shaft that cannot stand at once has left its encoder behind, which has missed counts then."""
     coasts_on = status.limits.slowing_counts_per_s2 is not None
     return coasts_on and not event.reading.enabled and any(fault.hides_motion for fault in faults)
+
+
+def stood(status: AxisStatus, event: ReadingTaken) -> bool:
+    """Tell whether a drive has left a motion whose shaft was not seen to move any more: it jams, or moves unseen."""
+    reading, following = event.reading, status.following
+    if reading.enabled or not (status.enabled and status.state.is_motion) or shows_velocity(reading):
+        return False
+    if not any(fault.stops and fault.hides_motion for fault in reading.faults):
+        return False
+    # one that lags is slow, and is seen to move until it trips
+    return not following or abs(reading.position_counts - following.seen.low) < following.leeway.least_counts
 
 
 def watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) -> AxisStatus:
@@ -64,7 +76,11 @@ def _watch_following(
     at_velocity = _is_at_velocity(status, following, event.sent_at_s)
     seen = tripped or following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
     if isinstance(seen, Following):
-        return status if seen is following else replace(status, following=seen)
+        if seen is following:
+            return status
+        # a jam may be cleared, and an encoder come back: neither tells of the way between
+        status = place_lost(status) if seen.given_up else status
+        return replace(status, following=seen)
     if seen and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
         if following.settled and not following.is_missed:

@@ -11,6 +11,7 @@ from ldcnd.contract.commands import (
     HomeStop,
     MoveAbsolute,
     MoveAnalog,
+    MoveRelative,
     Power,
     Reset,
     SetGains,
@@ -157,7 +158,24 @@ async def test_a_jam_ends_in_a_position_error(dialect):
         rig.condition(FaultCondition.STALLED, present=False)
         await rig.send(Reset())
         await rig.send(Power(on=True))
-        assert (await rig.done(FAR)).state is AxisState.STANDSTILL
+        with pytest.raises(NotReferenced):  # an encoder that is dead shows the same as a jam
+            await rig.send(FAR)
+        assert (await rig.done(MoveRelative(distance=1.0))).state is AxisState.STANDSTILL
+
+
+@named(DIALECTS)
+@pytest.mark.sweep(4)
+async def test_a_shaft_that_moved_on_beside_a_dead_encoder_has_no_place_behind_the_reset(dialect):
+    async with dialect_rig(dialect, gains=GAINS | {"el": 500}) as rig:
+        await rig.power_on()
+        await rig.send(FAR)
+        await asyncio.sleep(0.5)
+        rig.condition(FaultCondition.ENCODER_STUCK)
+        await rig.until_fault(lambda faults: faults.active)
+        rig.condition(FaultCondition.ENCODER_STUCK, present=False)
+        await rig.send(Reset())
+        state = await rig.until(lambda state: state.state is AxisState.DISABLED)
+        assert (state.referenced, state.reference_lost) == (False, True)
 
 
 @named(LOGOSOL)
@@ -311,7 +329,8 @@ async def test_current_limiting_is_a_warning_that_reset_clears_with_the_loop_clo
 
         assert (codes(sample), sample.first.stops) == (["current_limit"], False)
         assert (await rig.until(lambda state: state.command is None)).state is AxisState.STANDSTILL
-        await rig.done(MoveAbsolute(position=0.0))
+        # an encoder that is dead shows the same, until it comes back
+        assert not (await rig.done(MoveRelative(distance=-1.0))).referenced
         await rig.send(Reset())
         assert (await rig.until_fault(lambda faults: not faults.active)).first is None
         assert rig.drive.loop.servo_on

@@ -27,7 +27,7 @@ LOOKS = 8
 KNOWN_AFTER_S = 4.0
 """By then two polls have followed an instant, also of a SmartStep."""
 FAST_HZ = 20
-SLOW_RATIO = 2.7
+SLOW_RATIO = 2.8
 """Where ramps begin and end between two polls, see `judge`."""
 KINDS = {"move_absolute": "move", "move_relative": "move", "move_velocity": "jog", "home": "home", "halt": "stop"}
 
