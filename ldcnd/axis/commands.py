@@ -70,9 +70,9 @@ from ldcnd.drives.driver import AxisReading, CountsMotion, StopMode
 from ldcnd.line.exchange import NEVER_S, Timing
 
 STEP_RETRY_S = 0.2
-"""Delay before a step whose packets were lost is taken again, seconds,"""
+"""Delay before a step whose packets were lost is taken again, seconds."""
 BLIND_RETRY_S = 1.0
-"""and the delay while the drive does not reply at all."""
+"""The same while the drive does not reply at all."""
 BRAKING_ROOM = 1.1
 """Least way to a new end in mid-motion, as a multiple of what it needs to brake."""
 MOVES = frozenset({Verb.MOVE_ABSOLUTE, Verb.MOVE_RELATIVE, Verb.MOVE_VELOCITY})

@@ -92,7 +92,7 @@ class AxisGains:
         if not request.lent:
             await permit.set_gains(changed)
             self._lent = False
-            # only now: what was not acknowledged must not be loaded later by itself
+            # the register book has what the drive is to hold, and took it once it was acknowledged; the set follows it
             self._in_force = self._in_force if request.gain_set is None else request.gain_set
             self._sets[self._in_force] = changed
             return self._motion.reply(permit)

@@ -208,7 +208,7 @@ class AxisReadings:
             self._bus.distrust()  # another drive's reply that came late would be followed by others
         return judged.verdict is ReadingVerdict.ASK_AGAIN
 
-    def take(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
+    def take_judged(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         """Process an accepted reading; that of a drive which was not identified says nothing about the axis."""
         if self._proof.holds:
             self._digest(reading, asked, timing)

@@ -85,10 +85,7 @@ from ldcnd.axis.watch import let_go, next_following, parted, stood, watch_brakin
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import AxisState, LinkState, Unseen
 from ldcnd.drives.driver import Fault, StopMode
-
-MISSES_UNTIL_DOWN = 3
-"""Consecutive polls without a reply after which the drive counts as lost, or with replies that cannot be used after
-which what it does is not understood."""
+from ldcnd.line.proof import MISSES_UNTIL_LOST
 
 LEFT = "sent before the drive was read: what it did while no daemon read it is not known"
 CLOSED_AGAIN = "sent because its drive had opened its loop, and what was sent before that was seen has closed it again"
@@ -250,8 +247,8 @@ def _see_loop(status: AxisStatus, event: LoopSeen) -> AxisStatus:
 
 
 def _miss(status: AxisStatus, event: PollMissed) -> AxisStatus:
-    status = changed(status, misses=min(status.misses + 1, MISSES_UNTIL_DOWN))
-    if status.misses >= MISSES_UNTIL_DOWN:
+    status = changed(status, misses=min(status.misses + 1, MISSES_UNTIL_LOST))
+    if status.misses >= MISSES_UNTIL_LOST:
         return _lose_drive(status, DriveLost(event.now_ns, event.another, event.before, asked=True))
     return replace(status, link=LinkState.DEGRADED) if status.link is LinkState.UP else status
 
@@ -282,8 +279,8 @@ def _out_of_sight(status: AxisStatus) -> RestEvidence:
 
 def _take_unusable(status: AxisStatus, event: ReplyUnusable) -> AxisStatus:
     link = LinkState.DEGRADED if status.link is LinkState.UP else status.link
-    status = changed(status, misses=0, in_vain=min(status.in_vain + 1, MISSES_UNTIL_DOWN), link=link)
-    if status.in_vain < MISSES_UNTIL_DOWN or status.replies_unusable or link is LinkState.DOWN:
+    status = changed(status, misses=0, in_vain=min(status.in_vain + 1, MISSES_UNTIL_LOST), link=link)
+    if status.in_vain < MISSES_UNTIL_LOST or status.replies_unusable or link is LinkState.DOWN:
         return status
     own = own_and(status, REPLIES_UNUSABLE)
     status = with_faults(replace(status, rest=_out_of_sight(status), own=own), own, event.now_ns)

@@ -72,7 +72,7 @@ class AxisStops:
 
     Attributes:
         possible: the drive takes stops over its line.
-        wanted: set when a stop waits to be sent again; its line sees to that.
+        wanted: set when a stop waits to be sent again; its line, which sees to that, puts one of all its axes here.
         inherited: a motion that an earlier host has left may still run.
         line_up: its line is ready for stops; while it is not, they wait for it.
         latches: keeps what forbids the axis to move; a stop is answered when that is kept.
@@ -143,21 +143,22 @@ class AxisStops:
         """
         if not self.possible:
             return False
-        wanted, name, verb = verb, verb or BY_MODE[mode], verb or Verb.HALT
+        asked_for, name = verb is not None, verb or BY_MODE[mode]
+        cause = verb or Verb.HALT
         # before its packet: whatever comes to its turn from here on finds that it is void
-        overtaken = self.overtake(by, by.verb if by else OVERTAKES.get(verb, verb))
+        overtaken = self.overtake(by, by.verb if by else OVERTAKES.get(cause, cause))
         stop = self._tracker.take(StopSent(mode, name)).stop
         try:
             if not self.line_up:
                 return False  # its line is being brought up, or is down: it is the first thing that is sent then
             # what waits on the line; the packet on the wire is over before the stop goes
             self._bus.withdraw(self._drive.spec.address, overtaken)
-            return await self._send(stop.mode if stop else mode, verb, STOP_ROUNDS, command_id)
+            return await self._send(stop.mode if stop else mode, cause, STOP_ROUNDS, command_id)
         finally:
             # also when this is cancelled: what is not confirmed by now its line sends again
             if still := self._tracker.status.stop:
                 first = still.asked[0].verb if still.asked else name
-                if wanted or self._tracker.status.was_read:
+                if asked_for or self._tracker.status.was_read:
                     self.require(still.mode, first)
                 else:  # no client has asked for it: the daemon does not know what the drive does
                     self._tracker.take(StopDue(still.mode, LEFT, first))

@@ -103,8 +103,8 @@ class Journal:
 
     def _note(self, axis: str, line: bytes) -> None:
         now_s = asyncio.get_running_loop().time()
-        for log in self._logs[axis]:
-            log.add(now_s, WireEvent.COMMAND, line)
+        for wire_log in self._logs[axis]:
+            wire_log.add(now_s, WireEvent.COMMAND, line)
 
 
 def without_tokens(given: object, *, secret: bool = False) -> object:

@@ -29,13 +29,12 @@ from ldcnd.daemon.link_events import LinkEvents, Note
 from ldcnd.drives.line_config import InputConfig, OutputConfig, OutputLevel
 from ldcnd.drives.network import IoDriver
 from ldcnd.line.exchange import Timing
-from ldcnd.line.proof import Condition, only_while
+from ldcnd.line.proof import MISSES_UNTIL_LOST, Condition, only_while
 from ldcnd.log import get_logger
 from ldcnd.net.publisher import Publisher
 
 FULL_SCALE_V = 5.0
 FULL_SCALE_COUNTS = 255
-MISSES_UNTIL_BAD = 3
 DIFFERS_AFTER = 2
 """Readings in a row in which a pin shows another level than was written, until the output counts as different."""
 APPLIED_AGAIN_S = 0.5
@@ -121,8 +120,9 @@ class ModuleService:
         read_at_s: when the latest reading was requested, in loop time; minus infinity while it is out of reach.
         values: of the named inputs, and the levels of the outputs; None while one is not known.
         before: of outputs that are being written the value that they had, and when that was read, in loop time.
-        check: raises what forbids to write outputs, each true for high, false for low and None to let go of it.
-        changed: called when one of the values has changed.
+        check: raises what forbids to write outputs, each true for high, false for low and None to let go of it; the
+            interlocks of the rig set it.
+        changed: called when one of the values has changed; likewise.
     """
 
     def __init__(
@@ -247,9 +247,9 @@ class ModuleService:
 
     def _lost(self) -> None:
         self._misses += 1
-        if self._misses == MISSES_UNTIL_BAD:
+        if self._misses == MISSES_UNTIL_LOST:
             self._gone()
-        self._topic.publish_again(Quality.BAD if self._misses >= MISSES_UNTIL_BAD else Quality.UNCERTAIN)
+        self._topic.publish_again(Quality.BAD if self._misses >= MISSES_UNTIL_LOST else Quality.UNCERTAIN)
 
     def _gone(self) -> None:
         """It is out of reach: nothing is known of its lines."""

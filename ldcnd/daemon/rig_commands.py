@@ -260,7 +260,7 @@ class RigCommands:
     def _admit_module(self, module: ModuleService, command: SetIo | SetIoTimer) -> None:
         """Refuse outputs to who may not move the axes of the module's line, and while one of them is stopped.
 
-        What an output switches is not known: it may move something.
+        What an output switches is not known: it may move something. A line that has modules has at least one axis.
         """
         for name in module.axes:
             self._admit(name, self._own(name, command.leases) or command.lease)

@@ -14,7 +14,8 @@ from ldcnd.contract.errors import AxisUnreachable, LdcndError, NotIdentified
 from ldcnd.line.exchange import Exchange, Lane, PacketEffect
 
 MISSES_UNTIL_LOST = 3
-"""Exchanges in a row without a reply after which another module may be at the address."""
+"""Exchanges in a row without a reply after which a node counts as lost: another module may be at its address. So do
+replies that cannot be used: what it does is not understood."""
 ALWAYS_SENT = frozenset({PacketEffect.READS, PacketEffect.RELIEVES})
 
 

@@ -15,7 +15,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from ldcnd.contract.errors import BusBusy
 from ldcnd.line.exchange import NO_DEADLINE_S, Exchange, Lane, Poller, Priority, Timing
-from ldcnd.line.proof import Proofs
+from ldcnd.line.proof import MISSES_UNTIL_LOST, Proofs
 from ldcnd.line.settings import ServoCycle
 
 STOP, COMMAND, POLL, BACKGROUND = Lane  # Lane.STOP is looked up slowly, and turns are taken between two packets
@@ -228,7 +228,6 @@ class Schedule(Generic[JobT]):
         self.reschedule(poller, max(poller.due_at_s, now_s + self.mute.pause_s(poller.node, lost_s)))
 
 
-MISSES_BEFORE_BACKOFF = 3
 MUTE_SHARE = 0.005
 """Fraction of the line's time that polls without a reply may take, so that mute nodes cost the others little."""
 FIRST_BACKOFF_S = 0.05
@@ -267,7 +266,7 @@ class MuteNodes:
             lost_s: time that a poll without a reply takes on the line.
         """
         self._lost_polls[node] = lost = self._lost_polls.get(node, 0) + 1
-        beyond = lost - MISSES_BEFORE_BACKOFF
+        beyond = lost - MISSES_UNTIL_LOST
         if beyond < 0:
             return 0.0
         self._backed_off.add(node)

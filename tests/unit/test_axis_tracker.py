@@ -19,13 +19,13 @@ from ldcnd.axis.events import (
 )
 from ldcnd.axis.faults import JUMPED
 from ldcnd.axis.status import ActiveCommand, AxisStatus, Completion
-from ldcnd.axis.step import MISSES_UNTIL_DOWN
 from ldcnd.axis.tracker import AxisTracker
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.events import CommandStatus
 from ldcnd.contract.samples import AxisState, LinkState, Moving, Quality
 from ldcnd.drives.driver import AxisReading, Fault
 from ldcnd.line.exchange import Timing
+from ldcnd.line.proof import MISSES_UNTIL_LOST
 from tests.support.axis_bench import tracked
 
 OFF = AxisReading(
@@ -201,7 +201,7 @@ def test_a_silent_drive_moves_unknown_not_no(moving):
         Quality.UNCERTAIN,
     )
 
-    for _ in range(MISSES_UNTIL_DOWN - 1):
+    for _ in range(MISSES_UNTIL_LOST - 1):
         moving.take(PollMissed(0, another=False))
     assert (moving.status.link, moving.status.moving, moving.status.quality) == (
         LinkState.DOWN,

@@ -1,6 +1,7 @@
 import pytest
 
-from ldcnd.line.schedule import LONGEST_BACKOFF_S, MISSES_BEFORE_BACKOFF, MUTE_SHARE, MuteNodes
+from ldcnd.line.proof import MISSES_UNTIL_LOST
+from ldcnd.line.schedule import LONGEST_BACKOFF_S, MUTE_SHARE, MuteNodes
 
 LOST_S = 0.015
 
@@ -14,7 +15,7 @@ def silent(nodes: MuteNodes, node: int, times: int) -> float:
 
 
 def test_the_first_misses_are_forgiven():
-    assert silent(MuteNodes(), 1, MISSES_BEFORE_BACKOFF - 1) == 0.0
+    assert silent(MuteNodes(), 1, MISSES_UNTIL_LOST - 1) == 0.0
 
 
 def test_a_mute_node_takes_its_share_of_the_line_and_no_more():

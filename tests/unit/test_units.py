@@ -6,9 +6,19 @@ from pathlib import Path
 import pytest
 
 from ldcnd.config.rig import load_config
+from ldcnd.contract.commands import COMMANDS
 from ldcnd.contract.errors import ConfigError
 from ldcnd.contract.number_text import NotANumber
-from ldcnd.contract.units import AxisUnits, Dimension, g_velocity, quantity_text, read_quantity, unit_table, units_of
+from ldcnd.contract.units import (
+    DIMENSIONS,
+    AxisUnits,
+    Dimension,
+    g_velocity,
+    quantity_text,
+    read_quantity,
+    unit_table,
+    units_of,
+)
 from tests.support.console_parts import ask_the_pages, part_of_pages
 from tests.unit.test_number_text import ROOT
 
@@ -161,3 +171,14 @@ def test_a_unit_that_does_not_fit_is_refused_where_it_stands(tmp_path, old, new,
         _axis_of(tmp_path, (old, new))
 
     assert said in refused.value.message
+
+
+def test_each_number_of_a_command_that_is_no_time_and_no_share_has_a_dimension():
+    floats = {
+        f"{command.__name__}.{name}"
+        for command in COMMANDS
+        for name, field in command.model_fields.items()
+        if float in getattr(field.annotation, "__args__", (field.annotation,))
+        and not (name in DIMENSIONS or name.endswith("_s") or name == "duty")
+    }
+    assert not floats, "typed with a unit they would be plain numbers"

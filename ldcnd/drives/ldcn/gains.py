@@ -37,6 +37,7 @@ class GainRegisters:
             RegisterUnknown: the divisor is not known, and the axis moves or has no gains to be loaded.
         """
         book = self._of.book
+        # in motion kp to deadband may be unknown: one of two values that clients gave, and Set Gain would act at once
         if book.wanted_gains is not None and not book.loaded:
             if await self._of.stands():
                 await self.load(book.wanted_gains)

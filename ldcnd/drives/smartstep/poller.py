@@ -35,11 +35,11 @@ from ldcnd.drives.smartstep.profiles import SmartStepProfile
 from ldcnd.drives.smartstep.words import stray_packets
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import NEVER_S, Exchange, Poller, Timing, next_on_grid
+from ldcnd.line.proof import MISSES_UNTIL_LOST
 from ldcnd.log import get_logger
 
 log = get_logger("smartstep")
 
-MISSES_BEFORE_BACKOFF = 3
 FIRST_BACKOFF_S = 1.0
 LONGEST_BACKOFF_S = 10.0
 STRAY_WAIT_S = 0.3
@@ -167,7 +167,7 @@ class UnitPoller(Poller[int | Refusal]):
         self._history_place = 0
         self._hurries_history = True
         self._audited = list(range(len(PARAMETERS)))  # places; the next one first
-        self._misses = 0 if wires_checked else MISSES_BEFORE_BACKOFF
+        self._misses = 0 if wires_checked else MISSES_UNTIL_LOST
 
     def forget_position(self) -> None:
         """The counter was cleared: what it said before is no help any more."""
@@ -182,7 +182,7 @@ class UnitPoller(Poller[int | Refusal]):
         the turn after this one is put off until then.
         """
         queued_at_s, self.due_at_s = self.due_at_s, now_s + self._profile.unit.first_character_s + PUT_OFF_S
-        if self._misses >= MISSES_BEFORE_BACKOFF or self._one_word_only:
+        if self._misses >= MISSES_UNTIL_LOST or self._one_word_only:
             # every drive has it, and it is never zero: 0099H without an alarm (manual 3)
             self._address = Register.PRESENT_ALARM
         else:
@@ -195,7 +195,7 @@ class UnitPoller(Poller[int | Refusal]):
     @override
     def deliver(self, reply: int | Refusal, timing: Timing) -> None:
         identifies = self._item is Basic.IDENTITY or self._due_s[Basic.IDENTITY] < NEVER_S
-        if self._misses >= MISSES_BEFORE_BACKOFF or (self._is_lost() and not identifies):
+        if self._misses >= MISSES_UNTIL_LOST or (self._is_lost() and not identifies):
             self._misses = 0
             self._abandon()
             self._back(timing.received_at_s)
@@ -227,10 +227,10 @@ class UnitPoller(Poller[int | Refusal]):
         self._at_rest_since_position = False
         self._listeners.missed(error)
         now_s = self._loop.time()
-        if self._misses < MISSES_BEFORE_BACKOFF:
+        if self._misses < MISSES_UNTIL_LOST:
             self._next_turn(now_s)
         else:
-            doublings = min(10, self._misses - MISSES_BEFORE_BACKOFF)
+            doublings = min(10, self._misses - MISSES_UNTIL_LOST)
             self._next_turn(now_s + min(LONGEST_BACKOFF_S, FIRST_BACKOFF_S * 2.0**doublings))
 
     def _next_turn(self, at_s: float) -> None:
