@@ -608,7 +608,7 @@ class AxisService:
                 reading = await self._motion.read()
                 now_s = self._clock.now_s()
                 if self.readings.are_of_the_drive:
-                    self.readings.take_judged(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
+                    self.readings.accept(reading, reading.asked, Timing(asked_s, asked_s, now_s, now_s))
                 else:
                     self.tracker.take(LoopSeen(reading.enabled))
         except LdcndError as error:

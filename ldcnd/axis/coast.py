@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from ldcnd.axis.rest import REST_COUNTS, is_fast
+from ldcnd.axis.rest import REST_COUNTS, Comparison, is_fast
 from ldcnd.drives.driver import AxisReading
 
 RUNAWAY_SHARE = 4.0
@@ -63,8 +63,8 @@ class Coast:
 
     def observe(
         self, reading: AxisReading, at_s: float, true_until_s: float, most_counts_per_s2: float | None = None
-    ) -> "Coast | bool":
-        """Take a reading; return how it goes on, True once the shaft stands, or False: it stands all too suddenly.
+    ) -> "Coast | Comparison":
+        """Take a reading; return how it goes on, or that the shaft stands: as it slowed down, or all too suddenly.
 
         Args:
             reading: of the shaft.
@@ -85,31 +85,32 @@ class Coast:
             return Coast(since_s, self.from_counts_per_s, at_s, speed, step, at_counts, true_until_s)
         coasted_s, most = self.at_s - self.since_s, most_counts_per_s2
         if not is_fast(self.speed_counts_per_s, step):
-            return True
+            return Comparison.AS_TOLD
         if most is None and coasted_s < COASTS_S:
-            return True
+            return Comparison.AS_TOLD
         if most is None:
             slowing = (max(0.0, self.from_counts_per_s - self.speed_counts_per_s) + step) / coasted_s
             most = SUDDEN_SHARE * slowing
-        return most * took_s > self.speed_counts_per_s / 2
+        slowed = most * took_s > self.speed_counts_per_s / 2
+        return Comparison.AS_TOLD if slowed else Comparison.NOT_AS_TOLD
 
     def _observe_way(
         self, reading: AxisReading, at_s: float, true_until_s: float, most: float, way_counts: int
-    ) -> "Coast | bool":
+    ) -> "Coast | Comparison":
         """Compare its way, which is exact, and its velocity, which is coarse, with the least that they can be."""
         took_s, speed = at_s - max(self.at_s, self.until_s), self.speed_counts_per_s
         braking_s = min(took_s, speed / most)
         if 2 * (way_counts + 4 * REST_COUNTS) < braking_s * (speed - most * braking_s / 2):
-            return False
+            return Comparison.NOT_AS_TOLD
         longest_s = max(at_s, true_until_s) - self.at_s
         least = max(0.0, speed - most * longest_s)
         shown, step = abs(reading.velocity_counts_per_s), reading.velocity_resolution_counts_per_s
         if 2 * shown < least and is_fast(least, step):
-            return False
+            return Comparison.NOT_AS_TOLD
         if reading.enabled and shown > self.shown_counts_per_s + RUNAWAY_SHARE * most * longest_s + 2 * step:
-            return False  # its loop makes up for counts that were missed
+            return Comparison.NOT_AS_TOLD  # its loop makes up for counts that were missed
         if way_counts <= REST_COUNTS and shown <= step:
-            return True
+            return Comparison.AS_TOLD
         # from its mean speed; where the counter is set its positions jump
         least = max(least, min(way_counts / longest_s - most * longest_s / 2, shown + step))
         at_counts = reading.position_counts

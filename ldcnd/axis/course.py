@@ -7,7 +7,7 @@ lost. So what a drive has acknowledged is believed once readings show it.
 import math
 from dataclasses import dataclass, replace
 
-from ldcnd.axis.rest import REST_COUNTS, REST_S
+from ldcnd.axis.rest import REST_COUNTS, REST_S, Comparison
 from ldcnd.drives.driver import AxisReading, StopMode
 
 LAG_S = 0.1
@@ -51,8 +51,8 @@ class Braking:
     still_counts: int = 0
     still_since_s: float = math.inf
 
-    def observe(self, reading: AxisReading, at_s: float, *, driven_open: bool = False) -> "Braking | bool":
-        """Take a reading; return what is still awaited, True once the stop is seen, or False: it was not heard.
+    def observe(self, reading: AxisReading, at_s: float, *, driven_open: bool = False) -> "Braking | Comparison":
+        """Take a reading; return what is still awaited, or that the stop is seen, or was not heard.
 
         Args:
             reading: what the drive shows.
@@ -64,9 +64,10 @@ class Braking:
         if at_s < self.acknowledged_at_s:
             return self
         if driven_open and not reading.enabled:
-            return self._observe_open(reading.position_counts, at_s) if self.mode is StopMode.OFF else False
+            is_off = self.mode is StopMode.OFF
+            return self._observe_open(reading.position_counts, at_s) if is_off else Comparison.NOT_AS_TOLD
         if self.mode is StopMode.OFF or not reading.enabled:
-            return not reading.enabled
+            return Comparison.NOT_AS_TOLD if reading.enabled else Comparison.AS_TOLD
         position = reading.position_counts
         if self.from_counts is None:
             return replace(
@@ -77,16 +78,17 @@ class Braking:
                 still_since_s=at_s,
             )
         if abs(position - self.from_counts) > self.room_counts:
-            return False
+            return Comparison.NOT_AS_TOLD
         if abs(position - self.still_counts) > REST_COUNTS:
             return replace(self, still_counts=position, still_since_s=at_s)
-        return True if at_s - self.still_since_s >= REST_S else self
+        return Comparison.AS_TOLD if at_s - self.still_since_s >= REST_S else self
 
-    def _observe_open(self, position: int, at_s: float) -> "Braking | bool":
+    def _observe_open(self, position: int, at_s: float) -> "Braking | Comparison":
         if abs(position - self.still_counts) > REST_COUNTS or math.isinf(self.still_since_s):
-            # still turning: after `AGAIN_S` of that it is False, and the stop is sent again
-            return at_s - self.acknowledged_at_s < AGAIN_S and replace(self, still_counts=position, still_since_s=at_s)
-        return True if at_s - self.still_since_s >= REST_S else self
+            if at_s - self.acknowledged_at_s >= AGAIN_S:  # it turns on
+                return Comparison.NOT_AS_TOLD
+            return replace(self, still_counts=position, still_since_s=at_s)
+        return Comparison.AS_TOLD if at_s - self.still_since_s >= REST_S else self
 
     def _room_counts(self, reading: AxisReading) -> float:
         return room_to_rest(reading, math.inf if self.mode is StopMode.ABRUPT else self.deceleration_counts_per_s2)
@@ -126,11 +128,11 @@ class Way:
     low: float | None = None
     high: float = 0.0
 
-    def observe(self, reading: AxisReading) -> "Way | bool":
+    def observe(self, reading: AxisReading) -> "Way | Comparison":
         """Take a reading of the motion; return the way with its ends, or whether the shaft is on it."""
         here, target = reading.position_counts, self.target_counts
         if self.low is not None:
-            return self.low <= here <= self.high
+            return Comparison.AS_TOLD if self.low <= here <= self.high else Comparison.NOT_AS_TOLD
         # a motion that follows another one may have to turn round
         room = self.stray_counts + room_to_rest(reading, self.deceleration_counts_per_s2)
         return replace(self, low=min(here, target) - room, high=max(here, target) + room)
@@ -154,7 +156,7 @@ class Pace:
     at_counts: int | None = None
     at_s: float = math.inf
 
-    def observe(self, reading: AxisReading, at_s: float) -> "Pace | bool":
+    def observe(self, reading: AxisReading, at_s: float) -> "Pace | Comparison":
         """Take a reading; return what is still to be seen, or whether the shaft is as slow as it was told.
 
         Args:
@@ -169,7 +171,8 @@ class Pace:
         if took_s < PACE_S:
             return self
         way = abs(reading.position_counts - self.at_counts)
-        return way <= PACE_SHARE * self.most_counts_per_s * took_s + ROOM_COUNTS
+        is_slow = way <= PACE_SHARE * self.most_counts_per_s * took_s + ROOM_COUNTS
+        return Comparison.AS_TOLD if is_slow else Comparison.NOT_AS_TOLD
 
 
 def pace_of(most_counts_per_s: float, deceleration_counts_per_s2: float, reading: AxisReading, now_s: float) -> Pace:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 from ldcnd.axis.coast import RUNAWAY_SHARE, Coast
 from ldcnd.axis.course import LAG_S
-from ldcnd.axis.rest import REST_COUNTS
+from ldcnd.axis.rest import REST_COUNTS, Comparison
 from ldcnd.drives.driver import AxisReading
 
 BRAKES_SHARE = 1.5
@@ -206,8 +206,8 @@ class Following:
 
     def observe(
         self, reading: AxisReading, at_s: float, true_until_s: float = 0.0, *, at_velocity: bool = False
-    ) -> "Following | bool":
-        """Take a reading; return what is awaited, True while the shaft has moved as it was to, or False: it has not.
+    ) -> "Following | Comparison":
+        """Take a reading; return what is awaited, or whether the shaft has moved as it was to.
 
         Args:
             reading: what the drive shows.
@@ -220,15 +220,16 @@ class Following:
         runs = reading.enabled and not reading.profile_done
         by_s = max(at_s, true_until_s)
         if runs and self._has_missed_counts(reading, at_s, by_s, brakes=not at_velocity):
-            return False
+            return Comparison.NOT_AS_TOLD
         if high - low > REST_COUNTS:
             until_s = true_until_s if self.leeway.coasts else 0.0
             return self._seen_to_move(reading, at_s, by_s, until_s, runs=runs, brakes=not at_velocity)
         if not reading.enabled:  # nothing pushes a shaft any more that has never moved; another may stop at once
-            return seen.counted or self._gone_counts(reading, at_s, runs=runs) < self.leeway.least_counts
+            moved = seen.counted or self._gone_counts(reading, at_s, runs=runs) < self.leeway.least_counts
+            return Comparison.AS_TOLD if moved else Comparison.NOT_AS_TOLD
         return self._stands(reading, at_s, replace(seen, low=low, high=high), runs=runs)
 
-    def _stands(self, reading: AxisReading, at_s: float, seen: Sighting, *, runs: bool) -> "Following | bool":
+    def _stands(self, reading: AxisReading, at_s: float, seen: Sighting, *, runs: bool) -> "Following | Comparison":
         """Judge a shaft under voltage that stands where it was seen last: it sticks, is held, or turns unseen."""
         error, least = reading.following_error_counts, self.leeway.least_counts
         gone = self._gone_counts(reading, at_s, runs=runs)
@@ -238,7 +239,7 @@ class Following:
             free = self.leeway.coasts and max(self._went_counts(at_s), lag) >= BREAKS_FREE_SHARE * least
             sticks_s = 0.0 if free else FOLLOWS_WITHIN_S
             if self.leeway.faults and self.is_unseen and at_s - seen.since_s >= sticks_s:
-                return False
+                return Comparison.NOT_AS_TOLD
         elif not 0 < (at_s - seen.since_s) * seen.speed_counts_per_s < 4 * REST_COUNTS:  # it had time to go on
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
             # a drive tells it in each second reading
@@ -248,10 +249,10 @@ class Following:
             behind = told and (untold or abs(error or 0) > self.leeway.held_counts)
             short = gone < least * (2 if seen.counted else 1)
             if short and not behind:
-                return True
+                return Comparison.AS_TOLD
             given_up = at_s >= until_s and not (short and untold)
             if given_up and self.leeway.faults:
-                return False
+                return Comparison.NOT_AS_TOLD
             if given_up is self.given_up and self.is_missed:
                 return self
         if seen.error_counts is None:

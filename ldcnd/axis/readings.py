@@ -208,8 +208,8 @@ class AxisReadings:
             self._bus.distrust()  # another drive's reply that came late would be followed by others
         return judged.verdict is ReadingVerdict.ASK_AGAIN
 
-    def take_judged(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
-        """Process an accepted reading; that of a drive which was not identified says nothing about the axis."""
+    def accept(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
+        """Process a reading that needs no judging; that of a drive which was not identified says nothing of the axis."""
         if self._proof.holds:
             self._digest(reading, asked, timing)
         else:

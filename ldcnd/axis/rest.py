@@ -1,6 +1,7 @@
 """When a shaft stands, and when a motion has settled: decided from readings. Pure; time is an input."""
 
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 
 from ldcnd.drives.axis_config import AxisConfig
 from ldcnd.drives.driver import AxisReading
@@ -18,6 +19,15 @@ LEAST_WINDOW_COUNTS = 5.0
 """A closed loop hunts by some counts."""
 WINDOW_OF_EL = 1 / 400
 """Settle window as a fraction of the position error limit: that is some hundred times the error at rest."""
+
+
+class Comparison(Enum):
+    """What readings have shown of a shaft, as soon as they have; before that a value says what is awaited."""
+
+    AS_TOLD = auto()
+    """It does, or did, what its drive was told, or what its friction makes of it."""
+    NOT_AS_TOLD = auto()
+    """It does not: the drive has not heard, or the encoder does not count."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,7 +13,7 @@ from ldcnd.axis.events import MotionStarted, ReadingTaken, StopUnconfirmed
 from ldcnd.axis.faults import NOT_FOLLOWED, STOOD_AT_ONCE
 from ldcnd.axis.following import BRAKES_SHARE, Following
 from ldcnd.axis.outcome import changed, fail, keep_stop, own_and, place_lost, with_faults
-from ldcnd.axis.rest import shows_velocity
+from ldcnd.axis.rest import Comparison, shows_velocity
 from ldcnd.axis.status import AxisStatus
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import AxisState
@@ -49,7 +49,7 @@ def watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) -> 
     seen = braking.observe(event.reading, event.sent_at_s, driven_open=status.driven_open)
     if isinstance(seen, Braking):
         return status if seen is braking else replace(status, braking=seen)
-    if seen:
+    if seen is Comparison.AS_TOLD:
         return replace(status, braking=None, driven_open=False)
     if status.driven_open and braking.mode is StopMode.OFF:
         return replace(status, braking=None, off_again=True)  # a rotor that coasts for a minute is no fault
@@ -74,19 +74,21 @@ def _watch_following(
     # its drive knows more of it, and has switched the motor off
     tripped = any(fault.stops for fault in event.reading.faults)
     at_velocity = _is_at_velocity(status, following, event.sent_at_s)
-    seen = tripped or following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
+    seen = following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
+    if tripped:
+        seen = Comparison.AS_TOLD
     if isinstance(seen, Following):
         if seen is following:
             return status
         # a jam may be cleared, and an encoder come back: neither tells of the way between
         status = place_lost(status) if seen.given_up else status
         return replace(status, following=seen)
-    if seen and status.command and not tripped:
+    if seen is Comparison.AS_TOLD and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
         if following.settled and not following.is_missed:
             return status
         return replace(status, following=replace(following, until_s=math.inf, settled=event.reading.enabled))
-    return replace(status, following=None) if seen else _lose_encoder(status, event, faults)
+    return replace(status, following=None) if seen is Comparison.AS_TOLD else _lose_encoder(status, event, faults)
 
 
 def _lose_encoder(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
@@ -111,10 +113,10 @@ def _watch_coast(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, .
     seen = coast.observe(reading, at_s, event.true_until_s, most)
     if isinstance(seen, Coast):
         return status if seen is coast else replace(status, coast=seen)
-    if not seen and reading.enabled:
+    if seen is Comparison.NOT_AS_TOLD and reading.enabled:
         return _lose_encoder(status, event, faults)
     status = replace(status, coast=None)
-    if seen or STOOD_AT_ONCE in status.own:
+    if seen is Comparison.AS_TOLD or STOOD_AT_ONCE in status.own:
         return status
     status = with_faults(replace(status, own=own_and(status, STOOD_AT_ONCE)), (*faults, STOOD_AT_ONCE), event.now_ns)
     # at once, for a reset may come before the next reading
@@ -172,15 +174,15 @@ def next_following(status: AxisStatus, event: MotionStarted) -> Following | None
 def watch_course(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
     """Have a shaft stopped that goes elsewhere than it was sent, or faster than it was told."""
     reading, way, pace = event.reading, status.way, status.pace
-    on_way = way.observe(reading) if way else True
-    if on_way is False:
+    on_way = way.observe(reading) if way else Comparison.AS_TOLD
+    if on_way is Comparison.NOT_AS_TOLD:
         return _stray(status, event)
     if isinstance(on_way, Way):
         status = replace(status, way=on_way)
     if pace is None:
         return status
     seen = pace.observe(reading, event.sent_at_s)
-    if seen is False:
+    if seen is Comparison.NOT_AS_TOLD:
         return _outrun(status, pace, event)
     return status if seen is pace else replace(status, pace=seen if isinstance(seen, Pace) else None)
 

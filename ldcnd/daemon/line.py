@@ -377,7 +377,7 @@ class BusService:
         drive, taken = axis.driver, axis.readings
         if isinstance(drive, PollsItself):
             poller = drive.own_poller(
-                now_s, ReadingListeners(taken.take, taken.take_monitor, taken.miss, taken.take_alarm)
+                now_s, ReadingListeners(taken.accept, taken.take_monitor, taken.miss, taken.take_alarm)
             )
         elif isinstance(drive, Readable):
             rates_hz = axis.config.rates.wanted_hz(adc=bool(drive.adc_full_scale))

@@ -47,7 +47,7 @@ async def settle_figures(rig: RunningRig, axis: str, distance: float) -> SettleF
     await rig.until(axis, lambda state: state.link == "up")
     await rig.client.command(axis, Power(on=True))
     at_end: list[float] = []
-    observed = service.readings.take_judged
+    observed = service.readings.accept
 
     def watch(reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
         command = service.tracker.status.command
@@ -61,12 +61,12 @@ async def settle_figures(rig: RunningRig, axis: str, distance: float) -> SettleF
             at_end.extend((timing.sent_at_s, command.settling.target_counts - reading.position_counts))
         observed(reading, asked, timing)
 
-    service.readings.take_judged = watch  # type: ignore[method-assign]
+    service.readings.accept = watch  # type: ignore[method-assign]
     reply = await rig.client.command(axis, MoveRelative(distance=distance))
     await rig.client.wait_for_end(axis, reply.command_id)
     done_s = asyncio.get_running_loop().time()
     outcome = await rig.client.ask(ReadOutcome(command_id=reply.command_id))
-    service.readings.take_judged = observed  # type: ignore[method-assign]
+    service.readings.accept = observed  # type: ignore[method-assign]
     return SettleFigures(
         axis=axis,
         distance=distance,

@@ -250,7 +250,7 @@ class AxisBench:
         """Let the axis see what the drive reads from now on."""
         self.drive.shown = replace(self.drive.shown, **changes)
         now_s = asyncio.get_running_loop().time()
-        self.axis.readings.take_judged(self.drive.shown, frozenset(), Timing(now_s, now_s, now_s, now_s))
+        self.axis.readings.accept(self.drive.shown, frozenset(), Timing(now_s, now_s, now_s, now_s))
 
     async def pass_s(self, seconds: float, **changes: Any) -> None:
         """Let time pass, then show the drive's reading, and let the axis act upon it."""

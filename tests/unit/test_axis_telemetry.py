@@ -23,7 +23,7 @@ CHUNK = TraceChunk(
 
 
 def poll(bench: AxisBench, *asked: TelemetryItem, **changes: object) -> None:
-    bench.axis.readings.take_judged(replace(bench.drive.shown, **changes), frozenset(asked), TIMING)
+    bench.axis.readings.accept(replace(bench.drive.shown, **changes), frozenset(asked), TIMING)
 
 
 @pytest.mark.parametrize("item", [POSITION, VELOCITY, ADC])

@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 
 from ldcnd.axis.course import Braking
+from ldcnd.axis.rest import Comparison
 from ldcnd.drives.driver import AxisReading, StopMode
 from tests.support.axis_bench import AT_REST
 
@@ -30,7 +31,7 @@ def verdict(braking: Braking, shaft: Callable[[float], tuple[float, float]]) -> 
     at_s = EVERY_S
     while at_s < WITHIN_S:
         seen = braking.observe(shown(*shaft(at_s)), at_s)
-        if isinstance(seen, bool):
+        if isinstance(seen, Comparison):
             return seen, at_s
         braking, at_s = seen, at_s + EVERY_S
     raise AssertionError(braking)
@@ -53,7 +54,7 @@ def test_a_shaft_that_brakes_has_heard_however_long_it_takes(speed: float, braki
 
     seen, at_s = verdict(Braking(StopMode.SMOOTH, 0.0, deceleration), slowing(speed, deceleration))
 
-    assert seen
+    assert seen is Comparison.AS_TOLD
     assert at_s < braking_s + 1
 
 
@@ -62,7 +63,7 @@ def test_a_shaft_that_brakes_has_heard_however_long_it_takes(speed: float, braki
 def test_a_shaft_that_runs_on_has_not_heard_about_when_it_should_stand(speed: float, braking_s: float):
     seen, at_s = verdict(Braking(StopMode.SMOOTH, 0.0, speed / braking_s), lambda at_s: (speed * at_s, speed))
 
-    assert not seen
+    assert seen is Comparison.NOT_AS_TOLD
     assert at_s < 1.2 * braking_s + 1.5
 
 
@@ -70,32 +71,32 @@ def test_a_shaft_that_runs_on_has_not_heard_about_when_it_should_stand(speed: fl
 def test_a_shaft_that_creeps_on_below_what_a_velocity_can_show_has_not_heard(mode: StopMode):
     seen, _ = verdict(Braking(mode, 0.0, 40_000.0), lambda at_s: (100 * at_s, 100))
 
-    assert not seen
+    assert seen is Comparison.NOT_AS_TOLD
 
 
 def test_a_shaft_whose_deceleration_is_not_known_has_a_second():
     seen, at_s = verdict(Braking(StopMode.SMOOTH, 0.0), lambda at_s: (10_000 * at_s, 10_000))
 
-    assert not seen
+    assert seen is Comparison.NOT_AS_TOLD
     assert 1 < at_s < 2
 
 
 def test_an_abrupt_stop_is_not_given_the_way_of_a_smooth_one():
     seen, at_s = verdict(Braking(StopMode.ABRUPT, 0.0, 5000.0), lambda at_s: (50_000 * at_s, 50_000))
 
-    assert not seen
+    assert seen is Comparison.NOT_AS_TOLD
     assert at_s < 0.3
 
 
 def test_a_motor_that_is_off_coasts_as_long_as_it_likes():
     off = replace(shown(0, 90_000), enabled=False)
 
-    assert Braking(StopMode.OFF, 0.0).observe(off, 1.0) is True
-    assert Braking(StopMode.SMOOTH, 0.0, 1000.0).observe(off, 1.0) is True
+    assert Braking(StopMode.OFF, 0.0).observe(off, 1.0) is Comparison.AS_TOLD
+    assert Braking(StopMode.SMOOTH, 0.0, 1000.0).observe(off, 1.0) is Comparison.AS_TOLD
 
 
 def test_a_loop_that_is_still_closed_was_not_switched_off():
-    assert Braking(StopMode.OFF, 0.0).observe(shown(0, 0), 0.01) is False
+    assert Braking(StopMode.OFF, 0.0).observe(shown(0, 0), 0.01) is Comparison.NOT_AS_TOLD
 
 
 def test_a_reading_from_before_the_stop_says_nothing():
