@@ -209,7 +209,7 @@ class AxisReadings:
         return judged.verdict is ReadingVerdict.ASK_AGAIN
 
     def accept(self, reading: AxisReading, asked: frozenset[TelemetryItem], timing: Timing) -> None:
-        """Process a reading that needs no judging; that of a drive which was not identified says nothing of the axis."""
+        """Process a reading that is not to be judged; that of a drive which was not identified says nothing."""
         if self._proof.holds:
             self._digest(reading, asked, timing)
         else:

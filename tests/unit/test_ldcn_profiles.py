@@ -1,7 +1,11 @@
 """Which device speaks which dialect: later vendor data sheets and both manuals."""
 
-import pytest
+from dataclasses import replace
 
+import pytest
+from pydantic import ValidationError
+
+from ldcnd.drives.ldcn import config
 from ldcnd.drives.ldcn.profiles import PROFILES, HomingSource, Support, identify
 
 
@@ -64,3 +68,11 @@ def test_the_motion_lock_begins_with_a_version_of_its_own():
     locks = {name: p.motion_lock_from for name, p in PROFILES.items() if p.motion_lock_from is not None}
 
     assert locks == {"ls-182ap": 22}
+
+
+def test_a_model_whose_divisor_misses_the_top_rate_is_refused_it_before_anything_is_opened(monkeypatch):
+    fast = replace(PROFILES["ls-182ap"], top_baud=230_400)
+    monkeypatch.setattr(config, "PROFILES", {**PROFILES, "ls-182ap": fast})
+    axis = {"name": "x", "address": 1, "model": "ls-182ap", "velocity": 1, "acceleration": 1, "counts_per_unit": 1}
+    with pytest.raises(ValidationError, match="no divisor of ls-182ap at address 1 makes it"):
+        config.LdcnBusConfig(name="line", port="sim:line", family="ldcn", baud=230_400, axis=[axis])

@@ -18,7 +18,7 @@ from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.commands import Node, spaced, unanswered
 from ldcnd.drives.ldcn.packet import StatusItem, StatusPacket, check_status, decode_status
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, CYCLE_CLOCKS, PIC_SERVO_SC, PIC_SERVO_V4, Profile, identify
-from ldcnd.drives.ldcn.registers import BaudCodes, actual_baud, baud_at_reset, baud_divisor
+from ldcnd.drives.ldcn.registers import FASTEST_BAUD, BaudCodes, actual_baud, baud_at_reset, baud_divisor
 from ldcnd.drives.network import GroupSpec
 from ldcnd.line.bus import Bus
 from ldcnd.line.exchange import Exchange, PacketEffect, ReplyVerdict
@@ -184,8 +184,6 @@ class GroupPlan:
 COMMON_CODES = (0x0A, 0x14, 0x81)
 """Of the rates at which a crashed host may have left the drives: 115200, 57600 and 9600 baud with the usual clock."""
 COMMON_BAUDS = (115_200, 57_600, 9600)
-FASTEST_BAUD = 230_400
-"""PIC-SERVO SC only: it has the code in a table and sets exactly this rate."""
 EVERYBODY = 0xFF
 """The group address after power-up."""
 NULLS = bytes(16)

@@ -12,7 +12,7 @@ from ldcnd.contract.frozen import Frozen
 from ldcnd.drives.axis_config import MovedAxisConfig
 from ldcnd.drives.driver import AxisSpec
 from ldcnd.drives.ldcn.profiles import CLOCK_HZ, PIC_IO, PROFILES, HomingSource, Support, at_clock
-from ldcnd.drives.ldcn.registers import baud_divisor, encode_gains
+from ldcnd.drives.ldcn.registers import FASTEST_BAUD, baud_divisor, encode_gains
 from ldcnd.drives.line_config import BAUDS, BusConfig, InputConfig, OutputConfig
 from ldcnd.drives.network import AdoptFallback, GroupSpec, StartPolicy
 from ldcnd.drives.toml import DeviceIdentity, Name, refuse_duplicates
@@ -222,6 +222,9 @@ a time take less processor time. 0 for one at a time."""
                 raise ValueError(f"baud {self.baud}: of {model} at address {address} only {rates} are known")
             if self.baud > top:
                 raise ValueError(f"baud {self.baud}: {model} at address {address} reaches {top} at most")
+            # with the usual clock the code that is printed for 230400 makes 208333, which a port reads as noise
+            if not profile.baud_keys and self.baud == FASTEST_BAUD and self.clock_hz == CLOCK_HZ:
+                raise ValueError(f"baud {self.baud}: no divisor of {model} at address {address} makes it")
         if self.baud not in BAUDS:
             try:
                 baud_divisor(self.baud, clock_hz=self.clock_hz)

@@ -18,7 +18,6 @@ from ldcnd.drives.ldcn import commands
 from ldcnd.drives.ldcn.addressing import (
     ANY_DIALECT,
     EVERYBODY,
-    FASTEST_BAUD,
     NULLS,
     NULLS_SETTLE_S,
     Addressing,
@@ -37,7 +36,7 @@ from ldcnd.drives.ldcn.groups import Groups
 from ldcnd.drives.ldcn.io_module import IoModule
 from ldcnd.drives.ldcn.packet import STATUS_BYTE_ONLY, AuxFlag, StatusItem, StatusPacket
 from ldcnd.drives.ldcn.profiles import PIC_IO, PIC_STEP, PROFILES, Support, at_clock
-from ldcnd.drives.ldcn.registers import BaudCodes
+from ldcnd.drives.ldcn.registers import FASTEST_BAUD, BaudCodes
 from ldcnd.drives.ldcn.servo import LdcnAxis
 from ldcnd.drives.network import AdoptFallback, BringUpReport, Instant, IoDriver, Network, StartPolicy
 from ldcnd.line.bus import Bus

@@ -51,7 +51,9 @@ BAUD_DIVISORS = MappingProxyType(
         BaudCodes.ALTERNATE: MappingProxyType({9600: 127, 19_200: 64, 57_600: 21, 115_200: 0x0A, 230_400: 0x05}),
     }
 )
-"""The divisor of each rate; 230400 exists on PIC-SERVO SC only."""
+"""The divisor of each rate."""
+FASTEST_BAUD = 230_400
+"""PIC-SERVO SC only: it has the code in a table and sets exactly this rate."""
 BAUD_KEYS = MappingProxyType({code: baud for rates in BAUD_DIVISORS.values() for baud, code in rates.items()})
 """The table of PIC-SERVO SC for the byte: it has the codes of both families and sets its clock to the rate itself."""
 
