@@ -105,8 +105,8 @@ class Sighting:
     """Where a shaft was seen last to have moved to, and how fast.
 
     Attributes:
-        since_s: since when the shaft is there, in loop time; before it was seen to move, when the drive had the motion:
-            its profile runs from then on, if not before.
+        since_s: since when the shaft is there, in loop time; before it was seen to move, when the drive acknowledged
+            the motion, whose profile has begun by then.
         until_s: the latest instant at which it can have been there when it was first seen there, in loop time.
         low: lowest position since; before it was seen to move, since the reading before its motion.
         high: highest.
@@ -158,9 +158,14 @@ class Following:
     settled: bool = False
 
     @property
-    def is_missed(self) -> bool:
-        """Whether a part of the profile is over in which the shaft was to move, and was not seen to."""
+    def is_late(self) -> bool:
+        """Whether the profile is over, and the shaft was not seen to move as it was to."""
         return self.until_s < math.inf
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether the shaft is late, and may yet be seen to have moved in time: what it does is not known."""
+        return self.until_s < math.inf and not self.given_up
 
     @property
     def is_long(self) -> bool:
@@ -171,7 +176,11 @@ class Following:
     def is_unseen(self) -> bool:
         """Whether a part of the profile has gone, or is over, in which the shaft was not seen to move."""
         coming = self.seen.speed_counts_per_s**2 / (4 * self.profile.braking_counts_per_s2)
-        return self.is_missed or self.gone_counts >= 2 * self.leeway.least_counts + coming
+        return self.is_late or self.gone_counts >= 2 * self.leeway.least_counts + coming
+
+    def doubted(self) -> "Following":
+        """Return it for a shaft whose encoder has proved nothing: it is unseen until it has counted."""
+        return replace(self, gone_counts=math.inf)
 
     def after(self, before: "Following | None") -> "Following":
         """Return it behind an earlier motion of its command, in which the shaft was perhaps not seen to move."""
@@ -240,7 +249,7 @@ class Following:
             sticks_s = 0.0 if free else FOLLOWS_WITHIN_S
             if self.leeway.faults and self.is_unseen and at_s - seen.since_s >= sticks_s:
                 return Comparison.NOT_AS_TOLD
-        elif not 0 < (at_s - seen.since_s) * seen.speed_counts_per_s < 4 * REST_COUNTS:  # it had time to go on
+        elif not self._was_seen_just_now(at_s):
             until_s = min(self.until_s, at_s + FOLLOWS_WITHIN_S)
             # a drive tells it in each second reading
             untold = error is None and seen.error_counts is not None and not self.settled
@@ -253,12 +262,20 @@ class Following:
             given_up = at_s >= until_s and not (short and untold)
             if given_up and self.leeway.faults:
                 return Comparison.NOT_AS_TOLD
-            if given_up is self.given_up and self.is_missed:
+            if given_up is self.given_up and self.is_late:
                 return self
         if seen.error_counts is None:
             seen = replace(seen, error_counts=error)
         settled = self.settled and not behind
         return Following(self.command_id, self.profile, self.leeway, seen, gone, until_s, given_up, settled)
+
+    def _was_seen_just_now(self, at_s: float) -> bool:
+        """Tell whether the shaft was seen to move so shortly before that standing here is no news.
+
+        At its speed it would have gone on by less than twice what a loop at rest hunts in either direction.
+        """
+        went = (at_s - self.seen.since_s) * self.seen.speed_counts_per_s
+        return 0 < went < 4 * REST_COUNTS
 
     def _gone_counts(self, reading: AxisReading, at_s: float, *, runs: bool) -> float:
         """Return the least way that the profile has gone while the shaft stood: by its time, and by its drive."""

@@ -403,8 +403,7 @@ class AxisStatus:
     @property
     def at_rest(self) -> bool:
         """Whether the readings show that nothing moves; a fault may hide motion, see `moving`."""
-        missed = self.following is not None and self.following.is_missed and not self.following.given_up
-        return self.rest.rests is True and not missed
+        return self.rest.rests is True and not (self.following and self.following.is_awaited)
 
     @property
     def coasts(self) -> bool:

@@ -176,7 +176,7 @@ def _fail_by_fault(status: AxisStatus, event: ReadingTaken) -> AxisStatus:
 def _take_enabled(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> AxisStatus:
     """Take a reading of a closed loop that nothing has stopped; `faults` are warnings."""
     command, rests, reading = status.command, status.rest.rests, event.reading
-    awaited = status.following and status.following.is_missed and not status.following.given_up
+    awaited = status.following and status.following.is_awaited
     if awaited:
         rests = None
     if command is None:
@@ -375,7 +375,7 @@ def _start(status: AxisStatus, event: MotionStarted) -> AxisStatus:
     following, rest = next_following(status, event), RestEvidence(rests=False, commanded=True)
     if status.unseen:  # its encoder proves nothing before it has counted in a motion that is long enough for that
         if event.following and following and following.is_long:
-            following = replace(following, gone_counts=math.inf)
+            following = following.doubted()
         else:
             rest = replace(status.rest, rests=False)
     if command and command.duration_s is not None:

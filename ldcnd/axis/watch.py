@@ -85,7 +85,7 @@ def _watch_following(
         return replace(status, following=seen)
     if seen is Comparison.AS_TOLD and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
-        if following.settled and not following.is_missed:
+        if following.settled and not following.is_late:
             return status
         return replace(status, following=replace(following, until_s=math.inf, settled=event.reading.enabled))
     return replace(status, following=None) if seen is Comparison.AS_TOLD else _lose_encoder(status, event, faults)
