@@ -11,6 +11,7 @@ from structlog.testing import capture_logs
 
 from ldcnd import durable
 from ldcnd.axis import kept as kept_files
+from ldcnd.axis.kept import LATCH_ROOM_BYTES, LATCHES
 from ldcnd.client.fleet import survey
 from ldcnd.contract.commands import Halt, MoveRelative, MoveVelocity, Power, QuickStop, Reset
 from ldcnd.contract.errors import OutcomeUnknown, RequestRefused, WrongState
@@ -252,12 +253,20 @@ async def test_without_a_place_for_it_the_answer_says_that_the_latch_ends_with_t
     assert not state.stop_latched
 
 
+async def has_kept_room(disk: Path) -> None:
+    """Wait until a thread of the daemon, which no clock of a test holds back, has kept room for the next latches."""
+    draft = disk / f"{LATCHES}.new"
+    while not draft.exists() or draft.stat().st_size < LATCH_ROOM_BYTES:
+        await asyncio.to_thread(time.sleep, 0.01)
+
+
 async def test_a_stop_on_a_full_disk_outlasts_a_killed_daemon(tmp_path):
     """Nothing else is kept there then; what is not is said in the health report."""
     with small_disk(tmp_path / "state", 256 * 1024) as disk:
         chain, config = chain_of(), keeping(disk)
         async with rig_on(chain, config) as rig:
             await jogging(rig)
+            await has_kept_room(disk)
             fill(disk)
             replies = [await rig.client.stop(axis) for axis in ("x", "y")]
             await settled(rig)
