@@ -22,6 +22,10 @@ LAGS_S = 0.02
 """Shortest time over which a way is compared with its speed."""
 CLOCK_SHARE = 1.1
 """Longest braking as a multiple of the computed one: a drive has a clock of its own, and rounds its profile."""
+OUTRUNS_SHARE = 2.0
+"""Factor by which a shaft that lags no more than friction holds one swings above the speed of its profile at most."""
+PULLS_PER_S = 60.0
+"""A loop pulls a shaft that breaks free over its lag within this share of a second: it swings ten times a second."""
 SWINGS_ABOVE, SWINGS_S = 1.5, 0.5
 """A shaft swings by less than half of its speed when it was this much faster at most, and has ceased to by then."""
 
@@ -90,12 +94,14 @@ class Leeway:
         least_counts: part of a profile in which a shaft must have been seen to begin to move, and once it has, twice
             as much in which it must have been seen to go on.
         held_counts: how far behind the end of a profile friction may hold a shaft; infinite where nothing tells.
+        sticks_counts: how far a profile may go on before friction lets the shaft go.
         faults: what was not seen in time is a fault; else the axis may only move unseen, until its encoder counts.
         coasts: the shaft cannot stand at once: where it seems to, at a speed, its encoder has missed counts.
     """
 
     least_counts: float
     held_counts: float
+    sticks_counts: float
     faults: bool
     coasts: bool
 
@@ -175,8 +181,23 @@ class Following:
     @property
     def is_unseen(self) -> bool:
         """Whether a part of the profile has gone, or is over, in which the shaft was not seen to move."""
-        coming = self.seen.speed_counts_per_s**2 / (4 * self.profile.braking_counts_per_s2)
-        return self.is_late or self.gone_counts >= 2 * self.leeway.least_counts + coming
+        return self.is_late or self.gone_counts >= 2 * self.leeway.least_counts + self._coming_counts
+
+    @property
+    def has_parted(self) -> bool:
+        """Whether the shaft stood for longer than friction holds one: it jammed, or has gone on unseen."""
+        return self.given_up or self.leeway.sticks_counts + self._coming_counts <= self.gone_counts < math.inf
+
+    @property
+    def _coming_counts(self) -> float:
+        """How far a shaft that was seen to move goes before it stands, by half of its profile's braking."""
+        return self.seen.speed_counts_per_s**2 / (4 * self.profile.braking_counts_per_s2)
+
+    def outruns(self, reading: AxisReading) -> bool:
+        """Tell whether a shaft is faster than its profile, and friction that lets go, make it: counts were missed."""
+        fastest = max(self.profile.fastest_counts_per_s, self.profile.velocity_counts_per_s)
+        most = OUTRUNS_SHARE * (fastest + reading.velocity_resolution_counts_per_s)
+        return abs(reading.velocity_counts_per_s) > most + PULLS_PER_S * self.leeway.sticks_counts
 
     def doubted(self) -> "Following":
         """Return it for a shaft whose encoder has proved nothing: it is unseen until it has counted."""

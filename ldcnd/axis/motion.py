@@ -31,6 +31,10 @@ BEHIND_SHARE = 1.5
 """Most by which friction holds a shaft behind the end of its profile, as a multiple of its settle window."""
 LEAST_FOLLOWED_COUNTS = 30.0
 """Way of a profile behind which a shaft was seen to move, whatever its settle window: friction holds it for less."""
+STICKS_SHARE = 8.0
+"""Least lag of a shaft that does not stick only, as a multiple of the way behind which it was seen to move."""
+OUTPUT_SCALE = 256
+"""Of the servo filter: counts times gain for one step of PWM."""
 LOOK_AGAIN_S = 0.02
 """From one look at a shaft that turns to the next one, seconds."""
 
@@ -212,6 +216,7 @@ class AxisMotion:
             Leeway(
                 max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS),
                 held_counts=BEHIND_SHARE * self.window_counts if self._pulls() else math.inf,
+                sticks_counts=self._sticks_counts(),
                 # what a search finds makes a reference: of an encoder that does not count it is none
                 faults=self.config.settle.unsettled == "fault" or permit.verb is Verb.HOME,
                 coasts=self.config.coast_s is not None,
@@ -219,6 +224,14 @@ class AxisMotion:
             # one that is halted soon has its way behind it when it is read first
             Sighting(self.clock.now_s(), 0.0, low=begins, high=begins),
         )
+
+    def _sticks_counts(self) -> float:
+        """Return how far a shaft may lag that friction holds: until its loop pushes with half of what it may.
+
+        "output = Kp*pos_error - ...; PWM = min(abs(output/256), output_limit)" (PIC-SERVO manual, 4.3).
+        """
+        gains, least = self.driver.wanted_gains, STICKS_SHARE * max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS)
+        return max(least, OUTPUT_SCALE * gains.ol / 2 / gains.kp) if gains and gains.kp else least
 
     def _pulls(self) -> bool:
         """Tell whether the loop pulls its shaft into the settle window, whatever friction holds it: it integrates.

@@ -208,6 +208,9 @@ def _take_profile_end(
     # it may never have begun, so that it stands elsewhere is no fault of the axis
     if not settled and status.unsure:
         return finished(status, status.unsure.why, settled=False)
+    off_counts = abs(settling.target_counts - reading.position_counts)
+    if not settled and status.following and off_counts >= status.following.leeway.sticks_counts:
+        status = changed(place_lost(status), target=None)  # friction holds no shaft as far from there
     if settled or not settling.faults:
         return finished(status, settled=settled)
     status = replace(status, own=own_and(status, NOT_SETTLED))

@@ -27,6 +27,10 @@ UNFOLLOWED = "sent because the profile of a motion has run and the encoder has n
 OUTRUN = "sent because the axis stayed faster than it was told"
 
 
+LEAST_PUSHED_COUNTS = 50
+"""A shaft that was pushed off its place, and tripped its drive, was seen there by more than it hunts."""
+
+
 def parted(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> bool:
     """Tell whether a shaft that cannot stand at once has left its encoder behind, which has missed counts then."""
     coasts_on = status.limits.slowing_counts_per_s2 is not None
@@ -34,14 +38,18 @@ def parted(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -
 
 
 def stood(status: AxisStatus, event: ReadingTaken) -> bool:
-    """Tell whether a drive has left a motion whose shaft was not seen to move any more: it jams, or moves unseen."""
+    """Tell whether a drive has let go of a shaft that was not seen to move, and pushed it: it jams, or moves unseen."""
     reading, following = event.reading, status.following
-    if reading.enabled or not (status.enabled and status.state.is_motion) or shows_velocity(reading):
+    if reading.enabled or not status.enabled or shows_velocity(reading):
         return False
     if not any(fault.stops and fault.hides_motion for fault in reading.faults):
         return False
-    # one that lags is slow, and is seen to move until it trips
-    return not following or abs(reading.position_counts - following.seen.low) < following.leeway.least_counts
+    # one that lags, or is pushed away, is seen to move until its drive trips
+    position = reading.position_counts
+    if following:
+        return abs(position - following.seen.low) < following.leeway.least_counts
+    off = 0.0 if status.target is None else abs(status.scale.shown_at(position) - status.target)
+    return status.state.is_motion or off * abs(status.scale.counts_per_unit) < LEAST_PUSHED_COUNTS
 
 
 def watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) -> AxisStatus:
@@ -75,13 +83,15 @@ def _watch_following(
     tripped = any(fault.stops for fault in event.reading.faults)
     at_velocity = _is_at_velocity(status, following, event.sent_at_s)
     seen = following.observe(event.reading, event.sent_at_s, event.true_until_s, at_velocity=at_velocity)
+    if status.referenced and event.reading.enabled and following.outruns(event.reading):
+        status = place_lost(status)
     if tripped:
         seen = Comparison.AS_TOLD
     if isinstance(seen, Following):
         if seen is following:
             return status
         # a jam may be cleared, and an encoder come back: neither tells of the way between
-        status = place_lost(status) if seen.given_up else status
+        status = place_lost(status) if seen.has_parted else status
         return replace(status, following=seen)
     if seen is Comparison.AS_TOLD and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done

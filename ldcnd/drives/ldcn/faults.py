@@ -50,8 +50,11 @@ class FaultCode(StrEnum):
 WARNINGS = frozenset({FaultCode.CURRENT_LIMIT, FaultCode.POSITION_WRAP, FaultCode.SERVO_OVERRUN})
 """Conditions that do not switch the motor off: current limiting only lowers the PWM value (PIC-SERVO manual, 4.3)."""
 
-_UNFOLLOWED = frozenset({FaultCode.POSITION_ERROR, FaultCode.ENCODER_OR_HALL, FaultCode.LATCHED_FAULT})
-"""A jam and an encoder that stands still look the same, and a cause that is not known may be either."""
+_UNFOLLOWED = frozenset(
+    {FaultCode.POSITION_ERROR, FaultCode.OVERCURRENT, FaultCode.ENCODER_OR_HALL, FaultCode.LATCHED_FAULT}
+)
+"""A jam and an encoder that stands still look the same: in both the motor pushes as far as it may. A cause that is not
+known may be either."""
 
 _REMEDIES = MappingProxyType(
     {
