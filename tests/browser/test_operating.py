@@ -5,7 +5,7 @@ import re
 
 import pytest
 
-from ldcnd.contract.commands import MoveRelative, MoveVelocity, Power, SetGains, SetPosition
+from ldcnd.contract.commands import Home, MoveRelative, MoveVelocity, Power, SetGains, SetPosition
 from ldcnd.contract.errors import LdcndError
 from ldcnd.contract.leases import Acquire, ListHolders
 from ldcnd.contract.parameters import ReadParameter
@@ -339,6 +339,42 @@ async def test_the_velocity_never_contradicts_the_state(house):
     assert len(moving) > 5
     assert sorted(moving)[len(moving) // 2] == pytest.approx(5, abs=0.3)
     assert sum(value < 4 for value in moving) <= 4  # while it begins and while it settles
+
+
+async def test_homing_shows_no_velocity_that_the_shaft_has_not(house):
+    await house.sim.quiet("x")
+    await house.sim.rig.command("x", Power(on=True))
+    await house.sim.rig.command("x", SetPosition(position=40.0))  # the mark gives it another number, far from this one
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.page.evaluate(WATCH_VELOCITY)
+        await house.sim.rig.command("x", Home())
+        await house.sim.until("x", lambda state: state.state == "homing")
+        await house.sim.until("x", lambda state: state.referenced and state.moving == "no")
+        await expect(desk.page.locator(".now-state .state")).to_have_text("standstill")
+        seen = await desk.page.evaluate("window.seen")
+    values = [abs(float(text.replace("\u2212", "-"))) for _, text in seen if text != "\u2013"]
+    assert len(values) > 5
+    assert max(values) < 10
+
+
+async def test_what_is_in_the_way_of_a_move_follows_a_shaft_that_comes_to_rest(house):
+    await house.sim.quiet("x")
+    async with house.desk() as desk:
+        await desk.open("axis/sim/x")
+        await desk.button("Take control").click()
+        await desk.button("Enable").click()
+        await house.sim.until("x", lambda state: state.enabled)
+        move = desk.panel("Move")
+        await move.get_by_label("Move", exact=True).select_option("at a velocity")
+        await move.get_by_label("Velocity mm/s").fill("20")
+        await desk.button("Move").click()
+        await house.sim.until("x", lambda state: state.moving == "yes")
+        await desk.button("Disable").click()
+        await house.sim.until("x", lambda state: not state.enabled and state.moving == "no")
+        way = desk.panel("Can it move?")
+        await expect(way).to_contain_text("disabled")
+        await expect(way).not_to_contain_text("turns with its motor off")
 
 
 async def test_a_speed_override_and_every_axis_that_was_lost_stand_on_top_of_every_page(house):

@@ -55,6 +55,9 @@ export function WhyPanel({ axis }) {
   const situation = JSON.stringify([
     isWanted,
     state?.state,
+    state?.moving,
+    state?.motion_hidden_by,
+    state?.stop_pending,
     state?.link,
     state?.stop_latched,
     state?.referenced,

@@ -113,7 +113,7 @@ export class Axis {
     const told = sample && sample.t >= sinceNs && !AT_REST.has(this.state?.state) ? sample.value : null;
     const [first, last] = [this.#positions[0], this.#positions.at(-1)];
     if (!first || last.t === first.t) return told;
-    return ((this.#unwound(last) - this.#unwound(first)) * 1e9) / (last.t - first.t);
+    return (this.#way(first, last) * 1e9) / (last.t - first.t);
   }
 
   /** The health report of its line says how often it is published, and how often that was wanted. */
@@ -198,9 +198,10 @@ export class Axis {
     return { word: sample?.quality ?? mark, level: { good: "", uncertain: "warn" }[sample?.quality] ?? "bad" };
   }
 
-  /** A position counted on through all turns: on an axis with a modulo the value begins again with each. */
-  #unwound({ value, turns }) {
-    return value + (turns ?? 0) * (this.info?.modulo ?? 0);
+  /** The way from one position to another: homing gives both another number, and the counts go on. */
+  #way(first, last) {
+    const { counts_per_unit: scale, direction } = this.info ?? {};
+    return ((direction === "reverse" ? -1 : 1) * (last.counts - first.counts)) / (scale || 1);
   }
 
   #remember(sample) {
