@@ -27,10 +27,6 @@ UNFOLLOWED = "sent because the profile of a motion has run and the encoder has n
 OUTRUN = "sent because the axis stayed faster than it was told"
 
 
-LEAST_PUSHED_COUNTS = 50
-"""A shaft that was pushed off its place, and tripped its drive, was seen there by more than it hunts."""
-
-
 def parted(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -> bool:
     """Tell whether a shaft that cannot stand at once has left its encoder behind, which has missed counts then."""
     coasts_on = status.limits.slowing_counts_per_s2 is not None
@@ -45,11 +41,9 @@ def stood(status: AxisStatus, event: ReadingTaken) -> bool:
     if not any(fault.stops and fault.hides_motion for fault in reading.faults):
         return False
     # one that lags, or is pushed away, is seen to move until its drive trips
-    position = reading.position_counts
-    if following:
-        return abs(position - following.seen.low) < following.leeway.least_counts
-    off = 0.0 if status.target is None else abs(status.scale.shown_at(position) - status.target)
-    return status.state.is_motion or off * abs(status.scale.counts_per_unit) < LEAST_PUSHED_COUNTS
+    if not status.state.is_motion:
+        return any(fault.pushed for fault in reading.faults)
+    return not following or abs(reading.position_counts - following.seen.low) < following.leeway.least_counts
 
 
 def watch_braking(status: AxisStatus, braking: Braking, event: ReadingTaken) -> AxisStatus:

@@ -45,6 +45,7 @@ class Fault:
         loses_position: what the drive counts from then on is not where the axis is: it needs a new reference.
         hides_motion: shaft and encoder did not go where they were sent, or no encoder is seen: what the drive counts
             from then on does not prove that the axis stands.
+        pushed: the motor has pushed with all its current, and nothing gave way, or the encoder did not count that.
     """
 
     code: str
@@ -52,6 +53,7 @@ class Fault:
     stops: bool = True
     loses_position: bool = False
     hides_motion: bool = False
+    pushed: bool = False
 
 
 @dataclass(frozen=True, slots=True)

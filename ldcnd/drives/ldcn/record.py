@@ -245,6 +245,7 @@ class DriveState:
                 stops=fault.stops,
                 loses_position=fault.loses_position,
                 hides_motion=fault.hides_motion,
+                pushed=fault.code is FaultCode.OVERCURRENT,
             )
             for fault in found
         )

@@ -5,7 +5,7 @@ import { Action, Facts, Panel } from "../parts/controls.js";
 import { age, clock, decimalsOf, number, words } from "../parts/format.js";
 import { shownQuantity } from "../parts/number_text.js";
 import { EndOfMotion } from "../parts/motion_story.js";
-import { Lamp, Mark, QualityWord, StateWord } from "../parts/state.js";
+import { Lamp, Mark, placed, QualityWord, StateWord } from "../parts/state.js";
 import { readSignals, signalsOf } from "../session/captures.js";
 import { obstacle } from "../session/obstacles.js";
 
@@ -20,7 +20,7 @@ export function NowPanel({ axis }) {
   return html`<${Panel} title="Now" of=${axis.rig} data-stale=${live ? "no" : "yes"}>
     <div class="now">
       <p class="big" data-known=${known ? "yes" : "no"}><output aria-label="Position"
-        >${known ? number(position?.value, decimals) : `(${number(position?.value, decimals)})`}</output>
+        >${placed(axis, position?.value, decimals)}</output>
         <span class="unit">${info.unit}</span></p>
       ${!known && html`<p class="place-mark"><${Mark} level=${live ? "warn" : "bad"}>${mark}<//></p>`}
       <p class="now-state"><${StateWord} axis=${axis} /> <${QualityWord} axis=${axis} /></p>
@@ -28,7 +28,7 @@ export function NowPanel({ axis }) {
     <${Facts} of=${[
       ["velocity", html`${number(velocity.value, decimals)} <span class="unit">${velocity.said}</span>`],
       ["following error", html`${number(live ? position?.following_error : null, decimals)} <span class="unit">${info.unit}</span>`],
-      ["target", html`${number(target, decimals)} <span class="unit">${info.unit}</span>`],
+      ["target", html`${placed(axis, target, decimals)} <span class="unit">${info.unit}</span>`],
       ["left to go", html`${number(left, decimals)} <span class="unit">${info.unit}</span>`],
       ["encoder", html`${number(position?.counts, 0)} <span class="unit">count</span>`],
       ["A/D input", adc ? html`${number(adc.volts, 3)} <span class="unit">V</span> (${adc.counts})` : "none"],

@@ -6,7 +6,7 @@ import { askEach } from "../parts/fates.js";
 import { decimalsOf, number, percent, words } from "../parts/format.js";
 import { shownQuantity } from "../parts/number_text.js";
 import { inPageTerms, pageOf } from "../parts/remedies.js";
-import { Homed, Mark, Meter, Place, StateWord, TroubleWords } from "../parts/state.js";
+import { Homed, Mark, Meter, Place, placed, StateWord, TroubleWords } from "../parts/state.js";
 import { command, controls, take } from "../session/control.js";
 import { calms, obstacle } from "../session/obstacles.js";
 import { changed } from "../session/rigs.js";
@@ -87,7 +87,7 @@ function AxisRow({ axis }) {
     ${cell("Position", html`<${Place} axis=${axis} decimals=${decimals} label="Position" />`, "number main")}
     ${cell("Homed", html`<${Homed} axis=${axis} />`, "homed")}
     ${cell("Velocity", html`${number(velocity.value, Math.min(decimals, 2))}<span class="unit"> ${velocity.unit}</span>${velocity.acts && html` <small class="acts">${velocity.acts}</small>`}`, "number")}
-    ${cell("Target", number(live ? state?.command?.target : null, decimals), "number")}
+    ${cell("Target", placed(axis, live ? state?.command?.target : null, decimals), "number")}
     ${cell("Following error", number(live ? samples.position?.following_error : null, decimals), "number")}
     ${cell("Control", html`<${HolderWord} axis=${axis} />`, "holder", axis.control)}
     ${cell("Commands", html`<${AxisCommands} axis=${axis} />`, "commands")}

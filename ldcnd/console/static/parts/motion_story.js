@@ -2,7 +2,7 @@
 
 import { html } from "../html.js";
 import { clock, decimalsOf, duration, number, words } from "./format.js";
-import { Mark } from "./state.js";
+import { Mark, placed } from "./state.js";
 
 const ENDINGS = { halt: "halted", stop: "stopped", quick_stop: "stopped" };
 
@@ -21,9 +21,9 @@ export function EndOfMotion({ axis, event }) {
   const last = sameUnit ? event.last_position : null;
   const shown = position ?? last;
   const place = shown == null ? ""
-    : html`${position == null ? ", last read" : ""} at ${number(shown, decimals)} <span class="unit">${axis.info.unit}</span>`;
+    : html`${position == null ? ", last read" : ""} at ${placed(axis, shown, decimals)} <span class="unit">${axis.info.unit}</span>`;
   const goal = event.target ?? (settled == null || off == null || position == null ? null : position + off);
-  const target = goal == null || !sameUnit ? "" : ` to ${number(goal, decimals)}`;
+  const target = goal == null || !sameUnit ? "" : ` to ${placed(axis, goal, decimals)}`;
   const at = html` <span class="quiet">${clock(event.t).slice(0, -4)}</span>`;
   if (status === "done") {
     const tookS = axis.settlingS(event);

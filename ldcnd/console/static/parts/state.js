@@ -19,19 +19,23 @@ export function StateWord({ axis }) {
   return html`<span class="state" data-level=${live ? (LEVELS[axis.state?.state] ?? "unknown") : "unknown"}>${state}</span>`;
 }
 
-/** The position of an axis as text: in brackets and with its mark where it does not say where the axis is. */
+/** A position of an axis, or one that it goes to: in brackets where its numbers do not say where it is. */
+export function placed(axis, position, decimals) {
+  const value = number(position, decimals);
+  return position == null || axis.condition.known ? value : `(${value})`;
+}
+
+/** The position of an axis as text: with its mark where it does not say where the axis is. */
 export function placeText(axis, decimals) {
   const { known, mark } = axis.condition;
-  const value = number(axis.samples.position?.value, decimals);
-  return known ? value : `(${value}) ${mark}`;
+  const value = placed(axis, axis.samples.position?.value, decimals);
+  return known ? value : `${value} ${mark}`;
 }
 
 /** The same without the mark, which `Homed` has. */
 export function Place({ axis, decimals, label = null }) {
-  const { known } = axis.condition;
-  const value = number(axis.samples.position?.value, decimals);
-  return html`<span class="place" data-known=${known ? "yes" : "no"}><b aria-label=${label}
-    >${known ? value : `(${value})`}</b> <span class="unit">${axis.info.unit}</span></span>`;
+  return html`<span class="place" data-known=${axis.condition.known ? "yes" : "no"}><b aria-label=${label}
+    >${placed(axis, axis.samples.position?.value, decimals)}</b> <span class="unit">${axis.info.unit}</span></span>`;
 }
 
 /** Whether the position says where the axis is: the mark where it does not. */

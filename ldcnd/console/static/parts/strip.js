@@ -5,15 +5,15 @@ import { command } from "../session/control.js";
 import { obstacle } from "../session/obstacles.js";
 import { titleOf } from "../session/rigs.js";
 import { Action } from "./controls.js";
-import { clock, decimalsOf, number, sentence } from "./format.js";
-import { Homed, Place, StateWord, TroubleWords } from "./state.js";
+import { clock, decimalsOf, sentence } from "./format.js";
+import { Homed, Place, placed, StateWord, TroubleWords } from "./state.js";
 import { stopAxis } from "./stop_all.js";
 
 /** Where an axis is, and where it goes. */
 export function PlaceAndTarget({ axis }) {
   const decimals = decimalsOf(axis.info);
   const target = axis.condition.live ? axis.state?.command?.target : null;
-  return html`<span class="number"><${Place} axis=${axis} decimals=${decimals} />${target != null && html` <span class="quiet">→ ${number(target, decimals)}</span>`}</span>`;
+  return html`<span class="number"><${Place} axis=${axis} decimals=${decimals} />${target != null && html` <span class="quiet">→ ${placed(axis, target, decimals)}</span>`}</span>`;
 }
 
 /** The strip of the page of an axis. Anyone may end a motion, with or without control.
