@@ -94,7 +94,8 @@ class Leeway:
         least_counts: part of a profile in which a shaft must have been seen to begin to move, and once it has, twice
             as much in which it must have been seen to go on.
         held_counts: how far behind the end of a profile friction may hold a shaft; infinite where nothing tells.
-        sticks_counts: how far a profile may go on before friction lets the shaft go.
+        sticks_counts: how far a profile may go on before friction lets the shaft go; infinite where what the axis meets
+            may stop it.
         faults: what was not seen in time is a fault; else the axis may only move unseen, until its encoder counts.
         coasts: the shaft cannot stand at once: where it seems to, at a speed, its encoder has missed counts.
     """

@@ -230,6 +230,8 @@ class AxisMotion:
 
         "output = Kp*pos_error - ...; PWM = min(abs(output/256), output_limit)" (PIC-SERVO manual, 4.3).
         """
+        if self.config.settle.stalls:
+            return math.inf
         gains, least = self.driver.wanted_gains, STICKS_SHARE * max(2 * self.window_counts, LEAST_FOLLOWED_COUNTS)
         return max(least, OUTPUT_SCALE * gains.ol / 2 / gains.kp) if gains and gains.kp else least
 

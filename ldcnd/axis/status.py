@@ -54,6 +54,7 @@ class SoftLimits:
         slowing_counts_per_s2: how fast its shaft slows down at most with its motor off; None where that is not known.
         braking_counts_per_s2: how fast it slows down at most in a motion; None where either is not known.
         unseen: what is known of the rest of its shaft before it is first read.
+        stalls: what it meets may stop it.
     """
 
     low: float = -math.inf
@@ -62,6 +63,7 @@ class SoftLimits:
     slowing_counts_per_s2: float | None = None
     braking_counts_per_s2: float | None = None
     unseen: RestEvidence = NOTHING_SEEN
+    stalls: bool = False
 
     @classmethod
     def of(cls, config: AxisConfig) -> "SoftLimits":
@@ -76,6 +78,7 @@ class SoftLimits:
             speed / config.coast_s if config.coast_s else None,
             BRAKES_SHARE * scale * acceleration if config.coast_s and acceleration else None,
             RestEvidence(unseen_s=UNSEEN_SHARE * config.coast_s) if config.coast_s else NOTHING_SEEN,
+            config.settle.stalls,
         )
 
     def span(self, scale: AxisScale) -> tuple[float, float]:

@@ -36,7 +36,7 @@ def parted(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault, ...]) -
 def stood(status: AxisStatus, event: ReadingTaken) -> bool:
     """Tell whether a drive has let go of a shaft that was not seen to move, and pushed it: it jams, or moves unseen."""
     reading, following = event.reading, status.following
-    if reading.enabled or not status.enabled or shows_velocity(reading):
+    if reading.enabled or not status.enabled or status.limits.stalls or shows_velocity(reading):
         return False
     if not any(fault.stops and fault.hides_motion for fault in reading.faults):
         return False
@@ -85,7 +85,7 @@ def _watch_following(
         if seen is following:
             return status
         # a jam may be cleared, and an encoder come back: neither tells of the way between
-        status = place_lost(status) if seen.has_parted else status
+        status = place_lost(status) if seen.has_parted and not status.limits.stalls else status
         return replace(status, following=seen)
     if seen is Comparison.AS_TOLD and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done

@@ -114,6 +114,9 @@ counts."""
     """Reaction when it takes longer: report ends the motion as done with `settled` false, and an event; fault \
 ends it as failed with the fault `not_settled`."""
 
+    stalls: bool = False
+    """Whether what it meets may stop the axis, as a gripper; else standing in mid-motion costs the reference."""
+
     @model_validator(mode="after")
     def _reachable(self) -> Self:
         if self.timeout_s <= self.time_s:

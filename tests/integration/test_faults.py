@@ -163,6 +163,20 @@ async def test_a_jam_ends_in_a_position_error(dialect):
         assert (await rig.done(MoveRelative(distance=1.0))).state is AxisState.STANDSTILL
 
 
+@named((LS_182AP, V4))
+async def test_an_axis_that_may_be_stopped_by_what_it_meets_keeps_its_reference(dialect):
+    async with dialect_rig(dialect, gains=GAINS | {"el": 500}, settle={"stalls": True}) as rig:
+        await rig.power_on()
+        await rig.send(FAR)
+        await asyncio.sleep(0.5)
+        rig.condition(FaultCondition.STALLED)
+        await rig.until_fault(lambda faults: faults.active)
+        rig.condition(FaultCondition.STALLED, present=False)
+        await rig.send(Reset())
+        await rig.send(Power(on=True))
+        assert (await rig.done(FAR)).state is AxisState.STANDSTILL
+
+
 @named(DIALECTS)
 @pytest.mark.sweep(4)
 async def test_a_shaft_that_moved_on_beside_a_dead_encoder_has_no_place_behind_the_reset(dialect):
