@@ -92,7 +92,7 @@ class AxisMotion:
         self.window_counts = window_counts(config)
 
     async def check_does_not_coast(self, within_s: float = 0.0) -> None:
-        """Refuse to close the loop of a shaft that turns; where its rest is not proven, by a reading of now.
+        """Refuse to close the loop of a shaft that turns: by a reading of now where its rest or a stop is not proven.
 
         Args:
             within_s: how long to wait until it stands.
@@ -102,7 +102,7 @@ class AxisMotion:
             BusError: the line failed.
         """
         until_s = self._loop.time() + within_s
-        while not (self.tracker.status.enabled or self.tracker.status.at_rest):
+        while not self.tracker.status.enabled and (self.tracker.status.braking or not self.tracker.status.at_rest):
             self.tracker.take(LookTaken(await self.read()))
             if not (self.tracker.status.coasts or self.tracker.status.unseen) or self._loop.time() >= until_s:
                 break

@@ -253,7 +253,7 @@ class House:
             await context.add_cookies(self._cookies)
             yield desk
             assert not desk.strangers()
-            assert not desk.troubles
+            assert not desk.troubles, desk.troubles
         finally:
             await context.close()
 

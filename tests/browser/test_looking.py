@@ -289,13 +289,14 @@ async def test_the_velocity_of_a_turning_axis_is_that_of_its_turns(house):
             """async () => {
               const { Axis } = await import("/static/session/rigs.js");
               const axis = new Axis({ nowNs: () => 0, worth: null }, "rotor");
-              axis.info = { modulo: 1.0 };
+              axis.info = { modulo: 1.0, counts_per_unit: 8000, direction: "forward" };
               axis.take("state", { t: 1, state: "continuous_motion", moving: "yes" });
               for (let n = 1; n <= 9; n += 1) {
                 const turned = 5.13 * n / 10;
-                axis.take("position", { t: n * 1e8, value: turned % 1, turns: Math.floor(turned), quality: "good" });
+                const counts = Math.round(8000 * turned);
+                axis.take("position", { t: n * 1e8, value: turned % 1, counts, quality: "good" });
               }
               return axis.velocity;
             }"""
         )
-        assert velocity == pytest.approx(5.13)
+        assert velocity == pytest.approx(5.13, rel=1e-3)
