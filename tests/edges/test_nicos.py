@@ -226,10 +226,12 @@ def test_a_fault_ends_the_wait_as_an_error_that_is_reset(used):
     session.becomes(ERROR)
     rig.ask(lambda _: jam.end())
     session("reset(x)")
-    session.until("x.status(0)", lambda status: status[0] != ERROR)
-    session(POWER[world])
-    session("maw(x, 9)")
-    assert abs(shaft(rig).position - 9) < 0.02
+    # an encoder that has died shows the same as a jam
+    session.until("x.status(0)", lambda status: "reference lost" in status[1])
+    if world == "secop":  # over Channel Access NICOS takes a lost reference for an error of the device
+        home(world, session)
+        session("maw(x, 9)")
+        assert abs(shaft(rig).position - 9) < 0.02
 
 
 def test_an_axis_whose_line_is_down_is_in_error_and_its_last_values_are_not_good(used):
