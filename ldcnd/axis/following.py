@@ -187,7 +187,8 @@ class Following:
     @property
     def has_parted(self) -> bool:
         """Whether the shaft stood for longer than friction holds one: it jammed, or has gone on unseen."""
-        return self.given_up or self.leeway.sticks_counts + self._coming_counts <= self.gone_counts < math.inf
+        sticks = self.leeway.sticks_counts
+        return sticks < math.inf and (self.given_up or sticks + self._coming_counts <= self.gone_counts < math.inf)
 
     @property
     def _coming_counts(self) -> float:

@@ -327,7 +327,7 @@ class AxisPlans:
         return 0.0 if asked_s is None else abs(plan.velocity) / plan.acceleration
 
     def end_in_words(self, run_s: float, velocity: float, *, at_limit: bool) -> str:
-        """Return what ends a motion at a velocity that nobody stops; see `CommandReply.ends`."""
+        """Return what ends a motion at a velocity that is not stopped; see `CommandReply.ends`."""
         limit = self.limit_ahead(velocity)
         if at_limit and limit is not None:
             return f"runs until it is stopped, at most to its software limit {limit:g} {self.scale.unit}"

@@ -85,7 +85,7 @@ def _watch_following(
         if seen is following:
             return status
         # a jam may be cleared, and an encoder come back: neither tells of the way between
-        status = place_lost(status) if seen.has_parted and not status.limits.stalls else status
+        status = place_lost(status) if seen.has_parted else status
         return replace(status, following=seen)
     if seen is Comparison.AS_TOLD and status.command and not tripped:
         # at a velocity that it has reached its drive says that its profile is done
