@@ -81,7 +81,16 @@ from ldcnd.axis.status import (
     AxisStatus,
     Completion,
 )
-from ldcnd.axis.watch import let_go, next_following, parted, stood, watch_braking, watch_course, watch_encoder
+from ldcnd.axis.watch import (
+    LOOK_AND_HOME,
+    let_go,
+    next_following,
+    parted,
+    stood,
+    watch_braking,
+    watch_course,
+    watch_encoder,
+)
 from ldcnd.contract.commands import Verb
 from ldcnd.contract.samples import AxisState, LinkState, Unseen
 from ldcnd.drives.driver import Fault, StopMode
@@ -141,7 +150,8 @@ def _take_effective(status: AxisStatus, event: ReadingTaken, faults: tuple[Fault
         status = replace(status, target=None)
     if status.following or status.coast or (rest.turns and (not enabled or status.limits.braking_counts_per_s2)):
         before, status = status, watch_encoder(status, event, faults)
-        if status.own is not before.own and NOT_FOLLOWED in status.own:
+        # what it has found has ended the command, and the axis is in error_stop
+        if status.command is not before.command or (status.own is not before.own and NOT_FOLLOWED in status.own):
             return status
     if faults and any(fault.stops for fault in faults):
         return _fail_by_fault(status, event)
@@ -209,14 +219,18 @@ def _take_profile_end(
     if not settled and status.unsure:
         return finished(status, status.unsure.why, settled=False)
     off_counts = abs(settling.target_counts - reading.position_counts)
-    if not settled and status.following and off_counts >= status.following.leeway.sticks_counts:
-        status = changed(place_lost(status), target=None)  # friction holds no shaft as far from there
-    if settled or not settling.faults:
+    # friction holds no shaft as far from there
+    astray = status.referenced and status.following and off_counts >= status.following.leeway.sticks_counts
+    if settled or not (settling.faults or astray):
         return finished(status, settled=settled)
-    status = replace(status, own=own_and(status, NOT_SETTLED))
-    status = with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
     off = (settling.target_counts - reading.position_counts) / status.scale.counts_per_unit
-    return fail(status, f"{command.verb} did not settle: {off:.4g} {status.scale.unit} off", settled=False)
+    why = f"{command.verb} did not settle: {off:.4g} {status.scale.unit} off"
+    if astray:
+        status, why = changed(place_lost(status), target=None), f"{why}; {LOOK_AND_HOME}"
+    if settling.faults:
+        status = replace(status, own=own_and(status, NOT_SETTLED))
+        status = with_faults(status, (*faults, NOT_SETTLED), event.now_ns)
+    return fail(status, why, settled=False)
 
 
 def _take_of_others(status: AxisStatus, event: ReadingTaken) -> AxisStatus:

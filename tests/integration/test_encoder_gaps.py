@@ -49,6 +49,30 @@ def test_an_encoder_that_stuck_for_a_while_in_a_motion_leaves_no_place(axis, vel
     assert not referenced
 
 
+@pytest.mark.parametrize("trouble", ["encoder", "jam"])
+def test_a_motion_whose_place_is_not_known_any_more_is_stopped_and_has_failed(trouble):
+    async def program() -> tuple[float, float, str, bool]:
+        async with simulated_rig(SIMULATED, seed=1) as rig, rig.client.control("x", client="test") as moved:
+            await moved.power(on=True)
+            if trouble == "encoder":
+                rig.faults.encoder_stuck("x", at=6.0, for_s=0.4)
+            else:
+                rig.faults.jam("x", at=6.0, for_s=0.4)
+            motion = await moved.move_absolute(60.0, velocity=5.0)
+            with pytest.raises(LdcndError) as raised:
+                await motion.done()
+            await asyncio.sleep(2)
+            stood = rig.truth("x").position
+            await asyncio.sleep(2)
+            return stood, rig.truth("x").position, str(raised.value), moved.state.sample.referenced
+
+    stood, later, why, referenced = run(program())
+    assert 5 < stood < 55
+    assert abs(later - stood) < 0.01
+    assert "home it" in why
+    assert not referenced
+
+
 @pytest.mark.parametrize("seed", range(24))
 @pytest.mark.sweep(6)
 def test_a_healthy_axis_keeps_its_place_whatever_friction_it_has(seed):
