@@ -111,11 +111,11 @@ counts."""
     timeout_s: float = Field(default=1.0, gt=0, le=60)
     """Longest time for that, from the end of the profile, in seconds."""
     unsettled: Literal["report", "fault"] = "report"
-    """Reaction when it takes longer: report ends the motion as done with `settled` false, and an event; fault \
-ends it as failed with the fault `not_settled`."""
+    """Reaction when it takes longer: report ends the motion as done with `settled` false, and an event; fault as \
+failed, with the fault `not_settled`."""
 
     stalls: bool = False
-    """Whether what it meets may stop the axis, as a gripper; else standing in mid-motion costs the reference."""
+    """What it meets may stop the axis (a gripper); else standing in mid-motion fails, and costs the reference."""
 
     @model_validator(mode="after")
     def _reachable(self) -> Self:
